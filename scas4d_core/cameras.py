@@ -1,0 +1,233 @@
+"""Cameras, rigs, and the frame of the inside world. Numpy only.
+
+Axes are OpenCV's: x right, y down, z forward; ``X_cam = R X_world + t``; ``u = fx x/z + cx``.
+Pixel (column i, row j) covers [i, i+1) x [j, j+1); its centre is (i + 0.5, j + 0.5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Float = NDArray[np.float64]
+
+ROTATION_TOLERANCE = 1e-3
+"""Largest entry of R Rᵀ − I that still counts as a rotation: calibration files round to 4–6 digits."""
+
+
+class CameraError(ValueError):
+    """A camera that cannot be: the message names the camera, the field, the value and the remedy."""
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera without distortion.
+
+    Attributes:
+        name: identifies the camera within its rig.
+        intrinsics: [3, 3] float64 in pixels, ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``.
+        world_to_camera: [4, 4] float64, OpenCV axes.
+        width, height: picture size in pixels.
+
+    Raises:
+        CameraError: not finite, focal length not positive, skew, no rotation, or empty picture.
+    """
+
+    name: str
+    intrinsics: Float
+    world_to_camera: Float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        for field, shape in (("intrinsics", (3, 3)), ("world_to_camera", (4, 4))):
+            value = np.array(getattr(self, field), dtype=np.float64)
+            if value.shape != shape:
+                raise CameraError(f"camera {self.name!r}: {field} has shape {value.shape}; give {shape}")
+            if not np.isfinite(value).all():
+                raise CameraError(f"camera {self.name!r}: {field} holds NaN or infinity; give finite numbers")
+            value.setflags(write=False)
+            object.__setattr__(self, field, value)
+        k, r = self.intrinsics, self.rotation
+        if k[0, 0] <= 0 or k[1, 1] <= 0:
+            raise CameraError(f"camera {self.name!r}: focal lengths {k[0, 0]:g}, {k[1, 1]:g} must be positive pixels")
+        if abs(k[0, 1]) + abs(k[1, 0]) + abs(k[2, 0]) + abs(k[2, 1]) + abs(k[2, 2] - 1) > 1e-6:
+            raise CameraError(f"camera {self.name!r}: intrinsics must be [[fx,0,cx],[0,fy,cy],[0,0,1]]; undo skew first")
+        if np.abs(r @ r.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(r) < 0:
+            raise CameraError(
+                f"camera {self.name!r}: world_to_camera[:3,:3] is no rotation "
+                f"(determinant {np.linalg.det(r):.4g}); give world-to-camera with OpenCV axes"
+            )
+        if not np.allclose(self.world_to_camera[3], (0, 0, 0, 1)):
+            raise CameraError(f"camera {self.name!r}: last row of world_to_camera must be 0 0 0 1")
+        if self.width < 1 or self.height < 1:
+            raise CameraError(f"camera {self.name!r}: size {self.width}x{self.height} must be at least 1x1")
+
+    @property
+    def fx(self) -> float:
+        """Focal length in pixels along x."""
+        return float(self.intrinsics[0, 0])
+
+    @property
+    def fy(self) -> float:
+        """Focal length in pixels along y."""
+        return float(self.intrinsics[1, 1])
+
+    @property
+    def cx(self) -> float:
+        """Principal point, pixels from the left edge of the picture."""
+        return float(self.intrinsics[0, 2])
+
+    @property
+    def cy(self) -> float:
+        """Principal point, pixels from the upper edge of the picture."""
+        return float(self.intrinsics[1, 2])
+
+    @property
+    def rotation(self) -> Float:
+        """[3, 3] world to camera."""
+        return self.world_to_camera[:3, :3]
+
+    @property
+    def translation(self) -> Float:
+        """[3] world to camera."""
+        return self.world_to_camera[:3, 3]
+
+    @property
+    def centre(self) -> Float:
+        """[3] centre of projection in the world."""
+        centre: Float = -self.rotation.T @ self.translation
+        return centre
+
+    def scaled(self, image_scale: float) -> Camera:
+        """The same camera seeing pictures resized by ``image_scale``; sizes round to whole pixels.
+
+        With pixel centres at +0.5 a resize multiplies u, v (and so fx, fy, cx, cy) by the exact ratio of the sizes.
+        """
+        width = max(1, round(self.width * image_scale))
+        height = max(1, round(self.height * image_scale))
+        ratio = np.array([[width / self.width], [height / self.height], [1.0]])
+        return Camera(self.name, self.intrinsics * ratio, self.world_to_camera, width, height)
+
+    def to_camera(self, points: ArrayLike) -> Float:
+        """[..., 3] world points in camera axes."""
+        result: Float = np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
+        return result
+
+    def project(self, points: ArrayLike) -> tuple[Float, Float]:
+        """[..., 3] world points to pixels [..., 2] and depths [...]; behind the camera (depth <= 0) pixels are NaN."""
+        seen = self.to_camera(points)
+        depth = seen[..., 2]
+        safe = np.where(depth > 0, depth, np.nan)
+        uv = np.stack([self.fx * seen[..., 0] / safe + self.cx, self.fy * seen[..., 1] / safe + self.cy], axis=-1)
+        return uv, depth
+
+    def unproject(self, uv: ArrayLike, depth: ArrayLike) -> Float:
+        """Pixels [..., 2] at depths [...] (along z, not along the ray) to world points [..., 3]."""
+        uv = np.asarray(uv, dtype=np.float64)
+        z = np.asarray(depth, dtype=np.float64)
+        x = (uv[..., 0] - self.cx) / self.fx * z
+        y = (uv[..., 1] - self.cy) / self.fy * z
+        result: Float = (np.stack([x, y, z], axis=-1) - self.translation) @ self.rotation
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class WorldFrame:
+    """The similarity from the user's world to the inside world: ``inside = (user − origin) · metres_per_unit``.
+
+    Attributes:
+        origin: [3] float64, in the user's units.
+        metres_per_unit: metres in one of the user's units.
+    """
+
+    origin: Float
+    metres_per_unit: float = 1.0
+
+    def to_inside(self, points: ArrayLike) -> Float:
+        """[..., 3] user's units to metres about the origin."""
+        result: Float = (np.asarray(points, dtype=np.float64) - self.origin) * self.metres_per_unit
+        return result
+
+    def to_user(self, points: ArrayLike) -> Float:
+        """[..., 3] metres about the origin to the user's units."""
+        result: Float = np.asarray(points, dtype=np.float64) / self.metres_per_unit + self.origin
+        return result
+
+    def camera_to_inside(self, camera: Camera) -> Camera:
+        """The camera as the inside world sees it; rotation and intrinsics stay."""
+        pose = camera.world_to_camera.copy()
+        pose[:3, 3] = (camera.rotation @ self.origin + camera.translation) * self.metres_per_unit
+        return Camera(camera.name, camera.intrinsics, pose, camera.width, camera.height)
+
+
+AUTO_RIG_RADIUS_M = 3.0
+"""``metres_per_unit="auto"`` takes the rig's radius for this many metres: a room-sized stage."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Cameras that look at one scene, names unique."""
+
+    cameras: tuple[Camera, ...]
+
+    def __post_init__(self) -> None:
+        names = [camera.name for camera in self.cameras]
+        if not names:
+            raise CameraError("a rig needs at least one camera")
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise CameraError(f"camera names must be unique within a rig; given twice: {', '.join(twice)}")
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def __getitem__(self, name: str) -> Camera:
+        for camera in self.cameras:
+            if camera.name == name:
+                return camera
+        raise KeyError(name)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Camera names in the rig's order."""
+        return tuple(camera.name for camera in self.cameras)
+
+    @property
+    def centre(self) -> Float:
+        """[3] mean of the camera centres."""
+        centre: Float = np.mean([camera.centre for camera in self.cameras], axis=0)
+        return centre
+
+    @property
+    def radius(self) -> float:
+        """1.1 x the largest distance of a camera centre from their mean: the scene radius of Dynamic3DGaussians."""
+        distances = [np.linalg.norm(camera.centre - self.centre) for camera in self.cameras]
+        return float(1.1 * max(distances))
+
+    def world_frame(self, metres_per_unit: float | str = 1.0) -> WorldFrame:
+        """The frame recentred on the rig.
+
+        Args:
+            metres_per_unit: metres in one unit of the calibration, or "auto" to take the rig's radius for 3 m.
+        """
+        if metres_per_unit == "auto":
+            radius = self.radius
+            metres = AUTO_RIG_RADIUS_M / radius if radius > 0 else 1.0
+        else:
+            metres = float(metres_per_unit)
+            if not (np.isfinite(metres) and metres > 0):
+                raise CameraError(f"metres_per_unit {metres_per_unit!r} must be a positive number or 'auto'")
+        return WorldFrame(self.centre, metres)
+
+    def scaled(self, image_scale: float) -> Rig:
+        """Every camera under ``image_scale``."""
+        return Rig(tuple(camera.scaled(image_scale) for camera in self.cameras))
+
+
+def rig_inside(frame: WorldFrame, cameras: Sequence[Camera]) -> Rig:
+    """The cameras of a rig as the inside world sees them."""
+    return Rig(tuple(frame.camera_to_inside(camera) for camera in cameras))

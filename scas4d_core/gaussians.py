@@ -1,0 +1,62 @@
+"""Θ, the state of a scene: a fixed, ordered set of 3D Gaussians. Numpy only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """N Gaussians at one moment. Row order is identity: row i is the same piece of matter in every frame.
+
+    Attributes:
+        means: [N, 3] float32, metres in the inside world.
+        factors: [N, 3, 3] float32; Σ = F Fᵀ; the columns are the transported axes, metres.
+        rotations: [N, 4] float32 unit quaternions (w, x, y, z): material rotation since frame 0.
+        opacities: [N] float32 in (0, 1), fixed after frame 0.
+        colours: [N, 3] float32 RGB, nominally 0…1.
+        foreground: [N] float32 in 0…1: the learnt label; above 0.5 the Gaussian moves.
+        ids: [N] int64, for ever.
+    """
+
+    means: Array
+    factors: Array
+    rotations: Array
+    opacities: Array
+    colours: Array
+    foreground: Array
+    ids: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def replace(self, **changes: Any) -> Gaussians:
+        """A copy with some of the arrays exchanged; the others are shared."""
+        return replace(self, **changes)
+
+    @property
+    def moving(self) -> NDArray[np.bool_]:
+        """[N] which Gaussians the label lets move."""
+        moving: NDArray[np.bool_] = self.foreground > 0.5
+        return moving
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays by name, for files and messages."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+def quaternions_to_matrices(quaternions: NDArray[Any]) -> NDArray[Any]:
+    """Unit quaternions [..., 4] (w, x, y, z) to rotation matrices [..., 3, 3]."""
+    w, x, y, z = np.moveaxis(quaternions, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
