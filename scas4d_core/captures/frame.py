@@ -1,0 +1,44 @@
+"""What one moment of a capture holds: pictures and masks by camera; and the points it may start from. Numpy only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The pictures of one moment.
+
+    Attributes:
+        index: 0, 1, 2, … in order of time.
+        time: seconds since the first frame.
+        images: by camera name, [H, W, 3] uint8, the sRGB values of the file. May decode when an entry is read.
+        masks: by camera name, [H, W] uint8, 1 where the foreground is; empty where the capture has no masks.
+    """
+
+    index: int
+    time: float
+    images: Mapping[str, NDArray[np.uint8]]
+    masks: Mapping[str, NDArray[np.uint8]]
+
+
+@dataclass(eq=False)
+class InitialPoints:
+    """A cloud on the surfaces of frame 0, to start from.
+
+    Attributes:
+        positions: [P, 3] float64, user's units and axes.
+        colours: [P, 3] float32 in 0…1, sRGB values as in the pictures.
+        foreground: [P] float32 in 0…1, or None where nobody said.
+    """
+
+    positions: NDArray[np.float64]
+    colours: NDArray[np.float32]
+    foreground: NDArray[np.float32] | None = None
+
+    def __len__(self) -> int:
+        return len(self.positions)
