@@ -1,0 +1,1 @@
+"""Differentiable rasterization of Gaussians: ``cpu`` (Numba), ``twin`` (torch, float64), ``cuda`` (gsplat)."""

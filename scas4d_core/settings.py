@@ -1,0 +1,129 @@
+"""Every number a user can set, with its unit, range and the reason for its default. Pydantic only."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+
+
+class Model(BaseModel):
+    """Settings do not change once read, and an unknown name is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class SceneSettings(Model):
+    """How the outside world enters."""
+
+    metres_per_unit: Positive | Literal["auto"] = Field(
+        1.0, description="Metres in one unit of the calibration; 'auto' takes the rig's radius for 3 m."
+    )
+    image_scale: float = Field(1.0, gt=0, le=1, description="Pictures are resized by this before anything else.")
+    background: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), description="RGB in 0…1 behind everything; black, as in the captures of the field."
+    )
+    floor: tuple[float, float, float, float] | None = Field(
+        None,
+        description="Plane (a, b, c, d) of the floor in the user's world, a·x+b·y+c·z+d > 0 below it; "
+        "foreground below the floor is pushed up. None: the scene has no floor term.",
+    )
+
+
+class StaticSettings(Model):
+    """Frame 0: 3D Gaussian Splatting with adaptive density control."""
+
+    iterations: int = Field(2000, ge=1, description="Iterations of frame 0, one training view each.")
+    max_gaussians: int = Field(25_000, ge=1, description="Budget of Gaussians; densification stops there.")
+    initial_gaussians: int = Field(15_000, ge=1, description="At most this many points of the first cloud are used.")
+    densify_from: int = Field(200, ge=0, description="First iteration that densifies; before, gradients are noise.")
+    densify_every: int = Field(100, ge=1, description="Iterations between densifications.")
+    densify_until: float = Field(0.6, ge=0, le=1, description="Fraction of the iterations after which none is added.")
+    densify_gradient: Positive = Field(
+        2e-4, description="Mean screen gradient (per half picture, as in 3DGS) above which a Gaussian is refined."
+    )
+    prune_opacity: NotNegative = Field(0.01, description="Less opaque Gaussians are removed while densifying.")
+    exposure: bool = Field(
+        False, description="Learn a colour gain and offset per training camera (held-out cameras are scored raw)."
+    )
+    rate_position: Positive = Field(1.6e-4, description="Adam rate of means at the start, per metre of scene radius.")
+    rate_position_end: Positive = Field(1.6e-6, description="The same at the end; the decay is exponential.")
+    rate_colour: Positive = Field(1e-2, description="Adam rate of colours.")
+    rate_opacity: Positive = Field(5e-2, description="Adam rate of opacity logits.")
+    rate_scale: Positive = Field(5e-3, description="Adam rate of log scales.")
+    rate_rotation: Positive = Field(2e-3, description="Adam rate of quaternions.")
+    rate_exposure: Positive = Field(1e-3, description="Adam rate of log gain and offset.")
+    weight_mask: NotNegative = Field(3.0, description="Weight of the mask loss where masks are given.")
+    seed: int = Field(0, ge=0, description="Seed of the order of views and of the split of Gaussians.")
+
+
+class LayerRates(Model):
+    """Adam rates of one layer of clusters."""
+
+    rotation: Positive = Field(description="Per iteration, in units of tan(angle/2).")
+    translation: Positive = Field(description="Metres per iteration, for a scene radius of 4 m.")
+    scaling: Positive = Field(description="Of c (1/m) and s.")
+
+
+class Weights(Model):
+    """Weights of the terms. A term with weight 0 is not computed."""
+
+    image: Positive = Field(1.0, description="0.8 L1 + 0.2 (1 − SSIM).")
+    mask: NotNegative = Field(3.0, description="The same form on the rendered label; only where masks are given.")
+    rigidity: NotNegative = Field(4.0, description="Dynamic3DGaussians; with image 1, the paper's 0.19 to 0.05.")
+    isometry: NotNegative = Field(2.0, description="Likewise.")
+    rotation: NotNegative = Field(4.0, description="Likewise.")
+    scale: NotNegative = Field(10.0, description="Likewise, the paper's 0.48 to 0.05.")
+    soft_colour: NotNegative = Field(0.01, description="Dynamic3DGaussians; the paper does not give it.")
+    floor: NotNegative = Field(2.0, description="Dynamic3DGaussians; only where the scene names a floor.")
+    background: NotNegative = Field(20.0, description="Dynamic3DGaussians; only where standing Gaussians may move.")
+
+
+class UpdateSettings(Model):
+    """One update: from Θ_{t−1} and the pictures of frame t to Θ_t."""
+
+    iterations: int = Field(100, ge=1, description="Iterations a frame, one forward and backward render each.")
+    clusters: tuple[int, ...] = Field(
+        (64, 320, 1280), description="Clusters per layer, coarse to fine (the paper's); empty: each Gaussian alone."
+    )
+    smallest_cluster: int = Field(8, ge=1, description="Layers are capped so that clusters hold this many on average.")
+    cluster_map: Literal["centred", "published"] = Field(
+        "centred", description="Scaling about the pivot (translation-equivariant) or about the world origin (paper)."
+    )
+    layer_rates: tuple[LayerRates, ...] = Field(
+        (
+            LayerRates(rotation=0.02, translation=0.004, scaling=0.002),
+            LayerRates(rotation=0.01, translation=0.002, scaling=0.002),
+            LayerRates(rotation=0.005, translation=0.001, scaling=0.002),
+        ),
+        description="One per layer, coarse to fine; with more layers the last is repeated.",
+    )
+    rate_position: Positive = Field(1.6e-4, description="Δp, per metre of scene radius.")
+    rate_rotation: Positive = Field(0.002, description="ΔR, in units of tan(angle/2).")
+    rate_scale: NotNegative = Field(0.001, description="Δs, log.")
+    rate_colour: NotNegative = Field(0.0025, description="RGB.")
+    rate_end: float = Field(
+        1.0, gt=0, le=1, description="All rates decay to this fraction over the frame (cosine); 1: constant."
+    )
+    beta1: float = Field(0.9, ge=0, lt=1, description="Adam's first decay.")
+    beta2: float = Field(0.999, ge=0, lt=1, description="Adam's second decay.")
+    warm_start: float = Field(1.0, ge=0, le=1, description="Share of the previous deformation that starts the next.")
+    neighbours: int = Field(20, ge=1, description="Neighbours of a Gaussian in the rigidity terms.")
+    neighbour_falloff: Positive = Field(2000.0, description="1/m²: weight exp(−falloff d²) of a neighbour at d.")
+    neighbour_sample: int = Field(4000, ge=1, description="Gaussians whose neighbours are looked at an iteration.")
+    max_scale: Positive = Field(0.02, description="Metres; longer axes are held at their length of frame 0.")
+    weights: Weights = Field(default_factory=Weights)
+    use_masks: bool = Field(True, description="Use the frame's masks where it has any.")
+    seed: int = Field(0, ge=0, description="Seed of the order of views and of the sampled neighbours.")
+
+
+class Settings(Model):
+    """All settings of one scene."""
+
+    scene: SceneSettings = Field(default_factory=SceneSettings)
+    static: StaticSettings = Field(default_factory=StaticSettings)
+    update: UpdateSettings = Field(default_factory=UpdateSettings)
+    device: Literal["cpu", "cuda"] = Field("cpu", description="Where the update runs.")
