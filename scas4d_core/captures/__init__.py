@@ -1,5 +1,46 @@
-"""Captures on disk: `open_capture` is the door."""
+"""Captures on disk: `open_capture` is the door. Numpy and Pillow only."""
 
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from scas4d_core.captures.capture import Capture
+from scas4d_core.captures.dynamic3dgs import TRAIN_META, read_dynamic3dgs
+from scas4d_core.captures.files import CaptureError
 from scas4d_core.captures.frame import Frame, InitialPoints
+from scas4d_core.captures.ground_truth import GroundTruth, Part
+from scas4d_core.captures.images import ImageError, decode_image, decode_mask, resize_area
 
-__all__ = ["Frame", "InitialPoints"]
+__all__ = [
+    "Capture",
+    "CaptureError",
+    "Frame",
+    "GroundTruth",
+    "ImageError",
+    "InitialPoints",
+    "Part",
+    "decode_image",
+    "decode_mask",
+    "open_capture",
+    "read_dynamic3dgs",
+    "resize_area",
+]
+
+
+def open_capture(folder: Path | str, **options: Any) -> Capture:
+    """Open a capture of any known layout; the files in the folder tell which.
+
+    Args:
+        folder: of the capture.
+        options: those of the reader: `read_dynamic3dgs` (image_scale, fps, use_masks, use_points).
+
+    Raises:
+        CaptureError: no such folder, no known layout, or a fault in one of the files.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise CaptureError(f"{folder}: no such folder")
+    if (folder / TRAIN_META).exists():
+        return read_dynamic3dgs(folder, **options)
+    raise CaptureError(f"{folder}: no known capture layout; Dynamic3DGaussians has {TRAIN_META} here")

@@ -1,0 +1,212 @@
+"""Reads the layout of the Dynamic3DGaussians data. Numpy and Pillow only.
+
+``train_meta.json`` and ``test_meta.json`` hold ``w``, ``h``, ``k[t][c]`` (3×3, pixels), ``w2c[t][c]`` (4×4, OpenCV
+axes), ``fn[t][c]`` (path under ``ims/``) and ``cam_id[t][c]``. Masks lie under ``seg/`` with the same path, ending in
+``.png``. ``init_pt_cld.npz`` holds ``data`` [P, 7]: x y z, r g b (0…1), foreground (0…1).
+(JonathonLuiten/Dynamic3DGaussians, ``train.py``.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Camera, CameraError, Rig
+from scas4d_core.captures.capture import Capture, Files
+from scas4d_core.captures.files import CaptureError, read_json, read_npz
+from scas4d_core.captures.frame import InitialPoints
+from scas4d_core.captures.ground_truth import read_extent, read_ground_truth
+from scas4d_core.captures.images import ImageError, picture_size, scaled_size
+
+TRAIN_META = "train_meta.json"
+STILL_TOLERANCE = 1e-6
+"""Largest change of an entry of k or w2c over time that still counts as a camera standing still."""
+
+
+def read_dynamic3dgs(
+    folder: Path | str,
+    *,
+    image_scale: float = 1.0,
+    fps: float = 30.0,
+    use_masks: bool = True,
+    use_points: bool = True,
+) -> Capture:
+    """Open a capture. Cameras are named ``str(cam_id)``; test cameras are those of ``test_meta.json``.
+
+    Masks, cloud, test cameras and ground truth are optional, but masks must be there for all training cameras or none.
+
+    Args:
+        folder: holds ``train_meta.json``.
+        image_scale: resizes pictures, masks, labels and cameras alike.
+        fps: frames per second; the layout does not say.
+        use_masks: False to leave ``seg/`` alone.
+        use_points: False to leave ``init_pt_cld.npz`` alone.
+
+    Raises:
+        CaptureError: a file is missing, broken, or does not fit the others; or a camera moves.
+    """
+    folder = Path(folder)
+    if not (np.isfinite(fps) and fps > 0):
+        raise CaptureError(f"fps {fps!r} must be a positive number of frames per second")
+    train = _read_cameras(folder, TRAIN_META)
+    test = _read_cameras(folder, "test_meta.json") if (folder / "test_meta.json").exists() else None
+    if test is not None:
+        both = sorted(set(train.rig.names) & set(test.rig.names))
+        if both:
+            raise CaptureError(f"{folder / 'test_meta.json'}: cam_id {', '.join(both)} is also in {TRAIN_META}")
+        if len(test.images) != len(train.images):
+            raise CaptureError(
+                f"{folder / 'test_meta.json'}: has {len(test.images)} frames, {TRAIN_META} {len(train.images)}"
+            )
+    sizes = {
+        camera.name: ((camera.width, camera.height), scaled_size((camera.width, camera.height), image_scale))
+        for rig in ([train.rig, test.rig] if test else [train.rig])
+        for camera in rig.cameras
+    }
+    with_masks = use_masks and (folder / "seg").is_dir()
+    return Capture(
+        name=folder.resolve().name,
+        full_rig=train.rig,
+        full_test_rig=test.rig if test else None,
+        image_scale=image_scale,
+        image_files=train.images,
+        mask_files=_masks(folder, train, required=True) if with_masks else tuple({} for _ in train.images),
+        test_image_files=test.images if test else (),
+        test_mask_files=_masks(folder, test, required=False)
+        if test and with_masks
+        else tuple({} for _ in train.images),
+        fps=fps,
+        points=_read_points(folder / "init_pt_cld.npz") if use_points else None,
+        ground_truth=read_ground_truth(folder, len(train.images), sizes),
+        extent=read_extent(folder),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Cameras:
+    rig: Rig
+    images: tuple[Files, ...]
+    relative: tuple[dict[str, PurePosixPath], ...]
+
+
+def _read_cameras(folder: Path, file: str) -> _Cameras:
+    path = folder / file
+    meta = read_json(path)
+    missing = [key for key in ("w", "h", "k", "w2c", "fn", "cam_id") if key not in meta]
+    if missing:
+        raise CaptureError(f"{path}: has no {', '.join(missing)}")
+    width, height = (_whole(path, key, meta[key]) for key in ("w", "h"))
+    names = _names(path, meta["cam_id"])
+    intrinsics = _still(path, "k", meta["k"], (len(meta["cam_id"]), len(names), 3, 3))
+    poses = _still(path, "w2c", meta["w2c"], (len(meta["cam_id"]), len(names), 4, 4))
+    try:
+        rig = Rig(tuple(Camera(n, k, p, width, height) for n, k, p in zip(names, intrinsics, poses, strict=True)))
+    except CameraError as fault:
+        raise CaptureError(f"{path}: {fault}") from fault
+    relative = _relative_paths(path, meta["fn"], len(meta["cam_id"]), names)
+    images = tuple({name: folder / "ims" / file for name, file in frame.items()} for frame in relative)
+    for frame in images:
+        absent = next((file for file in frame.values() if not file.is_file()), None)
+        if absent:
+            raise CaptureError(f"{absent}: no such file, but {file} names it")
+    for name, picture in images[0].items():
+        try:
+            size = picture_size(picture)
+        except ImageError as fault:
+            raise CaptureError(str(fault)) from fault
+        if size != (width, height):
+            raise CaptureError(
+                f"{picture}: is {size[0]}x{size[1]} pixels, but {file} says {width}x{height} (camera {name}); "
+                "give pictures at the size the cameras were calibrated for (image_scale resizes both)"
+            )
+    return _Cameras(rig, images, relative)
+
+
+def _whole(path: Path, key: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | float) or value != round(value) or value < 1:
+        raise CaptureError(f"{path}: {key} is {value!r}; give a whole number of pixels")
+    return int(value)
+
+
+def _names(path: Path, cam_id: Any) -> list[str]:
+    if not isinstance(cam_id, list) or not cam_id or not all(isinstance(row, list) and row for row in cam_id):
+        raise CaptureError(f"{path}: cam_id must be a list of frames, each a list of cameras, none empty")
+    changed = next((t for t, row in enumerate(cam_id) if row != cam_id[0]), None)
+    if changed is not None:
+        raise CaptureError(
+            f"{path}: cam_id of frame {changed} differs from frame 0; list the same cameras in every frame"
+        )
+    return [str(name) for name in cam_id[0]]
+
+
+def _still(path: Path, key: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as fault:
+        raise CaptureError(f"{path}: {key} must be numbers of shape {list(shape)}, as cam_id has; {fault}") from fault
+    if array.shape != shape:
+        raise CaptureError(f"{path}: {key} must have shape {list(shape)}, as cam_id has; found {list(array.shape)}")
+    moved = np.abs(array - array[:1]).max(axis=(2, 3)) > STILL_TOLERANCE * np.maximum(1, np.abs(array[:1])).max()
+    if moved.any():
+        frame, camera = np.argwhere(moved)[0]
+        raise CaptureError(
+            f"{path}: {key} of camera number {camera} changes at frame {frame}; a rig's cameras must stand still: "
+            "cut the capture where they move"
+        )
+    still: NDArray[np.float64] = array[0]
+    return still
+
+
+def _relative_paths(path: Path, fn: Any, frames: int, names: list[str]) -> tuple[dict[str, PurePosixPath], ...]:
+    if not isinstance(fn, list) or len(fn) != frames:
+        raise CaptureError(f"{path}: fn must list {frames} frames, as cam_id does")
+    result = []
+    for number, row in enumerate(fn):
+        if not isinstance(row, list) or len(row) != len(names) or not all(isinstance(entry, str) for entry in row):
+            raise CaptureError(f"{path}: fn[{number}] must list {len(names)} file names, as cam_id does")
+        files = {}
+        for name, entry in zip(names, row, strict=True):
+            file = PurePosixPath(entry)
+            if file.is_absolute() or ".." in file.parts or "\\" in entry or not file.name:
+                raise CaptureError(f"{path}: fn[{number}] {entry!r} leads out of ims/; give a path below it")
+            files[name] = file
+        result.append(files)
+    return tuple(result)
+
+
+def _masks(folder: Path, cameras: _Cameras, *, required: bool) -> tuple[Files, ...]:
+    frames = []
+    for relative in cameras.relative:
+        files = {name: folder / "seg" / file.with_suffix(".png") for name, file in relative.items()}
+        absent = [name for name, file in files.items() if not file.is_file()]
+        if absent and required:
+            raise CaptureError(
+                f"{files[absent[0]]}: no mask for camera {absent[0]}; give masks for every training camera and frame, "
+                "or leave them all out (use_masks=False)"
+            )
+        frames.append({name: file for name, file in files.items() if name not in absent})
+    return tuple(frames)
+
+
+def _read_points(path: Path) -> InitialPoints | None:
+    if not path.exists():
+        return None
+    data = read_npz(path, ("data",))["data"]
+    if data.ndim != 2 or data.shape[1] != 7 or len(data) == 0 or data.dtype.kind not in "fiu":
+        raise CaptureError(
+            f"{path}: data must be [P, 7] numbers, x y z r g b foreground; found {data.dtype} {list(data.shape)}"
+        )
+    if not np.isfinite(data).all():
+        raise CaptureError(f"{path}: data holds NaN or infinity in row {int(np.argmin(np.isfinite(data).all(axis=1)))}")
+    shown = data[:, 3:]
+    if shown.min() < -1e-3 or shown.max() > 1 + 1e-3:
+        raise CaptureError(
+            f"{path}: colours and foreground must be in 0…1; found {shown.min():g}…{shown.max():g}; "
+            "divide by 255 what is in 0…255"
+        )
+    shown = np.clip(shown, 0, 1).astype(np.float32)
+    return InitialPoints(data[:, :3].astype(np.float64), shown[:, :3], shown[:, 3])

@@ -1,0 +1,47 @@
+"""The files of a capture that are not pictures: JSON and npz, with errors that say what is wrong. Numpy only."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class CaptureError(ValueError):
+    """A capture that cannot be read: the message names the file, the fault and the remedy."""
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON file that holds an object.
+
+    Raises:
+        CaptureError: missing, not JSON, or not an object.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as fault:
+        raise CaptureError(f"{path}: no such file") from fault
+    except (OSError, ValueError, RecursionError) as fault:
+        raise CaptureError(f"{path}: is not JSON ({fault})") from fault
+    if not isinstance(content, dict):
+        raise CaptureError(f"{path}: must hold a JSON object; found {type(content).__name__}")
+    return content
+
+
+def read_npz(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    """Named arrays of an npz file, without pickle.
+
+    Raises:
+        CaptureError: missing, broken, or without one of the keys.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {key: file[key] for key in keys}
+    except KeyError as fault:
+        raise CaptureError(f"{path}: has no array {fault}; needed: {', '.join(keys)}") from fault
+    except Exception as fault:  # zipfile, zlib and numpy each raise their own on a damaged file
+        raise CaptureError(f"{path}: is no npz file without pickle ({type(fault).__name__}: {fault})") from fault
+    return arrays

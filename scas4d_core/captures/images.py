@@ -1,0 +1,235 @@
+"""Pictures and masks, from the bytes of a file to arrays. Numpy and Pillow only.
+
+What a picture file may hold, and what becomes of it:
+
+======================  ====================================================================================
+EXIF orientation ≠ 1    refused: the intrinsics of a calibrated camera belong to one reading of the pixels,
+                        and whether the calibration turned the picture cannot be told from the file
+alpha (also palette)    composited over black, in the values of the file: the empty background of a capture
+grey                    replicated to three channels
+16 bit                  to 8 bit by value / 257: grey exactly, colour by its high byte (within one level of that)
+ICC profile             converted to sRGB, relative to white; a profile that calls itself sRGB leaves values as is
+ICC profile of grey     not applied: the values are taken as they are
+no ICC profile          taken for sRGB; gAMA and cHRM chunks are not read
+CMYK, float, Lab        refused
+more than one picture   refused (animations, multi-page and multi-picture files)
+======================  ====================================================================================
+
+A mask is 1 where the stored value of any channel is not zero; alpha in a mask and lossy formats are refused.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageCms
+
+PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP")
+MASK_FORMATS = ("PNG", "BMP")
+EXIF_ORIENTATION = 0x0112
+
+Size = tuple[int, int]
+
+
+class ImageError(ValueError):
+    """A picture or mask that cannot be used: the message names the file and the fault."""
+
+
+def scaled_size(size: Size, image_scale: float) -> Size:
+    """Width and height under ``image_scale``, rounded as `Camera.scaled` rounds them."""
+    if not (np.isfinite(image_scale) and image_scale > 0):
+        raise ImageError(f"image_scale {image_scale!r} must be a positive number")
+    return max(1, round(size[0] * image_scale)), max(1, round(size[1] * image_scale))
+
+
+def decode_image(
+    source: bytes | Path, *, size: Size | None = None, image_scale: float = 1.0, name: str | None = None
+) -> NDArray[np.uint8]:
+    """A picture as sRGB values.
+
+    Args:
+        source: the bytes of a picture file, or its path.
+        size: (width, height) in pixels that the file must have: those of the camera before ``image_scale``.
+        image_scale: resizes by area averaging to the size that `Camera.scaled` gives, edges on edges.
+        name: what to call the picture in messages; the path, if None.
+
+    Returns:
+        [H, W, 3] uint8.
+
+    Raises:
+        ImageError: no such file, not a picture, or one of the refusals in the head of this module.
+    """
+    name = name or _name(source)
+    picture = _open(source, name, PICTURE_FORMATS, size)
+    rgb = _rgb(picture, name)
+    return resize_area(rgb, scaled_size(picture.size, image_scale))
+
+
+def decode_mask(
+    source: bytes | Path, *, size: Size | None = None, image_scale: float = 1.0, name: str | None = None
+) -> NDArray[np.uint8]:
+    """A foreground mask, 1 where any stored value is not zero. Arguments and errors as for `decode_image`.
+
+    Under ``image_scale`` a pixel is foreground when at least half of its area is.
+
+    Returns:
+        [H, W] uint8, values 0 and 1.
+    """
+    name = name or _name(source)
+    picture = _open(source, name, MASK_FORMATS, size)
+    if picture.mode in ("LA", "PA", "RGBA", "La", "RGBa"):
+        raise ImageError(f"{name}: a mask with an alpha channel can be read two ways; give one channel, 0 and not 0")
+    values = np.asarray(picture)  # palette pictures: the index, not the colour
+    foreground = values != 0
+    if foreground.ndim == 3:
+        foreground = foreground.any(axis=-1)
+    target = scaled_size(picture.size, image_scale)
+    if target == picture.size:
+        return np.array(foreground, dtype=np.uint8)
+    share = _area_average(foreground.astype(np.float64), target)
+    mask: NDArray[np.uint8] = (share >= 0.5 - 1e-9).astype(np.uint8)
+    return mask
+
+
+def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str | None = None) -> NDArray[np.uint8]:
+    """A picture of labels, one channel of 8 bit; a label is a name, so pixels are picked, never averaged.
+
+    Args:
+        source: the bytes of the file, or its path.
+        size: (width, height) the file must have.
+        target: (width, height) of the result; a pixel takes the label under its centre.
+        name: what to call the picture in messages; the path, if None.
+
+    Returns:
+        [H, W] uint8.
+
+    Raises:
+        ImageError: as for `decode_mask`, or more than one channel.
+    """
+    name = name or _name(source)
+    picture = _open(source, name, MASK_FORMATS, size)
+    if picture.mode not in ("L", "P"):
+        raise ImageError(f"{name}: labels have colour mode {picture.mode}; give one channel of 8 bit")
+    columns, rows = (
+        np.floor((np.arange(count) + 0.5) * (length / count)).astype(np.intp)
+        for count, length in zip(target, size, strict=True)
+    )
+    labels: NDArray[np.uint8] = np.asarray(picture)[np.ix_(rows, columns)]
+    return labels
+
+
+def picture_size(source: bytes | Path, name: str | None = None) -> Size:
+    """Width and height in pixels from the head of the file, without decoding it."""
+    name = name or _name(source)
+    try:
+        with Image.open(_stream(source), formats=PICTURE_FORMATS) as picture:
+            return picture.size
+    except Exception as fault:
+        raise _unreadable(name, fault) from fault
+
+
+def resize_area(picture: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
+    """A picture [H, W, C] resized to (width, height), each new pixel the mean over its area of the old picture.
+
+    Edges map to edges, so a pixel position (centres at +0.5) is multiplied by the ratio of the sizes, as in
+    `Camera.scaled`. (Pillow's BOX filter takes whole source pixels only: half a pixel off at fractional ratios.)
+    """
+    if size == (picture.shape[1], picture.shape[0]):
+        return picture
+    return np.rint(_area_average(picture.astype(np.float64), size)).astype(np.uint8)
+
+
+def _area_average(picture: NDArray[np.float64], size: Size) -> NDArray[np.float64]:
+    for axis, target in ((0, size[1]), (1, size[0])):
+        picture = np.moveaxis(picture, axis, 0)
+        length = picture.shape[0]
+        # The running integral of the picture is linear inside a pixel: read it at the edges of the new pixels.
+        integral = np.concatenate([np.zeros_like(picture[:1]), np.cumsum(picture, axis=0)])
+        edges = np.arange(target + 1) * (length / target)
+        left = np.minimum(edges.astype(np.intp), length - 1)
+        inside = (edges - left).reshape(-1, *[1] * (picture.ndim - 1))
+        at_edges = integral[left] + inside * picture[left]
+        picture = np.moveaxis(np.diff(at_edges, axis=0) * (target / length), 0, axis)
+    return picture
+
+
+def _name(source: bytes | Path) -> str:
+    return "picture" if isinstance(source, bytes) else str(source)
+
+
+def _stream(source: bytes | Path) -> io.BytesIO:
+    return io.BytesIO(source if isinstance(source, bytes) else source.read_bytes())
+
+
+def _unreadable(name: str, fault: Exception) -> ImageError:
+    if isinstance(fault, ImageError):
+        return fault
+    if isinstance(fault, FileNotFoundError):
+        return ImageError(f"{name}: no such file")
+    return ImageError(f"{name}: cannot be read as a picture ({type(fault).__name__}: {fault})")
+
+
+def _open(source: bytes | Path, name: str, formats: tuple[str, ...], size: Size | None) -> Image.Image:
+    # Pillow's decoders fail on damaged files with many kinds of exceptions (OSError, SyntaxError, struct.error, …).
+    try:
+        picture = Image.open(_stream(source), formats=formats)
+        # Before decoding: a small file can unfold into gigabytes.
+        if size is not None and picture.size != size:
+            raise ImageError(
+                f"{name}: is {picture.width}x{picture.height} pixels, the camera {size[0]}x{size[1]}; "
+                "give pictures at the size the camera was calibrated for (image_scale resizes both)"
+            )
+        count = getattr(picture, "n_frames", 1)
+        if count > 1:
+            raise ImageError(f"{name}: holds {count} pictures; give a file with one")
+        orientation = picture.getexif().get(EXIF_ORIENTATION, 1)
+        if orientation != 1:
+            raise ImageError(
+                f"{name}: EXIF orientation is {orientation}; the intrinsics refer to stored pixels and a turned "
+                "picture would not fit them; store the pixels the way the camera was calibrated and drop the tag"
+            )
+        picture.load()
+    except Exception as fault:
+        raise _unreadable(name, fault) from fault
+    return picture
+
+
+def _rgb(picture: Image.Image, name: str) -> NDArray[np.uint8]:
+    profile = picture.info.get("icc_profile")
+    if picture.mode in ("I;16", "I;16B", "I;16L", "I"):
+        grey = np.asarray(picture).astype(np.int64)
+        if grey.min() < 0 or grey.max() > 65535:
+            raise ImageError(f"{name}: grey values {grey.min()}…{grey.max()} exceed 16 bit; give 8 or 16 bit")
+        picture = Image.fromarray(((grey + 128) // 257).astype(np.uint8))
+    if picture.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
+        raise ImageError(f"{name}: colour mode {picture.mode} is not supported; give RGB or grey")
+    transparent = picture.mode in ("LA", "PA", "RGBA") or "transparency" in picture.info
+    picture = picture.convert("RGBA" if transparent else "RGB")
+    alpha = np.asarray(picture.getchannel("A")).astype(np.uint32)[..., None] if transparent else None
+    picture = picture.convert("RGB")
+    if profile:
+        picture = _to_srgb(picture, profile, name)
+    rgb: NDArray[np.uint8] = np.array(picture)
+    if alpha is not None:
+        rgb = ((rgb * alpha + 127) // 255).astype(np.uint8)
+    return rgb
+
+
+def _to_srgb(picture: Image.Image, profile: bytes, name: str) -> Image.Image:
+    try:
+        source: Any = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        described = source.profile.profile_description or ""
+        if source.profile.xcolor_space.strip() != "RGB" or "sRGB" in described:
+            # A grey profile says only how grey is toned, and an sRGB one would turn values by a rounding.
+            return picture
+        converted = ImageCms.profileToProfile(
+            picture, source, ImageCms.createProfile("sRGB"), ImageCms.Intent.RELATIVE_COLORIMETRIC
+        )
+    except (ImageCms.PyCMSError, OSError) as fault:
+        raise ImageError(f"{name}: its ICC profile cannot be read ({fault}); convert the picture to sRGB") from fault
+    assert converted is not None  # only in-place conversion returns None
+    return converted
