@@ -146,10 +146,17 @@ class History:
             self._frames.move_to_end(index)
         return Gaussians(**frame, **self._fixed)
 
-    def stacked(self, name: str, indices: Sequence[int] | None = None) -> NDArray[Any]:
+    def stacked(
+        self, name: str, indices: Sequence[int] | None = None, rows: NDArray[np.intp] | None = None
+    ) -> NDArray[Any]:
         """One array of several frames, [T, N, ...], in the order of ``indices`` (default: every frame).
 
         Reads only that array of the files, so that a long history needs no more memory than the answer.
+
+        Args:
+            name: one of ``PER_FRAME``.
+            indices: committed frames; may repeat.
+            rows: Gaussians by row, any shape; the answer is then [T, *rows.shape, ...].
 
         Raises:
             HistoryError: ``name`` is not in ``PER_FRAME``, or a frame was not committed.
@@ -164,6 +171,8 @@ class History:
             self._require(index)
             frame = self._frames.get(index)
             array = frame[name] if frame is not None else _read(self._file(index), (name,))[name]
+            if rows is not None:
+                array = array[rows]
             if result is None:
                 result = np.empty((len(chosen), *array.shape), dtype=array.dtype)
             result[row] = array
@@ -185,6 +194,17 @@ class History:
             newest = self.indices[-1]
             for old in [i for i in self._frames if i != newest][: max(0, len(self._frames) - FRAMES_KEPT)]:
                 del self._frames[old]
+
+
+def moving_extent(gaussians: Gaussians) -> float:
+    """Longest side, in metres, of the box that holds 98 % of the moving Gaussians on each axis (of all if none moves).
+
+    The unit of tolerances and features that should not depend on the size of the scene; the few Gaussians that
+    stray do not change it.
+    """
+    means = gaussians.means[gaussians.moving] if gaussians.moving.any() else gaussians.means
+    low, high = np.percentile(means, (1, 99), axis=0)
+    return float(np.max(high - low))
 
 
 def _write(path: Path, arrays: dict[str, Any]) -> None:
