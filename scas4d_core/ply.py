@@ -1,0 +1,212 @@
+"""A frame as a standard 3D Gaussian Splatting ``.ply`` (Kerbl et al. 2023), for any splat viewer.
+
+Binary little-endian, one float32 row a Gaussian: x y z, nx ny nz (zero), f_dc_0…2 (degree 0 of the spherical
+harmonics), opacity (logit), scale_0…2 (log), rot_0…3 (w, x, y, z). World and lengths are the user's.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from itertools import permutations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement, PlyParseError
+from scipy.spatial.transform import Rotation
+
+from scas4d_core.cameras import WorldFrame
+from scas4d_core.gaussians import Gaussians
+
+Float = NDArray[np.float64]
+
+SH_DEGREE_0 = 0.28209479177387814
+"""The constant spherical harmonic, 1/(2√π): colour = 0.5 + SH_DEGREE_0 · f_dc."""
+OPACITY_MARGIN = 1e-6
+"""Opacities keep this far from 0 and 1, where the logit is infinite."""
+JACOBI_SWEEPS = 12
+"""Sweeps of one-sided Jacobi; it converges quadratically, and 3×3 takes about five."""
+ORTHOGONAL = 1e-6
+"""Cosine below which two axes count as orthogonal: float32 factors do not say it better."""
+
+_FIELDS = (
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+)
+
+
+class PlyError(ValueError):
+    """Gaussians that no file should carry, or a file that holds none: the message names rows or path and the fault."""
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """What a splat file says, in the user's world.
+
+    Attributes:
+        means: [N, 3] float64.
+        scales: [N, 3] float64 standard deviations along the axes.
+        rotations: [N, 4] float64 unit quaternions (w, x, y, z); the axes are the columns of the matrix.
+        opacities: [N] float64 in (0, 1).
+        colours: [N, 3] float64 RGB.
+    """
+
+    means: Float
+    scales: Float
+    rotations: Float
+    opacities: Float
+    colours: Float
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def covariances(self) -> Float:
+        """[N, 3, 3] Σ in the user's units squared."""
+        axes = Rotation.from_quat(np.roll(self.rotations, -1, axis=1)).as_matrix() * self.scales[:, None, :]
+        result: Float = axes @ axes.transpose(0, 2, 1)
+        return result
+
+
+def write_ply(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None:
+    """Writes one frame; the file appears whole or not at all.
+
+    Raises:
+        PlyError: rows that are not finite or have no volume, named by row and id. None is left out silently.
+    """
+    data = np.zeros(len(gaussians), dtype=[(name, "<f4") for name in _FIELDS])
+    for name, column in _columns(splats(gaussians, world)).items():
+        data[name] = column
+    target = Path(path)
+    beside = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        PlyData([PlyElement.describe(data, "vertex")], byte_order="<").write(str(beside))
+        beside.replace(target)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def read_ply(path: Path | str) -> Splats:
+    """Reads a splat file; of the spherical harmonics only degree 0.
+
+    Raises:
+        PlyError: no splat file, or a property is missing.
+    """
+    try:
+        vertex = PlyData.read(str(path))["vertex"]
+        table = {name: np.asarray(vertex[name], dtype=np.float64) for name in _FIELDS if name[0] != "n"}
+    except (OSError, KeyError, ValueError, PlyParseError) as error:
+        raise PlyError(f"{path}: no 3D Gaussian Splatting .ply ({error})") from error
+
+    def columns(*names: str) -> Float:
+        return np.stack([table[name] for name in names], axis=-1)
+
+    rotations = columns("rot_0", "rot_1", "rot_2", "rot_3")
+    return Splats(
+        means=columns("x", "y", "z"),
+        scales=np.exp(columns("scale_0", "scale_1", "scale_2")),
+        rotations=rotations / np.linalg.norm(rotations, axis=1, keepdims=True),
+        opacities=1 / (1 + np.exp(-table["opacity"])),
+        colours=0.5 + SH_DEGREE_0 * columns("f_dc_0", "f_dc_1", "f_dc_2"),
+    )
+
+
+def splats(gaussians: Gaussians, world: WorldFrame) -> Splats:
+    """The state as centre, axes and lengths in the user's world.
+
+    Raises:
+        PlyError: rows that are not finite or have no volume.
+    """
+    _refuse(gaussians)
+    axes, scales = split_factors(gaussians.factors)
+    return Splats(
+        means=world.to_user(gaussians.means),
+        scales=scales / world.metres_per_unit,
+        rotations=np.roll(Rotation.from_matrix(axes).as_quat(canonical=True), 1, axis=1),
+        opacities=gaussians.opacities.astype(np.float64),
+        colours=gaussians.colours.astype(np.float64),
+    )
+
+
+def split_factors(factors: NDArray[Any]) -> tuple[Float, Float]:
+    """Rotations Q [N, 3, 3] and lengths s [N, 3] with Q diag(s²) Qᵀ = F Fᵀ, Q nearest to the transported axes.
+
+    One-sided Jacobi: columns of F are turned pairwise, by at most 45°, until they are orthogonal. Columns that are
+    orthogonal already stay as they are, also where lengths are equal and eigenvectors would be arbitrary. Of the 24
+    ways to name the axes of a right-handed frame the one with the largest trace against the columns of F is taken.
+
+    Args:
+        factors: [N, 3, 3], full rank.
+    """
+    start = np.asarray(factors, dtype=np.float64)
+    columns = start.copy()
+    for _ in range(JACOBI_SWEEPS):
+        for i, j in ((0, 1), (0, 2), (1, 2)):
+            a, b = columns[:, :, i].copy(), columns[:, :, j].copy()
+            off = np.einsum("ni,ni->n", a, b)
+            difference = np.einsum("ni,ni->n", b, b) - np.einsum("ni,ni->n", a, a)
+            # tan of the angle, the smaller root of t² + 2 t (difference / 2 off) − 1 = 0 (Golub & Van Loan, 8.5).
+            sign = np.where(difference < 0, -1.0, 1.0)
+            size = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
+            off[np.abs(off) <= ORTHOGONAL * size] = 0
+            bottom = np.abs(difference) + np.hypot(difference, 2 * off)
+            t = 2 * off * sign / np.where(bottom > 0, bottom, 1)
+            cos = (1 / np.hypot(1, t))[:, None]
+            sin = cos * t[:, None]
+            columns[:, :, i], columns[:, :, j] = cos * a - sin * b, sin * a + cos * b
+    scales = np.linalg.norm(columns, axis=1)
+    axes = columns / scales[:, None, :]
+    return _nearest_naming(axes, scales, start / np.linalg.norm(start, axis=1)[:, None, :])
+
+
+def _nearest_naming(axes: Float, scales: Float, wanted: Float) -> tuple[Float, Float]:
+    """Permutes and flips axes to a right-handed frame with the largest trace(axesᵀ wanted)."""
+    rows = np.arange(len(axes))
+    dots = np.einsum("nki,nkj->nij", axes, wanted)  # of axis i with wanted column j
+    handed = np.linalg.det(axes)
+    best = np.full(len(axes), -np.inf)
+    order = np.zeros((len(axes), 3), dtype=np.intp)
+    flips = np.ones((len(axes), 3))
+    for chosen in permutations(range(3)):
+        parity = float(np.linalg.det(np.eye(3)[list(chosen)]))
+        dot = dots[:, list(chosen), range(3)]
+        sign = np.where(dot < 0, -1.0, 1.0)
+        weakest = np.abs(dot).argmin(axis=1)
+        wrong = handed * parity * sign.prod(axis=1) < 0
+        sign[rows[wrong], weakest[wrong]] *= -1
+        trace = (sign * dot).sum(axis=1)
+        better = trace > best + 1e-12
+        best[better], order[better], flips[better] = trace[better], chosen, sign[better]
+    named = np.take_along_axis(axes, order[:, None, :], axis=2) * flips[:, None, :]
+    return named, np.take_along_axis(scales, order, axis=1)
+
+
+def _columns(of: Splats) -> dict[str, Float]:
+    opacity = np.clip(of.opacities, OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+    result = {"opacity": np.log(opacity / (1 - opacity))}
+    for names, values in (
+        (("x", "y", "z"), of.means),
+        (("f_dc_0", "f_dc_1", "f_dc_2"), (of.colours - 0.5) / SH_DEGREE_0),
+        (("scale_0", "scale_1", "scale_2"), np.log(of.scales)),
+        (("rot_0", "rot_1", "rot_2", "rot_3"), of.rotations),
+    ):
+        result.update(zip(names, values.T, strict=True))
+    return result
+
+
+def _refuse(gaussians: Gaussians) -> None:
+    for name in ("means", "factors", "opacities", "colours"):
+        values = getattr(gaussians, name).reshape(len(gaussians), -1)
+        _name_rows(gaussians, ~np.isfinite(values).all(axis=1), f"{name} not finite")
+    volume = np.abs(np.linalg.det(gaussians.factors.astype(np.float64)))
+    _name_rows(gaussians, ~(volume > 0), "no volume (an axis of length 0)")
+
+
+def _name_rows(gaussians: Gaussians, bad: NDArray[np.bool_], fault: str) -> None:
+    rows = np.flatnonzero(bad)
+    if rows.size:
+        raise PlyError(
+            f"{rows.size} Gaussians have {fault}: rows {rows[:5].tolist()}, ids {gaussians.ids[rows[:5]].tolist()}"
+            f"{' …' if rows.size > 5 else ''}; export a frame before they went bad, or mend them"
+        )
