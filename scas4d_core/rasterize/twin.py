@@ -1,0 +1,182 @@
+"""The rasterizer in plain torch: dense, slow, exact; every other backend is tested against it in float64.
+
+Projection is EWA splatting (Zwicker et al. 2001) in the form of 3D Gaussian Splatting (Kerbl et al. 2023), with the
+Jacobian's clamping of gsplat. Camera axes are OpenCV's; the centre of pixel (column i, row j) is (i + 0.5, j + 0.5).
+Gradients of means, factors, opacities and features come from autograd through everything.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from scas4d_core.cameras import Camera
+from scas4d_core.rasterize.limits import DEFAULT, Limits
+
+PAIRS_AT_ONCE = 4_000_000
+"""Pixel–Gaussian pairs held in memory at a time; larger pictures go in strips and are computed anew for backward."""
+
+
+class CameraParams(NamedTuple):
+    """A camera as tensors.
+
+    Attributes:
+        rotation: [3, 3] world to camera.
+        translation: [3] metres, world to camera.
+        fx, fy, cx, cy: pixels.
+        width, height: pixels.
+    """
+
+    rotation: Tensor
+    translation: Tensor
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, camera: Camera, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> CameraParams:
+        """The camera's numbers in the given dtype on the given device."""
+        rotation = torch.tensor(camera.rotation, dtype=dtype, device=device)
+        translation = torch.tensor(camera.translation, dtype=dtype, device=device)
+        fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+        return cls(rotation, translation, fx, fy, cx, cy, camera.width, camera.height)
+
+    def depths(self, means: Tensor) -> Tensor:
+        """[N] metres along the camera's z axis of points [N, 3]; append it to the features to render depth."""
+        return means @ self.rotation[2] + self.translation[2]
+
+
+class Projected(NamedTuple):
+    """Gaussians as a camera sees them; rows nearer than the near plane hold no meaning.
+
+    Attributes:
+        means: [N, 2] pixels.
+        covariances: [N, 2, 2] pixels², low-pass included.
+        depths: [N] metres along z.
+    """
+
+    means: Tensor
+    covariances: Tensor
+    depths: Tensor
+
+
+class Rendered(NamedTuple):
+    """A picture.
+
+    Attributes:
+        features: [H, W, C], background included.
+        alpha: [H, W] in 0…1, one minus the light that passes.
+        means: [N, 2] pixels, the projected means; their gradient is what adaptive density control reads.
+        depths: [N] metres along z.
+    """
+
+    features: Tensor
+    alpha: Tensor
+    means: Tensor
+    depths: Tensor
+
+
+def project(means: Tensor, factors: Tensor, camera: CameraParams, limits: Limits = DEFAULT) -> Projected:
+    """EWA projection: cov2d = (A F)(A F)ᵀ + low_pass·I, A = J_projection·W of shape 2×3.
+
+    The Jacobian is evaluated with x/z and y/z clamped to the picture widened by ``tangent_margin`` (the means are not).
+
+    Args:
+        means: [N, 3] metres.
+        factors: [N, 3, 3].
+        camera: of the inside world.
+        limits: of the backend to agree with.
+    """
+    x, y, z = (means @ camera.rotation.T + camera.translation).unbind(-1)
+    # Culled rows would divide by zero and poison the gradients of all; they are not drawn, so any z does.
+    z_safe = torch.where(z < limits.near, torch.full_like(z, limits.near), z)
+    tan_x, tan_y = x / z_safe, y / z_safe
+    margin_x = limits.tangent_margin * camera.width / (2 * camera.fx)
+    margin_y = limits.tangent_margin * camera.height / (2 * camera.fy)
+    held_x = tan_x.clamp(-(camera.cx / camera.fx + margin_x), (camera.width - camera.cx) / camera.fx + margin_x)
+    held_y = tan_y.clamp(-(camera.cy / camera.fy + margin_y), (camera.height - camera.cy) / camera.fy + margin_y)
+    zero = torch.zeros_like(z)
+    row_u = torch.stack([camera.fx / z_safe, zero, -camera.fx * held_x / z_safe], dim=-1)
+    row_v = torch.stack([zero, camera.fy / z_safe, -camera.fy * held_y / z_safe], dim=-1)
+    spread = torch.stack([row_u, row_v], dim=-2) @ camera.rotation @ factors
+    low_pass = limits.low_pass * torch.eye(2, dtype=means.dtype, device=means.device)
+    uv = torch.stack([camera.fx * tan_x + camera.cx, camera.fy * tan_y + camera.cy], dim=-1)
+    return Projected(uv, spread @ spread.mT + low_pass, z)
+
+
+def _composite(
+    pixels: Tensor,
+    means: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    background: Tensor,
+    limits: Limits,
+) -> tuple[Tensor, Tensor]:
+    """Pixel centres [P, 2] to features [P, C] and alpha [P]; the Gaussians come front to back."""
+    d = pixels[:, None] - means
+    a, b, c = conics.unbind(-1)
+    power = -0.5 * (a * d[..., 0] ** 2 + c * d[..., 1] ** 2) - b * d[..., 0] * d[..., 1]
+    alpha = (opacities * torch.exp(power)).clamp(max=limits.alpha_cap)
+    alpha = torch.where(alpha >= limits.alpha_floor, alpha, 0)
+    # The running product falls, so where it is below the stop a pixel is finished for good.
+    passed = torch.cumprod(1 - alpha.detach(), dim=1)
+    alpha = torch.where(passed >= limits.transmittance_stop, alpha, 0)
+    passed = torch.cumprod(1 - alpha, dim=1)
+    before = torch.cat([torch.ones_like(passed[:, :1]), passed[:, :-1]], dim=1)
+    remaining = passed[:, -1]
+    return (alpha * before) @ features + remaining[:, None] * background, 1 - remaining
+
+
+def render(
+    means: Tensor,
+    factors: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    camera: CameraParams,
+    background: Tensor,
+    limits: Limits = DEFAULT,
+) -> Rendered:
+    """Σ_i w_i·feature_i + T_final·background at every pixel, front to back by depth, ties by row.
+
+    alpha = min(cap, o·exp(−½ dᵀ cov2d⁻¹ d)) with d from the projected mean to the pixel's centre; a Gaussian
+    contributes exactly where alpha ≥ floor; a pixel is finished, that Gaussian not drawn, once T·(1 − alpha) < stop.
+    Through the cap no gradient flows.
+
+    Args:
+        means: [N, 3] metres.
+        factors: [N, 3, 3]; Σ = F Fᵀ.
+        opacities: [N] in (0, 1).
+        features: [N, C], C ≥ 1: colour, label, depth, in one pass.
+        camera: of the inside world.
+        background: [C].
+        limits: of the backend to agree with.
+    """
+    projected = project(means, factors, camera, limits)
+    visible = torch.nonzero(projected.depths.detach() >= limits.near)[:, 0]
+    order = visible[torch.argsort(projected.depths.detach()[visible], stable=True)]
+    columns = torch.arange(camera.width, dtype=means.dtype, device=means.device) + 0.5
+    rows = torch.arange(camera.height, dtype=means.dtype, device=means.device) + 0.5
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    pixels = torch.stack([u, v], dim=-1).reshape(-1, 2)
+    shape = (camera.height, camera.width)
+    if len(order) == 0:
+        empty = background.expand(*shape, -1) + 0 * features.sum()
+        return Rendered(empty, means.new_zeros(shape), projected.means, projected.depths)
+    (xx, xy), (_, yy) = (row.unbind(-1) for row in projected.covariances[order].unbind(-2))
+    conics = torch.stack([yy, -xy, xx], dim=-1) / (xx * yy - xy * xy)[:, None]
+    drawn = (projected.means[order], conics, opacities[order], features[order], background, limits)
+    strips = torch.split(pixels, max(1, PAIRS_AT_ONCE // len(order)))
+    if len(strips) == 1:
+        parts = [_composite(pixels, *drawn)]
+    else:
+        parts = [checkpoint(_composite, strip, *drawn, use_reentrant=False) for strip in strips]
+    picture = torch.cat([part[0] for part in parts]).reshape(*shape, -1)
+    alpha = torch.cat([part[1] for part in parts]).reshape(shape)
+    return Rendered(picture, alpha, projected.means, projected.depths)
