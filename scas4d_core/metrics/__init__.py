@@ -1,0 +1,25 @@
+"""How good a reconstruction is: pictures, tracks and parts against the truth."""
+
+from scas4d_core.metrics.image import Score, flip, lpips, psnr, ssim
+from scas4d_core.metrics.parts import adjusted_rand_index
+from scas4d_core.metrics.tracks import (
+    TrackError,
+    median_trajectory_error,
+    oracle_tracks,
+    track_error_3d,
+    visibility_accuracy,
+)
+
+__all__ = [
+    "Score",
+    "TrackError",
+    "adjusted_rand_index",
+    "flip",
+    "lpips",
+    "median_trajectory_error",
+    "oracle_tracks",
+    "psnr",
+    "ssim",
+    "track_error_3d",
+    "visibility_accuracy",
+]

@@ -1,0 +1,182 @@
+"""Pictures against the truth: PSNR, SSIM, FLIP, LPIPS.
+
+Pictures are [H, W, 3]: floats in 0…1, or uint8 in 0…255. Rendered values outside 0…1 are clamped first, as a display
+does.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import correlate1d
+
+SSIM_WINDOW = 11
+SSIM_SIGMA = 1.5
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
+
+LPIPS_BACKBONES = {"vgg": "vgg16-397923af.pth", "alex": "alexnet-owt-7be5be79.pth"}
+"""The files of torchvision's weights that the lpips package loads, as torch.hub caches them."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """A metric that may not be available here.
+
+    Attributes:
+        value: None where the metric could not be computed.
+        reason: why not, and what to do about it; empty where there is a value.
+    """
+
+    value: float | None
+    reason: str = ""
+
+
+def psnr(image: NDArray[Any], truth: NDArray[Any], mask: NDArray[Any] | None = None) -> float:
+    """Peak signal-to-noise ratio, −10 log10 of the mean squared error over pixels and channels, in dB.
+
+    Args:
+        image: [H, W, 3] rendered.
+        truth: [H, W, 3].
+        mask: [H, W]; only pixels where it is not zero count: with the foreground's mask, PSNR on the foreground alone.
+
+    Returns:
+        dB; infinity where the pictures are the same; NaN where the mask is empty.
+
+    Raises:
+        ValueError: shapes differ, or values are not finite.
+    """
+    first, second = _pair(image, truth)
+    squared = (first - second) ** 2
+    if mask is not None:
+        if mask.shape != first.shape[:2]:
+            raise ValueError(f"mask has shape {mask.shape}; give {first.shape[:2]} as the pictures have")
+        squared = squared[np.asarray(mask) != 0]
+    if squared.size == 0:
+        return math.nan
+    error = float(squared.mean())
+    return math.inf if error == 0 else -10.0 * math.log10(error)
+
+
+def ssim(image: NDArray[Any], truth: NDArray[Any]) -> float:
+    """Structural similarity (Wang et al. 2004), mean over pixels and channels, as 3D Gaussian Splatting computes it.
+
+    11×11 Gaussian window with σ = 1.5 px, zeros beyond the edges, C1 = 0.01², C2 = 0.03², biased variances, values 0…1.
+
+    Args:
+        image: [H, W, 3] rendered.
+        truth: [H, W, 3].
+
+    Returns:
+        At most 1, which means the same.
+
+    Raises:
+        ValueError: shapes differ, or values are not finite.
+    """
+    x, y = _pair(image, truth)
+    mean_x, mean_y = _window_mean(x), _window_mean(y)
+    variance_x = _window_mean(x * x) - mean_x**2
+    variance_y = _window_mean(y * y) - mean_y**2
+    covariance = _window_mean(x * y) - mean_x * mean_y
+    similarity = ((2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)) / (
+        (mean_x**2 + mean_y**2 + SSIM_C1) * (variance_x + variance_y + SSIM_C2)
+    )
+    return float(similarity.mean())
+
+
+def flip(image: NDArray[Any], truth: NDArray[Any]) -> Score:
+    """Mean LDR-ꟻLIP error (Andersson et al. 2020) at the 67 pixels per degree its authors recommend; 0 is the same.
+
+    Args:
+        image: [H, W, 3] rendered, sRGB.
+        truth: [H, W, 3], sRGB.
+
+    Raises:
+        ValueError: shapes differ, or values are not finite.
+    """
+    first, second = _pair(image, truth)
+    try:
+        evaluator = importlib.import_module("flip_evaluator")
+    except ImportError:
+        return Score(None, "flip_evaluator is not installed: pip install flip-evaluator")
+    _, error, _ = evaluator.evaluate(
+        np.ascontiguousarray(second, dtype=np.float32),
+        np.ascontiguousarray(first, dtype=np.float32),
+        "LDR",
+        inputsRGB=True,
+        applyMagma=False,
+        computeMeanError=True,
+    )
+    return Score(float(error))
+
+
+def lpips(image: NDArray[Any], truth: NDArray[Any], backbone: str = "vgg") -> Score:
+    """Learnt perceptual distance (Zhang et al. 2018); 0 is the same. Never downloads anything.
+
+    Args:
+        image: [H, W, 3] rendered.
+        truth: [H, W, 3].
+        backbone: "vgg" (as 3D Gaussian Splatting reports) or "alex".
+
+    Returns:
+        No value where the lpips package or the weights of its backbone are not on this machine.
+
+    Raises:
+        ValueError: shapes differ, values are not finite, or no such backbone.
+    """
+    first, second = _pair(image, truth)
+    if backbone not in LPIPS_BACKBONES:
+        raise ValueError(f"lpips backbone {backbone!r} must be one of {', '.join(LPIPS_BACKBONES)}")
+    try:
+        torch = importlib.import_module("torch")
+        importlib.import_module("torchvision")
+        importlib.import_module("lpips")
+    except ImportError as fault:
+        return Score(None, f"{fault.name} is not installed: pip install lpips")
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / LPIPS_BACKBONES[backbone]
+    if not weights.is_file():
+        return Score(None, f"the weights {weights} are missing and are never downloaded: put them there")
+    network = _lpips_network(backbone)
+    with torch.no_grad():
+        tensors = [torch.from_numpy(p.astype(np.float32)).permute(2, 0, 1)[None] * 2 - 1 for p in (first, second)]
+        return Score(float(network(*tensors)))
+
+
+@cache
+def _lpips_network(backbone: str) -> Any:
+    return importlib.import_module("lpips").LPIPS(net=backbone, verbose=False).eval()
+
+
+def _window_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    offsets = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
+    window = np.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
+    window /= window.sum()
+    rows = correlate1d(values, window, axis=0, mode="constant")
+    mean: NDArray[np.float64] = correlate1d(rows, window, axis=1, mode="constant")
+    return mean
+
+
+def _pair(image: NDArray[Any], truth: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    if image.shape != truth.shape:
+        raise ValueError(f"the image has shape {image.shape}, the truth {truth.shape}; render at the size of the truth")
+    return _unit(image, "image"), _unit(truth, "truth")
+
+
+def _unit(picture: NDArray[Any], name: str) -> NDArray[np.float64]:
+    if picture.ndim != 3 or picture.shape[2] != 3:
+        raise ValueError(f"{name} has shape {picture.shape}; give [H, W, 3]")
+    if picture.dtype == np.uint8:
+        return picture / 255.0
+    if picture.dtype.kind != "f":
+        raise ValueError(f"{name} is {picture.dtype}; give floats in 0…1, or uint8")
+    if not np.isfinite(picture).all():
+        raise ValueError(f"{name} holds NaN or infinity")
+    unit: NDArray[np.float64] = np.clip(picture.astype(np.float64), 0.0, 1.0)
+    return unit

@@ -1,0 +1,39 @@
+"""Part labels against the truth."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.metrics import adjusted_rand_score
+
+
+def adjusted_rand_index(
+    labels: NDArray[Any], truth: NDArray[Any], foreground: NDArray[np.bool_] | None = None
+) -> float:
+    """Agreement of two partitions of the foreground's pixels, corrected for chance (Hubert and Arabie 1985).
+
+    Pixels of several frames and cameras are pooled when stacked, so a part must keep its label over them; which number
+    it has does not matter. A foreground pixel where nothing was rendered carries whatever label ``labels`` has there:
+    to the index it is one more part.
+
+    Args:
+        labels: [...] integers, rendered.
+        truth: [...] integers, the same shape.
+        foreground: [...] the pixels that count; those where truth is not 0, if None.
+
+    Returns:
+        1 for the same partition, about 0 for chance.
+
+    Raises:
+        ValueError: shapes differ, or no pixel is foreground.
+    """
+    if labels.shape != truth.shape:
+        raise ValueError(f"labels have shape {labels.shape}, the truth {truth.shape}; render at the size of the truth")
+    counted = truth != 0 if foreground is None else np.asarray(foreground) != 0
+    if counted.shape != truth.shape:
+        raise ValueError(f"foreground has shape {counted.shape}; give {truth.shape} as the labels have")
+    if not counted.any():
+        raise ValueError("no pixel is foreground: nothing to compare")
+    return float(adjusted_rand_score(truth[counted].ravel(), labels[counted].ravel()))

@@ -1,0 +1,183 @@
+"""Point tracks against the truth.
+
+A track that has no finite position in a frame (behind the camera, lost) has missed the point: in two dimensions by one
+whole diagonal, in three by infinity. The query's own frame does not count: there the answer was given.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+ORACLE_RADIUS_PX = 10.0
+"""The paper's radius about the ground-truth point in the first frame (section "Point-Tracking")."""
+
+
+@dataclass(frozen=True)
+class TrackError:
+    """Distances of tracks in percent of the extent, pooled over points and frames.
+
+    Attributes:
+        median: %; infinity where at least half of the positions are lost.
+        percentile_90: %; the smallest observed distance that 90 % do not exceed.
+        count: how many positions went in.
+    """
+
+    median: float
+    percentile_90: float
+    count: int
+
+
+def median_trajectory_error(
+    tracks: NDArray[Any],
+    truth: NDArray[Any],
+    counted: NDArray[np.bool_],
+    diagonal: float,
+    *,
+    query: int = 0,
+) -> float:
+    """2D MTE without oracle: median over frames of each track's pixel error, mean over tracks, in % of the diagonal.
+
+    The definition is that of PointOdyssey (Zheng et al. 2023, ``median_l2``), which Dynamic 3D Gaussians follows,
+    without the query's frame; the paper normalizes by the diagonal of the picture.
+
+    Args:
+        tracks: [T, Q, 2] predicted pixels, NaN where lost.
+        truth: [T, Q, 2] pixels.
+        counted: [T, Q] where the truth counts: visible in that camera. A track never counted is left out.
+        diagonal: of the picture, pixels.
+        query: the frame in which the points were given; it does not count.
+
+    Returns:
+        %; NaN where nothing counts.
+
+    Raises:
+        ValueError: shapes differ.
+    """
+    errors = _percent_of_diagonal(tracks, truth, diagonal)
+    medians = _medians(errors, _without_query(counted, errors.shape, query))
+    return float(np.mean(medians)) if len(medians) else math.nan
+
+
+def oracle_tracks(
+    candidates: NDArray[Any],
+    truth: NDArray[Any],
+    counted: NDArray[np.bool_],
+    *,
+    radius: float = ORACLE_RADIUS_PX,
+    query: int = 0,
+) -> NDArray[np.float64]:
+    """The paper's oracle: of all candidates near a point in the query frame, the one whose track fits the truth best.
+
+    It looks at the answer, so its error (`median_trajectory_error` of what it returns) is a bound of what the centroids
+    could reach, no measure of tracking; report it beside the error without oracle.
+
+    Args:
+        candidates: [T, N, 2] pixels of all Gaussian centroids, NaN behind the camera.
+        truth: [T, Q, 2] pixels.
+        counted: [T, Q] where the truth counts.
+        radius: pixels about the true point in the query frame. Where no candidate lies within it, the nearest is taken
+            (the paper does not say).
+        query: the frame in which candidates are chosen.
+
+    Returns:
+        [T, Q, 2] tracks of the chosen candidates.
+
+    Raises:
+        ValueError: shapes do not fit, or no candidate is in front of the camera.
+    """
+    if candidates.ndim != 3 or candidates.shape[0] != truth.shape[0] or candidates.shape[2] != 2:
+        raise ValueError(f"candidates have shape {candidates.shape}; give [T={truth.shape[0]}, N, 2]")
+    present = np.flatnonzero(np.isfinite(candidates[query]).all(axis=-1))
+    if len(present) == 0:
+        raise ValueError("no candidate is in front of the camera in the query frame")
+    tree = cKDTree(candidates[query, present])
+    counts = _without_query(counted, truth.shape[:2], query)
+    chosen = np.empty(truth.shape, dtype=np.float64)
+    for point in range(truth.shape[1]):
+        near = tree.query_ball_point(truth[query, point], radius)
+        rows = present[near] if near else present[[int(tree.query(truth[query, point])[1])]]
+        paths = candidates[:, rows].astype(np.float64)
+        best = 0
+        if counts[:, point].any():
+            errors = np.linalg.norm(paths - truth[:, point : point + 1], axis=-1)[counts[:, point]]
+            best = int(np.argmin(np.median(np.where(np.isfinite(errors), errors, np.inf), axis=0)))
+        chosen[:, point] = paths[:, best]
+    return chosen
+
+
+def track_error_3d(
+    tracks: NDArray[Any], truth: NDArray[Any], moving: NDArray[np.bool_], extent: float, *, query: int = 0
+) -> TrackError:
+    """3D distance of tracks to the truth in % of the extent, pooled over moving points and all frames but the query's.
+
+    Args:
+        tracks: [T, P, 3] predicted, user's units; not finite where lost.
+        truth: [T, P, 3], user's units.
+        moving: [P] the points that count: those that move at all (standing ones would flatter the median).
+        extent: longest side of the box of the foreground, user's units.
+        query: the frame in which the points were given; it does not count.
+
+    Raises:
+        ValueError: shapes differ, extent not positive, or no point moves.
+    """
+    if tracks.shape != truth.shape or truth.ndim != 3 or truth.shape[2] != 3 or moving.shape != truth.shape[1:2]:
+        raise ValueError(f"tracks {tracks.shape}, truth {truth.shape} must be [T, P, 3], moving {moving.shape} [P]")
+    if not extent > 0:
+        raise ValueError(f"extent {extent!r} must be positive")
+    distances = np.linalg.norm(tracks.astype(np.float64) - truth.astype(np.float64), axis=-1)
+    frames = np.arange(len(truth)) != query
+    pooled = distances[np.ix_(frames, moving)].ravel()
+    if pooled.size == 0:
+        raise ValueError("no point moves, or there is only the query frame: nothing to measure")
+    pooled = np.where(np.isfinite(pooled), pooled, np.inf) * (100.0 / extent)
+    # Inverted CDF: no interpolation, which would make NaN of two infinities.
+    ninety = np.quantile(pooled, 0.9, method="inverted_cdf")
+    return TrackError(float(np.median(pooled)), float(ninety), int(pooled.size))
+
+
+def visibility_accuracy(predicted: NDArray[np.bool_], truth: NDArray[np.bool_], *, query: int = 0) -> float:
+    """Share of points and frames, 0…1, whose visibility was told rightly: the occlusion accuracy of TAP-Vid.
+
+    Args:
+        predicted: [T, Q].
+        truth: [T, Q].
+        query: the frame in which the points were given; it does not count.
+
+    Raises:
+        ValueError: shapes differ.
+    """
+    if predicted.shape != truth.shape or truth.ndim != 2:
+        raise ValueError(f"predicted {predicted.shape} and truth {truth.shape} must both be [T, Q]")
+    frames = np.arange(len(truth)) != query
+    right = predicted[frames] == truth[frames]
+    return float(right.mean()) if right.size else math.nan
+
+
+def _percent_of_diagonal(tracks: NDArray[Any], truth: NDArray[Any], diagonal: float) -> NDArray[np.float64]:
+    if tracks.shape != truth.shape or truth.ndim != 3 or truth.shape[2] != 2:
+        raise ValueError(f"tracks {tracks.shape} and truth {truth.shape} must both be [T, Q, 2]")
+    if not diagonal > 0:
+        raise ValueError(f"diagonal {diagonal!r} must be positive pixels")
+    distances = np.linalg.norm(tracks.astype(np.float64) - truth.astype(np.float64), axis=-1)
+    percent: NDArray[np.float64] = np.where(np.isfinite(distances), distances, diagonal) * (100.0 / diagonal)
+    return percent
+
+
+def _without_query(counted: NDArray[np.bool_], shape: tuple[int, ...], query: int) -> NDArray[np.bool_]:
+    if counted.shape != shape:
+        raise ValueError(f"counted has shape {counted.shape}; give [T, Q] = {shape}")
+    counts = counted.astype(np.bool_)
+    counts[query] = False
+    return counts
+
+
+def _medians(errors: NDArray[np.float64], counts: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Median of each column over the rows that count; columns where none does are left out."""
+    columns = [np.median(errors[counts[:, column], column]) for column in np.flatnonzero(counts.any(axis=0))]
+    return np.array(columns, dtype=np.float64)
