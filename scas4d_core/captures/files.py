@@ -38,7 +38,7 @@ def read_npz(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
         CaptureError: missing, broken, or without one of the keys.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = {key: file[key] for key in keys}
     except KeyError as fault:
         raise CaptureError(f"{path}: has no array {fault}; needed: {', '.join(keys)}") from fault
