@@ -1,9 +1,12 @@
 """The torch update on a toy scene in float64: it finds a known motion, and moves only what it may."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
+from scas4d_core import losses
 from scas4d_core.cameras import Camera
 from scas4d_core.deformation import quaternion_matrices, quaternion_product, rotation_quaternions
 from scas4d_core.gaussians import Gaussians
@@ -160,3 +163,52 @@ def test_rates_fall_along_half_a_cosine_and_zero_freezes() -> None:
 def test_one_rate_a_layer() -> None:
     with pytest.raises(ValueError, match=r"2 entries for 0 layers"):
         toy_update(ball_and_backdrop(), labels=[])
+
+
+def test_the_last_rate_is_the_one_asked_for() -> None:
+    before = ball_and_backdrop()
+    views = pictures(before, moved_truth(before), masks=False)
+    rates = dataclasses.replace(RATES, end=1e-9)
+    one, two = (toy_update(before, rates=rates).run(before, views, [0] * count) for count in (1, 2))
+    np.testing.assert_allclose(two.gaussians.means, one.gaussians.means, atol=1e-7)
+    assert np.abs(one.gaussians.means - before.means).max() > 1e-3
+
+
+@pytest.mark.parametrize("term", ["mask", "rigidity", "isometry", "rotation", "scale", "soft_colour"])
+def test_each_term_counts_with_its_weight(term: str, solved: tuple[Gaussians, np.ndarray, Updated]) -> None:
+    before, truth, after = solved
+    views = pictures(before, truth, masks=True)
+    # The deltas are stretched so that the scale term has something to say.
+    start = {"start": after.layers, "deltas": after.deltas._replace(ds=after.deltas.ds + 0.5)}
+    none = dict.fromkeys(("mask", "rigidity", "isometry", "rotation", "scale", "soft_colour"), 0.0)
+    # Soft colour only counts once the colours have moved, hence the second of two iterations at a fixed motion.
+    rates = Rates(layers=((0, 0, 0), (0, 0, 0)), position=0, rotation=0, scale=0, colour=1e-2)
+
+    def second_loss(**weights: float) -> float:
+        update = toy_update(before, rates=rates, weights=TermWeights(**{**none, **weights}))
+        return update.run(before, views, [1, 1], **start).losses[1]
+
+    # The first step's colours follow the sign of the gradient alone, which a term without colours does not change.
+    state = toy_update(before, rates=rates, weights=TermWeights(**none)).run(before, views, [1], **start)
+    update = toy_update(before)
+    m, f, q, c = (
+        torch.tensor(array, dtype=torch.float64)
+        for array in (state.gaussians.means, state.gaussians.factors, state.turns, state.gaussians.colours)
+    )
+    old = torch.tensor(before.means, dtype=torch.float64)[:MOVING]
+    neighbours, w, distances = (torch.tensor(array) for array in update.graph)
+    label = torch.tensor(before.foreground, dtype=torch.float64)[:, None]
+    opacities = torch.tensor(before.opacities, dtype=torch.float64)
+    camera, zero = CameraParams.of(views[1].camera), torch.zeros(1, dtype=torch.float64)
+    expected = {
+        "mask": lambda: losses.image_loss(
+            twin.render(m, f, opacities, label, camera, zero).features, torch.tensor(views[1].mask)[..., None]
+        ),
+        "rigidity": lambda: losses.rigidity_loss(m[:MOVING], q, old, neighbours, w),
+        "isometry": lambda: losses.isometry_loss(m[:MOVING], distances, neighbours, w),
+        "rotation": lambda: losses.rotation_loss(q, neighbours, w),
+        "scale": lambda: losses.scale_loss(f[:MOVING], torch.tensor(update.first_lengths), update.max_scale),
+        "soft_colour": lambda: losses.soft_colour_loss(c, torch.tensor(before.colours, dtype=torch.float64)),
+    }[term]().item()
+    assert expected > 1e-5
+    assert second_loss(**{term: 2.5}) - second_loss() == pytest.approx(2.5 * expected, rel=2e-3)
