@@ -1,0 +1,1 @@
+"""Studies that measure the method; ``scas4d bench`` runs them."""

@@ -1,0 +1,304 @@
+"""``scas4d bench quality``: how good the pictures, tracks and parts of captures are, and how long an update takes.
+
+One row for every capture, preset, number of iterations and seed. Each row runs in a process of its own, so that peak
+memory is that row's; rows that are on disk already are not run again.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import platform
+import sys
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scas4d_core.bench import measure as measures
+from scas4d_core.bench.store import Row, Store, digest
+from scas4d_core.bench.table import markdown, with_means
+from scas4d_core.captures import open_capture
+from scas4d_core.presets import preset
+from scas4d_core.settings import Settings
+
+Report = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One row to be measured.
+
+    Attributes:
+        capture: folder.
+        preset: name, for the table.
+        settings: what is run, complete.
+        frames: only so many frames of the capture; None: all.
+        masks: whether the method gets the masks (they are always used to measure).
+        points: whether the method gets the initial cloud.
+        pictures: frames whose comparison pictures are saved; negative ones count from the end.
+        lpips: also LPIPS; loads torch.
+    """
+
+    capture: Path
+    preset: str
+    settings: Settings
+    frames: int | None = None
+    masks: bool = True
+    points: bool = True
+    pictures: tuple[int, ...] = (0, 1, -1)
+    lpips: bool = False
+
+    @property
+    def variant(self) -> str:
+        """What is the same over captures: preset, iterations and everything else that is set."""
+        update = self.settings.update
+        given = {"frames": self.frames, "masks": self.masks, "points": self.points}
+        return (
+            f"{self.preset}-{update.iterations}-s{update.seed}-{digest(self.settings.model_dump(mode='json'), given)}"
+        )
+
+    @property
+    def key(self) -> str:
+        """Names the row; another setting is another row."""
+        return f"{self.capture.resolve().name}-{self.variant}"
+
+
+def run(
+    captures: Sequence[Path | str],
+    out: Path | str,
+    presets: Sequence[str] = ("scas4d",),
+    *,
+    iterations: Sequence[int] = (),
+    seeds: Sequence[int] = (0,),
+    overrides: Sequence[str] = (),
+    device: str | None = None,
+    frames: int | None = None,
+    masks: bool = True,
+    points: bool = True,
+    pictures: Sequence[int] = (0, 1, -1),
+    lpips: bool = False,
+    again: bool = False,
+    report: Report = print,
+) -> list[Row]:
+    """Measures every capture under every preset; prints the table and leaves it in ``out/table.md``.
+
+    Args:
+        captures: folders with test cameras.
+        out: rows, per-frame lines and pictures go here; run again with the same folder to go on.
+        presets: names.
+        iterations: of an update, each tried; none: the preset's own.
+        seeds: of frame 0 and of the updates, each tried.
+        overrides: further settings as ``"update.clusters=[64]"``, JSON behind the sign.
+        device: "cpu" or "cuda"; None: the preset's.
+        frames: only so many frames of each capture; None: all.
+        masks: False withholds the masks from the method.
+        points: False withholds the initial cloud.
+        pictures: frames to save as truth | render | difference; negative ones count from the end.
+        lpips: also LPIPS where its weights are installed.
+        again: measure rows anew that are on disk already.
+        report: takes the lines that are printed.
+
+    Returns:
+        The rows asked for, in order; a failed one has ``error`` and is tried again next time.
+
+    Raises:
+        ValueError: an unknown preset or setting, or a value out of range.
+    """
+    store = Store(Path(out))
+    jobs = [
+        Job(
+            capture=Path(capture),
+            preset=name,
+            settings=settings_of(name, count, seed, overrides, device),
+            frames=frames,
+            masks=masks,
+            points=points,
+            pictures=tuple(pictures),
+            lpips=lpips,
+        )
+        for name in presets
+        for count in (iterations or (None,))
+        for seed in seeds
+        for capture in captures
+    ]
+    rows = []
+    for number, job in enumerate(jobs, 1):
+        row = None if again else store.row(job.key)
+        if row is None:
+            report(f"[{number}/{len(jobs)}] {job.key}")
+            row = _apart(job, store.folder)
+            store.put(row)
+            if "error" in row:
+                report(f"    failed: {row['error']}")
+        else:
+            report(f"[{number}/{len(jobs)}] {job.key}: measured already")
+        rows.append(row)
+    table = markdown(with_means(rows))
+    (store.folder / "table.md").write_text(table + "\n")
+    report(table)
+    return rows
+
+
+def settings_of(
+    name: str,
+    iterations: int | None = None,
+    seed: int = 0,
+    overrides: Sequence[str] = (),
+    device: str | None = None,
+) -> Settings:
+    """A preset with changes, checked.
+
+    Raises:
+        ValueError: an unknown preset or setting, or a value out of range.
+    """
+    values = preset(name).model_dump()
+    values["static"]["seed"] = values["update"]["seed"] = seed
+    if iterations is not None:
+        values["update"]["iterations"] = iterations
+    if device is not None:
+        values["device"] = device
+    for change in overrides:
+        path, sign, text = change.partition("=")
+        if not sign:
+            raise ValueError(f"override {change!r} has no '='; write it as update.iterations=100")
+        *groups, last = path.strip().split(".")
+        inner = values
+        for group in groups:
+            if not isinstance(inner.get(group), dict):
+                raise ValueError(f"override {change!r}: there is no group of settings {group!r}")
+            inner = inner[group]
+        try:
+            inner[last] = json.loads(text)
+        except json.JSONDecodeError:
+            inner[last] = text.strip()
+    return Settings.model_validate(values)
+
+
+def measure(job: Job, folder: Path, report: Report = print) -> Row:
+    """Reconstructs one capture and measures everything that it can be measured by.
+
+    Seconds are those of ``step`` alone. Peak memory is this process's, measuring included.
+    """
+    truth = open_capture(job.capture, image_scale=job.settings.scene.image_scale)
+    given = open_capture(job.capture, use_masks=job.masks, use_points=job.points)
+    if truth.test_rig is None:
+        raise ValueError(f"{job.capture} has no test cameras (test_meta.json), so there is nothing to measure on")
+    from scas4d_core.reconstruction import Reconstruction  # brings the kernels; the table and the command do not
+
+    store = Store(folder)
+    store.start_frames(job.key)
+    count = given.frame_count if job.frames is None else min(job.frames, given.frame_count)
+
+    started = time.perf_counter()
+    reconstruction = Reconstruction.start(given.rig, given.frame(0), job.settings, points=given.points)
+    seconds_first = time.perf_counter() - started
+    lines: list[Row] = []
+    for index in range(count):
+        line: Row = {"index": index, "seconds": seconds_first, "stages": {}}
+        if index:
+            started = time.perf_counter()
+            done = reconstruction.step(given.frame(index))
+            line["seconds"] = time.perf_counter() - started
+            line["stages"] = {name: float(value) for name, value in done.seconds.items()}
+            line["moving"], line["gaussians"] = int(done.moving), int(done.gaussians)
+        scores, by_camera = measures.measure_pictures(reconstruction, truth, index, with_lpips=job.lpips)
+        line |= scores
+        store.put_frame(job.key, {**line, "cameras": by_camera})
+        lines.append(line)
+        report(f"    frame {index:3d}/{count - 1}  {line['psnr']:6.2f} dB  {line['seconds']:6.2f} s")
+
+    indices = list(range(count))
+    row: Row = {
+        "key": job.key,
+        "variant": job.variant,
+        "capture": truth.name,
+        "preset": job.preset,
+        "iterations": job.settings.update.iterations,
+        "seed": job.settings.update.seed,
+        "settings": job.settings.model_dump(mode="json"),
+        "given": {"frames": count, "masks": job.masks, "points": job.points},
+        "machine": {"processor": platform.processor() or platform.machine(), "python": platform.python_version()},
+        "gaussians": len(reconstruction.history.gaussians(0)),
+        "moving": int(reconstruction.history.gaussians(count - 1).moving.sum()),
+        "seconds_first": seconds_first,
+        "psnr_first": lines[0]["psnr"],
+        **summary(lines),
+    }
+    if truth.ground_truth is not None and count > 1:
+        row |= measures.measure_tracks(reconstruction, truth, indices)
+        row |= measures.measure_parts(reconstruction, truth, indices)
+    row["peak_mb"] = peak_megabytes()
+    pictures = folder / "pictures" / job.key
+    for index in sorted({range(count)[i] for i in job.pictures if -count <= i < count}):
+        measures.save_comparison(reconstruction, truth, index, pictures)
+    if "parts_count" in row:
+        labels = reconstruction.parts(int(row["parts_count"]))
+        measures.save_parts(reconstruction, truth, indices[-1], labels, pictures)
+    return row
+
+
+def summary(lines: Sequence[Row]) -> Row:
+    """What a table says of the per-frame lines: means over all updates (every frame but the first)."""
+    updates = lines[1:]
+    if not updates:
+        return {"updates": 0}
+    names = ("psnr", "psnr_foreground", "psnr_changed", "ssim", "flip", "lpips")
+    stages = measures.mean_scores(line["stages"] for line in updates)
+    return {
+        "updates": len(updates),
+        **measures.mean_scores({name: line.get(name) for name in names} for line in updates),
+        "psnr_worst": min(line["psnr"] for line in updates),
+        "psnr_last": updates[-1]["psnr"],
+        "psnr_by_frame": [round(line["psnr"], 3) for line in lines],
+        # The first update compiles or loads kernels; the median does not see it.
+        "seconds_update": float(np.median([line["seconds"] for line in updates])),
+        "seconds_stages": stages,
+    }
+
+
+def peak_megabytes() -> float | None:
+    """Largest resident memory of this process so far, 10⁶ bytes; None where the system does not tell (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
+
+
+def _apart(job: Job, folder: Path) -> Row:
+    """Runs ``measure`` in a fresh process; what goes wrong there becomes the row's ``error``."""
+    failed: Row = {
+        "key": job.key,
+        "variant": job.variant,
+        "capture": job.capture.resolve().name,
+        "preset": job.preset,
+        "iterations": job.settings.update.iterations,
+    }
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_child, args=(sender, job, folder))
+    process.start()
+    sender.close()
+    try:
+        answer: Any = receiver.recv()
+    except EOFError:
+        process.join()
+        return failed | {"error": f"its process ended with exit code {process.exitcode} (out of memory, or killed)"}
+    process.join()
+    return failed | {"error": answer} if isinstance(answer, str) else dict(answer)
+
+
+def _child(sender: Any, job: Job, folder: Path) -> None:
+    try:
+        answer: Any = measure(job, folder, lambda line: print(line, flush=True))
+    except Exception as error:
+        traceback.print_exc()
+        answer = f"{type(error).__name__}: {error}"
+    sender.send(answer)
+    sender.close()
