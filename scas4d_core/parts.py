@@ -23,6 +23,8 @@ Features = NDArray[np.float32]
 
 STANDING = -1
 """The label of Gaussians that do not move: they belong to no part."""
+SILHOUETTE_SAMPLE = 1000
+"""Gaussians on which the count of parts is chosen: the silhouette takes all distances between them."""
 ROWS_AT_ONCE = 8192
 """Rows whose features are held at once while every Gaussian is labelled."""
 
@@ -30,11 +32,14 @@ ROWS_AT_ONCE = 8192
 class PartsSettings(Model):
     """The features and the clustering; one set for all scenes."""
 
-    lambda_position: float = Field(default=1.0, ge=0, description="Of p over time, p in units of the extent.")
+    lambda_position: float = Field(default=0.5, ge=0, description="Of p over time, p in units of the extent.")
     lambda_rotation: float = Field(
-        default=0.5, ge=0, description="Of the entries of R over time; a turn of angle a moves them by 2.8 sin(a/2)."
+        default=1.0,
+        ge=0,
+        description="Of the entries of R over time; a turn of angle a moves them by 2.8 sin(a/2). Rotation tells parts "
+        "apart, position only those that turn alike: with more of it long parts are cut across.",
     )
-    lambda_initial: float = Field(default=1.0, ge=0, description="Of p at the first frame, repeated as in the paper.")
+    lambda_initial: float = Field(default=0.25, ge=0, description="Of p at the first frame, repeated as in the paper.")
     frames: int = Field(
         default=32, ge=2, description="At most this many frames, evenly over the history: memory stays bounded."
     )
@@ -55,7 +60,7 @@ def parts(history: History, count: int | None = None, settings: PartsSettings | 
     Args:
         history: at least one committed frame; with a single frame only its positions tell parts apart.
         count: how many parts; None: the count from 2 to ``most_parts`` with the largest mean silhouette
-            (Rousseeuw 1987) on 1,000 Gaussians.
+            (Rousseeuw 1987) on up to 1,000 Gaussians.
         settings: λ and the clustering.
 
     Raises:
@@ -136,21 +141,22 @@ def coverage(gaussians: Gaussians) -> NDArray[np.float64]:
 def _cluster(
     features: Features, weights: NDArray[Any], count: int | None, settings: PartsSettings, rng: np.random.Generator
 ) -> KMeans:
-    def fit(k: int) -> KMeans:
-        model = KMeans(n_clusters=k, n_init=settings.restarts, random_state=settings.seed)
-        return model.fit(features, sample_weight=weights)
+    if count is None:
+        # Drawn by weight, so that the silhouette sees what the pictures see.
+        drawn = rng.choice(len(features), size=SILHOUETTE_SAMPLE, p=weights / weights.sum())
+        count = _best_count(features[np.unique(drawn)], settings)
+    return _kmeans(count, settings).fit(features, sample_weight=weights)
 
-    if count is not None:
-        return fit(count)
-    # By weight, so that the silhouette sees what the pictures see; a point may be drawn twice.
-    drawn = rng.choice(len(features), size=min(1000, len(features)), p=weights / weights.sum())
-    best, best_score = fit(1), 0.0
-    for k in range(2, min(settings.most_parts, len(features)) + 1):
-        model = fit(k)
-        labels = model.labels_[drawn]
-        if len(np.unique(labels)) < 2:
-            continue
-        score = float(silhouette_score(features[drawn], labels))
+
+def _best_count(features: Features, settings: PartsSettings) -> int:
+    best, best_score = 1, 0.0
+    for count in range(2, min(settings.most_parts, len(features) - 1) + 1):
+        labels = _kmeans(count, settings).fit_predict(features)
+        score = float(silhouette_score(features, labels))
         if score > best_score:
-            best, best_score = model, score
+            best, best_score = count, score
     return best
+
+
+def _kmeans(count: int, settings: PartsSettings) -> KMeans:
+    return KMeans(n_clusters=count, n_init=settings.restarts, random_state=settings.seed)
