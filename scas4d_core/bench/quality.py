@@ -18,6 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
+from rich.progress import Progress
 
 from scas4d_core.bench import measure as measures
 from scas4d_core.bench.store import Row, Store, digest
@@ -194,23 +196,33 @@ def measure(job: Job, folder: Path, report: Report = print) -> Row:
     store.start_frames(job.key)
     count = given.frame_count if job.frames is None else min(job.frames, given.frame_count)
 
-    started = time.perf_counter()
-    reconstruction = Reconstruction.start(given.rig, given.frame(0), job.settings, points=given.points)
-    seconds_first = time.perf_counter() - started
     lines: list[Row] = []
-    for index in range(count):
-        line: Row = {"index": index, "seconds": seconds_first, "stages": {}}
-        if index:
-            started = time.perf_counter()
-            done = reconstruction.step(given.frame(index))
-            line["seconds"] = time.perf_counter() - started
-            line["stages"] = {name: float(value) for name, value in done.seconds.items()}
-            line["moving"], line["gaussians"] = int(done.moving), int(done.gaussians)
-        scores, by_camera = measures.measure_pictures(reconstruction, truth, index, with_lpips=job.lpips)
-        line |= scores
-        store.put_frame(job.key, {**line, "cameras": by_camera})
-        lines.append(line)
-        report(f"    frame {index:3d}/{count - 1}  {line['psnr']:6.2f} dB  {line['seconds']:6.2f} s")
+    with Progress(console=Console(stderr=True), transient=True) as bars:
+        bar = bars.add_task("frame 0")
+
+        def moved(now: Any) -> None:
+            bars.update(bar, description=f"frame 0, {now.stage}", completed=now.done, total=now.total)
+
+        started = time.perf_counter()
+        reconstruction = Reconstruction.start(
+            given.rig, given.frame(0), job.settings, points=given.points, progress=moved
+        )
+        seconds_first = time.perf_counter() - started
+        bars.update(bar, description="frames", completed=0, total=count)
+        for index in range(count):
+            line: Row = {"index": index, "seconds": seconds_first, "stages": {}}
+            if index:
+                started = time.perf_counter()
+                done = reconstruction.step(given.frame(index))
+                line["seconds"] = time.perf_counter() - started
+                line["stages"] = {name: float(value) for name, value in done.seconds.items()}
+                line["moving"], line["gaussians"] = int(done.moving), int(done.gaussians)
+            scores, by_camera = measures.measure_pictures(reconstruction, truth, index, with_lpips=job.lpips)
+            line |= scores
+            store.put_frame(job.key, {**line, "cameras": by_camera})
+            lines.append(line)
+            bars.advance(bar)
+            report(f"    frame {index:3d}/{count - 1}  {line['psnr']:6.2f} dB  {line['seconds']:6.2f} s")
 
     indices = list(range(count))
     row: Row = {
