@@ -1,0 +1,85 @@
+"""What the processes of a scene need of the core, as an interface: tests put a small fake in its place."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Camera, Rig
+from scas4d_core.captures import Frame, InitialPoints
+from scas4d_core.history import History
+
+if TYPE_CHECKING:
+    from scas4d_core.reconstruction import FrameReport, Progress, View
+
+    from scas4d_core.tracks import Tracks
+
+
+class Reconstruction(Protocol):
+    """What the worker process owns: see `scas4d_core.reconstruction.Reconstruction`."""
+
+    history: History
+
+    def step(self, frame: Frame) -> FrameReport:
+        """Finds the state of the next frame and commits it to the history."""
+
+
+class Reader(Protocol):
+    """What the reader process owns: views, tracks and parts of the committed states. Cameras, points: user's world."""
+
+    def render(
+        self,
+        camera: Camera,
+        index: int,
+        *,
+        background: tuple[float, float, float],
+        labels: NDArray[np.int64] | None = None,
+    ) -> View:
+        """A novel view of a committed frame."""
+
+    def tracks_of_points(self, points: NDArray[np.float64], index: int, indices: Sequence[int]) -> Tracks:
+        """Trajectories of points [Q, 3] of frame `index`."""
+
+    def tracks_of_pixels(self, camera: Camera, uv: NDArray[np.float64], index: int, indices: Sequence[int]) -> Tracks:
+        """Trajectories of pixels [Q, 2] of frame `index`."""
+
+    def tracks_of_ids(self, ids: NDArray[np.int64], indices: Sequence[int]) -> Tracks:
+        """Trajectories of Gaussians."""
+
+    def with_visibility(self, tracks: Tracks, camera: Camera, index: int) -> Tracks:
+        """The same tracks, asked for at frame `index`, with their visibility in one more camera."""
+
+    def parts(self, count: int | None) -> NDArray[np.int64]:
+        """[N] labels, 0 … count−1."""
+
+    def ply(self, index: int) -> bytes:
+        """A committed frame as a 3DGS .ply."""
+
+
+class Engine(Protocol):
+    """Makes both. One object in each process of a scene."""
+
+    def start(
+        self,
+        rig: Rig,
+        frame: Frame,
+        settings: Any,
+        *,
+        points: InitialPoints | None,
+        progress: Callable[[Progress], None],
+    ) -> Reconstruction:
+        """Reconstructs the first frame."""
+
+    def reader(self, rig: Rig, settings: Any, history: History) -> Reader:
+        """Reads what was committed to a history; made anew when the history has grown."""
+
+
+def load_engine(name: str) -> Engine:
+    """The engine that `module:function` makes."""
+    module, _, function = name.partition(":")
+    engine: Engine = getattr(importlib.import_module(module), function)()
+    return engine

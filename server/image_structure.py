@@ -1,0 +1,136 @@
+"""Walks an image file's structure without decoding its pixels: what a door can know at the speed of the wire.
+
+JPEG by its segments to the end marker, PNG by its chunks with their checksums, WebP by its RIFF chunks.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+
+
+class StructureError(ValueError):
+    """Not a whole picture of a kind that is taken: the message names the fault and the remedy."""
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """What the header declares: format "jpeg", "png" or "webp", and the size in pixels."""
+
+    format: str
+    width: int
+    height: int
+
+
+def walk(data: bytes) -> ImageHeader:
+    """The header of a file that is whole.
+
+    Raises:
+        StructureError: another format, truncated, damaged, CMYK, animated, or of a bit depth that is not taken.
+    """
+    if data[:3] == b"\xff\xd8\xff":
+        return _jpeg(data)
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        return _png(data)
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        return _webp(data)
+    raise StructureError(f"begins with {data[:8].hex(' ') or 'nothing'}: not a JPEG, PNG or WebP; send one of these")
+
+
+def _truncated(kind: str, size: int) -> StructureError:
+    return StructureError(f"a {kind} that ends early, after {size} bytes; send the whole file")
+
+
+def _jpeg(data: bytes) -> ImageHeader:
+    at, header = 2, None
+    while True:
+        while data[at : at + 2] == b"\xff\xff":  # fill bytes
+            at += 1
+        if at + 2 > len(data):
+            raise _truncated("JPEG", len(data))
+        if data[at] != 0xFF:
+            raise StructureError(f"a JPEG without a marker at byte {at}; the file is damaged: send it again")
+        marker = data[at + 1]
+        if marker == 0xD9:
+            break
+        if at + 4 > len(data):
+            raise _truncated("JPEG", len(data))
+        length = struct.unpack(">H", data[at + 2 : at + 4])[0]
+        if length < 2 or at + 2 + length > len(data):
+            raise _truncated("JPEG", len(data))
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            if length < 8:
+                raise StructureError("a JPEG with a short frame header; the file is damaged: send it again")
+            bits, height, width, channels = struct.unpack(">BHHB", data[at + 4 : at + 10])
+            if bits != 8 or channels not in (1, 3):
+                raise StructureError(f"a JPEG of {channels} channels of {bits} bits; send RGB or grey of 8 bits")
+            header = ImageHeader("jpeg", width, height)
+        at += 2 + length
+        if marker == 0xDA:  # entropy-coded data: to the next marker that is neither a stuffed zero nor a restart
+            while True:
+                at = data.find(b"\xff", at)
+                if at < 0 or at + 1 >= len(data):
+                    raise _truncated("JPEG", len(data))
+                if data[at + 1] == 0 or 0xD0 <= data[at + 1] <= 0xD7:
+                    at += 2
+                elif data[at + 1] == 0xFF:
+                    at += 1
+                else:
+                    break
+    if header is None:
+        raise StructureError("a JPEG without a frame header; the file is damaged: send it again")
+    return header
+
+
+def _png(data: bytes) -> ImageHeader:
+    at, header, pixels = 8, None, False
+    while True:
+        if at + 12 > len(data):
+            raise _truncated("PNG", len(data))
+        length, kind = struct.unpack(">I4s", data[at : at + 8])
+        end = at + 12 + length
+        if end > len(data):
+            raise _truncated("PNG", len(data))
+        if zlib.crc32(data[at + 4 : end - 4]) != struct.unpack(">I", data[end - 4 : end])[0]:
+            raise StructureError(f"a PNG whose {kind!r} chunk at byte {at} fails its checksum; send the file again")
+        if header is None:
+            if kind != b"IHDR" or length != 13:
+                raise StructureError("a PNG that does not begin with its header; the file is damaged: send it again")
+            header = ImageHeader("png", *struct.unpack(">II", data[at + 8 : at + 16]))
+        if kind == b"acTL":
+            raise StructureError("an animated PNG; send one picture a file")
+        pixels |= kind == b"IDAT"
+        if kind == b"IEND":
+            break
+        at = end
+    if not pixels:
+        raise StructureError("a PNG without pixels; the file is damaged: send it again")
+    return header
+
+
+def _webp(data: bytes) -> ImageHeader:
+    size = struct.unpack("<I", data[4:8])[0] + 8
+    if size > len(data):
+        raise _truncated("WebP", len(data))
+    at, header, pixels = 12, None, False
+    while at + 8 <= size:
+        kind, length = struct.unpack("<4sI", data[at : at + 8])
+        body = data[at + 8 : at + 8 + length]
+        if len(body) < length or at + 8 + length > size:
+            raise _truncated("WebP", len(data))
+        if kind in (b"ANIM", b"ANMF"):
+            raise StructureError("an animated WebP; send one picture a file")
+        if kind == b"VP8X" and length >= 10:
+            width, height = int.from_bytes(body[4:7], "little") + 1, int.from_bytes(body[7:10], "little") + 1
+            header = ImageHeader("webp", width, height)
+        if kind == b"VP8 " and length >= 10:
+            width, height = struct.unpack("<HH", body[6:10])
+            header, pixels = header or ImageHeader("webp", width & 0x3FFF, height & 0x3FFF), True
+        if kind == b"VP8L" and length >= 5:
+            bits = struct.unpack("<I", body[1:5])[0]
+            header, pixels = header or ImageHeader("webp", (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1), True
+        at += 8 + length + length % 2
+    if header is None or not pixels:
+        raise StructureError("a WebP without pixels; the file is damaged: send it again")
+    return header

@@ -1,0 +1,118 @@
+"""Every error is a problem document (RFC 9457) that names the field, the value and the remedy."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from client.wire import ProblemDetails
+
+MEDIA_TYPE = "application/problem+json"
+VALUE_LENGTH = 200
+"""A value quoted in an answer is cut here: it may be a whole cloud."""
+
+log = logging.getLogger("scas4d.server")
+
+
+class Problem(HTTPException):
+    """An answer that says what was wrong.
+
+    Args:
+        status: HTTP status, 400…599.
+        detail: one sentence for a person.
+        field: the parameter or field at fault.
+        value: what was given there; quoted, shortened.
+        remedy: what to send or do instead.
+        headers: further headers of the answer.
+        more: further members of the document, such as `expected`.
+    """
+
+    def __init__(
+        self,
+        status: int,
+        detail: str,
+        *,
+        field: str | None = None,
+        value: object = None,
+        remedy: str | None = None,
+        headers: Mapping[str, str] | None = None,
+        **more: Any,
+    ) -> None:
+        super().__init__(status, detail, dict(headers or {}))
+        self.document = ProblemDetails(
+            title=HTTPStatus(status).phrase,
+            status=status,
+            detail=detail,
+            field=field,
+            value=None if value is None else quoted(value),
+            remedy=remedy,
+            **more,
+        )
+
+
+def quoted(value: object) -> str:
+    """A value as text, short enough to be sent back."""
+    text = value if isinstance(value, str) else repr(value)
+    return text if len(text) <= VALUE_LENGTH else text[: VALUE_LENGTH - 1] + "…"
+
+
+def answer(document: ProblemDetails, headers: Mapping[str, str] | None = None) -> Response:
+    """The document as a response; ASCII, so that text which is no Unicode (lone surrogates) can be quoted too."""
+    body = json.dumps(document.model_dump(mode="python", exclude_none=True), ensure_ascii=True).encode()
+    return Response(body, document.status, dict(headers or {}), media_type=MEDIA_TYPE)
+
+
+def install(app: FastAPI) -> None:
+    """Makes the application answer every error as a problem document."""
+
+    async def from_problem(request: Request, error: Exception) -> Response:
+        assert isinstance(error, HTTPException)
+        if isinstance(error, Problem):
+            return answer(error.document, error.headers)
+        title = HTTPStatus(error.status_code).phrase
+        document = ProblemDetails(title=title, status=error.status_code, detail=str(error.detail))
+        return answer(document, error.headers)
+
+    async def from_validation(request: Request, error: Exception) -> Response:
+        assert isinstance(error, RequestValidationError)
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"])
+        others = len(error.errors()) - 1
+        document = ProblemDetails(
+            title=HTTPStatus.UNPROCESSABLE_ENTITY.phrase,
+            status=422,
+            detail=f"{field}: {first['msg']}" + (f" (and {others} more)" if others else ""),
+            field=field,
+            value=quoted(first.get("input")),
+            remedy=f"{first['msg']}; the schema is at /openapi.json",
+        )
+        return answer(document)
+
+    async def from_fault(request: Request, error: Exception) -> Response:
+        log.exception("%s %s failed", request.method, request.url.path, exc_info=error)
+        document = ProblemDetails(
+            title=HTTPStatus.INTERNAL_SERVER_ERROR.phrase,
+            status=500,
+            detail=f"the service failed: {type(error).__name__}",
+            remedy="this is a fault of the service; its log has the traceback",
+        )
+        return answer(document)
+
+    app.add_exception_handler(HTTPException, from_problem)
+    app.add_exception_handler(RequestValidationError, from_validation)
+    app.add_exception_handler(Exception, from_fault)
+
+
+RESPONSES: dict[int | str, dict[str, Any]] = {
+    "4XX": {"description": "What was wrong, with which value, and what to do.", "model": ProblemDetails},
+    422: {"description": "A field that cannot be.", "model": ProblemDetails},
+}
+"""For the OpenAPI document."""

@@ -1,0 +1,26 @@
+"""Parts: which Gaussians move together."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Response
+
+from client.wire import PartsModel
+from server.messages import PartsQuery
+from server.routes.access import TheScene
+
+router = APIRouter(prefix="/v1/scenes", tags=["parts"])
+
+ANSWERS: dict[int | str, dict[str, Any]] = {200: {"model": PartsModel}}
+
+
+@router.get("/{id}/parts", response_class=Response, responses=ANSWERS)
+async def parts(
+    scene: TheScene,
+    count: Annotated[int | None, Query(ge=1, le=254, description="How many; chosen by a rule if not given.")] = None,
+) -> Response:
+    """A label for every Gaussian, from its motion over all committed frames."""
+    scene.committed_frame(None, "id")
+    answer = await scene.ask(PartsQuery(count))
+    return Response(answer.body, media_type=answer.media_type)

@@ -1,0 +1,108 @@
+"""The initial cloud."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import io
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fastapi import APIRouter, Request
+from numpy.typing import NDArray
+
+from client.wire import PointsReceipt
+from server.problems import Problem
+from server.routes.access import TheScene, TheSettings
+
+router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
+
+BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {"application/vnd.numpy.npz": {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+
+
+@router.put("/{id}/points", openapi_extra=BODY)
+async def put(scene: TheScene, server: TheSettings, request: Request) -> PointsReceipt:
+    """Gives the cloud that frame 0 starts from, before frame 0.
+
+    The body is an npz: `positions` [P, 3] in the rig's world and units, `colours` [P, 3] in 0…1, and optionally
+    `foreground` [P] in 0…1. The same body again gets the same answer.
+    """
+    body = await request.body()
+    sha256 = hashlib.sha256(body).hexdigest()
+    arrays = await asyncio.to_thread(read_points, body, server.max_points)
+    receipt = PointsReceipt(points=len(arrays["positions"]), sha256=sha256)
+    async with scene.door:
+        if scene.points_sha256 == sha256:
+            return receipt
+        if scene.next_frame > 0:
+            raise Problem(
+                409,
+                "the first frame is here already, and started without these points",
+                field="points",
+                remedy="create a new scene and give the points before frame 0",
+            )
+        await asyncio.to_thread(_write, scene.spec.points, arrays)
+        scene.points_sha256 = sha256
+    return receipt
+
+
+def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
+    """The checked arrays of an npz cloud; nothing is unpickled, and nothing is unpacked before its size is known."""
+    shapes = {"positions": (np.float64, 3), "colours": (np.float32, 3), "foreground": (np.float32, 0)}
+    try:
+        with zipfile.ZipFile(io.BytesIO(body)) as archive:
+            unpacked = sum(member.file_size for member in archive.infolist())
+        if unpacked > 64 * limit:
+            raise Problem(
+                413,
+                f"the cloud unpacks to {unpacked} bytes",
+                field="points",
+                remedy=f"give at most {limit} points, or raise SCAS4D_MAX_POINTS",
+            )
+        with np.load(io.BytesIO(body), allow_pickle=False) as file:
+            arrays = {name: np.asarray(file[name]) for name in file.files if name in shapes}
+    except (zipfile.BadZipFile, ValueError, OSError, EOFError, KeyError, RuntimeError, NotImplementedError) as error:
+        raise Problem(
+            422,
+            f"the body is no npz that can be read without pickle ({error})",
+            field="points",
+            remedy="send numpy.savez(positions=…, colours=…, foreground=…) of plain numbers",
+        ) from None
+    count = len(arrays["positions"]) if "positions" in arrays and arrays["positions"].ndim else 0
+    for name, (kind, columns) in shapes.items():
+        if name not in arrays and name == "foreground":
+            continue
+        wanted = (count, columns) if columns else (count,)
+        array = arrays.get(name)
+        if array is None or array.shape != wanted or not 1 <= count <= limit or array.dtype.kind not in "fiu":
+            given = "missing" if array is None else f"{array.dtype} {array.shape}"
+            raise Problem(
+                422,
+                f"{name} is {given}",
+                field=name,
+                value=given,
+                remedy=f"give numbers of shape {'[P, 3]' if columns else '[P]'}, 1 ≤ P ≤ {limit}",
+            )
+        arrays[name] = array.astype(kind)
+        if not np.isfinite(arrays[name]).all():
+            raise Problem(
+                422, f"{name} holds NaN or infinity", field=name, value="NaN", remedy="give finite numbers only"
+            )
+        if name != "positions" and (arrays[name].min() < 0 or arrays[name].max() > 1):
+            top = f"{arrays[name].min():g} … {arrays[name].max():g}"
+            raise Problem(422, f"{name} has values {top}", field=name, value=top, remedy="give values in 0 … 1")
+    return arrays
+
+
+def _write(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+    beside = path.with_suffix(".part")
+    with beside.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
+    beside.replace(path)

@@ -1,0 +1,78 @@
+"""Create, list, inspect, delete scenes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter, Response
+from pydantic import ValidationError
+
+from client.wire import SceneCreate, SceneList, SceneStatus
+from scas4d_core.presets import preset
+from scas4d_core.settings import Settings
+from server.problems import Problem
+from server.routes.access import AllScenes, TheScene, TheSettings
+
+router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
+
+
+def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Nested dictionaries, the second over the first."""
+    result = dict(base)
+    for name, value in changes.items():
+        old = result.get(name)
+        result[name] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return result
+
+
+def scene_settings(request: SceneCreate) -> Settings:
+    """The preset with the request's changes."""
+    try:
+        base = preset(request.preset)
+    except ValueError as error:
+        raise Problem(422, str(error), field="preset", value=request.preset, remedy=str(error)) from None
+    try:
+        return Settings.model_validate(merged(base.model_dump(), request.settings))
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(("settings", *(str(part) for part in first["loc"])))
+        raise Problem(
+            422, f"{field}: {first['msg']}", field=field, value=first.get("input"), remedy=first["msg"]
+        ) from None
+
+
+@router.post("", status_code=201)
+async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, response: Response) -> SceneStatus:
+    """Creates a scene from a rig; it waits for its first frame."""
+    settings = scene_settings(request)
+    for camera in request.rig.cameras:
+        pixels = camera.width * camera.height
+        if pixels > server.max_image_pixels:
+            raise Problem(
+                422,
+                f"camera {camera.name!r} has {pixels} pixels, more than {server.max_image_pixels}",
+                field="rig.cameras",
+                value=f"{camera.width}x{camera.height}",
+                remedy="send smaller pictures with the intrinsics to match, or raise SCAS4D_MAX_IMAGE_PIXELS",
+            )
+    scene = scenes.create(request, settings)
+    response.headers["Location"] = f"/v1/scenes/{scene.id}"
+    return scene.status()
+
+
+@router.get("")
+async def listed(scenes: AllScenes) -> SceneList:
+    """All scenes."""
+    return SceneList(scenes=[scene.status() for scene in scenes.by_id.values()])
+
+
+@router.get("/{id}")
+async def inspect(scene: TheScene) -> SceneStatus:
+    """The scene's state, progress and queue."""
+    return scene.status()
+
+
+@router.delete("/{id}", status_code=204)
+async def delete(scene: TheScene, scenes: AllScenes) -> None:
+    """Ends the scene and removes all it has on disk."""
+    await scenes.delete(scene.id)

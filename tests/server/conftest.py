@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+import httpx
+import pytest
+from running import Running, fake_settings, make_rig
+
+from client.sdk import Client
+
+
+@pytest.fixture(scope="session")
+def service(tmp_path_factory):
+    running = Running(fake_settings(tmp_path_factory.mktemp("data")))
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def http(service):
+    with httpx.Client(base_url=service.url, timeout=30) as client:
+        yield client
+
+
+@pytest.fixture
+def sdk(service):
+    with Client(service.url, patience=20) as client:
+        yield client
+
+
+@pytest.fixture
+def scene(sdk):
+    """A scene of two cameras, deleted afterwards."""
+    status = sdk.create_scene(make_rig(), frames_per_second=10)
+    yield status.id
+    sdk.delete_scene(status.id)
+
+
+@pytest.fixture(scope="module")
+def quiet_scene(service):
+    """A scene that takes nothing: what is refused must leave it as it is."""
+    with Client(service.url) as client:
+        status = client.create_scene(make_rig())
+        yield status.id
+        assert client.scene(status.id) == status
+        client.delete_scene(status.id)

@@ -1,0 +1,129 @@
+"""An engine without a method: it honours the contract of the real one and does what the first picture's red says."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import numpy as np
+
+from scas4d_core import tracks
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.history import History
+
+SLOW, RAISES, DIES = 200, 250, 251
+SLOW_S = 2.0
+STEP_M = 0.125
+
+
+@dataclass
+class Progress:
+    stage: str
+    done: int
+    total: int
+    detail: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class Report:
+    index: int
+    time: float
+    iterations: int
+    seconds: dict[str, float]
+    loss: list[float]
+    psnr: float
+    moving: int
+    gaussians: int
+
+
+def obey(frame):
+    red = int(next(iter(frame.images.values()))[0, 0, 0])
+    if red == SLOW:
+        time.sleep(SLOW_S)
+    if red == RAISES:
+        raise FloatingPointError("the fake was told to raise")
+    if red == DIES:
+        os._exit(7)
+    return red
+
+
+def state(points, index):
+    count = len(points)
+    offset = np.array([STEP_M * index, 0, 0])
+    return Gaussians(
+        means=(points + offset).astype(np.float32),
+        factors=np.tile(0.05 * np.eye(3, dtype=np.float32), (count, 1, 1)),
+        rotations=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        opacities=np.full(count, 0.9, np.float32),
+        colours=np.full((count, 3), 0.5, np.float32),
+        foreground=np.ones(count, np.float32),
+        ids=np.arange(count),
+    )
+
+
+class FakeReconstruction:
+    def __init__(self, rig, frame, settings, points, progress):
+        obey(frame)
+        for done in range(3):
+            progress(Progress("fitting", done + 1, 3, {"psnr": 30.0}))
+        self.history = History()
+        given = points.positions if points is not None else np.array([[0.0, 0, 0], [0.5, 0, 0]])
+        self.points = rig.world_frame().to_inside(given)
+        self.history.append(frame.index, frame.time, state(self.points, frame.index))
+
+    def step(self, frame):
+        obey(frame)
+        self.history.append(frame.index, frame.time, state(self.points, frame.index))
+        return Report(
+            frame.index, frame.time, 100, {"update": 0.01}, [0.5, 0.25], 31.5, len(self.points), len(self.points)
+        )
+
+
+class FakeReader:
+    def __init__(self, rig, history):
+        self.history = history
+        self.world = rig.world_frame()
+
+    def render(self, camera, index, *, background, labels=None):
+        self.history.gaussians(index)
+        colour = np.broadcast_to(np.array(background, np.float32), (camera.height, camera.width, 3)).copy()
+        colour[0, 0] = min(1, index / 10)  # which frame this is
+        depth = np.full(colour.shape[:2], 2.0)
+        depth[0, 0], depth[0, 1] = np.nan, 4.0
+        parts = None if labels is None else np.full(colour.shape[:2], labels.max() + 1, np.uint8)
+        return SimpleNamespace(colour=colour, alpha=np.ones(colour.shape[:2]), depth=depth, parts=parts)
+
+    def _depth(self, camera, index):
+        return np.full((camera.height, camera.width), np.inf), np.zeros((camera.height, camera.width))
+
+    def tracks_of_points(self, points, index, indices):
+        return tracks.tracks_of_points(self.history, self.world, points, index, indices)
+
+    def tracks_of_pixels(self, camera, uv, index, indices):
+        return tracks.tracks_of_pixels(self.history, self.world, camera, uv, index, indices, self._depth)
+
+    def tracks_of_ids(self, ids, indices):
+        return tracks.tracks_of_ids(self.history, self.world, ids, indices)
+
+    def with_visibility(self, found, camera, index):
+        return found.with_visibility(camera, self._depth, 0.01)
+
+    def parts(self, count):
+        return np.arange(len(self.history.gaussians(0))) % (count or 2)
+
+    def ply(self, index):
+        return b"ply\n" + str(index).encode()
+
+
+class FakeEngine:
+    def start(self, rig, frame, settings, *, points, progress):
+        return FakeReconstruction(rig, frame, settings, points, progress)
+
+    def reader(self, rig, settings, history):
+        return FakeReader(rig, history)
+
+
+def engine():
+    return FakeEngine()
