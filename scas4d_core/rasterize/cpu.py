@@ -1,0 +1,258 @@
+"""The CPU rasterizer: projection, depth order, tile lists, blending, and the backward of all of them.
+
+Buffers are allocated once and grow only; forward and backward of the same view share them. Results do not depend
+on the number of threads. Twin: ``rasterize.twin``.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Camera
+from scas4d_core.kernels import blend as blend_kernels
+from scas4d_core.kernels import projection, tiles
+from scas4d_core.kernels.jit import threads
+from scas4d_core.rasterize.limits import DEFAULT, Limits
+
+Array = NDArray[np.float32]
+TILE = projection.TILE
+
+
+class CameraArrays(NamedTuple):
+    """A camera as kernels read it: ``pose`` [3, 4] and ``lens`` [6] (fx, fy, cx, cy, width, height), float32."""
+
+    pose: Array
+    lens: Array
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, camera: Camera) -> CameraArrays:
+        """From a ``Camera`` of the inside world."""
+        pose = np.ascontiguousarray(camera.world_to_camera[:3], dtype=np.float32)
+        lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], dtype=np.float32)
+        return cls(pose, lens, camera.width, camera.height)
+
+
+class Picture(NamedTuple):
+    """What a forward pass leaves: views into the rasterizer's buffers, valid until the next forward.
+
+    Attributes:
+        features: [C, H, W] float32. rest: [H, W] float32, transmittance left (alpha = 1 − rest).
+    """
+
+    features: Array
+    rest: Array
+
+
+class Gradients(NamedTuple):
+    """Views into the rasterizer's buffers, valid until the next backward; rows of culled Gaussians are 0."""
+
+    means: Array
+    factors: Array
+    opacities: Array
+    features: Array
+
+
+class CpuRasterizer:
+    """Renders any number of feature channels in one pass, and carries gradients back."""
+
+    def __init__(self, limits: Limits = DEFAULT) -> None:
+        self.limits = np.array(limits, dtype=np.float32)
+        self._buffers: dict[str, NDArray[Any]] = {}
+        self._histogram = np.empty(1 << tiles.RADIX_BITS, np.int64)
+
+    def _buffer(self, name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
+        """A contiguous scratch array; grows by a quarter so that a drifting count does not allocate each time."""
+        size = int(np.prod(shape))
+        flat = self._buffers.get(name)
+        if flat is None or flat.size < size:
+            flat = np.empty(size + size // 4, dtype)
+            self._buffers[name] = flat
+        return flat[:size].reshape(shape)
+
+    def forward(
+        self,
+        means: Array,
+        factors: Array,
+        opacities: Array,
+        features: Array,
+        camera: CameraArrays,
+        background: Array,
+        depth_channel: int = -1,
+    ) -> Picture:
+        """Render.
+
+        Args:
+            means: [N, 3]; factors: [N, 3, 3]; opacities: [N]; features: [N, C]; all float32, C-contiguous.
+            background: [C] float32.
+            depth_channel: a channel of ``features`` that this call fills with the depth of the centres (metres
+                along z), or −1.
+        """
+        count, channels = features.shape
+        width, height = camera.width, camera.height
+        tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+        splats = self._buffer("splats", (count, 8))
+        rects = self._buffer("rects", (count, 4), np.int32)
+        counts = self._buffer("counts", (count,), np.int32)
+        projection.project(means, factors, opacities, camera.pose, camera.lens, self.limits, splats, rects, counts)
+        if depth_channel >= 0:
+            features[:, depth_channel] = splats[:, projection.DEPTH]
+        order = self._buffer("order", (count,), np.int32)
+        visible = tiles.depth_order(
+            splats,
+            counts,
+            self._buffer("keys", (count,), np.uint32),
+            self._buffer("order_scratch", (count,), np.int32),
+            self._buffer("keys_too", (count,), np.uint32),
+            order,
+            self._histogram,
+        )
+        offsets = self._buffer("offsets", (count + 1,), np.int64)
+        pairs = tiles.pair_offsets(counts, offsets)
+        pair_used = self._buffer("pair_used", (pairs,), np.uint8)
+        tiles.reach_tiles(splats, rects, counts, offsets, pair_used)
+        tile_counts = self._buffer("tile_counts", (tiles_x * tiles_y,), np.int32)
+        tiles.count_tiles(rects, order, visible, offsets, pair_used, tiles_x, tile_counts)
+        starts = self._buffer("starts", (tiles_x * tiles_y + 1,), np.int64)
+        entries = tiles.tile_offsets(tile_counts, starts)
+        items = self._buffer("items", (entries,), np.int32)
+        slots = self._buffer("slots", (entries,), np.int32)
+        cursor = self._buffer("cursor", (tiles_x * tiles_y,), np.int64)
+        tiles.fill_tiles(rects, order, visible, offsets, pair_used, tiles_x, starts, cursor, items, slots)
+        # Heavy tiles first, dealt out in turn: the tasks end together.
+        tile_order = np.argsort(-tile_counts, kind="stable")
+        image = self._buffer("image", (channels, tiles_y * TILE, tiles_x * TILE))
+        rest = self._buffer("rest", (tiles_y * TILE, tiles_x * TILE))
+        used = self._buffer("used", (tiles_x * tiles_y,), np.int32)
+        blend_kernels.blend(
+            splats,
+            features,
+            (0,) * (channels // blend_kernels.GROUP),
+            starts,
+            items,
+            tile_order,
+            threads(),
+            (width, height),
+            background,
+            self.limits,
+            image,
+            rest,
+            used,
+        )
+        self._last = (
+            means,
+            factors,
+            features,
+            camera,
+            depth_channel,
+            splats,
+            counts,
+            offsets,
+            pair_used,
+            starts,
+            items,
+            slots,
+            tile_order,
+            image,
+            rest,
+            used,
+            pairs,
+        )
+        return Picture(image[:, :height, :width], rest[:height, :width])
+
+    def gradient_buffers(self) -> tuple[Array, Array]:
+        """dL/dfeatures [C, rows, stride] and dL/dalpha [rows, stride] to fill before ``backward``.
+
+        Padded to whole tiles like the forward buffers; the padding must hold 0 (it does when first given out).
+        """
+        image, rest = self._last[13], self._last[14]
+        g_image = self._buffer("g_image", image.shape)
+        g_alpha = self._buffer("g_alpha", rest.shape)
+        width, height = self._last[3].width, self._last[3].height
+        for buffer in (g_image, g_alpha):
+            buffer[..., height:, :] = 0
+            buffer[..., :, width:] = 0
+        return g_image, g_alpha
+
+    def backward(self, g_image: Array, g_alpha: Array) -> Gradients:
+        """Gradients of the last forward pass.
+
+        Args:
+            g_image, g_alpha: from ``gradient_buffers``, filled.
+        """
+        (
+            means,
+            factors,
+            features,
+            camera,
+            depth_channel,
+            splats,
+            counts,
+            offsets,
+            pair_used,
+            starts,
+            items,
+            slots,
+            tile_order,
+            image,
+            rest,
+            used,
+            pairs,
+        ) = self._last
+        count, channels = features.shape
+        records = self._buffer("records", (pairs, blend_kernels.FEATURES + channels))
+        blend_kernels.blend_backward(
+            splats,
+            features,
+            (0,) * (channels // blend_kernels.GROUP),
+            starts,
+            items,
+            slots,
+            tile_order,
+            threads(),
+            (camera.width, camera.height),
+            self.limits,
+            image,
+            rest,
+            used,
+            g_image,
+            g_alpha,
+            records,
+        )
+        gradients = Gradients(
+            self._buffer("g_means", (count, 3)),
+            self._buffer("g_factors", (count, 3, 3)),
+            self._buffer("g_opacities", (count,)),
+            self._buffer("g_features", (count, channels)),
+        )
+        projection.project_backward(
+            means,
+            factors,
+            camera.pose,
+            camera.lens,
+            self.limits,
+            splats,
+            counts,
+            offsets,
+            pair_used,
+            records,
+            depth_channel,
+            *gradients,
+        )
+        return gradients
+
+    @property
+    def splats(self) -> Array:
+        """[N, 8] of the last forward pass, columns as in ``kernels.projection``."""
+        splats: Array = self._last[5]
+        return splats
+
+    @property
+    def counts(self) -> NDArray[np.int32]:
+        """[N] tiles of each Gaussian in the last forward pass, 0 where culled."""
+        counts: NDArray[np.int32] = self._last[6]
+        return counts
