@@ -1,0 +1,169 @@
+"""The `scas4d` command. Sub-commands that need the core or the server import them when they run."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import httpx
+import typer
+
+from client import __version__, bench
+from client.overrides import overrides
+from client.progress import Bars, console
+from client.sdk import DEFAULT_URL, Client, ServiceError
+from scas4d_core.captures import CaptureError, ImageError, open_capture
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="Online 4D reconstruction of multi-camera rigs.")
+app.add_typer(bench.app, name="bench")
+
+CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture.")]
+Preset = Annotated[str, typer.Option(help="Named settings: scas4d or dynamic3dgs.")]
+Changes = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="As update.iterations=200.")]
+Frames = Annotated[int | None, typer.Option(min=1, help="Only so many frames.")]
+Out = Annotated[Path, typer.Option(help="Where pictures go.")]
+
+
+@app.command()
+def serve(
+    host: Annotated[str, typer.Option(help="Address to listen at.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535)] = 8000,
+    data: Annotated[Path | None, typer.Option(help="Folder of the scenes; SCAS4D_DATA, else ./data.")] = None,
+    allow_remote: Annotated[bool, typer.Option(help="Listen beyond this machine, without any authentication.")] = False,
+) -> None:
+    """Starts the service."""
+    if not (allow_remote or _loopback(host)):
+        raise typer.BadParameter(
+            f"{host} can be reached from other machines, and this version asks nobody who they are; "
+            "put an authenticating proxy before it and give --allow-remote",
+            param_hint="--host",
+        )
+    import uvicorn
+
+    from server.app import create_app
+    from server.settings import ServerSettings
+
+    uvicorn.run(create_app(ServerSettings.from_environment(data=data)), host=host, port=port)
+
+
+@app.command()
+def push(
+    capture: CaptureFolder,
+    url: Annotated[str, typer.Option(help="Of the service.")] = DEFAULT_URL,
+    fps: Annotated[float | None, typer.Option(min=0.001, help="Frames a second at most; as fast as taken.")] = None,
+    frames: Frames = None,
+    preset: Preset = "scas4d",
+    changes: Changes = None,
+) -> None:
+    """Sends a capture to a running service as its rig would, and waits for the last frame."""
+    from client import rig
+
+    opened = open_capture(capture)
+    with Client(url) as client, Bars() as bars:
+        status = rig.push(
+            opened, client, fps=fps, frames=frames, preset=preset, settings=overrides(changes or []), told=bars
+        )
+    console.print(f"scene {status.id}: {status.committed} of {status.next_frame} frames committed, {status.state}")
+    console.print(f"{url.rstrip('/')}/v1/scenes/{status.id}/render", soft_wrap=True)
+    if status.error:
+        raise SystemExit(f"scas4d: {status.error}")
+
+
+@app.command()
+def demo(
+    capture: Annotated[Path, typer.Option(help="Folder of a capture.")] = Path("samples/robot"),
+    out: Out = Path("out/demo"),
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Another is taken where this is in use.")] = 8000,
+    stay: Annotated[
+        bool | None, typer.Option(help="Leave the service running until Ctrl-C; the default in a terminal.")
+    ] = None,
+    frames: Frames = None,
+    preset: Preset = "scas4d",
+    changes: Changes = None,
+) -> None:
+    """Starts a service, streams the sample capture through it, and leaves renders beside the truth."""
+    from client import demo as main_job
+
+    opened = open_capture(capture)
+    with main_job.running_service(out / "data", out / "service.log", port) as url:
+        console.print(f"service at {url}, its log in {out / 'service.log'}; the first run also compiles kernels")
+        id = main_job.run(opened, url, out, frames=frames, preset=preset, settings=overrides(changes or []))
+        console.print(f"pictures (truth | render | difference x4): {out}")
+        if sys.stdout.isatty() if stay is None else stay:
+            console.print(f"open {url}/v1/scenes/{id}/render or {url}/docs; Ctrl-C ends the service", soft_wrap=True)
+            try:
+                while True:
+                    time.sleep(3600)
+            except KeyboardInterrupt:
+                console.print("ending the service")
+
+
+@app.command()
+def reconstruct(
+    capture: CaptureFolder,
+    out: Out = Path("out/reconstruct"),
+    frames: Frames = None,
+    preset: Preset = "scas4d",
+    device: Annotated[str | None, typer.Option(help="cpu or cuda.")] = None,
+    changes: Changes = None,
+) -> None:
+    """Reconstructs a capture in this process, without a service: pictures, states, and a .ply of the last frame."""
+    from client.local import reconstruct as run
+
+    given = [*(changes or []), *([f"device={device}"] if device else [])]
+    run(capture, out, frames=frames, preset=preset, changes=given)
+
+
+@app.command()
+def evaluate(
+    capture: CaptureFolder,
+    out: Out = Path("out/evaluate"),
+    frames: Frames = None,
+    preset: Preset = "scas4d",
+    changes: Changes = None,
+) -> None:
+    """Reconstructs a capture in this process and prints its scores on the test cameras and ground truth."""
+    bench.quality([capture], out=out, frames=frames, preset=[preset], changes=changes)
+
+
+def _loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        console.print(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def options(version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True)] = False) -> None:
+    """Runs before every command."""
+
+
+def kernel_cache() -> Path:
+    """Where compiled kernels are kept: NUMBA_CACHE_DIR, else scas4d/numba in the user's cache folder."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return Path(os.environ.setdefault("NUMBA_CACHE_DIR", str(home / "scas4d" / "numba")))
+
+
+def main() -> None:
+    """The entry point: errors that a user can mend are one line, not a traceback."""
+    kernel_cache()
+    try:
+        app()
+    except (ServiceError, CaptureError, ImageError, RuntimeError, ValueError) as error:
+        raise SystemExit(f"scas4d: {error}") from None
+    except httpx.TransportError as error:
+        raise SystemExit(f"scas4d: the service cannot be reached ({error}); start one with: scas4d serve") from None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,59 @@
+"""A reconstruction in this process, for `scas4d reconstruct`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from client import pictures
+from client.progress import Bars, console
+from scas4d_core.captures import open_capture
+
+
+def reconstruct(folder: Path, out: Path, *, frames: int | None, preset: str, changes: Sequence[str]) -> None:
+    """Runs every frame; `out` gets pictures beside the truth, `states/` and `last.ply`.
+
+    Args:
+        folder: of the capture.
+        out: folder; made when missing.
+        frames: how many; all where None.
+        preset: named settings.
+        changes: what differs, as ``update.iterations=200``.
+    """
+    from scas4d_core.reconstruction import Reconstruction
+
+    from scas4d_core.bench.quality import settings_of
+    from scas4d_core.ply import write_ply
+
+    settings = settings_of(preset, overrides=changes)
+    given = open_capture(folder)  # the reconstruction resizes what it is given
+    capture = open_capture(folder, image_scale=settings.scene.image_scale)
+    count = min(frames or capture.frame_count, capture.frame_count)
+    rig = capture.test_rig or capture.rig
+    cameras = rig.cameras if capture.test_rig is not None else rig.cameras[:1]
+    with Bars() as bars:
+
+        def told(progress: Any) -> None:
+            bars(progress.stage, progress.done, progress.total)
+
+        reconstruction = Reconstruction.start(given.rig, given.frame(0), settings, points=given.points, progress=told)
+        for index in range(count):
+            if index:
+                reconstruction.step(given.frame(index))
+            bars("frames", index + 1, count)
+            truth = capture.test_frame(index) if capture.test_rig is not None else capture.frame(index)
+            scores = []
+            for camera in cameras:
+                colour = reconstruction.render(camera, index).colour
+                render = np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8)
+                true = truth.images[camera.name]
+                scores.append(pictures.psnr(true, render))
+                pictures.save(out / f"camera_{camera.name}" / f"{index:06d}.png", pictures.comparison(true, render))
+            console.print(f"frame {index}: {np.mean(scores):.2f} dB")
+    last = reconstruction.history.indices[-1]
+    reconstruction.history.save(out / "states")
+    write_ply(out / "last.ply", reconstruction.history.gaussians(last), reconstruction.world)
+    console.print(f"pictures, states and last.ply: {out}")

@@ -1,0 +1,31 @@
+"""Settings written on the command line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+
+def overrides(changes: Sequence[str]) -> dict[str, Any]:
+    """``["update.iterations=200"]`` to ``{"update": {"iterations": 200}}``; JSON behind the sign, else text.
+
+    Raises:
+        ValueError: no sign, or one change inside another.
+    """
+    result: dict[str, Any] = {}
+    for change in changes:
+        path, sign, text = change.partition("=")
+        *groups, last = path.strip().split(".")
+        if not sign or not last:
+            raise ValueError(f"setting {change!r} cannot be read; write it as update.iterations=200")
+        inner = result
+        for group in groups:
+            inner = inner.setdefault(group, {})
+            if not isinstance(inner, dict):
+                raise ValueError(f"setting {change!r}: {group!r} has a value already")
+        try:
+            inner[last] = json.loads(text)
+        except json.JSONDecodeError:
+            inner[last] = text.strip()
+    return result

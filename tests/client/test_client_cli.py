@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from running import HEIGHT, WIDTH
+
+from client.overrides import overrides
+from client.pictures import coloured, comparison, psnr
+
+FAKES = str(Path(__file__).parents[1] / "server")
+
+
+def scas4d(*arguments, cwd=None, **environment):
+    path = os.pathsep.join([FAKES, os.getcwd()])
+    return subprocess.run(
+        [sys.executable, "-m", "client.cli", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": path, "COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb", **environment},
+    )
+
+
+def test_the_command_is_light():
+    code = "import client.cli, client.rig, client.sdk, sys; print(*[m for m in sys.modules if '.' not in m])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert "client" in loaded
+    assert not loaded & {"torch", "numba", "scipy", "sklearn", "fastapi", "uvicorn", "server", "matplotlib"}
+
+
+def test_push_to_a_running_service(service, capture_folder):
+    done = scas4d("push", str(capture_folder), "--url", service.url, "--frames", "2", "--set", "update.iterations=9")
+    assert done.returncode == 0, done.stderr
+    assert "2 of 2 frames committed, ready" in done.stdout
+    assert service.url in done.stdout
+
+
+def test_the_demo_starts_a_service_and_leaves_pictures(capture_folder, tmp_path):
+    done = scas4d(
+        "demo",
+        "--capture",
+        str(capture_folder),
+        "--no-stay",
+        "--out",
+        str(tmp_path / "out"),
+        SCAS4D_ENGINE="fakes:engine",
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "http://127.0.0.1:" in done.stdout
+    assert "dB PSNR" in done.stdout
+    pictures = sorted(path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.png"))
+    assert pictures == [*(f"camera_2/{t:06d}.png" for t in range(4)), "depth.png", "parts.png"]
+    with Image.open(tmp_path / "out/camera_2/000001.png") as picture:
+        assert picture.size == (3 * WIDTH, HEIGHT)
+
+
+def test_serve_refuses_to_listen_beyond_this_machine():
+    done = scas4d("serve", "--host", "0.0.0.0")
+    assert done.returncode == 2
+    assert "--allow-remote" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("push", "nowhere"), "nowhere: no such folder"),
+        (("push", "TINY", "--url", "http://127.0.0.1:9"), "start one with: scas4d serve"),
+        (("push", "TINY", "--set", "iterations"), "update.iterations=200"),
+    ],
+)
+def test_what_a_user_can_mend_is_one_line(capture_folder, arguments, said):
+    done = scas4d(*(str(capture_folder) if word == "TINY" else word for word in arguments))
+    assert done.returncode == 1
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_setting_the_service_refuses_is_named(service, capture_folder):
+    done = scas4d("push", str(capture_folder), "--url", service.url, "--set", "update.iteration=1")
+    assert done.returncode == 1
+    assert "settings.update.iteration" in done.stderr
+
+
+def test_overrides():
+    changes = ["update.iterations=200", "device=cuda", "update.clusters=[64]", "scene.metres_per_unit=auto"]
+    assert overrides(changes) == {
+        "update": {"iterations": 200, "clusters": [64]},
+        "device": "cuda",
+        "scene": {"metres_per_unit": "auto"},
+    }
+    for bad in (["update"], ["a=1", "a.b=2"]):
+        with pytest.raises(ValueError, match="setting"):
+            overrides(bad)
+
+
+def test_pictures():
+    truth, render = np.zeros((2, 3, 3), np.uint8), np.full((2, 3, 3), 100, np.uint8)
+    side = comparison(truth, render)
+    assert side.shape == (2, 9, 3)
+    assert side[0, [0, 3, 6], 0].tolist() == [0, 100, 255]
+    assert psnr(truth, render) == pytest.approx(20 * np.log10(2.55))
+    assert psnr(truth, truth) == float("inf")
+    colours = coloured(np.array([[0, 1, 8]], np.uint8))
+    assert colours[0, 0].tolist() == [0, 0, 0]
+    assert colours[0, 1].tolist() == colours[0, 2].tolist() != [0, 0, 0]
