@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 
 import httpx
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from client.wire import (
@@ -121,9 +121,9 @@ def tracks(
     id: str,
     *,
     ids: Sequence[int] | None,
-    pixels: NDArray[Any] | None,
+    pixels: ArrayLike | None,
     camera: str | None,
-    points: NDArray[Any] | None,
+    points: ArrayLike | None,
     at: int | None,
     frames: tuple[int, int] | None,
     project: Sequence[str],

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import httpx
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from client import calls
 from client.calls import Call
@@ -196,9 +196,9 @@ class Client:
         id: str,
         *,
         ids: Sequence[int] | None = None,
-        pixels: NDArray[Any] | None = None,
+        pixels: ArrayLike | None = None,
         camera: str | None = None,
-        points: NDArray[Any] | None = None,
+        points: ArrayLike | None = None,
         at: int | None = None,
         frames: tuple[int, int] | None = None,
         project: Sequence[str] = (),
@@ -349,9 +349,9 @@ class AsyncClient:
         id: str,
         *,
         ids: Sequence[int] | None = None,
-        pixels: NDArray[Any] | None = None,
+        pixels: ArrayLike | None = None,
         camera: str | None = None,
-        points: NDArray[Any] | None = None,
+        points: ArrayLike | None = None,
         at: int | None = None,
         frames: tuple[int, int] | None = None,
         project: Sequence[str] = (),
