@@ -7,7 +7,9 @@ from typing import Any
 import llvmlite.binding as llvm
 import numba
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
 
 # LLVM unrolls short loops before it vectorizes loops; unrolled, the rows of 16 pixels stay scalar (measured: blending
 # 3 times slower). Loops over channels (at most 8) may still be unrolled.
@@ -36,3 +38,29 @@ TWO = np.float32(2.0)
 def threads() -> int:
     """Threads that kernels use (``NUMBA_NUM_THREADS`` or the cores at hand)."""
     return int(numba.get_num_threads())
+
+
+@intrinsic
+def _float_of_bits(typing_context: Any, bits: Any) -> Any:
+    """Reinterpret an int32 as a float32."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.FloatType())
+
+    return types.float32(types.int32), generate
+
+
+@inline
+def exp(x):  # type: ignore[no-untyped-def]
+    """exp in float32, relative error 2e-7, clamped to ±87; unlike libm's, loops over it vectorize."""
+    v = min(max(x, np.float32(-87.0)), np.float32(87.0)) * np.float32(1.4426950408889634)
+    whole = np.floor(v + HALF)
+    r = v - whole
+    y = np.float32(1.535336188319500e-4)
+    y = y * r + np.float32(1.339887440266574e-3)
+    y = y * r + np.float32(9.618437357674640e-3)
+    y = y * r + np.float32(5.550332471162809e-2)
+    y = y * r + np.float32(2.402264791363012e-1)
+    y = y * r + np.float32(6.931472028550421e-1)
+    y = y * r + ONE
+    return y * _float_of_bits(np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)))
