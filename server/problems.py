@@ -85,14 +85,15 @@ def install(app: FastAPI) -> None:
         assert isinstance(error, RequestValidationError)
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"])
+        fault = first["msg"].removeprefix("Value error, ")
         others = len(error.errors()) - 1
         document = ProblemDetails(
             title=HTTPStatus.UNPROCESSABLE_ENTITY.phrase,
             status=422,
-            detail=f"{field}: {first['msg']}" + (f" (and {others} more)" if others else ""),
+            detail=f"{field}: {fault}" + (f" (and {others} more)" if others else ""),
             field=field,
             value=quoted(first.get("input")),
-            remedy=f"{first['msg']}; the schema is at /openapi.json",
+            remedy=f"{fault}; the schema is at /openapi.json",
         )
         return answer(document)
 
@@ -106,6 +107,20 @@ def install(app: FastAPI) -> None:
         )
         return answer(document)
 
+    described = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        """The document, with the media type that errors really have (FastAPI writes application/json)."""
+        document = described()
+        for operations in document["paths"].values():
+            for operation in operations.values():
+                for status in RESPONSES:
+                    content = operation["responses"].get(str(status), {}).get("content", {})
+                    if "application/json" in content:
+                        content[MEDIA_TYPE] = content.pop("application/json")
+        return document
+
+    app.openapi = openapi  # type: ignore[method-assign]
     app.add_exception_handler(HTTPException, from_problem)
     app.add_exception_handler(RequestValidationError, from_validation)
     app.add_exception_handler(Exception, from_fault)
