@@ -25,6 +25,7 @@ from client.wire import (
     SceneList,
     SceneStatus,
     TracksModel,
+    TracksRequest,
 )
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import InitialPoints
@@ -112,7 +113,7 @@ def frame(id: str, index: int) -> Call[FrameReportModel]:
 
 def render(id: str, camera: Camera | str, request: Mapping[str, Any], parse: Callable[[bytes], T]) -> Call[T]:
     """A view; `request` holds further fields of `RenderRequest`."""
-    model = RenderRequest(camera=camera if isinstance(camera, str) else CameraModel.of(camera), **request)
+    model = RenderRequest(camera=_wire(camera), **request)
     arguments = {"json": model.model_dump(mode="json")}
     return Call("POST", f"/v1/scenes/{id}/render", lambda r: parse(r.content), arguments=arguments)
 
@@ -122,24 +123,31 @@ def tracks(
     *,
     ids: Sequence[int] | None,
     pixels: ArrayLike | None,
-    camera: str | None,
+    camera: Camera | str | None,
     points: ArrayLike | None,
     at: int | None,
     frames: tuple[int, int] | None,
-    project: Sequence[str],
+    project: Sequence[Camera | str],
 ) -> Call[TracksModel]:
     """Trajectories."""
-    query: dict[str, Any] = {"camera": camera, "at": at, "project": list(project)}
-    if ids is not None:
-        query["ids"] = ",".join(str(int(value)) for value in ids)
-    for name, rows in (("pixel", pixels), ("point", points)):
-        if rows is not None:
-            query[name] = [",".join(repr(float(value)) for value in row) for row in np.asarray(rows)]
-    if frames is not None:
-        query["from"], query["to"] = frames
-    arguments = {"params": {name: value for name, value in query.items() if value is not None}}
+    first, last = frames or (None, None)
+    request = TracksRequest(
+        ids=None if ids is None else [int(value) for value in ids],
+        pixels=None if pixels is None else np.asarray(pixels, dtype=np.float64).tolist(),
+        camera=None if camera is None else _wire(camera),
+        points=None if points is None else np.asarray(points, dtype=np.float64).tolist(),
+        at=at,
+        first=first,
+        last=last,
+        project=[_wire(one) for one in project],
+    )
+    arguments = {"json": request.model_dump(mode="json")}
     parse = TracksModel.model_validate_json
-    return Call("GET", f"/v1/scenes/{id}/tracks", lambda r: parse(r.content), arguments=arguments)
+    return Call("POST", f"/v1/scenes/{id}/tracks/query", lambda r: parse(r.content), arguments=arguments)
+
+
+def _wire(camera: Camera | str) -> CameraModel | str:
+    return camera if isinstance(camera, str) else CameraModel.of(camera)
 
 
 def parts(id: str, count: int | None) -> Call[PartsModel]:

@@ -197,11 +197,11 @@ class Client:
         *,
         ids: Sequence[int] | None = None,
         pixels: ArrayLike | None = None,
-        camera: str | None = None,
+        camera: Camera | str | None = None,
         points: ArrayLike | None = None,
         at: int | None = None,
         frames: tuple[int, int] | None = None,
-        project: Sequence[str] = (),
+        project: Sequence[Camera | str] = (),
     ) -> TracksModel:
         """Trajectories of ids, of pixels [Q, 2] of `camera`, or of points [Q, 3], the latter two at frame `at`."""
         return self._send(
@@ -350,11 +350,11 @@ class AsyncClient:
         *,
         ids: Sequence[int] | None = None,
         pixels: ArrayLike | None = None,
-        camera: str | None = None,
+        camera: Camera | str | None = None,
         points: ArrayLike | None = None,
         at: int | None = None,
         frames: tuple[int, int] | None = None,
-        project: Sequence[str] = (),
+        project: Sequence[Camera | str] = (),
     ) -> TracksModel:
         """As `Client.tracks`."""
         return await self._send(

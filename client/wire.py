@@ -239,6 +239,26 @@ class RenderRequest(Model):
     )
 
 
+class TracksRequest(Model):
+    """Trajectories of what exactly one of ids, pixels and points names."""
+
+    ids: Annotated[list[int], Field(min_length=1)] | None = Field(default=None, description="Of Gaussians.")
+    pixels: Annotated[list[Pixel], Field(min_length=1)] | None = Field(
+        default=None, description="u v in the picture of `camera`; (0.5, 0.5) is the centre of the first pixel."
+    )
+    camera: CameraModel | str | None = Field(default=None, description="Where the pixels are: any, or one of the rig.")
+    points: Annotated[list[Row3], Field(min_length=1)] | None = Field(
+        default=None, description="x y z in the rig's world and units."
+    )
+    at: int | None = Field(default=None, ge=0, description="Frame of the pixels or points; the first committed.")
+    first: int | None = Field(default=None, ge=0, description="First frame; the first committed.")
+    last: int | None = Field(default=None, ge=0, description="Last frame, included; the last committed.")
+    project: list[CameraModel | str] = Field(
+        default_factory=list, max_length=64, description="Cameras to project into, with visibility."
+    )
+    format: Literal["json", "npz"] = "json"
+
+
 class TracksModel(Model):
     """Trajectories of Q points over T frames, in the rig's world and units."""
 

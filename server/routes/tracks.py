@@ -7,27 +7,36 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from fastapi import APIRouter, Query, Response
-from numpy.typing import NDArray
 
-from client.wire import TracksModel
+from client.wire import CameraModel, TracksModel, TracksRequest
+from scas4d_core.cameras import Camera
 from server.messages import TracksQuery
 from server.problems import Problem
 from server.routes.access import TheScene, TheSettings
 from server.scenes import Scene
+from server.settings import ServerSettings
 
 router = APIRouter(prefix="/v1/scenes", tags=["tracks"])
 
-Many = Annotated[list[str] | None, Query(max_length=4096)]
+LARGEST_ID = 2**63 - 1
+
+Many = Annotated[list[str] | None, Query(max_length=1024)]
 ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"model": TracksModel, "content": {"application/vnd.numpy.npz": {}}, "description": "As JSON or npz."}
 }
+
+
+@router.post("/{id}/tracks/query", response_class=Response, responses=ANSWERS)
+async def query(scene: TheScene, server: TheSettings, request: TracksRequest) -> Response:
+    """Trajectories in the world of what is asked for by id, by pixel, or by 3D point; any number of them."""
+    return await answer(scene, server, request)
 
 
 @router.get("/{id}/tracks", response_class=Response, responses=ANSWERS)
 async def tracks(
     scene: TheScene,
     server: TheSettings,
-    ids: Annotated[str | None, Query(max_length=100_000, description="Of Gaussians, separated by commas.")] = None,
+    ids: Annotated[str | None, Query(max_length=10_000, description="Of Gaussians, separated by commas.")] = None,
     pixel: Annotated[Many, Query(description="u,v in the picture of `camera`, repeated.")] = None,
     camera: Annotated[str | None, Query(max_length=64, description="Of the rig: where the pixels are.")] = None,
     point: Annotated[Many, Query(description="x,y,z in the rig's world and units, repeated.")] = None,
@@ -36,17 +45,36 @@ async def tracks(
     last: Annotated[
         int | None, Query(alias="to", ge=0, description="Last frame, included; the last committed.")
     ] = None,
-    project: Annotated[Many, Query(description="Cameras of the rig to project into, with visibility.")] = None,
+    project: Annotated[Many, Query(max_length=64, description="Cameras of the rig to project into.")] = None,
     format: Literal["json", "npz"] = "json",
 ) -> Response:
-    """Trajectories in the world of what is asked for by id, by pixel, or by 3D point."""
-    asked = [name for name, value in (("ids", ids), ("pixel", pixel), ("point", point)) if value]
+    """The same for a few, as an address."""
+    request = TracksRequest(
+        ids=_ids(ids) if ids else None,
+        pixels=_numbers(pixel, "pixel", 2) if pixel else None,
+        camera=camera,
+        points=_numbers(point, "point", 3) if point else None,
+        at=at,
+        first=first,
+        last=last,
+        project=list(project or []),
+        format=format,
+    )
+    return await answer(scene, server, request)
+
+
+async def answer(scene: Scene, server: ServerSettings, request: TracksRequest) -> Response:
+    """Checks the request and asks the reader."""
+    kinds = {"ids": request.ids, "pixels": request.pixels, "points": request.points}
+    asked = [(name, value) for name, value in kinds.items() if value is not None]
     if len(asked) != 1:
+        given = ", ".join(name for name, _ in asked) or "none"
         raise Problem(
-            422, "ask by one of ids, pixel, point", field="ids", value=", ".join(asked), remedy="give exactly one"
+            422, f"asked by {given} of ids, pixels, points", field="ids", value=given, remedy="give exactly one"
         )
-    start = scene.committed_frame(None, "from") and scene.committed[0] if first is None else first
-    end = scene.committed[-1] if last is None else last
+    scene.committed_frame(None, "from")
+    start = scene.committed[0] if request.first is None else request.first
+    end = scene.committed[-1] if request.last is None else request.last
     frames = tuple(index for index in scene.committed if start <= index <= end)
     if not frames:
         raise Problem(
@@ -56,45 +84,57 @@ async def tracks(
             value=start,
             remedy=f"ask within {scene.committed[0]} to {scene.committed[-1]}",
         )
-    query = TracksQuery(
-        frames=frames,
-        at=scene.committed_frame(scene.committed[0] if at is None else at, "at"),
-        ids=_ids(ids) if ids else None,
-        camera=_camera(scene, camera) if pixel else None,
-        pixels=_numbers(pixel, "pixel", 2) if pixel else None,
-        points=_numbers(point, "point", 3) if point else None,
-        project=tuple(scene.camera(name) for name in dict.fromkeys(project or [])),
-        format=format,
-    )
-    queries = next(len(value) for value in (query.ids, query.pixels, query.points) if value is not None)
-    if queries * len(frames) > server.max_track_points:
+    field, queries = asked[0]
+    if len(queries) * len(frames) > server.max_track_points:
         raise Problem(
             422,
-            f"{queries} points over {len(frames)} frames",
-            field=asked[0],
-            value=queries * len(frames),
+            f"{len(queries)} points over {len(frames)} frames",
+            field=field,
+            value=len(queries) * len(frames),
             remedy=f"ask for at most {server.max_track_points} at once, or raise SCAS4D_MAX_TRACK_POINTS",
         )
-    answer = await scene.ask(query)
-    return Response(answer.body, media_type=answer.media_type)
-
-
-def _camera(scene: Scene, name: str | None) -> Any:
-    if name is None:
+    if request.ids is not None and not all(0 <= id <= LARGEST_ID for id in request.ids):
+        raise Problem(422, "ids count from 0", field="ids", value=request.ids, remedy="give ids of Gaussians")
+    if request.pixels is not None and request.camera is None:
         raise Problem(422, "pixels of which camera?", field="camera", remedy=f"one of {', '.join(scene.rig.names)}")
-    return scene.camera(name)
+    query = TracksQuery(
+        frames=frames,
+        at=scene.committed_frame(scene.committed[0] if request.at is None else request.at, "at"),
+        ids=None if request.ids is None else tuple(request.ids),
+        camera=None if request.camera is None else _camera(scene, server, request.camera),
+        pixels=None if request.pixels is None else np.array(request.pixels),
+        points=None if request.points is None else np.array(request.points),
+        project=tuple(_camera(scene, server, camera) for camera in request.project),
+        format=request.format,
+    )
+    found = await scene.ask(query)
+    return Response(found.body, media_type=found.media_type)
 
 
-def _ids(text: str) -> tuple[int, ...]:
+def _camera(scene: Scene, server: ServerSettings, camera: CameraModel | str) -> Camera:
+    if isinstance(camera, str):
+        return scene.camera(camera)
+    # Where a point can be seen is found from a rendered depth: the limit of views holds.
+    if camera.width * camera.height > server.max_render_pixels:
+        size = f"{camera.width}x{camera.height}"
+        raise Problem(
+            422,
+            f"camera {camera.name!r} has a picture of {size}",
+            field="camera",
+            value=size,
+            remedy=f"give at most {server.max_render_pixels} pixels",
+        )
+    return camera.camera()
+
+
+def _ids(text: str) -> list[int]:
     try:
-        ids = tuple(int(part) for part in text.split(","))
-        np.array(ids, dtype=np.int64)
-    except (ValueError, OverflowError):
+        return [int(part) for part in text.split(",")]
+    except ValueError:
         raise Problem(422, "ids are whole numbers", field="ids", value=text, remedy="give 3,17,2048") from None
-    return ids
 
 
-def _numbers(texts: list[str], field: str, count: int) -> NDArray[np.float64]:
+def _numbers(texts: list[str], field: str, count: int) -> list[list[float]]:
     rows = []
     for text in texts:
         try:
@@ -107,4 +147,4 @@ def _numbers(texts: list[str], field: str, count: int) -> NDArray[np.float64]:
                 422, f"{field} is {count} finite numbers", field=field, value=text, remedy=f"give {field}={example}"
             )
         rows.append(row)
-    return np.array(rows)
+    return rows

@@ -1,7 +1,15 @@
+"""A running service with the fake engine. Its processes import the fakes, so this folder is on the path."""
+
 from __future__ import annotations
+
+import sys
+from pathlib import Path
 
 import httpx
 import pytest
+
+sys.path.append(str(Path(__file__).parent))
+
 from running import Running, fake_settings, make_rig
 
 from client.sdk import Client

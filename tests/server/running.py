@@ -50,6 +50,7 @@ def fake_settings(folder):
         max_body_mb=2,
         max_scenes=4,
         max_points=1000,
+        max_track_points=5000,
     )
 
 

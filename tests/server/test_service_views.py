@@ -8,14 +8,13 @@ import pytest
 from PIL import Image
 from running import HEIGHT, WIDTH, make_rig, pictures, problem
 
+from client.sdk import Client, ServiceError
 from client.wire import CameraModel
 
 
 @pytest.fixture(scope="module")
 def finished(service):
     """A scene of three frames."""
-    from client.sdk import Client
-
     with Client(service.url) as sdk:
         id = sdk.create_scene(make_rig(), frames_per_second=10).id
         for index in range(3):
@@ -105,6 +104,8 @@ def test_tracks_by_id_point_and_pixel(sdk, http, finished):
     missed = sdk.tracks(finished, pixels=np.array([[3.5, 4.5]]), camera="c1", at=2)
     assert (missed.ids, missed.positions) == ([-1], [[None, None, None]])
 
+    addressed = http.get(f"/v1/scenes/{finished}/tracks?point=0.5,0.01,0&at=0&from=0&to=1")
+    assert addressed.json() == carried.model_dump(mode="json")
     response = http.get(f"/v1/scenes/{finished}/tracks?ids=0&format=npz")
     with np.load(io.BytesIO(response.content), allow_pickle=False) as file:
         assert file["tracks_XYZ"].shape == (3, 1, 3)
@@ -128,6 +129,15 @@ def test_tracks_by_id_point_and_pixel(sdk, http, finished):
 )
 def test_a_bad_track_query_is_refused_by_name(http, finished, query, field):
     assert field in problem(http.get(f"/v1/scenes/{finished}/tracks?{query}"), 422)["field"]
+
+
+def test_many_tracks_and_any_camera(sdk, finished):
+    mine = make_rig().cameras[0].scaled(2)
+    tracks = sdk.tracks(finished, points=np.zeros((3000, 3)), frames=(2, 2), project=[mine, "c1"])
+    assert np.shape(tracks.positions) == (3000, 1, 3)
+    assert sorted(tracks.pixels) == ["c0", "c1"]
+    with pytest.raises(ServiceError, match="2000 points over 3 frames"):
+        sdk.tracks(finished, points=np.zeros((2000, 3)))
 
 
 def test_what_only_the_reader_knows_is_refused_too(http, finished):
