@@ -1,0 +1,229 @@
+"""PatchMatch stereo: depth and normal of every pixel of one picture against several neighbours. Numba.
+
+Each pixel holds a small plane; planes that match well spread to the pixels around and are refined by random steps.
+After Bleyer, Rhemann & Rother 2011 (slanted planes) and Galliani, Lasinger & Schindler 2015 (red–black order, several
+views). The match is the weighted normalized cross-correlation of COLMAP (Schönberger et al. 2016).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+
+REACH = 2
+"""Samples on either side of the centre of a patch: 5 × 5 of them,"""
+STEP = 2
+"""two pixels apart: a window of 9 pixels at the cost of 25 samples."""
+TEXTURE = 0.012
+"""Standard deviation of a patch (0…1), below which a match means nothing: three steps of an 8-bit picture."""
+NO_MATCH = 2.0
+"""Cost of a patch that cannot be compared; the cost of one that can is 1 − NCC, between 0 and 2."""
+
+_SAMPLES = (2 * REACH + 1) ** 2
+
+
+@njit(cache=True, inline="always")
+def _random(key: int, draw: int) -> float:
+    """A number in [0, 1) that depends on its arguments alone, whatever thread asks (splitmix64)."""
+    z = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    z = z ^ (z >> np.uint64(31))
+    return float(z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
+
+
+@njit(cache=True, fastmath=True)
+def _cost(
+    patch: Any, weight: Any, mean: float, deviation: float, x: float, y: float, depth: float,
+    nx: float, ny: float, nz: float, inverse: Any, others: Any, matrices: Any, shifts: Any, best: int,
+) -> float:  # fmt: skip
+    """1 − NCC, mean over the ``best`` best neighbours; NO_MATCH where fewer than that see the patch."""
+    rx, ry = inverse[0] * x + inverse[1], inverse[2] * y + inverse[3]
+    reach = depth * (nx * rx + ny * ry + nz)  # n · X of the plane's centre
+    low0, low1, low2, low3 = NO_MATCH, NO_MATCH, NO_MATCH, NO_MATCH
+    if abs(reach) < 1e-9:
+        return NO_MATCH
+    for v in range(others.shape[0]):
+        m, t = matrices[v], shifts[v]
+        height, width = others.shape[1], others.shape[2]
+        # Pixel (a, b) of the reference lies at the inverse depth (n · ray) / reach, linear in a and b:
+        # its image is M ray + T · (inverse depth), linear too (the homography of the plane).
+        sum_w, sum_i, sum_ii, sum_ri = 0.0, 0.0, 0.0, 0.0
+        inside = True
+        k = 0
+        for j in range(-REACH, REACH + 1):
+            qy = inverse[2] * (y + j * STEP) + inverse[3]
+            for i in range(-REACH, REACH + 1):
+                qx = inverse[0] * (x + i * STEP) + inverse[1]
+                s = (nx * qx + ny * qy + nz) / reach
+                w3 = m[2, 0] * qx + m[2, 1] * qy + m[2, 2] + t[2] * s
+                if s <= 0.0 or w3 <= 1e-6:
+                    inside = False
+                    break
+                u = (m[0, 0] * qx + m[0, 1] * qy + m[0, 2] + t[0] * s) / w3 - 0.5
+                r = (m[1, 0] * qx + m[1, 1] * qy + m[1, 2] + t[1] * s) / w3 - 0.5
+                if not (u >= 0.0 and r >= 0.0 and u < width - 1.001 and r < height - 1.001):
+                    inside = False
+                    break
+                c0, r0 = int(u), int(r)
+                fu, fr = u - c0, r - r0
+                top = others[v, r0, c0] * (1.0 - fu) + others[v, r0, c0 + 1] * fu
+                low = others[v, r0 + 1, c0] * (1.0 - fu) + others[v, r0 + 1, c0 + 1] * fu
+                value = top * (1.0 - fr) + low * fr
+                w = weight[k]
+                sum_w += w
+                sum_i += w * value
+                sum_ii += w * value * value
+                sum_ri += w * value * patch[k]
+                k += 1
+            if not inside:
+                break
+        if not inside:
+            continue
+        centre = sum_i / sum_w
+        spread = sum_ii / sum_w - centre * centre
+        if spread < 0.25 * TEXTURE * TEXTURE:
+            continue
+        cost = 1.0 - (sum_ri / sum_w - centre * mean) / (deviation * np.sqrt(spread))
+        if cost < low0:
+            low0, low1, low2, low3 = cost, low0, low1, low2
+        elif cost < low1:
+            low1, low2, low3 = cost, low1, low2
+        elif cost < low2:
+            low2, low3 = cost, low2
+        elif cost < low3:
+            low3 = cost
+    if best == 1:
+        return low0
+    if best == 2:
+        return 0.5 * (low0 + low1) if low1 < NO_MATCH else NO_MATCH
+    return (low0 + low1 + low2) / 3.0 if low2 < NO_MATCH else NO_MATCH
+
+
+@njit(cache=True, fastmath=True)
+def _patch(image: Any, x: int, y: int, patch: Any, weight: Any) -> tuple[float, float]:
+    """Fill the samples about a pixel and their weights (near in value counts more); mean and deviation."""
+    height, width = image.shape
+    middle = image[y, x]
+    sum_w, sum_i, sum_ii = 0.0, 0.0, 0.0
+    k = 0
+    for j in range(-REACH, REACH + 1):
+        b = min(max(y + j * STEP, 0), height - 1)
+        for i in range(-REACH, REACH + 1):
+            a = min(max(x + i * STEP, 0), width - 1)
+            value = image[b, a]
+            w = np.exp(-abs(value - middle) / 0.2 - (i * i + j * j) / (2.0 * REACH * REACH))
+            patch[k], weight[k] = value, w
+            sum_w += w
+            sum_i += w * value
+            sum_ii += w * value * value
+            k += 1
+    mean = sum_i / sum_w
+    return mean, np.sqrt(max(sum_ii / sum_w - mean * mean, 0.0))
+
+
+@njit(cache=True, parallel=True)
+def _sweep(
+    image: Any, active: Any, prior: Any, depth: Any, normal: Any, cost: Any, inverse: Any, others: Any, matrices: Any,
+    shifts: Any, near: float, far: float, round_: int, colour: int, best: int, seed: int,
+) -> None:  # fmt: skip
+    """One round over the pixels of one colour of the chequerboard; round 0 only gives each pixel its first plane."""
+    height, width = image.shape
+    for y in prange(height):
+        patch, weight = np.empty(_SAMPLES), np.empty(_SAMPLES)
+        for x in range(width):
+            if not active[y, x] or (round_ > 0 and (x + y) % 2 != colour):
+                continue
+            mean, deviation = _patch(image, x, y, patch, weight)
+            if deviation < TEXTURE:
+                cost[y, x] = NO_MATCH
+                continue
+            key = ((seed * 64 + round_) * height + y) * width + x + 1
+            px, py = x + 0.5, y + 0.5
+            d, c = depth[y, x], cost[y, x]
+            nx, ny, nz = normal[y, x, 0], normal[y, x, 1], normal[y, x, 2]
+            tries = 3 if round_ == 0 else 8 + 4
+            for attempt in range(tries):
+                td, tx, ty, tz = d, nx, ny, nz
+                if round_ == 0:
+                    td = 1.0 / (1.0 / far + _random(key, 8 * attempt) * (1.0 / near - 1.0 / far))
+                    if attempt > 0 and prior[y, x] > 0.0:
+                        td = prior[y, x]
+                    # A normal within 60 degrees of facing the camera.
+                    angle, tilt = 6.2831853 * _random(key, 8 * attempt + 1), np.sqrt(_random(key, 8 * attempt + 2))
+                    sine = 0.86 * tilt
+                    tx, ty, tz = sine * np.cos(angle), sine * np.sin(angle), -np.sqrt(1.0 - sine * sine)
+                elif attempt < 8:
+                    span = 1 if attempt < 4 else 3 + 2 * (round_ % 3)
+                    side = attempt % 4
+                    a = x + (span if side == 0 else -span if side == 1 else 0)
+                    b = y + (span if side == 2 else -span if side == 3 else 0)
+                    if a < 0 or b < 0 or a >= width or b >= height or cost[b, a] >= NO_MATCH:
+                        continue
+                    # The neighbour's plane, met by this pixel's ray.
+                    tx, ty, tz = normal[b, a, 0], normal[b, a, 1], normal[b, a, 2]
+                    there = tx * (inverse[0] * (a + 0.5) + inverse[1]) + ty * (inverse[2] * (b + 0.5) + inverse[3]) + tz
+                    here = tx * (inverse[0] * px + inverse[1]) + ty * (inverse[2] * py + inverse[3]) + tz
+                    if abs(here) < 1e-6:
+                        continue
+                    td = depth[b, a] * there / here
+                else:
+                    scale = 0.5 ** (round_ + 2 * (attempt - 8))
+                    step = 0.25 * scale * (1.0 / near - 1.0 / far)
+                    td = 1.0 / (1.0 / d + step * (2.0 * _random(key, 8 * attempt) - 1.0))
+                    tx += scale * (2.0 * _random(key, 8 * attempt + 1) - 1.0)
+                    ty += scale * (2.0 * _random(key, 8 * attempt + 2) - 1.0)
+                    tz += scale * (2.0 * _random(key, 8 * attempt + 3) - 1.0)
+                    length = np.sqrt(tx * tx + ty * ty + tz * tz)
+                    if length < 1e-3:
+                        continue
+                    tx, ty, tz = tx / length, ty / length, tz / length
+                facing = tx * (inverse[0] * px + inverse[1]) + ty * (inverse[2] * py + inverse[3]) + tz
+                if not (td >= near and td <= far) or facing > -0.15:
+                    continue
+                tc = _cost(
+                    patch, weight, mean, deviation, px, py, td, tx, ty, tz, inverse, others, matrices, shifts, best
+                )
+                if tc < c:
+                    d, c, nx, ny, nz = td, tc, tx, ty, tz
+            depth[y, x], cost[y, x] = d, c
+            normal[y, x, 0], normal[y, x, 1], normal[y, x, 2] = nx, ny, nz
+
+
+def patch_match(
+    image: Any, active: Any, prior: Any, inverse: Any, others: Any, matrices: Any, shifts: Any,
+    *, near: float, far: float, iterations: int, best: int, seed: int,
+) -> tuple[Any, Any, Any]:  # fmt: skip
+    """Depth of each pixel of one picture.
+
+    Args:
+        image: [H, W] float32 grey in 0…1.
+        active: [H, W] bool, pixels that are wanted.
+        prior: [H, W] float64 depth to try first, 0 where nobody knows one.
+        inverse: [4] float64, (1/fx, −cx/fx, 1/fy, −cy/fy).
+        others: [V, H', W'] float32 neighbours' pictures.
+        matrices: [V, 3, 3] float64, K' R of each neighbour, R from the reference's axes.
+        shifts: [V, 3] float64, K' t of each neighbour.
+        near: depth at which to begin, world units.
+        far: depth at which to end.
+        iterations: rounds.
+        best: 1 to 3, how many neighbours must match well.
+        seed: of the random planes.
+
+    Returns:
+        depth [H, W] float64 (0 where there is none), normals [H, W, 3] in camera axes, cost [H, W] 1 − NCC.
+    """
+    height, width = image.shape
+    depth, cost = np.zeros((height, width)), np.full((height, width), NO_MATCH)
+    normal = np.zeros((height, width, 3))
+    normal[..., 2] = -1.0
+    for round_ in range(iterations + 1):
+        for colour in range(2 if round_ else 1):
+            _sweep(
+                image, active, prior, depth, normal, cost, inverse, others, matrices, shifts,
+                near, far, round_, colour, best, seed,
+            )  # fmt: skip
+    depth[cost >= NO_MATCH] = 0.0
+    return depth, normal, cost
