@@ -111,6 +111,9 @@ class UpdateSettings(Model):
     beta1: float = Field(0.9, ge=0, lt=1, description="Adam's first decay.")
     beta2: float = Field(0.999, ge=0, lt=1, description="Adam's second decay.")
     warm_start: float = Field(1.0, ge=0, le=1, description="Share of the previous deformation that starts the next.")
+    momentum: bool = Field(
+        False, description="Also start Δp and ΔR from those of the previous frame (Dynamic3DGaussians does)."
+    )
     neighbours: int = Field(20, ge=1, description="Neighbours of a Gaussian in the rigidity terms.")
     neighbour_falloff: Positive = Field(2000.0, description="1/m²: weight exp(−falloff d²) of a neighbour at d.")
     neighbour_sample: int = Field(4000, ge=1, description="Gaussians whose neighbours are looked at an iteration.")

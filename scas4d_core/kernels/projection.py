@@ -184,6 +184,7 @@ def project_backward(  # type: ignore[no-untyped-def]
     g_factors,
     g_opacities,
     g_features,
+    g_screen,
 ):
     """Sum each Gaussian's pairs (in a fixed order) and carry the gradients to the world.
 
@@ -191,6 +192,7 @@ def project_backward(  # type: ignore[no-untyped-def]
         records: [pairs, 6 + C] from ``blend_backward``; offsets [N + 1], pair_used [pairs].
         depth_channel: the feature channel that holds the depth of the centre, or -1.
         g_means [N, 3], g_factors [N, 3, 3], g_opacities [N], g_features [N, C]: out, float32; 0 where culled.
+        g_screen: out [N, 2], dL/d(projected centre) per pixel, which density control reads.
     """
     channels = g_features.shape[1]
     count = means.shape[0]
@@ -209,6 +211,7 @@ def project_backward(  # type: ignore[no-untyped-def]
                             sums[column] += records[pair, column]
             if not any_pair:
                 g_opacities[i] = ZERO
+                g_screen[i, 0] = g_screen[i, 1] = ZERO
                 for k in range(3):
                     g_means[i, k] = ZERO
                     for j in range(3):
@@ -220,6 +223,7 @@ def project_backward(  # type: ignore[no-untyped-def]
             g_opacities[i] = sums[0] / splat[OPACITY]
             g_mean[0] = splat[CONIC_A] * sums[1] + splat[CONIC_B] * sums[2]
             g_mean[1] = splat[CONIC_B] * sums[1] + splat[CONIC_C] * sums[2]
+            g_screen[i, 0], g_screen[i, 1] = g_mean[0], g_mean[1]
             g_conic[0] = -HALF * sums[3]
             g_conic[1] = -sums[4]
             g_conic[2] = -HALF * sums[5]

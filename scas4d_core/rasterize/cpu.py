@@ -55,6 +55,7 @@ class Gradients(NamedTuple):
     factors: Array
     opacities: Array
     features: Array
+    screen: Array
 
 
 class CpuRasterizer:
@@ -63,6 +64,7 @@ class CpuRasterizer:
     def __init__(self, limits: Limits = DEFAULT) -> None:
         self.limits = np.array(limits, dtype=np.float32)
         self._buffers: dict[str, NDArray[Any]] = {}
+        self._gradient_shape: tuple[int, ...] = ()
         self._histogram = np.empty(1 << tiles.RADIX_BITS, np.int64)
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
@@ -167,15 +169,16 @@ class CpuRasterizer:
     def gradient_buffers(self) -> tuple[Array, Array]:
         """dL/dfeatures [C, rows, stride] and dL/dalpha [rows, stride] to fill before ``backward``.
 
-        Padded to whole tiles like the forward buffers; the padding must hold 0 (it does when first given out).
+        Padded to whole tiles like the forward buffers. They hold 0 when first given out for a size of picture; the
+        padding must keep it.
         """
         image, rest = self._last[13], self._last[14]
         g_image = self._buffer("g_image", image.shape)
         g_alpha = self._buffer("g_alpha", rest.shape)
-        width, height = self._last[3].width, self._last[3].height
-        for buffer in (g_image, g_alpha):
-            buffer[..., height:, :] = 0
-            buffer[..., :, width:] = 0
+        if self._gradient_shape != image.shape:
+            g_image[:] = 0
+            g_alpha[:] = 0
+            self._gradient_shape = image.shape
         return g_image, g_alpha
 
     def backward(self, g_image: Array, g_alpha: Array) -> Gradients:
@@ -228,6 +231,7 @@ class CpuRasterizer:
             self._buffer("g_factors", (count, 3, 3)),
             self._buffer("g_opacities", (count,)),
             self._buffer("g_features", (count, channels)),
+            self._buffer("g_screen", (count, 2)),
         )
         projection.project_backward(
             means,
@@ -244,6 +248,12 @@ class CpuRasterizer:
             *gradients,
         )
         return gradients
+
+    @property
+    def planes(self) -> Array:
+        """[C, rows, stride] of the last forward pass, padded to whole tiles."""
+        planes: Array = self._last[13]
+        return planes
 
     @property
     def splats(self) -> Array:

@@ -1,0 +1,105 @@
+"""The hierarchy of clusters (paper, Training Strategy): K-means for the finest layer, agglomerative merging upward.
+
+Clusters are numbered so that, with Gaussians sorted by their finest cluster, every cluster of every layer is one
+contiguous range: the kernels and the sums of gradients rely on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.cluster import AgglomerativeClustering, KMeans
+from threadpoolctl import threadpool_limits
+
+Int = NDArray[np.int64]
+
+KMEANS_ROUNDS = 30
+"""Lloyd iterations: the update needs compact clusters, not an optimum."""
+
+KMEANS_SAMPLE_PER_CLUSTER = 256
+"""Points per cluster that K-means looks at; beyond, a sample bounds time and memory (1 M points: 330,000 x 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hierarchy:
+    """Nested clusters of the M moving Gaussians.
+
+    Attributes:
+        rows: [M] int64, the moving Gaussians' rows in Θ, in the order that makes clusters contiguous.
+        labels: per layer, coarse to fine, [M] int32 cluster of each entry of ``rows``; ascending.
+        starts: per layer [K + 1] int64, each cluster's range of entries.
+    """
+
+    rows: Int
+    labels: tuple[NDArray[np.int32], ...]
+    starts: tuple[Int, ...]
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Clusters per layer."""
+        return tuple(len(starts) - 1 for starts in self.starts)
+
+
+def build_hierarchy(
+    means: NDArray[Any], moving: NDArray[np.bool_], clusters: tuple[int, ...], smallest: int, seed: int = 0
+) -> Hierarchy:
+    """Cluster the moving Gaussians.
+
+    Args:
+        means: [N, 3] metres. moving: [N]; the others belong to no cluster.
+        clusters: wished clusters per layer, coarse to fine, ascending; capped so that ``smallest`` Gaussians fall into
+            each on average. Empty: no layer.
+        seed: of K-means.
+
+    Raises:
+        ValueError: the wished numbers do not ascend.
+    """
+    if any(a >= b for a, b in zip(clusters, clusters[1:], strict=False)):
+        raise ValueError(f"clusters {clusters} must ascend from the coarsest layer to the finest")
+    rows = np.flatnonzero(moving)
+    cap = max(1, len(rows) // smallest)
+    sizes = tuple(dict.fromkeys(min(size, cap) for size in clusters)) if len(rows) else ()
+    if not sizes:
+        return Hierarchy(rows, (), ())
+    points = np.asarray(means, dtype=np.float64)[rows]
+    # Libraries sum in the order of their threads: one thread, so that the same scene gets the same clusters.
+    with threadpool_limits(limits=1):
+        finest = _kmeans(points, sizes[-1], seed)
+        layers = [finest]
+        for size in reversed(sizes[:-1]):
+            layers.insert(0, _merge(points, layers[0], size))
+    order = np.lexsort([rows, *reversed(layers)])
+    labels, starts = [], []
+    for layer in layers:
+        ordered = layer[order]
+        changes = np.flatnonzero(np.diff(ordered)) + 1
+        begin = np.concatenate([[0], changes, [len(ordered)]]).astype(np.int64)
+        labels.append(np.repeat(np.arange(len(begin) - 1, dtype=np.int32), np.diff(begin)))
+        starts.append(begin)
+    return Hierarchy(rows[order], tuple(labels), tuple(starts))
+
+
+def _kmeans(points: NDArray[np.float64], count: int, seed: int) -> Int:
+    """[M] labels of K-means; empty clusters vanish."""
+    limit = KMEANS_SAMPLE_PER_CLUSTER * count
+    rng = np.random.default_rng(seed)
+    sample = points if len(points) <= limit else points[np.sort(rng.choice(len(points), limit, replace=False))]
+    distinct = len(np.unique(sample, axis=0))
+    model = KMeans(min(count, distinct), init="random", n_init=1, max_iter=KMEANS_ROUNDS, random_state=seed)
+    model.fit(sample.astype(np.float32))
+    labels: Int = model.predict(points.astype(np.float32)).astype(np.int64)
+    return np.unique(labels, return_inverse=True)[1]
+
+
+def _merge(points: NDArray[np.float64], labels: Int, count: int) -> Int:
+    """[M] labels after agglomerative merging of the clusters' mean positions to ``count`` clusters."""
+    present = int(labels.max()) + 1
+    if count >= present:
+        return labels
+    sums = np.stack([np.bincount(labels, weights=points[:, k], minlength=present) for k in range(3)], axis=1)
+    centroids = sums / np.bincount(labels, minlength=present)[:, None]
+    parents: Int = AgglomerativeClustering(count).fit_predict(centroids).astype(np.int64)
+    return parents[labels]

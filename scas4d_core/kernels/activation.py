@@ -1,0 +1,68 @@
+"""Frame 0's free parameters to what the rasterizer reads, and back. Twin: the same formulas in torch, in the tests.
+
+F = R(q/|q|) diag(exp s); opacity = sigmoid(o); label = sigmoid(m).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from scas4d_core.kernels.cascade import rotation_entries, rotation_gradient
+from scas4d_core.kernels.jit import ONE, ZERO, exp, parallel_kernel
+
+CHUNK = 256
+
+# Columns of a row of parameters: mean 0–2, quaternion 3–6, log scale 7–9, opacity logit 10, colour 11–13, label 14.
+COLUMNS = 15
+
+
+@parallel_kernel
+def activate(parameters, means, factors, opacities, features):  # type: ignore[no-untyped-def]
+    """Fill means [N, 3], factors [N, 3, 3], opacities [N], features [N, 4] (RGB, label) from parameters [N, 15]."""
+    count = parameters.shape[0]
+    for task in prange((count + CHUNK - 1) // CHUNK):
+        for i in range(task * CHUNK, min(count, (task + 1) * CHUNK)):
+            p = parameters[i]
+            norm = ONE / np.float32(np.sqrt(p[3] * p[3] + p[4] * p[4] + p[5] * p[5] + p[6] * p[6]))
+            entries = rotation_entries(p[3] * norm, p[4] * norm, p[5] * norm, p[6] * norm)
+            for column in range(3):
+                means[i, column] = p[column]
+                scale = exp(p[7 + column])
+                factors[i, 0, column] = entries[column] * scale
+                factors[i, 1, column] = entries[3 + column] * scale
+                factors[i, 2, column] = entries[6 + column] * scale
+                features[i, column] = p[11 + column]
+            opacities[i] = ONE / (ONE + exp(-p[10]))
+            features[i, 3] = ONE / (ONE + exp(-p[14]))
+
+
+@parallel_kernel
+def activate_backward(parameters, factors, opacities, features, g_means, g_factors, g_opacities, g_features, gradients):  # type: ignore[no-untyped-def]
+    """dL/dparameters [N, 15] from the rasterizer's gradients."""
+    count = parameters.shape[0]
+    for task in prange((count + CHUNK - 1) // CHUNK):
+        for i in range(task * CHUNK, min(count, (task + 1) * CHUNK)):
+            p = parameters[i]
+            norm = ONE / np.float32(np.sqrt(p[3] * p[3] + p[4] * p[4] + p[5] * p[5] + p[6] * p[6]))
+            w, x, y, z = p[3] * norm, p[4] * norm, p[5] * norm, p[6] * norm
+            s0, s1, s2 = exp(p[7]), exp(p[8]), exp(p[9])
+            g = g_factors[i]
+            gw, gx, gy, gz = rotation_gradient(
+                w, x, y, z, g[0, 0] * s0, g[0, 1] * s1, g[0, 2] * s2, g[1, 0] * s0, g[1, 1] * s1, g[1, 2] * s2,
+                g[2, 0] * s0, g[2, 1] * s1, g[2, 2] * s2,
+            )  # fmt: skip
+            along = w * gw + x * gx + y * gy + z * gz
+            gradients[i, 3] = (gw - w * along) * norm
+            gradients[i, 4] = (gx - x * along) * norm
+            gradients[i, 5] = (gy - y * along) * norm
+            gradients[i, 6] = (gz - z * along) * norm
+            for column in range(3):
+                gradients[i, column] = g_means[i, column]
+                total = ZERO
+                for row in range(3):
+                    total += g[row, column] * factors[i, row, column]
+                gradients[i, 7 + column] = total
+                gradients[i, 11 + column] = g_features[i, column]
+            gradients[i, 10] = g_opacities[i] * opacities[i] * (ONE - opacities[i])
+            gradients[i, 14] = g_features[i, 3] * features[i, 3] * (ONE - features[i, 3])

@@ -1,0 +1,48 @@
+"""The neighbour graph of the rigidity terms (Dynamic3DGaussians): k nearest moving Gaussians and their weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbours:
+    """Graph over M Gaussians, in the order of the hierarchy.
+
+    Attributes:
+        index: [M, k] int32. weights: [M, k] float32, exp(−falloff d²), 0 where there is no neighbour.
+        distances: [M, k] float32 metres, when the graph was built.
+    """
+
+    index: NDArray[np.int32]
+    weights: NDArray[np.float32]
+    distances: NDArray[np.float32]
+
+
+def build_neighbours(means: NDArray[Any], count: int, falloff: float) -> Neighbours:
+    """The ``count`` nearest neighbours of each of ``means`` [M, 3] (metres); fewer where there are fewer Gaussians.
+
+    Args:
+        falloff: 1/m².
+    """
+    points = np.asarray(means, dtype=np.float64)
+    total = len(points)
+    found = min(count, total - 1)
+    index = np.zeros((total, count), np.int32)
+    weights = np.zeros((total, count), np.float32)
+    distances = np.zeros((total, count), np.float32)
+    if found > 0:
+        far, near = cKDTree(points).query(points, k=found + 1)
+        # The point itself is usually first, but among coincident points it may be any, or none.
+        own = near == np.arange(total)[:, None]
+        own[~own.any(axis=1), -1] = True
+        near, far = near[~own].reshape(total, found), far[~own].reshape(total, found)
+        index[:, :found] = near
+        distances[:, :found] = far
+        weights[:, :found] = np.exp(-falloff * far**2)
+    return Neighbours(index, weights, distances)

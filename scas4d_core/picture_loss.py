@@ -1,0 +1,81 @@
+"""One training view rendered, compared and carried back: what frame 0 and every update do each iteration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.kernels import image_loss
+from scas4d_core.rasterize.cpu import CpuRasterizer, Gradients
+from scas4d_core.rasterize.limits import DEFAULT, Limits
+from scas4d_core.views import CHANNELS, TrainingView, ViewFactory
+
+Array = NDArray[np.float32]
+
+
+def _no_lap(stage: str) -> None:
+    """Nobody takes the time."""
+
+
+class PictureLoss:
+    """The image and mask loss of a set of Gaussians in one view, with gradients.
+
+    Args:
+        background: RGB behind everything.
+        image_weight, mask_weight: weights of the two terms.
+    """
+
+    def __init__(
+        self,
+        factory: ViewFactory,
+        background: tuple[float, float, float],
+        image_weight: float,
+        mask_weight: float,
+        limits: Limits = DEFAULT,
+    ) -> None:
+        self.rasterizer = CpuRasterizer(limits)
+        self._factory = factory
+        self._background = np.array([*background, 0.0], np.float32)
+        self._weights = np.array([image_weight / 3] * 3 + [mask_weight], np.float32)
+        self.exposure_gradient = np.zeros((CHANNELS, 2), np.float32)
+        self.image_part = 0.0
+        self.mask_part = 0.0
+
+    def evaluate(
+        self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView,
+        lap: Callable[[str], None] = _no_lap,
+    ) -> Gradients:
+        """Render the view, set ``image_part`` and ``mask_part``, and return the gradients (buffers, valid until next).
+
+        Args:
+            means [N, 3], factors [N, 3, 3], opacities [N], features [N, 4] (RGB, label): float32.
+            lap: told when each stage is done.
+        """
+        self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background)
+        lap("render")
+        g_image, g_alpha = self.rasterizer.gradient_buffers()
+        channels, height, width = view.target.shape
+        rows = np.empty((channels, height), np.float32)
+        g_exposure = np.empty((channels, height, 2), np.float32)
+        image_loss.image_loss(
+            self.rasterizer.planes,
+            view.exposure,
+            view.target,
+            view.means,
+            view.squares,
+            self._weights[:channels],
+            self._factory.scratch(channels, height, width),
+            g_image,
+            rows,
+            g_exposure,
+        )
+        g_image[channels:] = 0
+        sums = rows.sum(axis=1, dtype=np.float64)
+        self.image_part, self.mask_part = float(sums[:3].sum()), float(sums[3:].sum())
+        self.exposure_gradient[:channels] = g_exposure.sum(axis=1)
+        lap("picture loss")
+        gradients = self.rasterizer.backward(g_image, g_alpha)
+        lap("render backward")
+        return gradients

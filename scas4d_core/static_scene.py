@@ -1,0 +1,251 @@
+"""Frame 0: 3D Gaussian Splatting with adaptive density control (Kerbl et al. 2023), under a budget of Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.kernels import activation
+from scas4d_core.kernels.adam import adam
+from scas4d_core.picture_loss import PictureLoss
+from scas4d_core.settings import SceneSettings, StaticSettings
+from scas4d_core.views import TrainingView, ViewFactory, view_order
+
+Array = NDArray[np.float32]
+
+BETA1, BETA2 = np.float32(0.9), np.float32(0.999)
+MEAN, QUATERNION, SCALE, OPACITY, COLOUR, LABEL = (
+    slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 11), slice(11, 14), slice(14, 15)
+)  # fmt: skip
+
+INITIAL_OPACITY = 0.1
+SPLIT_SHRINK = 1.6
+"""A split Gaussian's halves are smaller by this (3DGS)."""
+
+
+@dataclass(frozen=True, eq=False)
+class StaticResult:
+    """What frame 0 leaves.
+
+    Attributes:
+        gaussians: Θ_0. exposures: [3, 2] gain and offset of each training camera, empty without exposure terms.
+        losses: the training loss of every iteration.
+    """
+
+    gaussians: Gaussians
+    exposures: dict[str, Array]
+    losses: list[float]
+
+
+def logit(probability: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Inverse of the sigmoid, away from its ends."""
+    clipped = np.clip(probability, 1e-4, 1 - 1e-4)
+    result: NDArray[np.floating] = np.log(clipped / (1 - clipped))
+    return result
+
+
+def initial_parameters(
+    positions: NDArray[np.float64], colours: Array, foreground: Array | None, limit: int, rng: np.random.Generator
+) -> Array:
+    """A row of parameters per point: round Gaussians as wide as the mean distance to their three nearest neighbours.
+
+    Args:
+        positions: [P, 3] metres inside. colours: [P, 3] in 0…1. foreground: [P] label or None.
+        limit: points beyond this many are left out at random.
+    """
+    if len(positions) > limit:
+        keep = np.sort(rng.choice(len(positions), limit, replace=False))
+        positions, colours = positions[keep], colours[keep]
+        foreground = None if foreground is None else foreground[keep]
+    neighbours = min(4, len(positions))
+    distances = cKDTree(positions).query(positions, k=neighbours)[0]
+    squared = np.square(distances).reshape(len(positions), -1)[:, 1:]
+    width = np.sqrt(np.maximum(squared.mean(axis=1), 1e-7)) if neighbours > 1 else np.full(len(positions), 0.05)
+    parameters = np.zeros((len(positions), activation.COLUMNS), np.float32)
+    parameters[:, MEAN] = positions
+    parameters[:, 3] = 1
+    parameters[:, SCALE] = np.log(width)[:, None]
+    parameters[:, OPACITY] = logit(np.array(INITIAL_OPACITY))
+    parameters[:, COLOUR] = colours
+    parameters[:, LABEL] = 0 if foreground is None else logit(np.clip(foreground, 0.1, 0.9))[:, None]
+    return parameters
+
+
+class StaticTrainer:
+    """Fits Gaussians to the views of one frame."""
+
+    def __init__(
+        self,
+        factory: ViewFactory,
+        views: list[TrainingView],
+        parameters: Array,
+        scene: SceneSettings,
+        settings: StaticSettings,
+    ) -> None:
+        self.settings = settings
+        self.views = views
+        self.parameters = parameters
+        self.radius = factory.rig.radius
+        self._loss = PictureLoss(factory, scene.background, 1.0, settings.weight_mask)
+        self._masked = any(len(view.target) > 3 for view in views)
+        self._rng = np.random.default_rng(settings.seed)
+        self._reset_moments()
+        self._exposure_moments = {view.name: np.zeros((2, *view.exposure.shape), np.float32) for view in views}
+
+    def _reset_moments(self) -> None:
+        count = len(self.parameters)
+        self._first = np.zeros_like(self.parameters)
+        self._second = np.zeros_like(self.parameters)
+        self._screen = np.zeros(count)
+        self._seen = np.zeros(count, np.int64)
+
+    def _allocate(self) -> None:
+        count = len(self.parameters)
+        self._means = np.empty((count, 3), np.float32)
+        self._factors = np.empty((count, 3, 3), np.float32)
+        self._opacities = np.empty(count, np.float32)
+        self._features = np.empty((count, 4), np.float32)
+        self._gradients = np.empty_like(self.parameters)
+
+    def train(self, progress: Callable[[int, float], None] | None = None) -> list[float]:
+        """Run all iterations; ``progress`` gets the iteration and the loss."""
+        settings = self.settings
+        losses = []
+        order = view_order(len(self.views), settings.iterations, self._rng)
+        self._allocate()
+        start = len(self.parameters)
+        until = int(settings.densify_until * settings.iterations)
+        for iteration, index in enumerate(order):
+            losses.append(self.step(self.views[index], iteration))
+            done = iteration + 1
+            if settings.densify_from <= done <= until and done % settings.densify_every == 0:
+                share = (done - settings.densify_from) / max(until - settings.densify_from, 1)
+                self.control_density(round(start + (settings.max_gaussians - start) * min(1.0, share + 0.1)))
+            if progress is not None:
+                progress(done, losses[-1])
+        return losses
+
+    def step(self, view: TrainingView, iteration: int) -> float:
+        """One iteration: render the view, compare, carry back, Adam. Returns the loss."""
+        activation.activate(self.parameters, self._means, self._factors, self._opacities, self._features)
+        gradients = self._loss.evaluate(self._means, self._factors, self._opacities, self._features, view)
+        activation.activate_backward(
+            self.parameters, self._factors, self._opacities, self._features, gradients.means, gradients.factors,
+            gradients.opacities, gradients.features, self._gradients,
+        )  # fmt: skip
+        width = np.float32([view.camera.width / 2, view.camera.height / 2])
+        visible = self._loss.rasterizer.counts > 0
+        self._screen += np.sqrt(np.square(gradients.screen * width).sum(axis=1))
+        self._seen += visible
+        adam(
+            self.parameters, self._gradients, self._first, self._second, self._rates(iteration), BETA1, BETA2,
+            iteration + 1,
+        )  # fmt: skip
+        if self.settings.exposure:
+            self._step_exposure(view, iteration)
+        return self._loss.image_part + self._loss.mask_part
+
+    def _rates(self, iteration: int) -> Array:
+        settings = self.settings
+        share = iteration / max(settings.iterations - 1, 1)
+        position = settings.rate_position ** (1 - share) * settings.rate_position_end**share
+        rates = np.empty(activation.COLUMNS, np.float32)
+        rates[MEAN] = position * self.radius
+        rates[QUATERNION] = settings.rate_rotation
+        rates[SCALE] = settings.rate_scale
+        rates[OPACITY] = settings.rate_opacity
+        rates[COLOUR] = settings.rate_colour
+        rates[LABEL] = settings.rate_opacity if self._masked else 0.0
+        return rates
+
+    def _step_exposure(self, view: TrainingView, iteration: int) -> None:
+        """Adam on the camera's gain and offset; afterwards their mean over cameras is brought back to 1 and 0."""
+        moments = self._exposure_moments[view.name]
+        rates = np.full(2, self.settings.rate_exposure, np.float32)
+        gradient = self._loss.exposure_gradient[: len(view.exposure)].copy()
+        gradient[3:] = 0
+        adam(view.exposure, gradient, moments[0], moments[1], rates, BETA1, BETA2, iteration + 1)
+        centre = np.mean([other.exposure[:3] for other in self.views], axis=0) - np.float32([1, 0])
+        for other in self.views:
+            other.exposure[:3] -= centre
+
+    def control_density(self, target: int) -> None:
+        """Remove what is all but transparent; clone or split those the pictures pull hardest, up to ``target``."""
+        settings = self.settings
+        opacity = 1 / (1 + np.exp(-self.parameters[:, 10]))
+        score = self._screen / np.maximum(self._seen, 1)
+        keep = opacity >= settings.prune_opacity
+        room = max(0, min(target, settings.max_gaussians) - int(keep.sum()))
+        score = np.where(keep & (score >= settings.densify_gradient), score, 0)
+        chosen = np.argsort(-score, kind="stable")[: min(room, int((score > 0).sum()))]
+        largest = self.parameters[:, SCALE].max(axis=1)
+        median = np.median(largest[keep])
+        split = chosen[largest[chosen] > median]
+        clone = chosen[largest[chosen] <= median]
+        halves = [self._half(split), self._half(split)]
+        keep[split] = False
+        old = np.flatnonzero(keep)
+        added = [self.parameters[clone], *halves]
+        fresh = np.zeros((sum(map(len, added)), activation.COLUMNS), np.float32)
+        first, second = self._first[old], self._second[old]
+        self.parameters = np.ascontiguousarray(np.concatenate([self.parameters[old], *added]))
+        self._reset_moments()
+        self._first[:] = np.concatenate([first, fresh])
+        self._second[:] = np.concatenate([second, fresh])
+        self._allocate()
+
+    def _half(self, rows: NDArray[np.int64]) -> Array:
+        """The rows, smaller, and displaced by a sample of themselves."""
+        half = self.parameters[rows].copy()
+        offset = self._rng.standard_normal((len(rows), 3)).astype(np.float32)
+        half[:, MEAN] += np.einsum("nij,nj->ni", self._factors[rows], offset)
+        half[:, SCALE] -= np.log(SPLIT_SHRINK)
+        return half
+
+    def gaussians(self) -> Gaussians:
+        """Θ_0. Without masks everything may move."""
+        self._allocate()
+        activation.activate(self.parameters, self._means, self._factors, self._opacities, self._features)
+        count = len(self.parameters)
+        return Gaussians(
+            means=self._means.copy(),
+            factors=self._factors.copy(),
+            rotations=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+            opacities=self._opacities.copy(),
+            colours=self._features[:, :3].copy(),
+            foreground=self._features[:, 3].copy() if self._masked else np.ones(count, np.float32),
+            ids=np.arange(count, dtype=np.int64),
+        )
+
+
+def fit_static_scene(
+    factory: ViewFactory,
+    views: list[TrainingView],
+    positions: NDArray[np.float64],
+    colours: Array,
+    foreground: Array | None,
+    scene: SceneSettings,
+    settings: StaticSettings,
+    progress: Callable[[int, float], None] | None = None,
+) -> StaticResult:
+    """Θ_0 from the views of frame 0 and a first cloud.
+
+    Args:
+        positions: [P, 3] metres inside. colours: [P, 3] in 0…1. foreground: [P] or None.
+
+    Raises:
+        ValueError: the cloud is empty.
+    """
+    if len(positions) == 0:
+        raise ValueError("the first cloud holds no point; give points, masks, or more overlapping cameras")
+    rng = np.random.default_rng(settings.seed)
+    parameters = initial_parameters(positions, colours, foreground, settings.initial_gaussians, rng)
+    trainer = StaticTrainer(factory, views, parameters, scene, settings)
+    losses = trainer.train(progress)
+    exposures = {view.name: view.exposure[:3].copy() for view in views} if settings.exposure else {}
+    return StaticResult(trainer.gaussians(), exposures, losses)

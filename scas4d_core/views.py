@@ -1,0 +1,95 @@
+"""Training views: what one iteration renders and compares with. CPU buffers, prepared once a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Rig
+from scas4d_core.captures.frame import Frame
+from scas4d_core.kernels import image_loss
+from scas4d_core.rasterize.cpu import CameraArrays
+
+Array = NDArray[np.float32]
+
+CHANNELS = 4
+"""Red, green, blue, label."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingView:
+    """One camera's pictures of one frame.
+
+    Attributes:
+        name: the camera's. camera: as kernels read it.
+        target: [C, H, W] float32, RGB in 0…1 and, where the frame has a mask, the mask; C is 3 or 4.
+        means, squares: [C, H, W], SSIM's windowed moments of the target.
+        exposure: [C, 2] gain and offset of the camera; the label's are 1 and 0.
+    """
+
+    name: str
+    camera: CameraArrays
+    target: Array
+    means: Array
+    squares: Array
+    exposure: Array
+
+
+class ViewFactory:
+    """Makes the training views of each frame of a rig; keeps the cameras and the scratch of the image loss."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self._cameras = {camera.name: CameraArrays.of(camera) for camera in rig.cameras}
+        self._scratch: dict[tuple[int, int, int], Array] = {}
+
+    def scratch(self, channels: int, height: int, width: int) -> Array:
+        """Zero-bordered scratch of the image loss, one per size."""
+        key = (channels, height, width)
+        if key not in self._scratch:
+            self._scratch[key] = np.zeros((6, channels, height + 2 * image_loss.REACH, width), np.float32)
+        return self._scratch[key]
+
+    def views(self, frame: Frame, exposures: dict[str, Array], use_masks: bool = True) -> list[TrainingView]:
+        """The views of a frame, in the rig's order; cameras that the frame lacks are left out.
+
+        Args:
+            exposures: [3, 2] gain and offset per camera; a camera that is not named has 1 and 0.
+
+        Raises:
+            ValueError: a picture's size is not its camera's, or no camera of the rig is in the frame.
+        """
+        views = []
+        for name in self.rig.names:
+            if name not in frame.images:
+                continue
+            camera = self._cameras[name]
+            image = frame.images[name]
+            if image.shape != (camera.height, camera.width, 3):
+                raise ValueError(
+                    f"frame {frame.index}, camera {name!r}: picture is {image.shape[1]}x{image.shape[0]}, "
+                    f"the rig says {camera.width}x{camera.height}"
+                )
+            masked = use_masks and name in frame.masks
+            target = np.empty((3 + masked, camera.height, camera.width), np.float32)
+            np.multiply(np.moveaxis(image, -1, 0), np.float32(1 / 255), out=target[:3])
+            if masked:
+                target[3] = frame.masks[name]
+            exposure = np.tile(np.float32([1, 0]), (3 + masked, 1))
+            exposure[:3] = exposures.get(name, exposure[:3])
+            means, squares = np.empty_like(target), np.empty_like(target)
+            image_loss.target_moments(target, self.scratch(*target.shape), means, squares)
+            views.append(TrainingView(name, camera, target, means, squares, exposure))
+        if not views:
+            raise ValueError(f"frame {frame.index} has none of the rig's cameras ({', '.join(self.rig.names)})")
+        return views
+
+
+def view_order(count: int, iterations: int, rng: np.random.Generator) -> Sequence[int]:
+    """Which view each iteration trains: a new random order whenever all have been used."""
+    rounds = -(-iterations // count)
+    order = np.concatenate([rng.permutation(count) for _ in range(rounds)])[:iterations]
+    return [int(index) for index in order]
