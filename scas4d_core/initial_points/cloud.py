@@ -241,7 +241,12 @@ def _merged(
         )
     visible = visible_from(views, points, fine)
     foreground = _foreground(labelled, points, visible)
-    if foreground is not None and not plain:
+    if plain:
+        # What projects before the plain background there is an outline, and has none of its colour.
+        for row, view in zip(visible, views, strict=True):
+            column, line, _, _ = pixels_inside(view.camera, points)
+            row &= np.asarray(view.mask)[line, column]
+    elif foreground is not None:
         # A person before the wall is no sample of the wall's colour, nor the wall beside him of his.
         for row, view in zip(visible, views, strict=True):
             if view.mask is not None:

@@ -41,8 +41,8 @@ class Triangulated:
     error: Float
 
 
-def features(view: View, max_features: int) -> tuple[Float, NDArray[np.float32]]:
-    """SIFT keypoints [K, 2] (pixel centres at +0.5, which is COLMAP's habit too) and unit descriptors [K, 128]."""
+def features(views: Sequence[View], max_features: int) -> list[tuple[Float, NDArray[np.float32]]]:
+    """SIFT of every view: keypoints [K, 2] (pixel centres at +0.5, as in COLMAP) and unit descriptors [K, 128]."""
     import pycolmap
 
     options: Any = pycolmap.FeatureExtractionOptions()
@@ -51,13 +51,20 @@ def features(view: View, max_features: int) -> tuple[Float, NDArray[np.float32]]
     options.sift.max_num_features = max_features
     # A quarter of COLMAP's contrast: smooth walls have little, and the known poses throw wrong matches out.
     options.sift.peak_threshold = 0.0017
-    grey = view.image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
-    keypoints, descriptors = pycolmap.Sift(options, device=pycolmap.Device.cpu).extract(
-        np.ascontiguousarray(grey / np.float32(255))
-    )
-    found = np.asarray(descriptors, dtype=np.float32)
-    norms = np.linalg.norm(found, axis=1, keepdims=True)
-    return np.asarray(keypoints[:, :2], dtype=np.float64), found / np.maximum(norms, 1e-12)
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = max(level, 1)  # a line of news a picture is too much
+    try:
+        sift = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+        found = []
+        for view in views:
+            grey = view.image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
+            keypoints, raw = sift.extract_from_float32_array(np.ascontiguousarray(grey / np.float32(255)))
+            descriptors = np.asarray(raw.data, dtype=np.float32).reshape(-1, 128)
+            descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-12)
+            found.append((np.array([(point.x, point.y) for point in keypoints]).reshape(-1, 2), descriptors))
+    finally:
+        pycolmap.logging.minloglevel = level
+    return found
 
 
 def fundamental_matrix(first: Camera, second: Camera) -> Float:
@@ -112,7 +119,10 @@ def triangulate(
     """
     import pycolmap
 
-    found = [(view.camera, *features(view, max_features)) for view in views]
+    found = [
+        (view.camera, uv, descriptors)
+        for view, (uv, descriptors) in zip(views, features(views, max_features), strict=True)
+    ]
     offsets = np.concatenate([[0], np.cumsum([len(uv) for _, uv, _ in found])])
     owner = np.repeat(np.arange(len(views)), np.diff(offsets))
     pixels = np.concatenate([uv for _, uv, _ in found]) if len(owner) else np.zeros((0, 2))

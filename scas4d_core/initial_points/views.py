@@ -7,12 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import minimum_filter
 
 from scas4d_core.cameras import Camera, Rig
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
+
+
+BLOCK = 32_768
+"""Points whose colours are gathered at a time."""
 
 
 class InitialPointsError(ValueError):
@@ -106,23 +109,23 @@ def front_depth(camera: Camera, occluders: Float, spacing: float, points: Float)
     column, line, depth, inside = pixels_inside(camera, occluders)
     if not inside.any():
         return front
-    # Cells as coarse as the discs, so that a filter of 3 x 3 cells closes the surface between neighbouring discs.
-    cell = max(1.0, camera.fx * spacing / float(np.median(depth[inside])))
+    # Cells two discs wide: each holds a piece of every surface over it, and none of the neighbours' slope.
+    cell = 2.0 * max(1.0, camera.fx * spacing / float(np.median(depth[inside])))
     shape = (int(camera.height / cell) + 1, int(camera.width / cell) + 1)
     nearest = np.full(shape, np.inf)
     np.minimum.at(
         nearest, ((line[inside] / cell).astype(np.intp), (column[inside] / cell).astype(np.intp)), depth[inside]
     )
-    closed = minimum_filter(nearest, size=3, mode="nearest")
     column, line, _, inside = pixels_inside(camera, points)
-    front[inside] = closed[(line[inside] / cell).astype(np.intp), (column[inside] / cell).astype(np.intp)]
+    front[inside] = nearest[(line[inside] / cell).astype(np.intp), (column[inside] / cell).astype(np.intp)]
     return front
 
 
 def visible_from(views: Sequence[View], points: Float, spacing: float) -> Bool:
     """Which cameras may see which points, the points themselves being the occluders.
 
-    A point is hidden if it lies more than three diameters of a disc behind the nearest one; see ``front_depth``.
+    A point is hidden if it lies more than four diameters of a disc behind the nearest one; see ``front_depth``.
+    Surfaces seen at more than about 60 degrees from their normal may count as hidden: poor witnesses of colour anyway.
 
     Returns:
         [V, P] bool; false also where the point projects outside the picture.
@@ -131,7 +134,7 @@ def visible_from(views: Sequence[View], points: Float, spacing: float) -> Bool:
     for row, view in zip(visible, views, strict=True):
         _, _, depth, inside = pixels_inside(view.camera, points)
         front = front_depth(view.camera, points, spacing, points)
-        row[:] = inside & (depth <= front + 3.0 * np.maximum(spacing, depth / view.camera.fx))
+        row[:] = inside & (depth <= front + 4.0 * np.maximum(spacing, depth / view.camera.fx))
     return visible
 
 
@@ -152,6 +155,14 @@ class Observed:
 
 def observe(views: Sequence[View], points: Float, visible: Bool) -> Observed:
     """Median colour of points [P, 3] over the cameras in ``visible`` [V, P]; NaN where no camera sees the point."""
+    if len(points) > BLOCK:  # bounds the memory of the samples
+        blocks = [slice(start, start + BLOCK) for start in range(0, len(points), BLOCK)]
+        parts = [observe(views, points[block], visible[:, block]) for block in blocks]
+        return Observed(
+            np.concatenate([part.colours for part in parts]),
+            np.concatenate([part.spread for part in parts]),
+            np.concatenate([part.count for part in parts]),
+        )
     samples = np.full((len(views), len(points), 3), np.nan, dtype=np.float32)
     for sample, view, seen in zip(samples, views, visible, strict=True):
         column, line, _, inside = pixels_inside(view.camera, points)

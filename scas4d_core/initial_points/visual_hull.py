@@ -172,9 +172,10 @@ def _kept(
         camera = view.camera
         column, line, depth, inside = pixels_inside(camera, centres)
         # Before the last level a cell stays if any part of it may be in the silhouette: its half diagonal and a pixel.
-        # On the last its centre decides, to within half a voxel or half a pixel: nothing thin is lost.
+        # On the last its centre decides, to within half a voxel and half the diagonal of a pixel: masks are sampled at
+        # pixel centres, and where many of them must all agree, every rounding would take something away.
         half = 0.5 * voxel if last else 0.5 * np.sqrt(3.0) * voxel
-        slack = camera.fx * half / np.maximum(depth, 1e-9) + (0.5 if last else 1.5)
+        slack = camera.fx * half / np.maximum(depth, 1e-9) + (0.71 if last else 1.5)
         judged = inside & (depth > half)
         missed += judged & (distance[line, column] > slack)
         seen += judged
