@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import log10
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,10 @@ from scas4d_core.rasterize.limits import DEFAULT, Limits
 from scas4d_core.views import CHANNELS, TrainingView, ViewFactory
 
 Array = NDArray[np.float32]
+
+
+SMALLEST_SQUARE = 1e-9
+"""Sum of squared differences below which two pictures count as equal: PSNR stays finite."""
 
 
 def _no_lap(stage: str) -> None:
@@ -42,12 +47,13 @@ class PictureLoss:
         self.exposure_gradient = np.zeros((CHANNELS, 2), np.float32)
         self.image_part = 0.0
         self.mask_part = 0.0
+        self.psnr = 0.0
 
     def evaluate(
         self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView,
         lap: Callable[[str], None] = _no_lap,
     ) -> Gradients:
-        """Render the view, set ``image_part`` and ``mask_part``, and return the gradients (buffers, valid until next).
+        """Render the view, set ``image_part``, ``mask_part`` and ``psnr`` (dB), and return the gradients (buffers, valid until next).
 
         Args:
             means [N, 3], factors [N, 3, 3], opacities [N], features [N, 4] (RGB, label): float32.
@@ -57,7 +63,7 @@ class PictureLoss:
         lap("render")
         g_image, g_alpha = self.rasterizer.gradient_buffers()
         channels, height, width = view.target.shape
-        rows = np.empty((channels, height), np.float32)
+        rows = np.empty((channels, height, 2), np.float32)
         g_exposure = np.empty((channels, height, 2), np.float32)
         image_loss.image_loss(
             self.rasterizer.planes,
@@ -73,7 +79,8 @@ class PictureLoss:
         )
         g_image[channels:] = 0
         sums = rows.sum(axis=1, dtype=np.float64)
-        self.image_part, self.mask_part = float(sums[:3].sum()), float(sums[3:].sum())
+        self.image_part, self.mask_part = float(sums[:3, 0].sum()), float(sums[3:, 0].sum())
+        self.psnr = 10 * log10(3 * height * width / max(float(sums[:3, 1].sum()), SMALLEST_SQUARE))
         self.exposure_gradient[:channels] = g_exposure.sum(axis=1)
         lap("picture loss")
         gradients = self.rasterizer.backward(g_image, g_alpha)

@@ -58,13 +58,13 @@ class Adam:
 class Updated:
     """What an update leaves: Θ_t, the motion that warms the next start, and how it went.
 
-    ``losses`` holds each iteration's weighted sum, ``picture_losses`` its image part alone.
+    ``losses`` holds each iteration's weighted sum, ``psnr`` the dB of the view it rendered.
     """
 
     gaussians: Gaussians
     motion: Motion
     losses: list[float]
-    picture_losses: list[float]
+    psnr: list[float]
     seconds: dict[str, float]
 
 
@@ -108,7 +108,7 @@ class FrameUpdate:
         features = np.concatenate([previous.colours, previous.foreground[:, None]], axis=1)
         colours = features[:, :3].copy()
         optimizers = self._optimizers(colours)
-        losses, picture_losses = [], []
+        losses, psnr = [], []
         watch.lap("start")
         for iteration, index in enumerate(order):
             deformation.forward()
@@ -118,7 +118,7 @@ class FrameUpdate:
                 deformation.means, deformation.factors, previous.opacities, features, views[index], watch.lap
             )
             loss = self._picture.image_part + self._picture.mask_part
-            picture_losses.append(self._picture.image_part)
+            psnr.append(self._picture.psnr)
             loss += self._neighbour_terms(samples[iteration % len(samples)], gradients.means)
             watch.lap("neighbours")
             weight = settings.weights.scale
@@ -132,7 +132,7 @@ class FrameUpdate:
             losses.append(loss)
             watch.lap("adam")
         deformation.forward()
-        updated = Updated(self._commit(previous, colours), Motion.of(deformation, seconds), losses, picture_losses, {})
+        updated = Updated(self._commit(previous, colours), Motion.of(deformation, seconds), losses, psnr, {})
         watch.lap("commit")
         updated.seconds.update(watch.seconds)
         return updated

@@ -89,7 +89,7 @@ def image_loss(  # type: ignore[no-untyped-def]
         image: [>= C, >= H, >= W] rendered planes. exposure: [C, 2] gain and offset of the camera per channel.
         target, target_means, target_squares: [C, H, W]. weights: [C] weight of each channel's mean.
         scratch: [6, C, H + 10, W], its upper and lower 5 rows 0: three windowed quantities and their gradients.
-        g_image: out [>= C, >= H, >= W] dL/dimage. losses: out [C, H], each row's share of the loss.
+        g_image: out [>= C, >= H, >= W] dL/dimage. losses: out [C, H, 2], each row's share of the loss, and its sum of squared differences.
         g_exposure: out [C, H, 2], each row's share of the gradient of gain and offset.
     """
     channels, height, width = target.shape
@@ -115,6 +115,7 @@ def image_loss(  # type: ignore[no-untyped-def]
         filter_column(scratch[1, channel], y, square, width)
         filter_column(scratch[2, channel], y, cross, width)
         loss = ZERO
+        squared = ZERO
         row = np.zeros((3, width + 2 * REACH), np.float32)
         for x in range(width):
             m1, m2 = mean[x], target_means[channel, y, x]
@@ -131,8 +132,10 @@ def image_loss(  # type: ignore[no-untyped-def]
             row[1, x + REACH] = by_square
             row[2, x + REACH] = by_cross
             difference = exposed(image[channel, y, x], gain, offset) - target[channel, y, x]
+            squared += difference * difference
             loss += L1_SHARE * abs(difference) + SSIM_SHARE * (ONE - ssim)
-        losses[channel, y] = loss * share
+        losses[channel, y, 0] = loss * share
+        losses[channel, y, 1] = squared
         for k in range(3):
             filter_row(row[k], scratch[3 + k, channel, y + REACH], width)
     for task in prange(channels * height):

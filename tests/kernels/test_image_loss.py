@@ -31,11 +31,13 @@ def test_loss_and_gradients_agree_with_the_twin(height: int, width: int) -> None
     means, squares = np.empty_like(target), np.empty_like(target)
     image_loss.target_moments(target, scratch, means, squares)
     g_image = np.full_like(image, np.nan)
-    rows = np.empty((3, height), np.float32)
+    rows = np.empty((3, height, 2), np.float32)
     g_exposure = np.empty((3, height, 2), np.float32)
     image_loss.image_loss(image, exposure, target, means, squares, weights, scratch, g_image, rows, g_exposure)
 
-    np.testing.assert_allclose(rows.sum(dtype=np.float64), total.item(), rtol=1e-5)
+    np.testing.assert_allclose(rows[..., 0].sum(dtype=np.float64), total.item(), rtol=1e-5)
+    seen = exposure[:, :1, None] * image[:3, :height, :width] + exposure[:, 1:, None]
+    np.testing.assert_allclose(rows[..., 1].sum(1), np.square(seen - target).sum((1, 2)), rtol=1e-5)
     assert leaf.grad is not None
     assert model.grad is not None
     truth_gradient = leaf.grad.numpy()
@@ -50,8 +52,8 @@ def test_a_picture_equal_to_its_target_has_no_loss() -> None:
     scratch = np.zeros((6, 1, 30, 20), np.float32)
     means, squares = np.empty_like(target), np.empty_like(target)
     image_loss.target_moments(target, scratch, means, squares)
-    g_image, rows, g_exposure = np.empty_like(target), np.empty((1, 20), np.float32), np.empty((1, 20, 2), np.float32)
+    g_image, rows, g_exposure = np.empty_like(target), np.empty((1, 20, 2), np.float32), np.empty((1, 20, 2), np.float32)
     exposure, weights = np.array([[1.0, 0.0]], np.float32), np.ones(1, np.float32)
     image_loss.image_loss(target, exposure, target, means, squares, weights, scratch, g_image, rows, g_exposure)
-    assert abs(rows.sum()) < 1e-6
+    assert abs(rows[..., 0].sum()) < 1e-6
     assert np.abs(g_image).max() < 1e-6

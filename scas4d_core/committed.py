@@ -1,0 +1,129 @@
+"""Reading what was committed: novel views, tracks, parts and exports of any frame of a history."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core import parts as parts_of_history
+from scas4d_core import ply
+from scas4d_core import tracks as tracks_of_history
+from scas4d_core.cameras import Camera, WorldFrame
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.history import History
+from scas4d_core.kernels.blend import GROUP
+from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
+from scas4d_core.tracks import ALPHA_OF_A_SURFACE, Tracks
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A rendered picture.
+
+    Attributes:
+        colour: [H, W, 3] float32, nominally 0…1, over the background. alpha: [H, W] float32.
+        depth: [H, W] float32, alpha-weighted mean z along the camera's axis in the user's units; NaN where less than
+            half of the pixel is covered.
+        parts: [H, W] uint8 or None: 0 nothing or standing, else 1 + the label that covers the pixel most.
+    """
+
+    colour: Array
+    alpha: Array
+    depth: Array
+    parts: NDArray[np.uint8] | None = None
+
+
+class Committed:
+    """Reads a history. Cameras and points are in the user's world; ``index`` None is the newest frame."""
+
+    def __init__(self, history: History, world: WorldFrame) -> None:
+        self.history = history
+        self.world = world
+        self._rasterizer = CpuRasterizer()
+
+    def render(
+        self,
+        camera: Camera,
+        index: int | None = None,
+        *,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        labels: NDArray[Any] | None = None,
+    ) -> View:
+        """A novel view.
+
+        Args:
+            camera: user's world. index: a committed frame.
+            background: RGB in 0…1 behind everything.
+            labels: [N] part of each Gaussian, −1 for none; asks for ``View.parts``.
+
+        Raises:
+            HistoryError: the frame was not committed.
+        """
+        gaussians = self._state(index)
+        inside = self.world.camera_to_inside(camera)
+        features = np.concatenate([gaussians.colours, np.zeros((len(gaussians), 1), np.float32)], axis=1)
+        picture = self._rasterizer.forward(
+            gaussians.means, gaussians.factors, gaussians.opacities, features, CameraArrays.of(inside),
+            np.array([*background, 0.0], np.float32), depth_channel=3,
+        )  # fmt: skip
+        colour = np.moveaxis(picture.features[:3], 0, -1).copy()
+        alpha = 1 - picture.rest
+        with np.errstate(invalid="ignore", divide="ignore"):
+            depth = picture.features[3] / alpha / np.float32(self.world.metres_per_unit)
+        depth[alpha < ALPHA_OF_A_SURFACE] = np.nan
+        parts = None if labels is None else self._parts_picture(gaussians, np.asarray(labels), inside)
+        return View(colour, alpha, depth, parts)
+
+    def _parts_picture(self, gaussians: Gaussians, labels: NDArray[Any], inside: Camera) -> NDArray[np.uint8]:
+        """[H, W] the label whose Gaussians weigh most in the pixel, plus 1."""
+        count = int(labels.max()) + 2
+        weights = np.zeros((len(gaussians), -(-count // GROUP) * GROUP), np.float32)
+        weights[np.arange(len(gaussians)), labels + 1] = 1
+        picture = self._rasterizer.forward(
+            gaussians.means, gaussians.factors, gaussians.opacities, weights, CameraArrays.of(inside),
+            np.zeros(weights.shape[1], np.float32),
+        )  # fmt: skip
+        found: NDArray[np.uint8] = picture.features.argmax(axis=0).astype(np.uint8)
+        found[picture.rest > 1 - ALPHA_OF_A_SURFACE] = 0
+        return found
+
+    def _state(self, index: int | None) -> Gaussians:
+        return self.history.gaussians(self.history.indices[-1] if index is None else index)
+
+    def _depth(self, camera: Camera, index: int) -> tuple[NDArray[Any], NDArray[Any]]:
+        view = self.render(camera, index)
+        return view.depth, view.alpha
+
+    def tracks_of_points(self, points: NDArray[Any], index: int, indices: Sequence[int]) -> Tracks:
+        """Trajectories of points [Q, 3] of frame ``index`` over ``indices``."""
+        return tracks_of_history.tracks_of_points(self.history, self.world, points, index, indices)
+
+    def tracks_of_pixels(self, camera: Camera, uv: NDArray[Any], index: int, indices: Sequence[int]) -> Tracks:
+        """Trajectories of the surface points at pixels [Q, 2] of frame ``index``, through rendered depth."""
+        return tracks_of_history.tracks_of_pixels(
+            self.history, self.world, camera, uv, index, indices, self._depth
+        )
+
+    def tracks_of_ids(self, ids: NDArray[Any], indices: Sequence[int]) -> Tracks:
+        """Trajectories of Gaussians by id."""
+        return tracks_of_history.tracks_of_ids(self.history, self.world, ids, indices)
+
+    def with_visibility(self, tracks: Tracks, camera: Camera, index: int) -> Tracks:
+        """The same tracks, asked for at frame ``index``, with their visibility in one more camera."""
+        tolerance = tracks_of_history.depth_tolerance(self.history, self.world, index)
+        return tracks.with_visibility(camera, self._depth, tolerance)
+
+    def parts(self, count: int | None = None) -> NDArray[np.int64]:
+        """[N] part labels, the largest part 0; −1 for what does not move. ``count`` None: chosen by silhouette."""
+        return parts_of_history.parts(self.history, count)
+
+    def write_ply(self, path: Path, index: int | None = None) -> None:
+        """A committed frame as a standard 3DGS .ply."""
+        ply.write_ply(path, self._state(index), self.world)

@@ -1,0 +1,196 @@
+"""A ``Reconstruction`` holds Θ_t; ``step(frame)`` finds D_t and commits Θ_t = D_t(Θ_{t−1}), or raises and changes nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Rig, WorldFrame, rig_inside
+from scas4d_core.captures.frame import Frame, InitialPoints
+from scas4d_core.captures.images import resize_area
+from scas4d_core.committed import Committed, View
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.hierarchy import build_hierarchy
+from scas4d_core.history import History
+from scas4d_core.initial_points import initial_points
+from scas4d_core.neighbours import build_neighbours
+from scas4d_core.settings import Settings
+from scas4d_core.static_scene import fit_static_scene
+from scas4d_core.update import FrameUpdate, Updated
+from scas4d_core.views import TrainingView, ViewFactory
+from scas4d_core.warm_start import Motion
+
+__all__ = ["FrameReport", "Progress", "Reconstruction", "StepError", "View"]
+
+REPORTED_ITERATIONS = 24
+"""The report's training loss is a mean over this many last iterations: about one round of a rig's cameras."""
+
+
+class StepError(ValueError):
+    """A frame that cannot be stepped to; the state is as it was."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a long task is."""
+
+    stage: str
+    done: int
+    total: int
+    detail: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FrameReport:
+    """How the update of one frame went.
+
+    Attributes:
+        seconds: by stage. loss: each iteration's weighted sum. psnr: dB, over the training views of the last
+            iterations, each as it was rendered then.
+        moving, gaussians: how many Gaussians move, and are.
+    """
+
+    index: int
+    time: float
+    iterations: int
+    seconds: dict[str, float]
+    loss: list[float]
+    psnr: float
+    moving: int
+    gaussians: int
+
+
+class Reconstruction(Committed):
+    """One scene, from frame 0 on. Made by ``start``.
+
+    Attributes:
+        rig: the training cameras inside, image-scaled. world: user's world to inside. history: what was committed.
+    """
+
+    def __init__(self, settings: Settings, rig: Rig, world: WorldFrame, history: History) -> None:
+        super().__init__(history, world)
+        self.settings = settings
+        self.rig = rig
+        self._factory = ViewFactory(rig)
+        self._exposures: dict[str, NDArray[np.float32]] = {}
+        self._motion: Motion | None = None
+        self._updater: FrameUpdate | None = None
+
+    @classmethod
+    def start(
+        cls,
+        rig: Rig,
+        frame: Frame,
+        settings: Settings,
+        *,
+        points: InitialPoints | None = None,
+        progress: Callable[[Progress], None] | None = None,
+        history: History | None = None,
+    ) -> Reconstruction:
+        """Reconstruct the first frame and commit it.
+
+        Args:
+            rig: training cameras, user's world, at the size of the frame's pictures.
+            frame: with a picture of every camera, or of most; masks where there are.
+            points: a first cloud in the user's world; without it one is made from the pictures.
+            progress: told of each stage.
+            history: where to commit to; in memory when left out.
+        """
+        world = rig.world_frame(settings.scene.metres_per_unit)
+        scaled = rig_inside(world, rig.scaled(settings.scene.image_scale).cameras)
+        self = cls(settings, scaled, world, History() if history is None else history)
+        frame = self._scaled(frame)
+        tell = progress or (lambda _: None)
+        if points is None:
+            points = initial_points(
+                rig.scaled(settings.scene.image_scale), frame.images, frame.masks, None,
+                lambda stage, done, total: tell(Progress(stage, done, total)),
+            )  # fmt: skip
+        total = settings.static.iterations
+        result = fit_static_scene(
+            self._factory,
+            self._factory.views(frame, {}),
+            world.to_inside(points.positions),
+            points.colours,
+            points.foreground,
+            settings.scene,
+            settings.static,
+            lambda done, loss: tell(Progress("fitting frame 0", done, total, {"loss": loss})),
+        )
+        self._exposures = result.exposures
+        self._prepare(result.gaussians)
+        self.history.append(frame.index, frame.time, result.gaussians)
+        return self
+
+    def step(self, frame: Frame) -> FrameReport:
+        """Update to a frame and commit.
+
+        Raises:
+            StepError: not later than the last frame, no picture of the rig, or a picture of another size.
+        """
+        last = self.history.indices[-1]
+        if frame.index <= last:
+            raise StepError(f"frame {frame.index} is not after the last committed frame {last}")
+        seconds = frame.time - self.history.time(last)
+        if not seconds > 0:
+            raise StepError(f"frame {frame.index}: time {frame.time} s is not after {self.history.time(last)} s")
+        started = perf_counter()
+        try:
+            views = self._factory.views(self._scaled(frame), self._exposures, self.settings.update.use_masks)
+        except ValueError as error:
+            raise StepError(str(error)) from error
+        decoded = perf_counter() - started
+        updated = self._update(views, seconds, frame.index)
+        self._motion = updated.motion
+        self.history.append(frame.index, frame.time, updated.gaussians)
+        return self._report(frame, updated, decoded)
+
+    def _update(self, views: list[TrainingView], seconds: float, seed: int) -> Updated:
+        assert self._updater is not None
+        return self._updater.run(self._state(None), views, self._motion, seconds, seed)
+
+    def _prepare(self, gaussians: Gaussians) -> None:
+        """The hierarchy and the neighbour graph of what moves."""
+        settings = self.settings.update
+        hierarchy = build_hierarchy(
+            gaussians.means, gaussians.moving, settings.clusters, settings.smallest_cluster, settings.seed
+        )
+        weights = settings.weights
+        tied = weights.rigidity + weights.isometry + weights.rotation > 0
+        neighbours = (
+            build_neighbours(gaussians.means[hierarchy.rows], settings.neighbours, settings.neighbour_falloff)
+            if tied
+            else None
+        )
+        self._updater = FrameUpdate(
+            self._factory, self.settings.scene, settings, hierarchy, neighbours, gaussians
+        )
+
+    def _scaled(self, frame: Frame) -> Frame:
+        """The frame with its pictures at the size of ``rig``."""
+        if self.settings.scene.image_scale == 1.0:
+            return frame
+        sizes = {camera.name: (camera.width, camera.height) for camera in self.rig.cameras}
+        images = {name: resize_area(frame.images[name], size) for name, size in sizes.items() if name in frame.images}
+        masks = {
+            name: (resize_area(255 * frame.masks[name], size) >= 128).astype(np.uint8)
+            for name, size in sizes.items()
+            if name in frame.masks
+        }
+        return Frame(frame.index, frame.time, images, masks)
+
+    def _report(self, frame: Frame, updated: Updated, decoded: float) -> FrameReport:
+        return FrameReport(
+            index=frame.index,
+            time=frame.time,
+            iterations=len(updated.losses),
+            seconds={"decode": decoded, **updated.seconds},
+            loss=updated.losses,
+            psnr=float(np.mean(updated.psnr[-REPORTED_ITERATIONS:])),
+            moving=len(self._updater.hierarchy.rows) if self._updater else 0,
+            gaussians=len(updated.gaussians),
+        )
