@@ -280,7 +280,7 @@ class PartsModel(Model):
 
     count: int
     ids: list[int] = Field(description="[N]")
-    labels: list[int] = Field(description="[N] 0 … count−1.")
+    labels: list[int] = Field(description="[N] 0 … count−1; −1 for what stands still.")
 
 
 class Health(Model):

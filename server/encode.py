@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 if TYPE_CHECKING:
-    from scas4d_core.reconstruction import View
+    from scas4d_core.committed import View
 
 NPZ = "application/vnd.numpy.npz"
 JPEG_QUALITY = 92

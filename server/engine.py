@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -14,8 +15,8 @@ from scas4d_core.captures import Frame, InitialPoints
 from scas4d_core.history import History
 
 if TYPE_CHECKING:
-    from scas4d_core.reconstruction import FrameReport, Progress, View
-
+    from scas4d_core.committed import View
+    from scas4d_core.reconstruction import FrameReport, Progress
     from scas4d_core.tracks import Tracks
 
 
@@ -56,7 +57,7 @@ class Reader(Protocol):
     def parts(self, count: int | None) -> NDArray[np.int64]:
         """[N] labels, 0 … count−1."""
 
-    def ply(self, index: int) -> bytes:
+    def write_ply(self, path: Path, index: int) -> None:
         """A committed frame as a 3DGS .ply."""
 
 
@@ -71,11 +72,45 @@ class Engine(Protocol):
         *,
         points: InitialPoints | None,
         progress: Callable[[Progress], None],
+        history: History,
     ) -> Reconstruction:
-        """Reconstructs the first frame."""
+        """Reconstructs the first frame and commits it to the history."""
 
     def reader(self, rig: Rig, settings: Any, history: History) -> Reader:
         """Reads what was committed to a history; made anew when the history has grown."""
+
+
+class CoreEngine:
+    """The method itself. Numba is imported where it is used: the door does without."""
+
+    def start(
+        self,
+        rig: Rig,
+        frame: Frame,
+        settings: Any,
+        *,
+        points: InitialPoints | None,
+        progress: Callable[[Progress], None],
+        history: History,
+    ) -> Reconstruction:
+        """`Reconstruction.start`."""
+        from scas4d_core.reconstruction import Reconstruction
+
+        return Reconstruction.start(rig, frame, settings, points=points, progress=progress, history=history)
+
+    def reader(self, rig: Rig, settings: Any, history: History) -> Reader:
+        """`Committed`, on one thread: the others belong to the update."""
+        import numba
+
+        from scas4d_core.committed import Committed
+
+        numba.set_num_threads(1)
+        return Committed(history, rig.world_frame(settings.scene.metres_per_unit))
+
+
+def core_engine() -> Engine:
+    """The engine of the service."""
+    return CoreEngine()
 
 
 def load_engine(name: str) -> Engine:

@@ -9,6 +9,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from client.wire import PartsModel, tracks_model
 from scas4d_core.history import History, HistoryError
@@ -59,6 +60,7 @@ class Renderer:
         self.stale = True
         self._reader: Reader | None = None
         self._times: dict[int, float] = {}
+        self._labels: dict[int | None, NDArray[np.int64]] = {}
         self._ids = np.empty(0, dtype=np.int64)
 
     @property
@@ -69,8 +71,16 @@ class Renderer:
             self._times = dict(zip(history.indices, history.times.tolist(), strict=True))
             self._ids = history.gaussians(history.indices[-1]).ids
             self._reader = self.engine.reader(self.spec.rig, self.spec.settings, history)
+            self._labels = {}
             self.stale = False
         return self._reader
+
+    def labels(self, count: int | None) -> NDArray[np.int64]:
+        """Part labels, found once for what is committed now: a live view asks for them again and again."""
+        reader = self.reader
+        if count not in self._labels:
+            self._labels[count] = reader.parts(count)
+        return self._labels[count]
 
     def answer(self, ask: Ask) -> Answer | Refused:
         """The encoded answer, or why there is none."""
@@ -86,19 +96,21 @@ class Renderer:
     def _answer(self, number: int, query: Query) -> Answer:
         match query:
             case RenderQuery():
-                labels = self.reader.parts(query.parts) if "parts" in query.kinds else None
+                labels = self.labels(query.parts) if "parts" in query.kinds else None
                 view = self.reader.render(query.camera, query.frame, background=query.background, labels=labels)
                 body, media_type, headers = encode.view(view, query.kinds, query.format)
                 return Answer(number, body, media_type, {**headers, "X-Frame": str(query.frame)})
             case TracksQuery():
                 return self._tracks(number, query)
             case PartsQuery():
-                labels = self.reader.parts(query.count)
+                labels = self.labels(query.count)
                 count = query.count or int(labels.max(initial=-1)) + 1
                 model = PartsModel(count=count, ids=self._ids.tolist(), labels=labels.tolist())
                 return Answer(number, model.model_dump_json().encode(), "application/json")
             case PlyQuery():
-                return Answer(number, self.reader.ply(query.frame), "application/octet-stream")
+                file = self.spec.folder / "splat.ply"
+                self.reader.write_ply(file, query.frame)
+                return Answer(number, file.read_bytes(), "application/octet-stream")
 
     def _tracks(self, number: int, query: TracksQuery) -> Answer:
         frames = list(query.frames)

@@ -90,10 +90,14 @@ class Worker:
         began = time.perf_counter()
         if self.reconstruction is None:
             reconstruction = self.engine.start(
-                self.spec.rig, frame, self.spec.settings, points=self.points(), progress=self.progress
+                self.spec.rig,
+                frame,
+                self.spec.settings,
+                points=self.points(),
+                progress=self.progress,
+                history=self.states,
             )
-            state = reconstruction.history.gaussians(frame.index)
-            self.states.append(frame.index, frame.time, state)
+            state = self.states.gaussians(frame.index)
             self.reconstruction = reconstruction
             seconds = {"total": time.perf_counter() - began}
             return Committed(
@@ -108,7 +112,6 @@ class Worker:
                 dropped=dropped,
             )
         report = self.reconstruction.step(frame)
-        self.states.append(frame.index, frame.time, self.reconstruction.history.gaussians(frame.index))
         return Committed(
             frame.index,
             frame.time,

@@ -11,7 +11,6 @@ import numpy as np
 
 from scas4d_core import tracks
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.history import History
 
 SLOW, RAISES, DIES = 200, 250, 251
 SLOW_S = 2.0
@@ -64,11 +63,11 @@ def state(points, index):
 
 
 class FakeReconstruction:
-    def __init__(self, rig, frame, settings, points, progress):
+    def __init__(self, rig, frame, settings, points, progress, history):
         obey(frame)
         for done in range(3):
             progress(Progress("fitting", done + 1, 3, {"psnr": 30.0}))
-        self.history = History()
+        self.history = history
         given = points.positions if points is not None else np.array([[0.0, 0, 0], [0.5, 0, 0]])
         self.points = rig.world_frame().to_inside(given)
         self.history.append(frame.index, frame.time, state(self.points, frame.index))
@@ -113,13 +112,13 @@ class FakeReader:
     def parts(self, count):
         return np.arange(len(self.history.gaussians(0))) % (count or 2)
 
-    def ply(self, index):
-        return b"ply\n" + str(index).encode()
+    def write_ply(self, path, index):
+        path.write_bytes(b"ply\n" + str(index).encode())
 
 
 class FakeEngine:
-    def start(self, rig, frame, settings, *, points, progress):
-        return FakeReconstruction(rig, frame, settings, points, progress)
+    def start(self, rig, frame, settings, *, points, progress, history):
+        return FakeReconstruction(rig, frame, settings, points, progress, history)
 
     def reader(self, rig, settings, history):
         return FakeReader(rig, history)
