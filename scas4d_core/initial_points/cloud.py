@@ -42,8 +42,8 @@ COLOUR_SPREAD = 0.12
 """Median deviation of the cameras' colours (0…1) above which a point no stereo has confirmed is in the wrong place."""
 LOOKED_THROUGH = 2
 """Cameras that look through an unconfirmed point to refute it: one depth may be wrong."""
-CONTRADICTED = 2
-"""Masks that speak against a point to refute it: automatic masks have speckle."""
+CONTRADICTED = 1
+"""Masks that speak against a point to refute it: one will do, for all masks agree on the hull behind the point."""
 CROWD = 4
 """Stereo points that the 27 cells about one must hold: true surfaces are seen by many pixels, strays by few."""
 

@@ -142,7 +142,7 @@ def contradicted(views: Sequence[View], hull: VisualHull, points: Float, misses:
         seen += inside
         missed += inside & ~binary_dilation(view.mask, iterations=1)[line, column]
         before = depth < front_depth(view.camera, surface, hull.voxel, points) - 2.0 * hull.voxel
-        against += inside & before & binary_erosion(view.mask, iterations=2)[line, column]
+        against += inside & before & binary_erosion(view.mask, iterations=1)[line, column]
     against[missed <= np.floor(misses * seen)] = 0
     return against
 
