@@ -33,10 +33,10 @@ class Bars:
         self._progress.stop()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        """Moves the bar of a stage. A new stage other than "frames" finishes those before it."""
+        """Moves the bar of a stage. A new stage means that those before it are over."""
         if stage not in self._tasks:
             for task in self._progress.tasks:
-                if not task.finished and stage != "waiting":
+                if not task.finished:
                     self._progress.update(task.id, completed=task.total)
             self._tasks[stage] = self._progress.add_task(stage, total=total)
         self._progress.update(self._tasks[stage], completed=done, total=total)

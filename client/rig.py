@@ -34,7 +34,7 @@ def push(
         frames: how many to send; all where None.
         preset: named settings.
         settings: what differs from the preset, nested.
-        told: hears of progress: the stages of frame 0, then "frames" with the number committed.
+        told: hears of progress: the stages of frame 0, then "frames" with the number finished.
 
     Returns:
         The scene's status after the last frame.
@@ -63,7 +63,7 @@ def push(
         if index == 0:
             _follow(client, scene.id, 0, count, told)
         else:
-            told("frames", client.scene(scene.id).committed, count)
+            told("frames", _finished(client.scene(scene.id)), count)
     _follow(client, scene.id, count - 1, count, told)
     return client.scene(scene.id)
 
@@ -75,5 +75,12 @@ def _follow(client: Client, id: str, index: int, count: int, told: Told) -> None
             raise RuntimeError(f"scene {id} failed: {status.error}")
         if status.progress is not None:
             told(status.progress.stage, status.progress.done, status.progress.total)
+        elif status.state in ("awaiting_first_frame", "initialising"):
+            told("starting, compiling kernels", 0, 1)
         else:
-            told("frames", status.committed, count)
+            told("frames", _finished(status), count)
+
+
+def _finished(status: SceneStatus) -> int:
+    """Frames committed or set aside."""
+    return status.next_frame - status.queued
