@@ -32,7 +32,7 @@ ROWS_AT_ONCE = 8192
 class PartsSettings(Model):
     """The features and the clustering; one set for all scenes."""
 
-    lambda_position: float = Field(default=0.5, ge=0, description="Of p over time, p in units of the extent.")
+    lambda_position: float = Field(default=0.25, ge=0, description="Of p over time, p in units of the extent.")
     lambda_rotation: float = Field(
         default=1.0,
         ge=0,

@@ -149,6 +149,16 @@ def test_seen_asks_picture_depth_and_tolerance():
     assert not seen(np.full((1, 2, 3), np.nan), [0], CAMERA, wall, 0.5).any()
 
 
+def test_seen_forgives_a_pixel_at_an_edge():
+    def step(_: Camera, index: int) -> tuple[np.ndarray, np.ndarray]:
+        depth = np.full((48, 64), 20.0)
+        depth[:, :32] = 10
+        return depth, np.ones((48, 64))
+
+    at_edge, off_edge = CAMERA.unproject([[31.5, 8.5], [30.5, 8.5]], [20.0, 20.0])
+    assert seen(np.stack([at_edge, off_edge])[None], [0], CAMERA, step, 0.5).tolist() == [[True, False]]
+
+
 def test_pixels_go_through_the_rendered_depth_and_report_what_met_no_surface():
     history, _ = rigid_history()
     camera = Camera(
@@ -164,7 +174,7 @@ def test_pixels_go_through_the_rendered_depth_and_report_what_met_no_surface():
         alpha[:, :10] = 0
         return np.full((48, 64), 190.0), alpha
 
-    uv = np.array([[32.3, 24.9], [5.5, 24.5], [20.5, 20.5]])
+    uv = np.array([[32.3, 24.9], [5.5, 24.5], [8.5, 20.5]])  # the last misses the surface by two pixels
     tracks = tracks_of_pixels(history, WORLD, camera, uv, 0, FRAMES, depth)
     assert tracks.ids[1] == -1
     assert tracks.confidence[1] == 0
@@ -173,6 +183,8 @@ def test_pixels_go_through_the_rendered_depth_and_report_what_met_no_surface():
     np.testing.assert_allclose(camera.project(tracks.positions[0, [0, 2]])[1], 190, atol=1e-3)
     assert tracks.visibility["c"].shape == (6, 3)
     assert tracks.visibility["c"][0].tolist() == [True, False, True]
+    strict = TracksSettings(pixel_reach=1)
+    assert tracks_of_pixels(history, WORLD, camera, uv, 0, FRAMES, depth, strict).ids[2] == -1
     with pytest.raises(ValueError, match=r"pixel \[64\.0, 3\.0\] \(query 1\) lies outside"):
         tracks_of_pixels(history, WORLD, camera, np.array([[1, 1], [64, 3]]), 0, FRAMES, depth)
 
