@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scas4d_core.kernels import image_loss
 from scas4d_core.rasterize.cpu import CpuRasterizer, Gradients
 from scas4d_core.rasterize.limits import DEFAULT, Limits
-from scas4d_core.views import CHANNELS, TrainingView, ViewFactory
+from scas4d_core.views import CHANNELS, LABEL, TrainingView, ViewFactory
 
 Array = NDArray[np.float32]
 
@@ -30,6 +30,8 @@ class PictureLoss:
     Args:
         background: RGB behind everything.
         image_weight, mask_weight: weights of the two terms.
+        mask_moves: whether the mask loss pulls at positions and shapes, or at the labels alone: masks have hard edges,
+            and a silhouette fitted to them is not the one that fits the pictures.
     """
 
     def __init__(
@@ -38,10 +40,12 @@ class PictureLoss:
         background: tuple[float, float, float],
         image_weight: float,
         mask_weight: float,
+        mask_moves: bool = True,
         limits: Limits = DEFAULT,
     ) -> None:
         self.rasterizer = CpuRasterizer(limits)
         self._factory = factory
+        self._detached = -1 if mask_moves else LABEL
         self._background = np.array([*background, 0.0], np.float32)
         self._weights = np.array([image_weight / 3] * 3 + [mask_weight], np.float32)
         self.exposure_gradient = np.zeros((CHANNELS, 2), np.float32)
@@ -83,6 +87,6 @@ class PictureLoss:
         self.psnr = 10 * log10(3 * height * width / max(float(sums[:3, 1].sum()), SMALLEST_SQUARE))
         self.exposure_gradient[:channels] = g_exposure.sum(axis=1)
         lap("picture loss")
-        gradients = self.rasterizer.backward(g_image, g_alpha)
+        gradients = self.rasterizer.backward(g_image, g_alpha, self._detached)
         lap("render backward")
         return gradients

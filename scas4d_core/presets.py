@@ -8,7 +8,7 @@ PRESETS: dict[str, Settings] = {
     "scas4d": Settings(),
     # Per-Gaussian updates with the authors' rates (reference: Dynamic3DGaussians, train.py).
     "dynamic3dgs": Settings(
-        update=UpdateSettings(clusters=(), rate_rotation=0.001, rate_scale=0.0, rate_colour=0.0025, momentum=True)
+        update=UpdateSettings(clusters=(), rate_rotation=0.001, rate_scale=0.0, rate_colour=0.0025, momentum=1.0)
     ),
 }
 

@@ -19,7 +19,7 @@ from scas4d_core.history import History
 from scas4d_core.initial_points import initial_points
 from scas4d_core.neighbours import build_neighbours
 from scas4d_core.settings import Settings
-from scas4d_core.static_scene import fit_static_scene
+from scas4d_core.static_scene import StaticResult, fit_static_scene
 from scas4d_core.update import FrameUpdate, Updated
 from scas4d_core.views import TrainingView, ViewFactory
 from scas4d_core.warm_start import Motion
@@ -77,6 +77,7 @@ class Reconstruction(Committed):
         self.rig = rig
         self._factory = ViewFactory(rig)
         self._exposures: dict[str, NDArray[np.float32]] = {}
+        self.static: StaticResult | None = None
         self._motion: Motion | None = None
         self._updater: FrameUpdate | None = None
 
@@ -90,6 +91,7 @@ class Reconstruction(Committed):
         points: InitialPoints | None = None,
         progress: Callable[[Progress], None] | None = None,
         history: History | None = None,
+        static: StaticResult | None = None,
     ) -> Reconstruction:
         """Reconstruct the first frame and commit it.
 
@@ -99,32 +101,38 @@ class Reconstruction(Committed):
             points: a first cloud in the user's world; without it one is made from the pictures.
             progress: told of each stage.
             history: where to commit to; in memory when left out.
+            static: a frame 0 that was fitted before, taken as it is.
         """
         world = rig.world_frame(settings.scene.metres_per_unit)
         scaled = rig_inside(world, rig.scaled(settings.scene.image_scale).cameras)
         self = cls(settings, scaled, world, History() if history is None else history)
-        frame = self._scaled(frame)
-        tell = progress or (lambda _: None)
-        if points is None:
-            points = initial_points(
-                rig.scaled(settings.scene.image_scale), frame.images, frame.masks, None,
-                lambda stage, done, total: tell(Progress(stage, done, total)),
-            )  # fmt: skip
-        total = settings.static.iterations
-        result = fit_static_scene(
-            self._factory,
-            self._factory.views(frame, {}),
-            world.to_inside(points.positions),
-            points.colours,
-            points.foreground,
-            settings.scene,
-            settings.static,
-            lambda done, loss: tell(Progress("fitting frame 0", done, total, {"loss": loss})),
-        )
+        result = static or self._fit_static(rig, self._scaled(frame), points, progress or (lambda _: None))
+        self.static = result
         self._exposures = result.exposures
         self._prepare(result.gaussians)
         self.history.append(frame.index, frame.time, result.gaussians)
         return self
+
+    def _fit_static(
+        self, rig: Rig, frame: Frame, points: InitialPoints | None, tell: Callable[[Progress], None]
+    ) -> StaticResult:
+        """Frame 0 from a first cloud, which is made from the pictures where none is given."""
+        scene, static = self.settings.scene, self.settings.static
+        if points is None:
+            points = initial_points(
+                rig.scaled(scene.image_scale), frame.images, frame.masks, None,
+                lambda stage, done, total: tell(Progress(stage, done, total)),
+            )  # fmt: skip
+        return fit_static_scene(
+            self._factory,
+            self._factory.views(frame, {}),
+            self.world.to_inside(points.positions),
+            points.colours,
+            points.foreground,
+            scene,
+            static,
+            lambda done, loss: tell(Progress("fitting frame 0", done, static.iterations, {"loss": loss})),
+        )
 
     def step(self, frame: Frame) -> FrameReport:
         """Update to a frame and commit.

@@ -43,7 +43,9 @@ class StaticSettings(Model):
     densify_every: int = Field(100, ge=1, description="Iterations between densifications.")
     densify_until: float = Field(0.6, ge=0, le=1, description="Fraction of the iterations after which none is added.")
     densify_gradient: Positive = Field(
-        2e-4, description="Mean screen gradient (per half picture, as in 3DGS) above which a Gaussian is refined."
+        1e-6,
+        description="Mean screen gradient (per half picture, as in 3DGS) above which a Gaussian may be refined; the "
+        "budget decides how many are, hardest pulled first.",
     )
     prune_opacity: NotNegative = Field(0.01, description="Less opaque Gaussians are removed while densifying.")
     exposure: bool = Field(
@@ -51,12 +53,14 @@ class StaticSettings(Model):
     )
     rate_position: Positive = Field(1.6e-4, description="Adam rate of means at the start, per metre of scene radius.")
     rate_position_end: Positive = Field(1.6e-6, description="The same at the end; the decay is exponential.")
-    rate_colour: Positive = Field(1e-2, description="Adam rate of colours.")
+    rate_colour: Positive = Field(2.5e-3, description="Adam rate of colours.")
     rate_opacity: Positive = Field(5e-2, description="Adam rate of opacity logits.")
     rate_scale: Positive = Field(5e-3, description="Adam rate of log scales.")
     rate_rotation: Positive = Field(2e-3, description="Adam rate of quaternions.")
     rate_exposure: Positive = Field(1e-3, description="Adam rate of log gain and offset.")
-    weight_mask: NotNegative = Field(3.0, description="Weight of the mask loss where masks are given.")
+    weight_mask: NotNegative = Field(
+        3.0, description="Weight of the mask loss where masks are given; in frame 0 it teaches the labels only."
+    )
     seed: int = Field(0, ge=0, description="Seed of the order of views and of the split of Gaussians.")
 
 
@@ -105,14 +109,18 @@ class UpdateSettings(Model):
     rate_rotation: Positive = Field(0.002, description="ΔR, in units of tan(angle/2).")
     rate_scale: NotNegative = Field(0.001, description="Δs, log.")
     rate_colour: NotNegative = Field(0.0025, description="RGB.")
+    coarse_until: float = Field(
+        0.0, ge=0, le=1, description="Share of the iterations, at the start, that render coarser pictures."
+    )
+    coarse_scale: float = Field(0.5, gt=0, le=1, description="Their size: less to render, and a wider basin.")
     rate_end: float = Field(
         1.0, gt=0, le=1, description="All rates decay to this fraction over the frame (cosine); 1: constant."
     )
     beta1: float = Field(0.9, ge=0, lt=1, description="Adam's first decay.")
     beta2: float = Field(0.999, ge=0, lt=1, description="Adam's second decay.")
     warm_start: float = Field(1.0, ge=0, le=1, description="Share of the previous deformation that starts the next.")
-    momentum: bool = Field(
-        False, description="Also start Δp and ΔR from those of the previous frame (Dynamic3DGaussians does)."
+    momentum: float = Field(
+        0.0, ge=0, le=1, description="Share of what the layers leave of the previous motion that Δp starts from."
     )
     neighbours: int = Field(20, ge=1, description="Neighbours of a Gaussian in the rigidity terms.")
     neighbour_falloff: Positive = Field(2000.0, description="1/m²: weight exp(−falloff d²) of a neighbour at d.")

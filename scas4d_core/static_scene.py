@@ -91,7 +91,7 @@ class StaticTrainer:
         self.views = views
         self.parameters = parameters
         self.radius = factory.rig.radius
-        self._loss = PictureLoss(factory, scene.background, 1.0, settings.weight_mask)
+        self._loss = PictureLoss(factory, scene.background, 1.0, settings.weight_mask, mask_moves=False)
         self._masked = any(len(view.target) > 3 for view in views)
         self._rng = np.random.default_rng(settings.seed)
         self._reset_moments()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import cos, pi
 from time import perf_counter
@@ -82,6 +83,7 @@ class FrameUpdate:
     ) -> None:
         self.settings = settings
         self.hierarchy = hierarchy
+        self._factory = factory
         self._radius = factory.rig.radius
         weights = settings.weights
         self._picture = PictureLoss(factory, scene.background, weights.image, weights.mask)
@@ -100,9 +102,9 @@ class FrameUpdate:
         """
         settings, deformation = self.settings, self._deformation
         rng = np.random.default_rng([settings.seed, seed])
-        order = view_order(len(views), settings.iterations, rng)
-        samples = self._samples(rng)
         watch = Stopwatch()
+        pictures = self._pictures(views, view_order(len(views), settings.iterations, rng))
+        samples = self._samples(rng)
         deformation.start(previous)
         warm_start(deformation, motion, seconds, settings)
         features = np.concatenate([previous.colours, previous.foreground[:, None]], axis=1)
@@ -110,12 +112,12 @@ class FrameUpdate:
         optimizers = self._optimizers(colours)
         losses, psnr = [], []
         watch.lap("start")
-        for iteration, index in enumerate(order):
+        for iteration, view in enumerate(pictures):
             deformation.forward()
             features[:, :3] = colours
             watch.lap("cascade")
             gradients = self._picture.evaluate(
-                deformation.means, deformation.factors, previous.opacities, features, views[index], watch.lap
+                deformation.means, deformation.factors, previous.opacities, features, view, watch.lap
             )
             loss = self._picture.image_part + self._picture.mask_part
             psnr.append(self._picture.psnr)
@@ -136,6 +138,13 @@ class FrameUpdate:
         watch.lap("commit")
         updated.seconds.update(watch.seconds)
         return updated
+
+    def _pictures(self, views: list[TrainingView], order: Sequence[int]) -> list[TrainingView]:
+        """The picture of each iteration: coarser ones first, where the settings say so."""
+        settings = self.settings
+        coarse = order[: round(settings.coarse_until * settings.iterations)]
+        small = {index: self._factory.coarser(views[index], settings.coarse_scale) for index in set(coarse)}
+        return [small[index] for index in coarse] + [views[index] for index in order[len(coarse) :]]
 
     def _optimizers(self, colours: Array) -> list[Adam]:
         """One per table: each layer of clusters, the Gaussians' own deltas, the colours. Moments start at zero."""

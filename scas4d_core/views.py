@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import Rig
 from scas4d_core.captures.frame import Frame
+from scas4d_core.captures.images import area_average
 from scas4d_core.kernels import image_loss
 from scas4d_core.rasterize.cpu import CameraArrays
 
@@ -17,6 +18,8 @@ Array = NDArray[np.float32]
 
 CHANNELS = 4
 """Red, green, blue, label."""
+LABEL = 3
+"""The label's channel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +46,6 @@ class ViewFactory:
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
-        self._cameras = {camera.name: CameraArrays.of(camera) for camera in rig.cameras}
         self._scratch: dict[tuple[int, int, int], Array] = {}
 
     def scratch(self, channels: int, height: int, width: int) -> Array:
@@ -66,7 +68,7 @@ class ViewFactory:
         for name in self.rig.names:
             if name not in frame.images:
                 continue
-            camera = self._cameras[name]
+            camera = CameraArrays.of(self.rig[name])
             image = frame.images[name]
             if image.shape != (camera.height, camera.width, 3):
                 raise ValueError(
@@ -80,12 +82,27 @@ class ViewFactory:
                 target[3] = frame.masks[name]
             exposure = np.tile(np.float32([1, 0]), (3 + masked, 1))
             exposure[:3] = exposures.get(name, exposure[:3])
-            means, squares = np.empty_like(target), np.empty_like(target)
-            image_loss.target_moments(target, self.scratch(*target.shape), means, squares)
-            views.append(TrainingView(name, camera, target, means, squares, exposure))
+            views.append(self._view(name, camera, target, exposure))
         if not views:
             raise ValueError(f"frame {frame.index} has none of the rig's cameras ({', '.join(self.rig.names)})")
         return views
+
+    def coarser(self, view: TrainingView, scale: float) -> TrainingView:
+        """The view with its pictures resized by area averaging, and the camera that sees them so."""
+        camera = self.rig[view.name].scaled(scale)
+        target = np.moveaxis(view.target, 0, -1)
+        rows, columns = view.camera.height // camera.height, view.camera.width // camera.width
+        if (rows * camera.height, columns * camera.width) == (view.camera.height, view.camera.width):
+            small = target.reshape(camera.height, rows, camera.width, columns, -1).mean(axis=(1, 3))
+        else:
+            small = area_average(target.astype(np.float64), (camera.width, camera.height)).astype(np.float32)
+        planes = np.ascontiguousarray(np.moveaxis(small, -1, 0))
+        return self._view(view.name, CameraArrays.of(camera), planes, view.exposure)
+
+    def _view(self, name: str, camera: CameraArrays, target: Array, exposure: Array) -> TrainingView:
+        means, squares = np.empty_like(target), np.empty_like(target)
+        image_loss.target_moments(target, self.scratch(*target.shape), means, squares)
+        return TrainingView(name, camera, target, means, squares, exposure)
 
 
 def view_order(count: int, iterations: int, rng: np.random.Generator) -> Sequence[int]:

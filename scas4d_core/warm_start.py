@@ -1,4 +1,8 @@
-"""The start of an update: the previous deformation goes on (paper, Optimization Pipeline)."""
+"""The start of an update: the motion of the frame before goes on (paper, Optimization Pipeline).
+
+A cluster keeps its twist in its own axes: what turns carries its displacement and its axis of rotation along, so that
+a point on a circle goes on along the circle, and so do the clusters of finer layers inside it.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ from scas4d_core.deformation_cpu import CpuDeformation
 from scas4d_core.settings import UpdateSettings
 
 Array = NDArray[np.float32]
-
+Float = NDArray[np.float64]
 
 def quaternion_products(a: Array, b: Array) -> Array:
     """[M, 4] a∘b (w, x, y, z): first b, then a."""
@@ -28,42 +32,60 @@ def quaternion_products(a: Array, b: Array) -> Array:
     )
 
 
-def quaternion_rotate(r: Array, vectors: Array) -> Array:
-    """[K, 3] vectors turned by the quaternions (1, r)/|(1, r)|, r [K, 3]."""
+def rotate(r: NDArray[np.floating], vectors: NDArray[np.floating]) -> Float:
+    """[K, 3] vectors turned by the quaternions (1, r)/|(1, r)|, r [K, 3] = axis · tan(angle/2)."""
     cross = np.cross(r, vectors)
-    return vectors + 2 * (cross + np.cross(r, cross)) / (1 + np.square(r).sum(axis=1, keepdims=True))
+    turned: Float = vectors + 2 * (cross + np.cross(r, cross)) / (1 + np.square(r).sum(axis=1, keepdims=True))
+    return turned
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A deformation that was found, to start the next from.
+    """A motion that was found, to start the next from.
 
     Attributes:
-        clusters: per layer [K, 10]. deltas: [M, 9]. seconds: it took.
+        turns: per layer [K, 3] axis · tan(angle/2). shifts: per layer [K, 3] metres, relative to the layer above; both
+            in the axes that the cluster has turned to.
+        rest: [M, 3] metres, Δp less what the finest clusters have taken of it. seconds: it took.
     """
 
-    clusters: list[Array]
-    deltas: Array
+    turns: list[Float]
+    shifts: list[Float]
+    rest: Float
     seconds: float
 
     @classmethod
     def of(cls, deformation: CpuDeformation, seconds: float) -> Motion:
-        """What a deformation holds now."""
-        return cls([values.copy() for values in deformation.clusters], deformation.deltas.copy(), seconds)
+        """Read what a deformation found. What the Gaussians of a finest cluster add in common becomes its own shift."""
+        hierarchy = deformation.hierarchy
+        turns = [values[:, :3].astype(np.float64) for values in deformation.clusters]
+        shifts = [values[:, 3:6].astype(np.float64) for values in deformation.clusters]
+        rest = deformation.deltas[:, :3].astype(np.float64)
+        if turns:
+            starts = hierarchy.starts[-1]
+            common = np.add.reduceat(rest, starts[:-1]) / np.diff(starts)[:, None]
+            shifts[-1] += common
+            rest -= common[hierarchy.labels[-1]]
+        # Into the axes that the clusters turned to, from the finest layer up: each layer turns what is below it.
+        for k in reversed(range(len(turns))):
+            labels = hierarchy.labels[k]
+            rest = rotate(turns[k][labels], rest)
+            for below in range(k + 1, len(turns)):
+                parents = labels[hierarchy.starts[below][:-1]]
+                turns[below] = rotate(turns[k][parents], turns[below])
+                shifts[below] = rotate(turns[k][parents], shifts[below])
+            shifts[k] = rotate(turns[k], shifts[k])
+        return cls(turns, shifts, rest, seconds)
 
 
 def warm_start(deformation: CpuDeformation, motion: Motion | None, seconds: float, settings: UpdateSettings) -> None:
-    """Set the parameters to the previous motion, per unit of time; scaling (c, s) and Δs start at the identity.
-
-    A cluster that turns carries its displacement along: a pivot on a circle goes on along the circle.
-    """
-    share = 0.0 if motion is None else settings.warm_start * seconds / motion.seconds
-    for k, values in enumerate(deformation.clusters):
+    """Set the parameters to the motion before, per unit of time; scaling (c, s) and Δs start at the identity."""
+    for values in [*deformation.clusters, deformation.deltas]:
         values[:] = 0
-        if motion is not None:
-            r, t = motion.clusters[k][:, :3], motion.clusters[k][:, 3:6]
-            values[:, :3] = share * r
-            values[:, 3:6] = share * quaternion_rotate(share * r, t)
-    deformation.deltas[:] = 0
-    if motion is not None and settings.momentum:
-        deformation.deltas[:, :6] = share * motion.deltas[:, :6]
+    if motion is None:
+        return
+    share = settings.warm_start * seconds / motion.seconds
+    for values, turns, shifts in zip(deformation.clusters, motion.turns, motion.shifts, strict=True):
+        values[:, :3] = share * turns
+        values[:, 3:6] = share * shifts
+    deformation.deltas[:, :3] = share * settings.momentum * motion.rest

@@ -90,7 +90,7 @@ def decode_mask(
     target = scaled_size(picture.size, image_scale)
     if target == picture.size:
         return np.array(foreground, dtype=np.uint8)
-    share = _area_average(foreground.astype(np.float64), target)
+    share = area_average(foreground.astype(np.float64), target)
     mask: NDArray[np.uint8] = (share >= 0.5 - 1e-9).astype(np.uint8)
     return mask
 
@@ -140,10 +140,11 @@ def resize_area(picture: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
     """
     if size == (picture.shape[1], picture.shape[0]):
         return picture
-    return np.rint(_area_average(picture.astype(np.float64), size)).astype(np.uint8)
+    return np.rint(area_average(picture.astype(np.float64), size)).astype(np.uint8)
 
 
-def _area_average(picture: NDArray[np.float64], size: Size) -> NDArray[np.float64]:
+def area_average(picture: NDArray[np.float64], size: Size) -> NDArray[np.float64]:
+    """``resize_area`` for float64 pictures, unrounded."""
     for axis, target in ((0, size[1]), (1, size[0])):
         picture = np.moveaxis(picture, axis, 0)
         length = picture.shape[0]

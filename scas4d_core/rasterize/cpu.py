@@ -181,11 +181,13 @@ class CpuRasterizer:
             self._gradient_shape = image.shape
         return g_image, g_alpha
 
-    def backward(self, g_image: Array, g_alpha: Array) -> Gradients:
+    def backward(self, g_image: Array, g_alpha: Array, detached: int = -1) -> Gradients:
         """Gradients of the last forward pass.
 
         Args:
             g_image, g_alpha: from ``gradient_buffers``, filled.
+            detached: a channel whose gradient reaches the features but not the geometry, or −1. Its plane of the
+                forward picture is cleared.
         """
         (
             means,
@@ -206,6 +208,11 @@ class CpuRasterizer:
             used,
             pairs,
         ) = self._last
+        if detached >= 0:
+            # A channel that is zero everywhere pulls at nothing; its own gradient does not read its value.
+            features = features.copy()
+            features[:, detached] = 0
+            image[detached] = 0
         count, channels = features.shape
         records = self._buffer("records", (pairs, blend_kernels.FEATURES + channels))
         blend_kernels.blend_backward(
