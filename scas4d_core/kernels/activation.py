@@ -18,7 +18,7 @@ COLUMNS = 15
 
 
 @parallel_kernel
-def activate(parameters, means, factors, opacities, features):  # type: ignore[no-untyped-def]
+def activate(parameters, means, factors, opacities, features):
     """Fill means [N, 3], factors [N, 3, 3], opacities [N], features [N, 4] (RGB, label) from parameters [N, 15]."""
     count = parameters.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):
@@ -38,7 +38,7 @@ def activate(parameters, means, factors, opacities, features):  # type: ignore[n
 
 
 @parallel_kernel
-def activate_backward(parameters, factors, opacities, features, g_means, g_factors, g_opacities, g_features, gradients):  # type: ignore[no-untyped-def]
+def activate_backward(parameters, factors, opacities, features, g_means, g_factors, g_opacities, g_features, gradients):
     """dL/dparameters [N, 15] from the rasterizer's gradients."""
     count = parameters.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):

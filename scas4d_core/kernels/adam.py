@@ -1,4 +1,4 @@
-"""One step of Adam (Kingma and Ba 2015) over a table of parameters, with a rate per column. Twin: ``torch.optim.Adam``."""
+"""A step of Adam (Kingma and Ba 2015) over a table of parameters, a rate per column. Twin: ``torch.optim.Adam``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ROWS = 1024
 
 
 @parallel_kernel
-def adam(parameters, gradients, first, second, rates, beta1, beta2, step):  # type: ignore[no-untyped-def]
+def adam(parameters, gradients, first, second, rates, beta1, beta2, step):
     """Update ``parameters`` [n, columns] in place.
 
     Args:

@@ -23,7 +23,7 @@ EXP_LOWEST = np.float32(-6.0)
 
 
 @inline
-def exp_in_support(power):  # type: ignore[no-untyped-def]
+def exp_in_support(power):
     """exp(power) for power in [-6, 0], relative error 3e-7: a polynomial on power/8, squared three times."""
     x = max(power, EXP_LOWEST) * np.float32(0.125)
     y = np.float32(1.0 / 5040.0)
@@ -40,7 +40,7 @@ def exp_in_support(power):  # type: ignore[no-untyped-def]
 
 
 @inline
-def rows_reached(splat, top):  # type: ignore[no-untyped-def]
+def rows_reached(splat, top):
     """First and last (exclusive) row of a tile that the support's box meets."""
     determinant = splat[CONIC_A] * splat[CONIC_C] - splat[CONIC_B] * splat[CONIC_B]
     half = np.float32(np.sqrt(splat[REACH] * splat[CONIC_A] / max(determinant, np.float32(1e-30)))) + np.float32(0.01)
@@ -50,7 +50,7 @@ def rows_reached(splat, top):  # type: ignore[no-untyped-def]
 
 
 @inline
-def row_is_reached(a, b, c, reach, slope, low_x, dy):  # type: ignore[no-untyped-def]
+def row_is_reached(a, b, c, reach, slope, low_x, dy):
     """Whether the support meets a row of 16 pixel centres that begins ``low_x`` right of the Gaussian's centre.
 
     ``slope`` is -b/a: along the row, the quadratic form is smallest at slope dy. ``reach`` allows for rounding.
@@ -60,7 +60,7 @@ def row_is_reached(a, b, c, reach, slope, low_x, dy):  # type: ignore[no-untyped
 
 
 @kernel
-def blend_task(  # type: ignore[no-untyped-def]
+def blend_task(
     task, splats, features, groups, starts, items, tile_order, tasks, size, background, limits, image, rest, depths_used
 ):
     """The tiles of one task of ``blend``. Scratch arrays have constant shapes here, see ``groups``."""
@@ -133,7 +133,7 @@ def blend_task(  # type: ignore[no-untyped-def]
 @parallel_kernel
 def blend(
     splats, features, groups, starts, items, tile_order, tasks, size, background, limits, image, rest, depths_used
-):  # type: ignore[no-untyped-def]
+):
     """Blend every tile front to back.
 
     Args:
@@ -165,7 +165,7 @@ def blend(
 
 
 @kernel
-def blend_backward_task(  # type: ignore[no-untyped-def]
+def blend_backward_task(
     task,
     splats,
     features,
@@ -285,7 +285,7 @@ def blend_backward_task(  # type: ignore[no-untyped-def]
 
 
 @parallel_kernel
-def blend_backward(  # type: ignore[no-untyped-def]
+def blend_backward(
     splats,
     features,
     groups,

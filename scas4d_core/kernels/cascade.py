@@ -6,7 +6,8 @@ identity. Kernels work on blocks of 16 points: a scratch array of constant shape
 LLVM turns each statement into one vector instruction.
 
 Cluster map, y = x − p, z = c·y + s, f = 2σ(2z), f' = f(2 − f):
-centred x' = p + t + f R y, published x' = f (R y + p + t); both have J = R (f I + f' e cᵀ) with e = y, or e = y + Rᵀ(p + t).
+centred x' = p + t + f R y, published x' = f (R y + p + t); both have J = R (f I + f' e cᵀ)
+with e = y, or e = y + Rᵀ(p + t).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from scas4d_core.kernels.jit import HALF, ONE, TWO, ZERO, exp, inline, kernel, parallel_kernel
+from scas4d_core.kernels.jit import ONE, TWO, ZERO, exp, inline, kernel, parallel_kernel
 
 LANES = 16
 BLOCKS = 16
@@ -29,7 +30,7 @@ RECORD = 20
 
 
 @inline
-def rotation_entries(w, x, y, z):  # type: ignore[no-untyped-def]
+def rotation_entries(w, x, y, z):
     """Unit quaternion to the nine entries of its matrix, row by row."""
     return (
         ONE - TWO * (y * y + z * z), TWO * (x * y - w * z), TWO * (x * z + w * y),
@@ -39,7 +40,7 @@ def rotation_entries(w, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @inline
-def rotation_gradient(w, x, y, z, g0, g1, g2, g3, g4, g5, g6, g7, g8):  # type: ignore[no-untyped-def]
+def rotation_gradient(w, x, y, z, g0, g1, g2, g3, g4, g5, g6, g7, g8):
     """dL/dquaternion from dL/dmatrix (nine entries, row by row), for the formula of ``rotation_entries``."""
     gw = TWO * (-z * g1 + y * g2 + z * g3 - x * g5 - y * g6 + x * g7)
     gx = TWO * (y * g1 + z * g2 + y * g3 - TWO * x * g4 - w * g5 + z * g6 + w * g7 - TWO * x * g8)
@@ -49,7 +50,7 @@ def rotation_gradient(w, x, y, z, g0, g1, g2, g3, g4, g5, g6, g7, g8):  # type: 
 
 
 @inline
-def product(aw, ax, ay, az, bw, bx, by, bz):  # type: ignore[no-untyped-def]
+def product(aw, ax, ay, az, bw, bx, by, bz):
     """Quaternion product a∘b: first b, then a."""
     return (
         aw * bw - ax * bx - ay * by - az * bz,
@@ -60,14 +61,14 @@ def product(aw, ax, ay, az, bw, bx, by, bz):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def unit_gradient(norm, w, x, y, z, gw, gx, gy, gz):  # type: ignore[no-untyped-def]
+def unit_gradient(norm, w, x, y, z, gw, gx, gy, gz):
     """dL/dr of the quaternion (1, r)/norm from dL/dquaternion; (w, x, y, z) is the unit quaternion."""
     along = w * gw + x * gx + y * gy + z * gz
     return (gx - x * along) / norm, (gy - y * along) / norm, (gz - z * along) / norm
 
 
 @parallel_kernel
-def cluster_tables(points, starts, parameters, tables):  # type: ignore[no-untyped-def]
+def cluster_tables(points, starts, parameters, tables):
     """Pivot and rotation of every cluster of a layer.
 
     Args:
@@ -95,7 +96,7 @@ def cluster_tables(points, starts, parameters, tables):  # type: ignore[no-untyp
 
 
 @kernel
-def load_block(first, count, points, jacobians, rotations, labels, tables, v):  # type: ignore[no-untyped-def]
+def load_block(first, count, points, jacobians, rotations, labels, tables, v):
     """Rows 0–2 x, 3–11 J, 12–15 Q, 16–38 the table of each point's cluster; lanes past the end repeat the last."""
     for lane in range(LANES):
         i = min(first + lane, count - 1)
@@ -111,7 +112,9 @@ def load_block(first, count, points, jacobians, rotations, labels, tables, v):  
 
 
 @kernel
-def layer_task(task, points, jacobians, rotations, labels, tables, about_origin, points_out, jacobians_out, rotations_out):  # type: ignore[no-untyped-def]
+def layer_task(
+    task, points, jacobians, rotations, labels, tables, about_origin, points_out, jacobians_out, rotations_out
+):
     """A task of ``layer``."""
     count = points.shape[0]
     v = np.empty((16 + TABLE + 16, LANES), np.float32)
@@ -171,7 +174,7 @@ def layer_task(task, points, jacobians, rotations, labels, tables, about_origin,
 
 
 @parallel_kernel
-def layer(points, jacobians, rotations, labels, tables, about_origin, points_out, jacobians_out, rotations_out):  # type: ignore[no-untyped-def]
+def layer(points, jacobians, rotations, labels, tables, about_origin, points_out, jacobians_out, rotations_out):
     """Move points, Jacobians and rotations by one layer of clusters.
 
     Args:
@@ -186,7 +189,9 @@ def layer(points, jacobians, rotations, labels, tables, about_origin, points_out
 
 
 @kernel
-def layer_backward_task(task, points, jacobians, rotations, labels, tables, about_origin, g_points, g_jacobians, g_rotations, records):  # type: ignore[no-untyped-def]
+def layer_backward_task(
+    task, points, jacobians, rotations, labels, tables, about_origin, g_points, g_jacobians, g_rotations, records
+):
     """A task of ``layer_backward``."""
     count = points.shape[0]
     # Rows 0–38 as loaded; 39–54 the gradients of x, J, Q, in place; 55–74 the record.
@@ -225,7 +230,11 @@ def layer_backward_task(task, points, jacobians, rotations, labels, tables, abou
                 j0, j1, j2 = v[3 + column, k], v[6 + column, k], v[9 + column, k]
                 g0, g1, g2 = v[42 + column, k], v[45 + column, k], v[48 + column, k]
                 along = cx * j0 + cy * j1 + cz * j2
-                g_f += g0 * (r0 * j0 + r1 * j1 + r2 * j2) + g1 * (r3 * j0 + r4 * j1 + r5 * j2) + g2 * (r6 * j0 + r7 * j1 + r8 * j2)
+                g_f += (
+                    g0 * (r0 * j0 + r1 * j1 + r2 * j2)
+                    + g1 * (r3 * j0 + r4 * j1 + r5 * j2)
+                    + g2 * (r6 * j0 + r7 * j1 + r8 * j2)
+                )
                 outer = ux * g0 + uy * g1 + uz * g2
                 g_slope += outer * along
                 gux += slope * along * g0
@@ -261,9 +270,7 @@ def layer_backward_task(task, points, jacobians, rotations, labels, tables, abou
             scale = ONE / np.sqrt(h * h + sx * sx + sy * sy + sz * sz)
             aw, ax, ay, az = h * scale, sx * scale, sy * scale, sz * scale
             lw, lx, ly, lz = product(v[25, k], v[26, k], v[27, k], v[28, k], aw, ax, ay, az)
-            hw, hx, hy, hz = product(
-                v[51, k], v[52, k], v[53, k], v[54, k], v[12, k], -v[13, k], -v[14, k], -v[15, k]
-            )
+            hw, hx, hy, hz = product(v[51, k], v[52, k], v[53, k], v[54, k], v[12, k], -v[13, k], -v[14, k], -v[15, k])
             ow, ox, oy, oz = product(lw, -lx, -ly, -lz, v[51, k], v[52, k], v[53, k], v[54, k])
             v[51, k] = ow
             v[52, k] = ox
@@ -330,7 +337,9 @@ def layer_backward_task(task, points, jacobians, rotations, labels, tables, abou
 
 
 @parallel_kernel
-def layer_backward(points, jacobians, rotations, labels, tables, about_origin, g_points, g_jacobians, g_rotations, records):  # type: ignore[no-untyped-def]
+def layer_backward(
+    points, jacobians, rotations, labels, tables, about_origin, g_points, g_jacobians, g_rotations, records
+):
     """Backward of ``layer``.
 
     Args:
@@ -340,12 +349,13 @@ def layer_backward(points, jacobians, rotations, labels, tables, about_origin, g
     """
     for task in prange((points.shape[0] + LANES * BLOCKS - 1) // (LANES * BLOCKS)):
         layer_backward_task(
-            task, points, jacobians, rotations, labels, tables, about_origin, g_points, g_jacobians, g_rotations, records
-        )
+            task, points, jacobians, rotations, labels, tables, about_origin,
+            g_points, g_jacobians, g_rotations, records,
+        )  # fmt: skip
 
 
 @parallel_kernel
-def cluster_gradients(records, starts, parameters, tables, gradients):  # type: ignore[no-untyped-def]
+def cluster_gradients(records, starts, parameters, tables, gradients):
     """Sum the records of each cluster, in order, into dL/dparameters [K, 10]."""
     for j in prange(starts.shape[0] - 1):
         sums = np.zeros(RECORD, np.float32)

@@ -16,7 +16,7 @@ LOADED = 34
 
 
 @kernel
-def load_block(first, count, points, jacobians, rotations, deltas, rows, factors, v):  # type: ignore[no-untyped-def]
+def load_block(first, count, points, jacobians, rotations, deltas, rows, factors, v):
     """Load 16 Gaussians; lanes past the end repeat the last."""
     for lane in range(LANES):
         i = min(first + lane, count - 1)
@@ -34,7 +34,7 @@ def load_block(first, count, points, jacobians, rotations, deltas, rows, factors
 
 
 @kernel
-def apply_task(task, points, jacobians, rotations, deltas, rows, factors, means_out, factors_out, turns):  # type: ignore[no-untyped-def]
+def apply_task(task, points, jacobians, rotations, deltas, rows, factors, means_out, factors_out, turns):
     """A task of ``apply_deltas``."""
     count = points.shape[0]
     v = np.empty((LOADED + 16, LANES), np.float32)
@@ -75,7 +75,7 @@ def apply_task(task, points, jacobians, rotations, deltas, rows, factors, means_
 
 
 @parallel_kernel
-def apply_deltas(points, jacobians, rotations, deltas, rows, factors, means_out, factors_out, turns):  # type: ignore[no-untyped-def]
+def apply_deltas(points, jacobians, rotations, deltas, rows, factors, means_out, factors_out, turns):
     """The moved Gaussians.
 
     Args:
@@ -88,7 +88,10 @@ def apply_deltas(points, jacobians, rotations, deltas, rows, factors, means_out,
 
 
 @kernel
-def apply_backward_task(task, points, jacobians, rotations, deltas, rows, factors, scale_weight, bounds, g_means, g_factors, g_turns, g_points, g_jacobians, g_rotations, g_deltas, losses):  # type: ignore[no-untyped-def]
+def apply_backward_task(
+    task, points, jacobians, rotations, deltas, rows, factors, scale_weight, bounds, g_means, g_factors, g_turns,
+    g_points, g_jacobians, g_rotations, g_deltas, losses,
+):  # fmt: skip
     """A task of ``apply_deltas_backward``."""
     count = points.shape[0]
     # Rows 34–36 g mean, 37–45 g F, 46–49 g turn, 50–52 bounds; out: 53–61 g J, 62–65 g Q, 66–71 g Δr, g Δs; 72 loss.
@@ -160,7 +163,7 @@ def apply_backward_task(task, points, jacobians, rotations, deltas, rows, factor
             v[60, k] = j7
             v[61, k] = j8
             v[72, k] = excess
-            qw, qx, qy, qz = product(w, x, y, z, v[12, k], v[13, k], v[14, k], v[15, k])
+            qw, _, _, _ = product(w, x, y, z, v[12, k], v[13, k], v[14, k], v[15, k])
             sign = ONE if qw >= ZERO else -ONE
             tw, tx, ty, tz = sign * v[46, k], sign * v[47, k], sign * v[48, k], sign * v[49, k]
             ow, ox, oy, oz = product(w, -x, -y, -z, tw, tx, ty, tz)
@@ -193,7 +196,10 @@ def apply_backward_task(task, points, jacobians, rotations, deltas, rows, factor
 
 
 @parallel_kernel
-def apply_deltas_backward(points, jacobians, rotations, deltas, rows, factors, scale_weight, bounds, g_means, g_factors, g_turns, g_points, g_jacobians, g_rotations, g_deltas, losses):  # type: ignore[no-untyped-def]
+def apply_deltas_backward(
+    points, jacobians, rotations, deltas, rows, factors, scale_weight, bounds, g_means, g_factors, g_turns,
+    g_points, g_jacobians, g_rotations, g_deltas, losses,
+):  # fmt: skip
     """Backward of ``apply_deltas``, with the gradient of the scale loss added.
 
     Args:
@@ -205,6 +211,6 @@ def apply_deltas_backward(points, jacobians, rotations, deltas, rows, factors, s
     """
     for task in prange((points.shape[0] + LANES * BLOCKS - 1) // (LANES * BLOCKS)):
         apply_backward_task(
-            task, points, jacobians, rotations, deltas, rows, factors, scale_weight, bounds, g_means, g_factors, g_turns,
-            g_points, g_jacobians, g_rotations, g_deltas, losses,
+            task, points, jacobians, rotations, deltas, rows, factors, scale_weight, bounds, g_means, g_factors,
+            g_turns, g_points, g_jacobians, g_rotations, g_deltas, losses,
         )  # fmt: skip

@@ -25,7 +25,7 @@ SSIM_SHARE = np.float32(0.2)
 
 
 @kernel
-def filter_row(source, out, width):  # type: ignore[no-untyped-def]
+def filter_row(source, out, width):
     """Filter a padded row [width + 10] along itself into ``out`` [width]."""
     for x in range(width):
         out[x] = (
@@ -39,25 +39,29 @@ def filter_row(source, out, width):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def filter_column(plane, row, out, width):  # type: ignore[no-untyped-def]
+def filter_column(plane, row, out, width):
     """Filter across rows ``row`` … ``row + 10`` of a plane padded by 5 rows above and below into ``out`` [width]."""
     a, b, c, d, e, f = plane[row], plane[row + 1], plane[row + 2], plane[row + 3], plane[row + 4], plane[row + 5]
     g, h, i, j, k = plane[row + 6], plane[row + 7], plane[row + 8], plane[row + 9], plane[row + 10]
     for x in range(width):
         out[x] = (
-            T0 * (a[x] + k[x]) + T1 * (b[x] + j[x]) + T2 * (c[x] + i[x]) + T3 * (d[x] + h[x]) + T4 * (e[x] + g[x])
+            T0 * (a[x] + k[x])
+            + T1 * (b[x] + j[x])
+            + T2 * (c[x] + i[x])
+            + T3 * (d[x] + h[x])
+            + T4 * (e[x] + g[x])
             + T5 * f[x]
         )
 
 
 @inline
-def exposed(value, gain, offset):  # type: ignore[no-untyped-def]
+def exposed(value, gain, offset):
     """What the camera records of a rendered value."""
     return gain * value + offset
 
 
 @parallel_kernel
-def target_moments(target, scratch, means, squares):  # type: ignore[no-untyped-def]
+def target_moments(target, scratch, means, squares):
     """The window's mean of a target and of its square, once per frame and view.
 
     Args:
@@ -80,16 +84,15 @@ def target_moments(target, scratch, means, squares):  # type: ignore[no-untyped-
 
 
 @parallel_kernel
-def image_loss(  # type: ignore[no-untyped-def]
-    image, exposure, target, target_means, target_squares, weights, scratch, g_image, losses, g_exposure
-):
+def image_loss(image, exposure, target, target_means, target_squares, weights, scratch, g_image, losses, g_exposure):
     """Loss of a rendered picture and its gradient.
 
     Args:
         image: [>= C, >= H, >= W] rendered planes. exposure: [C, 2] gain and offset of the camera per channel.
         target, target_means, target_squares: [C, H, W]. weights: [C] weight of each channel's mean.
         scratch: [6, C, H + 10, W], its upper and lower 5 rows 0: three windowed quantities and their gradients.
-        g_image: out [>= C, >= H, >= W] dL/dimage. losses: out [C, H, 2], each row's share of the loss, and its sum of squared differences.
+        g_image: out [>= C, >= H, >= W] dL/dimage. losses: out [C, H, 2], each row's share of the loss and its sum
+            of squared differences.
         g_exposure: out [C, H, 2], each row's share of the gradient of gain and offset.
     """
     channels, height, width = target.shape
@@ -155,9 +158,7 @@ def image_loss(  # type: ignore[no-untyped-def]
             value = exposed(rendered, gain, offset)
             truth = target[channel, y, x]
             sign = ONE if value > truth else (-ONE if value < truth else ZERO)
-            g = share * (
-                L1_SHARE * sign - SSIM_SHARE * (by_mean[x] + TWO * value * by_square[x] + truth * by_cross[x])
-            )
+            g = share * (L1_SHARE * sign - SSIM_SHARE * (by_mean[x] + TWO * value * by_square[x] + truth * by_cross[x]))
             g_gain += g * rendered
             g_offset += g
             g_image[channel, y, x] = g * gain

@@ -55,8 +55,8 @@ def _float_of_bits(typing_context: Any, bits: Any) -> Any:
 
 
 @inline
-def exp(x):  # type: ignore[no-untyped-def]
-    """exp in float32, relative error 2e-7, clamped to ±87; unlike libm's, loops over it vectorize."""
+def exp(x):
+    """The exponential in float32, relative error 2e-7, clamped to ±87; unlike libm's, loops over it vectorize."""
     v = min(max(x, np.float32(-87.0)), np.float32(87.0)) * np.float32(1.4426950408889634)
     whole = np.floor(v + HALF)
     r = v - whole

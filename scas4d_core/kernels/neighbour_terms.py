@@ -22,7 +22,7 @@ COLUMNS = 7
 
 
 @kernel
-def pairs_task(means, turns, previous, sample, neighbours, weights, distances, rigid, isometric, turning, own, losses):  # type: ignore[no-untyped-def]
+def pairs_task(means, turns, previous, sample, neighbours, weights, distances, rigid, isometric, turning, own, losses):
     """The sampled Gaussians ``sample`` of one task; gradients are added to ``own`` [M, 7], losses to ``losses`` [3]."""
     count = neighbours.shape[1]
     for n in range(sample.shape[0]):
@@ -101,9 +101,7 @@ def pairs_task(means, turns, previous, sample, neighbours, weights, distances, r
 
 
 @parallel_kernel
-def neighbour_terms(  # type: ignore[no-untyped-def]
-    means, turns, previous, sample, neighbours, weights, distances, strengths, accumulators, losses
-):
+def neighbour_terms(means, turns, previous, sample, neighbours, weights, distances, strengths, accumulators, losses):
     """Weighted sum of the three losses over the sampled Gaussians and its gradient.
 
     Args:
@@ -125,7 +123,7 @@ def neighbour_terms(  # type: ignore[no-untyped-def]
 
 
 @parallel_kernel
-def gather_terms(accumulators, rows, g_means, g_turns):  # type: ignore[no-untyped-def]
+def gather_terms(accumulators, rows, g_means, g_turns):
     """Add the accumulated gradients to ``g_means`` [N, 3] at ``rows`` [M] and write ``g_turns`` [M, 4]."""
     for i in prange(rows.shape[0]):
         row = rows[i]

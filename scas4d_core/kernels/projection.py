@@ -24,7 +24,7 @@ MEAN_X, MEAN_Y, CONIC_A, CONIC_B, CONIC_C, OPACITY, REACH, DEPTH = range(8)
 
 
 @inline
-def tangents(x, y, z, lens, margin):  # type: ignore[no-untyped-def]
+def tangents(x, y, z, lens, margin):
     """x/z and y/z, clamped for the Jacobian, and whether each is inside (1) or clamped (0)."""
     fx, fy, cx, cy, width, height = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
     margin_x = margin * HALF * width / fx
@@ -39,7 +39,7 @@ def tangents(x, y, z, lens, margin):  # type: ignore[no-untyped-def]
 
 
 @parallel_kernel
-def project(means, factors, opacities, pose, lens, limits, splats, rects, counts):  # type: ignore[no-untyped-def]
+def project(means, factors, opacities, pose, lens, limits, splats, rects, counts):
     """Project N Gaussians.
 
     Args:
@@ -109,9 +109,9 @@ def project(means, factors, opacities, pose, lens, limits, splats, rects, counts
 
 
 @kernel
-def project_backward_one(i, means, factors, pose, lens, limits, splat, g_mean, g_conic, g_depth, g_means, g_factors):  # type: ignore[no-untyped-def]
+def project_backward_one(i, means, factors, pose, lens, limits, splat, g_mean, g_conic, g_depth, g_means, g_factors):
     """Carry one Gaussian's gradients from the picture to the world; see ``project_backward``."""
-    low_pass, margin = limits[3], limits[5]
+    margin = limits[5]
     fx, fy = lens[0], lens[1]
     px, py, pz = means[i, 0], means[i, 1], means[i, 2]
     x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
@@ -168,7 +168,7 @@ def project_backward_one(i, means, factors, pose, lens, limits, splat, g_mean, g
 
 
 @parallel_kernel
-def project_backward(  # type: ignore[no-untyped-def]
+def project_backward(
     means,
     factors,
     pose,

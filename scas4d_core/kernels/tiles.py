@@ -12,7 +12,7 @@ RADIX_BITS = 11
 
 
 @inline
-def tile_is_reached(splat, tile_x, tile_y):  # type: ignore[no-untyped-def]
+def tile_is_reached(splat, tile_x, tile_y):
     """Whether the support (an ellipse) meets the tile's square of pixel centres: exact, so culling by it is."""
     low_x = np.float32(tile_x * TILE) + np.float32(0.5) - splat[MEAN_X]
     low_y = np.float32(tile_y * TILE) + np.float32(0.5) - splat[MEAN_Y]
@@ -36,7 +36,7 @@ def tile_is_reached(splat, tile_x, tile_y):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def depth_order(splats, counts, keys, order, keys_too, order_too, histogram):  # type: ignore[no-untyped-def]
+def depth_order(splats, counts, keys, order, keys_too, order_too, histogram):
     """Sort the visible Gaussians by depth, nearest first; equal depths keep row order.
 
     Depths are positive, so their float32 bits sort as integers; three stable passes of 11 bits.
@@ -83,7 +83,7 @@ def depth_order(splats, counts, keys, order, keys_too, order_too, histogram):  #
 
 
 @kernel
-def pair_offsets(counts, offsets):  # type: ignore[no-untyped-def]
+def pair_offsets(counts, offsets):
     """Exclusive sums of ``counts`` into ``offsets`` [N + 1] int64: where each Gaussian's pairs begin."""
     total = 0
     for i in range(counts.shape[0]):
@@ -94,7 +94,7 @@ def pair_offsets(counts, offsets):  # type: ignore[no-untyped-def]
 
 
 @parallel_kernel
-def reach_tiles(splats, rects, counts, offsets, pair_used):  # type: ignore[no-untyped-def]
+def reach_tiles(splats, rects, counts, offsets, pair_used):
     """Mark which tiles of each Gaussian's box its support reaches.
 
     Args:
@@ -115,7 +115,7 @@ def reach_tiles(splats, rects, counts, offsets, pair_used):  # type: ignore[no-u
 
 
 @kernel
-def count_tiles(rects, order, visible, offsets, pair_used, tiles_x, tile_counts):  # type: ignore[no-untyped-def]
+def count_tiles(rects, order, visible, offsets, pair_used, tiles_x, tile_counts):
     """Gaussians that reach each tile, ``tile_counts`` [tiles] int32."""
     tile_counts[:] = 0
     for k in range(visible):
@@ -128,7 +128,7 @@ def count_tiles(rects, order, visible, offsets, pair_used, tiles_x, tile_counts)
 
 
 @kernel
-def tile_offsets(tile_counts, starts):  # type: ignore[no-untyped-def]
+def tile_offsets(tile_counts, starts):
     """Exclusive sums of ``tile_counts`` into ``starts`` [tiles + 1] int64; returns the total."""
     total = 0
     for tile in range(tile_counts.shape[0]):
@@ -139,7 +139,7 @@ def tile_offsets(tile_counts, starts):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def fill_tiles(rects, order, visible, offsets, pair_used, tiles_x, starts, cursor, items, slots):  # type: ignore[no-untyped-def]
+def fill_tiles(rects, order, visible, offsets, pair_used, tiles_x, starts, cursor, items, slots):
     """Write the tile lists in depth order.
 
     Args:
