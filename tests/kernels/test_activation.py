@@ -40,7 +40,8 @@ def test_values_and_gradients_agree_with_the_twin(count: int) -> None:
 
     rng = np.random.default_rng(1)
     pulls = [rng.normal(size=shape).astype(np.float32) for shape in shapes]
-    torch.stack([(truth * torch.tensor(pull)).sum() for truth, pull in zip(expected, pulls, strict=True)]).sum().backward()
+    pulled = [(truth * torch.tensor(pull)).sum() for truth, pull in zip(expected, pulls, strict=True)]
+    torch.stack(pulled).sum().backward()
     gradients = np.full_like(table, np.nan)
     _, factors, opacities, features = found
     activation.activate_backward(table, factors, opacities, features, *pulls, gradients)
