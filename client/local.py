@@ -23,10 +23,9 @@ def reconstruct(folder: Path, out: Path, *, frames: int | None, preset: str, cha
         preset: named settings.
         changes: what differs, as ``update.iterations=200``.
     """
-    from scas4d_core.reconstruction import Reconstruction
-
     from scas4d_core.bench.quality import settings_of
     from scas4d_core.ply import write_ply
+    from scas4d_core.reconstruction import Reconstruction
 
     settings = settings_of(preset, overrides=changes)
     given = open_capture(folder)  # the reconstruction resizes what it is given

@@ -55,7 +55,9 @@ class Camera:
         if k[0, 0] <= 0 or k[1, 1] <= 0:
             raise CameraError(f"camera {self.name!r}: focal lengths {k[0, 0]:g}, {k[1, 1]:g} must be positive pixels")
         if abs(k[0, 1]) + abs(k[1, 0]) + abs(k[2, 0]) + abs(k[2, 1]) + abs(k[2, 2] - 1) > 1e-6:
-            raise CameraError(f"camera {self.name!r}: intrinsics must be [[fx,0,cx],[0,fy,cy],[0,0,1]]; undo skew first")
+            raise CameraError(
+                f"camera {self.name!r}: intrinsics must be [[fx,0,cx],[0,fy,cy],[0,0,1]]; undo skew first"
+            )
         if np.abs(r @ r.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(r) < 0:
             raise CameraError(
                 f"camera {self.name!r}: world_to_camera[:3,:3] is no rotation "

@@ -107,9 +107,7 @@ class Committed:
 
     def tracks_of_pixels(self, camera: Camera, uv: NDArray[Any], index: int, indices: Sequence[int]) -> Tracks:
         """Trajectories of the surface points at pixels [Q, 2] of frame ``index``, through rendered depth."""
-        return tracks_of_history.tracks_of_pixels(
-            self.history, self.world, camera, uv, index, indices, self._depth
-        )
+        return tracks_of_history.tracks_of_pixels(self.history, self.world, camera, uv, index, indices, self._depth)
 
     def tracks_of_ids(self, ids: NDArray[Any], indices: Sequence[int]) -> Tracks:
         """Trajectories of Gaussians by id."""

@@ -97,11 +97,12 @@ class CpuDeformation:
         pairs = max(1, len(sample) * self.neighbours.index.shape[1])
         neighbour_terms.neighbour_terms(
             self._gathered_means(), self.turns, self._points[0], sample, self.neighbours.index,
-            self.neighbours.weights, self.neighbours.distances, np.float32(weights) / np.float32(pairs),
+            self.neighbours.weights, self.neighbours.distances, np.array(weights, np.float32) / np.float32(pairs),
             self._accumulators, self._sums,
         )  # fmt: skip
         neighbour_terms.gather_terms(self._accumulators, self.hierarchy.rows, g_means, self._g_turns)
-        return self._sums.sum(axis=0) / pairs
+        means: Array = self._sums.sum(axis=0) / pairs
+        return means
 
     def _gathered_means(self) -> Array:
         """[M, 3] the moved means in the hierarchy's order."""

@@ -7,6 +7,7 @@ contiguous range: the kernels and the sums of gradients rely on it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,7 @@ def build_hierarchy(
     Raises:
         ValueError: the wished numbers do not ascend.
     """
-    if any(a >= b for a, b in zip(clusters, clusters[1:], strict=False)):
+    if any(a >= b for a, b in pairwise(clusters)):
         raise ValueError(f"clusters {clusters} must ascend from the coarsest layer to the finest")
     rows = np.flatnonzero(moving)
     cap = max(1, len(rows) // smallest)

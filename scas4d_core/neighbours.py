@@ -37,7 +37,7 @@ def build_neighbours(means: NDArray[Any], count: int, falloff: float) -> Neighbo
     weights = np.zeros((total, count), np.float32)
     distances = np.zeros((total, count), np.float32)
     if found > 0:
-        far, near = cKDTree(points).query(points, k=found + 1)
+        far, near = (np.asarray(found_by) for found_by in cKDTree(points).query(points, k=found + 1))
         # The point itself is usually first, but among coincident points it may be any, or none.
         own = near == np.arange(total)[:, None]
         own[~own.any(axis=1), -1] = True

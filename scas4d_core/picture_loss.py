@@ -54,13 +54,20 @@ class PictureLoss:
         self.psnr = 0.0
 
     def evaluate(
-        self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView,
+        self,
+        means: Array,
+        factors: Array,
+        opacities: Array,
+        features: Array,
+        view: TrainingView,
         lap: Callable[[str], None] = _no_lap,
     ) -> Gradients:
-        """Render the view, set ``image_part``, ``mask_part`` and ``psnr`` (dB), and return the gradients (buffers, valid until next).
+        """Render the view, set ``image_part``, ``mask_part`` and ``psnr`` (dB), and return the gradients.
+
+        The gradients are buffers, valid until the next call.
 
         Args:
-            means [N, 3], factors [N, 3, 3], opacities [N], features [N, 4] (RGB, label): float32.
+            means, factors, opacities, features: [N, 3], [N, 3, 3], [N], [N, 4] (RGB, label), float32.
             lap: told when each stage is done.
         """
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background)

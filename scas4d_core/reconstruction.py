@@ -1,4 +1,4 @@
-"""A ``Reconstruction`` holds Θ_t; ``step(frame)`` finds D_t and commits Θ_t = D_t(Θ_{t−1}), or raises and changes nothing."""
+"""A ``Reconstruction`` holds Θ_t; ``step(frame)`` commits Θ_t = D_t(Θ_{t−1}), or raises and changes nothing."""
 
 from __future__ import annotations
 
@@ -174,9 +174,7 @@ class Reconstruction(Committed):
             if tied
             else None
         )
-        self._updater = FrameUpdate(
-            self._factory, self.settings.scene, settings, hierarchy, neighbours, gaussians
-        )
+        self._updater = FrameUpdate(self._factory, self.settings.scene, settings, hierarchy, neighbours, gaussians)
 
     def _scaled(self, frame: Frame) -> Frame:
         """The frame with its pictures at the size of ``rig``."""

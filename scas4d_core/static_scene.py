@@ -138,7 +138,7 @@ class StaticTrainer:
             self.parameters, self._factors, self._opacities, self._features, gradients.means, gradients.factors,
             gradients.opacities, gradients.features, self._gradients,
         )  # fmt: skip
-        width = np.float32([view.camera.width / 2, view.camera.height / 2])
+        width = np.array([view.camera.width / 2, view.camera.height / 2], np.float32)
         visible = self._loss.rasterizer.counts > 0
         self._screen += np.sqrt(np.square(gradients.screen * width).sum(axis=1))
         self._seen += visible
@@ -170,7 +170,7 @@ class StaticTrainer:
         gradient = self._loss.exposure_gradient[: len(view.exposure)].copy()
         gradient[3:] = 0
         adam(view.exposure, gradient, moments[0], moments[1], rates, BETA1, BETA2, iteration + 1)
-        centre = np.mean([other.exposure[:3] for other in self.views], axis=0) - np.float32([1, 0])
+        centre = np.mean([other.exposure[:3] for other in self.views], axis=0) - np.array([1, 0], np.float32)
         for other in self.views:
             other.exposure[:3] -= centre
 
@@ -215,7 +215,7 @@ class StaticTrainer:
         return Gaussians(
             means=self._means.copy(),
             factors=self._factors.copy(),
-            rotations=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+            rotations=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
             opacities=self._opacities.copy(),
             colours=self._features[:, :3].copy(),
             foreground=self._features[:, 3].copy() if self._masked else np.ones(count, np.float32),

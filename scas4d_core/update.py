@@ -177,7 +177,8 @@ class FrameUpdate:
     def _soft_colour(self, colours: Array, previous: Array) -> Array:
         """Gradient of the soft-colour loss: mean absolute change of colour."""
         weight = np.float32(self.settings.weights.soft_colour / max(colours.size, 1))
-        return weight * np.sign(colours - previous)
+        gradient: Array = weight * np.sign(colours - previous)
+        return gradient
 
     def _rate_factor(self, iteration: int) -> float:
         """Half a cosine from 1 at the first iteration to ``rate_end`` at the last."""

@@ -80,7 +80,7 @@ class ViewFactory:
             np.multiply(np.moveaxis(image, -1, 0), np.float32(1 / 255), out=target[:3])
             if masked:
                 target[3] = frame.masks[name]
-            exposure = np.tile(np.float32([1, 0]), (3 + masked, 1))
+            exposure = np.tile(np.array([1, 0], np.float32), (3 + masked, 1))
             exposure[:3] = exposures.get(name, exposure[:3])
             views.append(self._view(name, camera, target, exposure))
         if not views:

@@ -17,6 +17,7 @@ from scas4d_core.settings import UpdateSettings
 Array = NDArray[np.float32]
 Float = NDArray[np.float64]
 
+
 def quaternion_products(a: Array, b: Array) -> Array:
     """[M, 4] a∘b (w, x, y, z): first b, then a."""
     aw, ax, ay, az = a.T
