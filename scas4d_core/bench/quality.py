@@ -1,19 +1,21 @@
 """``scas4d bench quality``: how good the pictures, tracks and parts of captures are, and how long an update takes.
 
 One row for every capture, preset, number of iterations and seed. Each row runs in a process of its own, so that peak
-memory is that row's; rows that are on disk already are not run again.
+memory is that row's; rows that are on disk already are not run again. Rows of a capture with the same settings of
+scene and frame 0 share one frame 0 (``first/`` in the folder of the study); only the first of them fits it. A row that
+was cut off begins again at its frame 0.
 """
 
 from __future__ import annotations
 
 import json
 import multiprocessing
-import platform
 import sys
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +24,9 @@ from rich.console import Console
 from rich.progress import Progress
 
 from scas4d_core.bench import measure as measures
+from scas4d_core.bench.machine import core_version, machine
 from scas4d_core.bench.store import Row, Store, digest
-from scas4d_core.bench.table import markdown, with_means
+from scas4d_core.bench.table import markdown, stage_table, with_means
 from scas4d_core.captures import open_capture
 from scas4d_core.presets import preset
 from scas4d_core.settings import Settings
@@ -63,6 +66,17 @@ class Job:
         return (
             f"{self.preset}-{update.iterations}-s{update.seed}-{digest(self.settings.model_dump(mode='json'), given)}"
         )
+
+    @property
+    def changes(self) -> str:
+        """What differs from the preset beside iterations and seed, and what is withheld, in words for the table."""
+        usual, own = preset(self.preset).model_dump(mode="json"), self.settings.model_dump(mode="json")
+        words = [
+            f"{name}={json.dumps(value, separators=(',', ':'))}"
+            for name, value in _flat(own)
+            if name not in ("update.iterations", "update.seed", "static.seed") and dict(_flat(usual)).get(name) != value
+        ]
+        return ", ".join(words + ["no masks"] * (not self.masks) + ["no points"] * (not self.points))
 
     @property
     def key(self) -> str:
@@ -111,7 +125,6 @@ def run(
     Raises:
         ValueError: an unknown preset or setting, or a value out of range.
     """
-    store = Store(Path(out))
     jobs = [
         Job(
             capture=Path(capture),
@@ -128,6 +141,12 @@ def run(
         for seed in seeds
         for capture in captures
     ]
+    return run_jobs(jobs, Path(out), again=again, report=report)
+
+
+def run_jobs(jobs: Sequence[Job], out: Path, *, again: bool = False, report: Report = print) -> list[Row]:
+    """Measures what is not on disk yet, one process a row; prints the table and leaves it in ``out/table.md``."""
+    store = Store(out)
     rows = []
     for number, job in enumerate(jobs, 1):
         row = None if again else store.row(job.key)
@@ -140,7 +159,7 @@ def run(
         else:
             report(f"[{number}/{len(jobs)}] {job.key}: measured already")
         rows.append(row)
-    table = markdown(with_means(rows))
+    table = markdown(with_means(rows)) + "\n\nMedian seconds of an update by stage:\n\n" + stage_table(rows)
     (store.folder / "table.md").write_text(table + "\n")
     report(table)
     return rows
@@ -190,7 +209,10 @@ def measure(job: Job, folder: Path, report: Report = print) -> Row:
     given = open_capture(job.capture, use_masks=job.masks, use_points=job.points)
     if truth.test_rig is None:
         raise ValueError(f"{job.capture} has no test cameras (test_meta.json), so there is nothing to measure on")
-    from scas4d_core.reconstruction import Reconstruction  # brings the kernels; the table and the command do not
+    # These bring the kernels; the table and the command do not.
+    from scas4d_core.bench.first_frame import first_frame_key, load_first_frame, save_first_frame
+    from scas4d_core.kernels.jit import threads
+    from scas4d_core.reconstruction import Reconstruction
 
     store = Store(folder)
     store.start_frames(job.key)
@@ -203,11 +225,18 @@ def measure(job: Job, folder: Path, report: Report = print) -> Row:
         def moved(now: Any) -> None:
             bars.update(bar, description=f"frame 0, {now.stage}", completed=now.done, total=now.total)
 
+        first_file = folder / "first" / f"{first_frame_key(given, job.settings)}.npz"
+        static, seconds_first = load_first_frame(first_file) or (None, 0.0)
+        if static is not None:
+            report(f"    frame 0 from {first_file}")
         started = time.perf_counter()
         reconstruction = Reconstruction.start(
-            given.rig, given.frame(0), job.settings, points=given.points, progress=moved
+            given.rig, given.frame(0), job.settings, points=given.points, progress=moved, static=static
         )
-        seconds_first = time.perf_counter() - started
+        if static is None:
+            seconds_first = time.perf_counter() - started
+            assert reconstruction.static is not None
+            save_first_frame(first_file, reconstruction.static, seconds_first)
         bars.update(bar, description="frames", completed=0, total=count)
         for index in range(count):
             line: Row = {"index": index, "seconds": seconds_first, "stages": {}}
@@ -232,9 +261,13 @@ def measure(job: Job, folder: Path, report: Report = print) -> Row:
         "preset": job.preset,
         "iterations": job.settings.update.iterations,
         "seed": job.settings.update.seed,
+        "changes": job.changes,
         "settings": job.settings.model_dump(mode="json"),
         "given": {"frames": count, "masks": job.masks, "points": job.points},
-        "machine": {"processor": platform.processor() or platform.machine(), "python": platform.python_version()},
+        "capture_frames": given.frame_count,
+        "measured": datetime.now(UTC).isoformat(timespec="seconds"),
+        "core": core_version(),
+        "machine": {**machine(), "threads": threads()},
         "gaussians": len(reconstruction.history.gaussians(0)),
         "moving": int(reconstruction.history.gaussians(count - 1).moving.sum()),
         "seconds_first": seconds_first,
@@ -260,17 +293,31 @@ def summary(lines: Sequence[Row]) -> Row:
     if not updates:
         return {"updates": 0}
     names = ("psnr", "psnr_foreground", "psnr_changed", "ssim", "flip", "lpips")
-    stages = measures.mean_scores(line["stages"] for line in updates)
+    stages = {name: float(np.median([line["stages"].get(name, 0.0) for line in updates])) for name in _stages(updates)}
     return {
         "updates": len(updates),
         **measures.mean_scores({name: line.get(name) for name in names} for line in updates),
         "psnr_worst": min(line["psnr"] for line in updates),
         "psnr_last": updates[-1]["psnr"],
         "psnr_by_frame": [round(line["psnr"], 3) for line in lines],
-        # The first update compiles or loads kernels; the median does not see it.
+        # The first update compiles or loads kernels; medians do not see it.
         "seconds_update": float(np.median([line["seconds"] for line in updates])),
         "seconds_stages": stages,
     }
+
+
+def _flat(values: Mapping[str, Any], under: str = "") -> Iterator[tuple[str, Any]]:
+    """``{"update": {"iterations": 100}}`` as ``("update.iterations", 100)``."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{under}{name}.")
+        else:
+            yield f"{under}{name}", value
+
+
+def _stages(lines: Sequence[Row]) -> list[str]:
+    """Names of the stages of an update, in the order in which they came."""
+    return list(dict.fromkeys(name for line in lines for name in line["stages"]))
 
 
 def peak_megabytes() -> float | None:

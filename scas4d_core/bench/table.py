@@ -23,7 +23,7 @@ class Column:
     def cell(self, row: Row) -> str:
         """The value as text; a dash where there is none."""
         value: Any = row.get(self.name)
-        if value is None:
+        if value is None or value == "":
             return "–"
         return format(value, self.form) if isinstance(value, int | float) else str(value)
 
@@ -32,6 +32,7 @@ QUALITY = (
     Column("capture", "capture"),
     Column("preset", "preset"),
     Column("it.", "iterations", "d"),
+    Column("changes", "changes"),
     Column("Gaussians", "gaussians", ",d"),
     Column("updates", "updates", "d"),
     Column("frame 0 dB", "psnr_first"),
@@ -63,6 +64,23 @@ def markdown(rows: Iterable[Row], columns: Sequence[Column] = QUALITY) -> str:
     return "\n".join(lines)
 
 
+def stage_table(rows: Sequence[Row]) -> str:
+    """A Markdown table of the seconds by stage of the rows that have updates, slowest stage first."""
+    timed = [row for row in rows if row.get("seconds_stages")]
+    names = dict.fromkeys(name for row in timed for name in row["seconds_stages"])
+    slowest = sorted(names, key=lambda name: -sum(row["seconds_stages"].get(name, 0.0) for row in timed))
+    lines = [
+        "| " + " | ".join(["capture", "preset", "it.", "update", *slowest]) + " |",
+        "|" + "---|" * (4 + len(slowest)),
+    ]
+    for row in timed:
+        stages = [row["seconds_stages"].get(name) for name in slowest]
+        cells = ["–" if value is None else f"{value:.3f}" for value in stages]
+        known = [row["capture"], row["preset"], str(row["iterations"]), f"{row['seconds_update']:.3f}"]
+        lines.append("| " + " | ".join([*known, *cells]) + " |")
+    return "\n".join(lines)
+
+
 def with_means(rows: Sequence[Row], over: Sequence[str] = OBJECT_CAPTURES, label: str = "mean of objects") -> list[Row]:
     """The rows, and behind them the means of each variant that has all captures in ``over``.
 
@@ -75,6 +93,7 @@ def with_means(rows: Sequence[Row], over: Sequence[str] = OBJECT_CAPTURES, label
             continue
         chosen = [of[name] for name in over]
         mean: Row = {"capture": label, "preset": chosen[0]["preset"], "iterations": chosen[0]["iterations"]}
+        mean["changes"] = chosen[0].get("changes")
         for column in QUALITY:
             values = [row.get(column.name) for row in chosen]
             if column.name in ("psnr_worst", "peak_mb"):

@@ -1,5 +1,6 @@
 """The study on a scene made here: two textured plates that part, seen by four cameras, splatted by a z-buffer."""
 
+import dataclasses
 import json
 import types
 
@@ -9,13 +10,15 @@ from PIL import Image
 
 from scas4d_core.bench import measure as measures
 from scas4d_core.bench import quality
+from scas4d_core.bench.first_frame import first_frame_key, load_first_frame, save_first_frame
 from scas4d_core.bench.store import Store, digest
 from scas4d_core.bench.table import markdown, with_means
 from scas4d_core.cameras import Camera, WorldFrame
-from scas4d_core.captures import open_capture
+from scas4d_core.captures import InitialPoints, open_capture
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.history import History
 from scas4d_core.parts import parts
+from scas4d_core.static_scene import StaticResult
 from scas4d_core.tracks import tracks_of_pixels, tracks_of_points
 
 FRAMES, WIDTH, HEIGHT = 4, 48, 40
@@ -105,12 +108,15 @@ class Perfect:
 
     speed = 1.0
     brightness = 1.0
+    fitted = 0
 
     @classmethod
-    def start(cls, rig, frame, settings, *, points=None, progress=None):
+    def start(cls, rig, frame, settings, *, points=None, progress=None, static=None):
         self = cls()
         self.world, self.history = WorldFrame(np.zeros(3)), History()
         self._commit(0)
+        self.static = static or StaticResult(self.history.gaussians(0), {}, [0.5, 0.25])
+        cls.fitted = cls.fitted + (static is None)
         return self
 
     def step(self, frame):
@@ -215,11 +221,15 @@ def test_standing_points_do_not_flatter_the_error():
     assert measures.moving_points(points, 2.5).tolist() == [False, False]
 
 
-def test_the_study_measures_saves_and_goes_on_where_it_stopped(capture_folder, tmp_path, stand_in):
+def test_the_study_measures_saves_and_goes_on_where_it_stopped(capture_folder, tmp_path, stand_in, monkeypatch):
     stand_in(Slow)
+    monkeypatch.setattr(Slow, "fitted", 0)
     lines: list[str] = []
     rows = quality.run([capture_folder], tmp_path, ["scas4d", "dynamic3dgs"], iterations=[7], report=lines.append)
     assert [row["preset"] for row in rows] == ["scas4d", "dynamic3dgs"]
+    assert Slow.fitted == 1  # both presets start from the same frame 0
+    assert len(list((tmp_path / "first").iterdir())) == 1
+    assert rows[0]["seconds_first"] == rows[1]["seconds_first"] > 0
     row = rows[0]
     assert row["updates"] == FRAMES - 1
     assert row["iterations"] == 7
@@ -230,6 +240,8 @@ def test_the_study_measures_saves_and_goes_on_where_it_stopped(capture_folder, t
     assert row["psnr"] == pytest.approx(np.mean([frame["psnr"] for frame in frames[1:]]))
     assert row["psnr_worst"] == min(frame["psnr"] for frame in frames[1:])
     assert row["seconds_stages"] == {"render": 0.5, "losses": 0.25}
+    assert row["capture_frames"] == FRAMES
+    assert "| plates | scas4d | 7 | " in lines[-1].split("by stage")[1]
     assert row["parts_ari"] > 0.5
     pictures = sorted(f.name for f in (tmp_path / "pictures" / row["key"]).iterdir())
     assert pictures == [f"frame{t:04d}_camera{c}.png" for t in (0, 1, 3) for c in TEST] + [
@@ -262,6 +274,44 @@ def test_a_row_that_fails_says_so_and_is_tried_again(tmp_path):
     assert sum("measured already" in line for line in lines) == 0
 
 
+def test_frame_0_comes_back_as_it_was_kept(tmp_path):
+    gaussians = Perfect.start(None, None, None).history.gaussians(0)
+    exposures = {name: np.random.default_rng(0).normal(size=(3, 2)).astype(np.float32) for name in ("10", "9", "a")}
+    assert load_first_frame(tmp_path / "first" / "x.npz") is None
+    for kept in ({}, exposures):
+        save_first_frame(tmp_path / "first" / "x.npz", StaticResult(gaussians, kept, [0.5, 0.25]), 3.5)
+        result, seconds = load_first_frame(tmp_path / "first" / "x.npz")
+        assert seconds == 3.5
+        assert result.losses == [0.5, 0.25]
+        assert {name: value.tolist() for name, value in result.exposures.items()} == {
+            name: value.tolist() for name, value in kept.items()
+        }
+        for name, array in gaussians.arrays().items():
+            np.testing.assert_array_equal(result.gaussians.arrays()[name], array)
+    assert [f.name for f in (tmp_path / "first").iterdir()] == ["x.npz"]
+
+
+def test_frame_0_is_shared_by_those_who_see_the_same(capture_folder):
+    settings = quality.settings_of("scas4d")
+    capture = open_capture(capture_folder)
+    name = first_frame_key(capture, settings)
+    assert name.startswith("plates-")
+    for same in (["update.clusters=[64]"], ["update.iterations=2000"]):
+        assert first_frame_key(capture, quality.settings_of("scas4d", overrides=same)) == name
+    assert first_frame_key(capture, quality.settings_of("dynamic3dgs", 300)) == name
+    others = {
+        name,
+        first_frame_key(open_capture(capture_folder, use_masks=False), settings),
+        first_frame_key(dataclasses.replace(capture, points=InitialPoints(plates(0), colours())), settings),
+        first_frame_key(dataclasses.replace(capture, points=InitialPoints(plates(1), colours())), settings),
+        first_frame_key(dataclasses.replace(capture, image_files=capture.image_files[1:]), settings),
+        first_frame_key(capture, quality.settings_of("scas4d", seed=1)),
+        first_frame_key(capture, quality.settings_of("scas4d", overrides=["static.iterations=5"])),
+        first_frame_key(capture, quality.settings_of("scas4d", overrides=["scene.image_scale=0.5"])),
+    }
+    assert len(others) == 8
+
+
 def test_settings_are_the_preset_with_checked_changes():
     settings = quality.settings_of("scas4d", 300, 5, ["update.clusters=[64]", "update.cluster_map=published"])
     assert settings.update.iterations == 300
@@ -286,7 +336,7 @@ def test_the_table_has_means_of_complete_variants_only():
     assert table[-1]["psnr"] == 30.5
     assert "psnr_worst" not in table[-1]
     text = markdown([*table, {"capture": "c", "preset": "p", "iterations": 100, "error": "no pictures"}]).splitlines()
-    assert text[2].startswith("| a | p | 100 | 1,000 | – |")
+    assert text[2].startswith("| a | p | 100 | – | 1,000 | – |")
     assert "| 30.50 |" in text[-2]
     assert text[-1] == "| c | p | 100 | failed: no pictures |"
 
