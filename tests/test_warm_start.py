@@ -18,28 +18,32 @@ CENTRE = np.array([0.5, -0.3, 0.1])
 """A point of the axis, outside the box: its middle goes around it on a circle."""
 
 
-def about_axis(box: Gaussians, angle: float, rows: slice = slice(0, MOVING)) -> Gaussians:
-    """Rows turned about the axis through ``CENTRE``."""
-    turn = Rotation.from_rotvec(angle * AXIS)
-    means = box.means.astype(np.float64)
-    means[rows] = turn.apply(means[rows] - CENTRE) + CENTRE
-    return box.replace(means=means.astype(np.float32))
+def turned(points: np.ndarray, angle: float, axis: np.ndarray = AXIS, centre: np.ndarray = CENTRE) -> np.ndarray:
+    """[M, 3] turned about an axis through a point."""
+    result: np.ndarray = Rotation.from_rotvec(angle * axis).apply(points - centre) + centre
+    return result
 
 
-def deformation(clusters: tuple[int, ...]) -> CpuDeformation:
-    box = make_box()
-    hierarchy = build_hierarchy(box.means, box.moving, clusters, 8)
+def deformation(clusters: tuple[int, ...], before: Gaussians) -> CpuDeformation:
+    hierarchy = build_hierarchy(before.means, before.moving, clusters, 8)
     return CpuDeformation(hierarchy, None, np.ones((MOVING, 3), np.float32), "centred")
 
 
-def motion_to(model: CpuDeformation, before: Gaussians, after: Gaussians, seconds: float = 1.0) -> Motion:
-    """The motion of a deformation that leaves everything to Δp, as if an update had found it so."""
-    model.start(before)
-    warm_start(model, None, seconds, UpdateSettings())
-    model.deltas[:, :3] = (after.means - before.means)[model.hierarchy.rows]
+def set_turn(
+    model: CpuDeformation, layer: int, which: np.ndarray, angle: float, axis: np.ndarray, centre: np.ndarray
+) -> None:
+    """Clusters ``which`` of a layer turn about an axis through a point (space as the layers above leave it)."""
     model.forward()
-    np.testing.assert_allclose(model.means, after.means, atol=1e-6)
-    return Motion.of(model, seconds)
+    starts = model.hierarchy.starts[layer]
+    pivots = np.add.reduceat(model._points[layer].astype(np.float64), starts[:-1]) / np.diff(starts)[:, None]
+    values = model.clusters[layer]
+    values[which, :3] = np.tan(angle / 2) * axis
+    values[which, 3:6] = (turned(pivots, angle, axis, centre) - pivots)[which]
+
+
+def begin(model: CpuDeformation, before: Gaussians) -> None:
+    model.start(before)
+    warm_start(model, None, 1.0, UpdateSettings())
 
 
 def predicted(
@@ -51,69 +55,97 @@ def predicted(
     return model.means.copy()
 
 
-@pytest.mark.parametrize("clusters", [(1,), (2, 12, 48)])
-def test_a_constant_rotation_about_an_axis_goes_on(clusters: tuple[int, ...]) -> None:
+def every(model: CpuDeformation, layer: int) -> np.ndarray:
+    return np.ones(model.hierarchy.sizes[layer], bool)
+
+
+@pytest.mark.parametrize(("clusters", "layer"), [((1,), 0), ((2, 12, 48), 0), ((2, 12, 48), 2)])
+def test_a_constant_rotation_about_an_axis_goes_on(clusters: tuple[int, ...], layer: int) -> None:
+    """Whichever layer found it."""
     box, angle = make_box(), 0.15
-    states = [about_axis(box, k * angle) for k in range(3)]
-    model = deformation(clusters)
-    found = predicted(model, states[1], motion_to(model, states[0], states[1]), 1.0)
-    step = np.linalg.norm(states[2].means - states[1].means, axis=1)[:MOVING]
-    error = np.linalg.norm(found - states[2].means, axis=1)
-    assert error[:MOVING].max() < 0.01 * step.min()
+    model = deformation(clusters, box)
+    begin(model, box)
+    set_turn(model, layer, every(model, layer), angle, AXIS, CENTRE)
+    model.forward()
+    moving = slice(0, MOVING)
+    np.testing.assert_allclose(model.means[moving], turned(box.means[moving], angle), atol=1e-6)
+    now = box.replace(means=model.means.copy(), factors=model.factors.copy())
+    found = predicted(model, now, Motion.of(model, 1.0), 1.0)
+    truth = turned(box.means[moving], 2 * angle)
+    step = np.linalg.norm(truth - now.means[moving], axis=1)
+    assert np.linalg.norm(found[moving] - truth, axis=1).max() < 0.01 * step.min()
     np.testing.assert_array_equal(found[MOVING:], box.means[MOVING:])
     # Axes and material rotations turn along.
     turn = Rotation.from_rotvec(angle * AXIS)
-    wanted = np.roll(turn.as_quat(canonical=True), 1)
-    assert np.abs(model.turns - wanted).max() < 2e-3
-    np.testing.assert_allclose(model.factors[:MOVING], turn.as_matrix() @ box.factors[:MOVING], atol=1e-4)
+    assert np.abs(model.turns - np.roll(turn.as_quat(canonical=True), 1)).max() < 2e-3
+    np.testing.assert_allclose(model.factors[moving], turn.as_matrix() @ now.factors[moving], atol=1e-4)
 
 
 def test_a_part_that_turns_on_a_turning_body_goes_on() -> None:
-    """Each body keeps its own twist: half of the box turns about an axis that the other half does not have."""
+    """Half of the box also turns about an axis that is fixed in the body, which carries that axis along."""
     box = make_box()
-    near, far = box.means[:MOVING, 0] < 0, box.means[:MOVING, 0] >= 0
-    before = box.replace(means=box.means + np.float32([0.5, 0, 0]) * np.pad(far, (0, 64))[:, None])
-    rows = np.flatnonzero(near)
+    far = np.pad(box.means[:MOVING, 0] >= 0, (0, 64))
+    before = box.replace(means=box.means + np.float32([0.5, 0, 0]) * far[:, None])
+    model = deformation((2, 12, 48), before)
+    body, part, own = 0.2, 0.25, np.array([0.0, 1.0, 0.0])
+    joint = np.array([-0.2, 0.0, 0.0])
 
-    def at(k: int) -> Gaussians:
-        turned = about_axis(before, 0.1 * k)
-        means = turned.means.copy()
-        turn = Rotation.from_rotvec([0, -0.12 * k, 0])
-        means[rows] = turn.apply(before.means[rows])
-        return turned.replace(means=means.astype(np.float32))
+    def at(k: int) -> np.ndarray:
+        points = before.means[:MOVING].astype(np.float64)
+        inner = turned(points, part * k, own, joint)
+        return turned(np.where(far[:MOVING, None], points, inner), body * k)
 
-    hierarchy = build_hierarchy(before.means, before.moving, (2, 12, 48), 8)
-    model = CpuDeformation(hierarchy, None, np.ones((MOVING, 3), np.float32), "centred")
-    found = predicted(model, at(1), motion_to(model, at(0), at(1)), 1.0)
-    step = np.linalg.norm(at(2).means - at(1).means, axis=1)[:MOVING]
-    assert np.linalg.norm(found - at(2).means, axis=1)[:MOVING].max() < 0.03 * np.median(step)
+    begin(model, before)
+    set_turn(model, 0, every(model, 0), body, AXIS, CENTRE)
+    near = ~far[model.hierarchy.rows][model.hierarchy.starts[1][:-1]]
+    turn = Rotation.from_rotvec(body * AXIS)
+    set_turn(model, 1, near, part, turn.apply(own), turned(joint, body))
+    model.forward()
+    np.testing.assert_allclose(model.means[:MOVING], at(1), atol=1e-6)
+    found = predicted(model, before.replace(means=model.means.copy()), Motion.of(model, 1.0), 1.0)
+    step = np.linalg.norm(at(2) - at(1), axis=1)
+    assert np.linalg.norm(found[:MOVING] - at(2), axis=1).max() < 0.03 * np.median(step)
 
 
+@pytest.mark.parametrize("by_deltas", [False, True])
 @pytest.mark.parametrize("ratio", [0.5, 1.0, 2.0])
-def test_displacement_is_in_proportion_to_the_time(ratio: float) -> None:
+def test_displacement_is_in_proportion_to_the_time(ratio: float, by_deltas: bool) -> None:
+    """Also what the Gaussians of a cluster did in common on their own."""
     box, shift = make_box(), np.array([0.02, -0.01, 0.03])
     after = moved(box, turn=Rotation.identity(), shift=shift)
-    model = deformation((2, 12, 48))
-    motion = motion_to(model, box, after, seconds=0.2)
-    found = predicted(model, after, motion, seconds=0.2 * ratio)
+    model = deformation((2, 12, 48), box)
+    begin(model, box)
+    if by_deltas:
+        model.deltas[:, :3] = shift
+    else:
+        model.clusters[1][:, 3:6] = shift
+    model.forward()
+    found = predicted(model, after, Motion.of(model, 0.2), seconds=0.2 * ratio)
     np.testing.assert_allclose(found[:MOVING] - after.means[:MOVING], np.tile(ratio * shift, (MOVING, 1)), atol=2e-6)
 
 
 def test_a_turn_is_in_proportion_to_the_time() -> None:
     box = make_box()
-    model = deformation((1,))
-    motion = motion_to(model, box, about_axis(box, 0.1), seconds=1.0)
-    predicted(model, about_axis(box, 0.1), motion, seconds=2.0)
+    model = deformation((1,), box)
+    begin(model, box)
+    set_turn(model, 0, every(model, 0), 0.1, AXIS, CENTRE)
+    model.forward()
+    predicted(model, box.replace(means=model.means.copy()), Motion.of(model, 1.0), seconds=2.0)
     angle = 2 * np.arctan2(np.linalg.norm(model.turns[:, 1:], axis=1), model.turns[:, 0])
     np.testing.assert_allclose(angle, 0.2, rtol=1e-2)
 
 
 def test_share_zero_and_no_motion_are_the_identity() -> None:
     box = make_box()
-    model = deformation((2, 12, 48))
-    motion = motion_to(model, box, about_axis(box, 0.1))
+    model = deformation((2, 12, 48), box)
+    begin(model, box)
+    set_turn(model, 0, every(model, 0), 0.1, AXIS, CENTRE)
+    model.deltas[:] = 0.01
+    model.forward()
+    motion = Motion.of(model, 1.0)
     for found in (predicted(model, box, None, 1.0), predicted(model, box, motion, 1.0, warm_start=0.0)):
         np.testing.assert_allclose(found, box.means, atol=1e-7)
+        np.testing.assert_allclose(model.factors, box.factors, atol=1e-7)
 
 
 def test_quaternions_and_rotations_are_scipys() -> None:
