@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from box_scene import SHIFT, SIZE, held_out_camera, make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
@@ -249,17 +250,11 @@ def test_without_weights_no_graph_is_built_and_no_neighbour_term_computed(monkey
     assert len(scene.step(FRAMES[1]).loss) == 3
 
 
-def test_a_device_that_is_not_served_is_refused() -> None:
-    with pytest.raises(ValueError, match="device"):
+def test_a_device_that_is_not_there_is_refused() -> None:
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    with pytest.raises((ValueError, RuntimeError), match="device 'cuda'"):
         start(shortened().model_copy(update={"device": "cuda"}))
-
-
-def test_wrong_cluster_numbers_are_refused_before_frame_0_is_fitted() -> None:
-    told: list[Progress] = []
-    settings = shortened(clusters=(8, 4))
-    with pytest.raises(ValueError, match="clusters"):
-        Reconstruction.start(training(), FRAMES[0], settings, points=points(), progress=told.append)
-    assert not told
 
 
 def test_progress_tells_stage_and_count() -> None:

@@ -17,7 +17,7 @@ CORE = Path(module.__file__).parent
 READERS = "\n".join(path.read_text() for path in CORE.rglob("*.py") if path.name not in ("settings.py", "presets.py"))
 
 # Names that mean something else elsewhere are looked for with what they hang on.
-HANGS_ON = {"Weights": r"weights", "Settings": r"settings", "SceneSettings": r"scene", "LayerRates": r"rates"}
+HANGS_ON = {"Weights": r"weights", "Settings": r"settings", "SceneSettings": r"scene", "LayerRates": r"\w+"}
 
 
 def models() -> list[type[BaseModel]]:
