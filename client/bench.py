@@ -9,23 +9,43 @@ import typer
 
 app = typer.Typer(no_args_is_help=True, help="Studies that measure the method.")
 
+Study = Annotated[Path, typer.Option(help="Folder of the study: rows, pictures, frames 0. Run again to go on.")]
+Again = Annotated[bool, typer.Option("--again", help="Measure anew what is there already (kept frames 0 are used).")]
+STUDY = Path("out/quality")
+
 
 @app.command()
 def quality(
     captures: Annotated[list[Path], typer.Argument(metavar="CAPTURE...", help="Folders with test cameras.")],
-    out: Annotated[Path, typer.Option(help="Rows and pictures; run again to go on.")] = Path("out/quality"),
-    preset: Annotated[list[str] | None, typer.Option(help="Named settings; may be repeated.")] = None,
-    iterations: Annotated[list[int] | None, typer.Option(min=1, help="Of an update; may be repeated.")] = None,
-    seed: Annotated[list[int] | None, typer.Option(min=0, help="May be repeated.")] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Only so many frames.")] = None,
-    device: Annotated[str | None, typer.Option(help="cpu or cuda.")] = None,
-    masks: Annotated[bool, typer.Option(help="Give the method the masks.")] = True,
+    out: Study = STUDY,
+    preset: Annotated[
+        list[str] | None, typer.Option(help="scas4d (the default) or dynamic3dgs; may be repeated.")
+    ] = None,
+    iterations: Annotated[
+        list[int] | None, typer.Option(min=1, help="Of an update; the preset's when left out. May be repeated.")
+    ] = None,
+    seed: Annotated[
+        list[int] | None, typer.Option(min=0, help="Of frame 0 and the updates, default 0. May be repeated.")
+    ] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Only so many frames; 1 measures frame 0 alone.")] = None,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda; the preset's when left out.")] = None,
+    masks: Annotated[bool, typer.Option(help="Give the method the masks; they measure in any case.")] = True,
     points: Annotated[bool, typer.Option(help="Give the method the initial cloud.")] = True,
-    lpips: Annotated[bool, typer.Option(help="Also LPIPS, where its weights are installed.")] = False,
-    again: Annotated[bool, typer.Option(help="Measure anew what is there already.")] = False,
-    changes: Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE")] = None,
+    lpips: Annotated[bool, typer.Option("--lpips", help="Also LPIPS, where its weights are installed.")] = False,
+    again: Again = False,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="A setting, as update.clusters=[1280]. May be repeated."),
+    ] = None,
 ) -> None:
-    """How good pictures, tracks and parts are, and how long an update takes."""
+    """Measures pictures, tracks, parts and seconds of captures; prints a table.
+
+    Reconstructs every capture with every preset, number of iterations and seed, each row in a process of its own, and
+    measures it on the capture's test cameras and ground truth. Rows on disk are not measured again. Leaves table.md,
+    a JSON file a row, a line a frame, and pictures (truth | render | difference) in the study's folder.
+
+    Example: scas4d bench quality captures/robot --preset scas4d --preset dynamic3dgs --iterations 100
+    """
     from scas4d_core.bench.quality import run
 
     rows = run(
@@ -44,3 +64,50 @@ def quality(
     )
     if any("error" in row for row in rows):
         raise typer.Exit(1)
+
+
+@app.command()
+def bars(
+    captures: Annotated[Path, typer.Argument(metavar="CAPTURES", help="Folder that holds the captures' folders.")],
+    out: Study = STUDY,
+    run: Annotated[
+        list[str] | None,
+        typer.Option(help="Only this run, as scas4d, clusters-64 or dynamic3dgs-2000. May be repeated."),
+    ] = None,
+    only: Annotated[list[str] | None, typer.Option(help="Only this capture, by name. May be repeated.")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Only so many frames; the table says how many.")] = None,
+    again: Again = False,
+) -> None:
+    """Measures every row that the bars need, or some of them; `scas4d bench table` judges them.
+
+    The costliest runs come last; dynamic3dgs-2000 takes 20 times as long as the others: --frames shortens it.
+    """
+    from scas4d_core.bench.runs import measure_runs
+
+    rows = measure_runs(captures, out, run or (), only=only or (), frames=frames, again=again)
+    if any("error" in row for row in rows):
+        raise typer.Exit(1)
+
+
+@app.command()
+def table(
+    study: Annotated[Path, typer.Argument(help="Folder of the study.")] = STUDY,
+    out: Annotated[
+        Path | None, typer.Option(help="Write the whole page here (commands, machine, bars, rows) as Markdown.")
+    ] = None,
+) -> None:
+    """Prints which bars the measured rows reach, as one Markdown table.
+
+    A row counts where its settings are exactly those of today's presets; of several, the one with most frames.
+    """
+    from scas4d_core.bench.bars import bar_table, count_words, judge, page, read_study
+
+    if not study.is_dir():
+        raise typer.BadParameter(f"{study} is no folder; measure first: scas4d bench bars CAPTURES --out {study}")
+    rows = read_study(study)
+    verdicts = judge(rows)
+    print(bar_table(verdicts))
+    print(f"\n{count_words(verdicts)}.")
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(page(rows))
