@@ -22,6 +22,8 @@ SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 """Stabilizers, for values in 0…1."""
 SSIM_SHARE = 0.2
 """Share of 1 − SSIM in the image loss; the rest is L1 (Kerbl et al. 2023)."""
+SMALLEST_SQUARE = 1e-9
+"""Sum of squared differences below which two pictures count as equal: PSNR stays finite."""
 ROOT_FLOOR = 1e-20
 """Under the square roots of the neighbour terms, so that their gradient is 0 and not NaN where nothing has moved."""
 
@@ -64,6 +66,12 @@ def image_loss(image: Tensor, target: Tensor) -> Tensor:
     """
     l1 = (image - target).abs().mean()
     return (1 - SSIM_SHARE) * l1 + SSIM_SHARE * (1 - ssim_map(image, target).mean())
+
+
+def psnr(image: Tensor, target: Tensor) -> Tensor:
+    """Peak signal-to-noise ratio, dB, of two pictures [H, W, C] in 0…1."""
+    squares = ((image - target) ** 2).sum().clamp_min(SMALLEST_SQUARE)
+    return 10 * torch.log10(image.numel() / squares)
 
 
 def _pairs(neighbours: Tensor, weights: Tensor, rows: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:

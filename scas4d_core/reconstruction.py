@@ -13,6 +13,7 @@ from scas4d_core.cameras import Rig, WorldFrame, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.captures.images import resize_area
 from scas4d_core.committed import Committed, View
+from scas4d_core.device import require_device
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import build_hierarchy
 from scas4d_core.history import History
@@ -20,7 +21,7 @@ from scas4d_core.initial_points import initial_points
 from scas4d_core.neighbours import build_neighbours
 from scas4d_core.settings import Settings
 from scas4d_core.static_scene import StaticResult, fit_static_scene
-from scas4d_core.update import FrameUpdate, Updated
+from scas4d_core.update import FrameUpdate, Updated, Updater
 from scas4d_core.views import TrainingView, ViewFactory
 from scas4d_core.warm_start import Motion
 
@@ -79,7 +80,7 @@ class Reconstruction(Committed):
         self._exposures: dict[str, NDArray[np.float32]] = {}
         self.static: StaticResult | None = None
         self._motion: Motion | None = None
-        self._updater: FrameUpdate | None = None
+        self._updater: Updater | None = None
 
     @classmethod
     def start(
@@ -102,7 +103,11 @@ class Reconstruction(Committed):
             progress: told of each stage.
             history: where to commit to; in memory when left out.
             static: a frame 0 that was fitted before, taken as it is.
+
+        Raises:
+            DeviceError: the settings' device cannot be had here.
         """
+        require_device(settings.device)
         world = rig.world_frame(settings.scene.metres_per_unit)
         scaled = rig_inside(world, rig.scaled(settings.scene.image_scale).cameras)
         self = cls(settings, scaled, world, History() if history is None else history)
@@ -174,7 +179,13 @@ class Reconstruction(Committed):
             if tied
             else None
         )
-        self._updater = FrameUpdate(self._factory, self.settings.scene, settings, hierarchy, neighbours, gaussians)
+        given = (self._factory, self.settings.scene, settings, hierarchy, neighbours, gaussians)
+        if self.settings.device == "cpu":
+            self._updater = FrameUpdate(*given)
+        else:
+            from scas4d_core.update_device import DeviceUpdate  # torch is loaded only where it is used
+
+            self._updater = DeviceUpdate(*given, device=self.settings.device)
 
     def _scaled(self, frame: Frame) -> Frame:
         """The frame with its pictures at the size of ``rig``."""

@@ -6,7 +6,6 @@ loss and neighbour terms, backward, Adam. Not yet run on a GPU.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias
@@ -23,6 +22,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.rasterize import cuda, twin
 from scas4d_core.rasterize.limits import DEFAULT, GSPLAT, Limits
 from scas4d_core.rasterize.twin import CameraParams, Rendered
+from scas4d_core.update_plan import Rates
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Render: TypeAlias = Callable[[Tensor, Tensor, Tensor, Tensor, CameraParams, Tensor, Limits], Rendered]
@@ -69,37 +69,13 @@ class TrainingView(NamedTuple):
         camera: of the inside world, of the picture's size.
         image: [H, W, 3] in 0…1.
         mask: [H, W] in 0…1, or None.
+        exposure: [3, 2] the camera's gain and offset of each colour; None: 1 and 0.
     """
 
     camera: Camera
     image: Floats
     mask: Floats | None
-
-
-@dataclass(frozen=True)
-class Rates:
-    """Adam's rates per iteration; a rate of 0 leaves the parameter where it starts.
-
-    Attributes:
-        layers: (rotation r, translation t in metres, scaling c and s), one a layer, coarse to fine.
-        position, rotation, scale, colour: of Δp in metres, ΔR, Δs, RGB.
-        end: all rates fall to this fraction in the last iteration, along half a cosine; 1 keeps them.
-        beta1, beta2: Adam's decays.
-    """
-
-    layers: tuple[tuple[float, float, float], ...]
-    position: float
-    rotation: float
-    scale: float
-    colour: float
-    end: float = 1.0
-    beta1: float = 0.9
-    beta2: float = 0.999
-
-    def factor(self, iteration: int, iterations: int) -> float:
-        """Share of the rates in an iteration counted from 0."""
-        done = iteration / max(1, iterations - 1)
-        return self.end + (1 - self.end) * 0.5 * (1 + math.cos(math.pi * done))
+    exposure: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -124,6 +100,7 @@ class Updated(NamedTuple):
         layers: cluster parameters at the end, coarse to fine; the next frame's warm start.
         deltas: per Gaussian at the end.
         losses: one weighted sum an iteration.
+        psnr: dB, of the view that each iteration rendered.
     """
 
     gaussians: Gaussians
@@ -131,6 +108,7 @@ class Updated(NamedTuple):
     layers: list[ClusterArrays]
     deltas: DeltaArrays
     losses: list[float]
+    psnr: list[float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +184,7 @@ class TorchUpdate:
             scene.parameter_groups(self.rates), betas=(self.rates.beta1, self.rates.beta2), eps=ADAM_EPSILON
         )
         base = [group["lr"] for group in optimizer.param_groups]
-        history: list[Tensor] = []
+        history: list[tuple[Tensor, Tensor]] = []
         for iteration, view in enumerate(order):
             for group, rate in zip(optimizer.param_groups, base, strict=True):
                 group["lr"] = rate * self.rates.factor(iteration, len(order))
@@ -215,11 +193,12 @@ class TorchUpdate:
             loss = scene.loss(view, sampled)
             loss.backward()  # type: ignore[no-untyped-call]
             optimizer.step()
-            history.append(loss.detach())
+            history.append((loss.detach(), scene.psnr))
             if on_iteration is not None:
                 on_iteration(iteration + 1)
         # The losses stay on the device until here: reading each would make the host wait for it.
-        return scene.result(gaussians, torch.stack(history).tolist() if history else [])
+        found, psnr = (torch.stack(values).tolist() for values in zip(*history, strict=True)) if history else ([], [])
+        return scene.result(gaussians, found, psnr)
 
 
 @dataclass(eq=False)
@@ -241,7 +220,8 @@ class _Scene:
     pair_weights: Tensor
     distances: Tensor
     first_lengths: Tensor
-    views: list[tuple[CameraParams, Tensor, Tensor | None]]
+    views: list[tuple[CameraParams, Tensor, Tensor | None, Tensor | None]]
+    psnr: Tensor = field(default_factory=lambda: torch.tensor(torch.nan))
 
     @classmethod
     def of(
@@ -276,6 +256,7 @@ class _Scene:
                 CameraParams.of(view.camera, update.dtype, update.device),
                 floats(view.image),
                 None if view.mask is None else floats(view.mask)[..., None],
+                None if view.exposure is None else floats(view.exposure),
             )
             for view in views
         ]
@@ -327,8 +308,8 @@ class _Scene:
         return deform(means, factors, self.layers, self.deltas, self.update.cluster_map)
 
     def loss(self, view: int, rows: Tensor | None) -> Tensor:
-        """The weighted sum of the terms, seen from one view."""
-        camera, image, mask = self.views[view]
+        """The weighted sum of the terms, seen from one view; leaves the view's ``psnr``."""
+        camera, image, mask, exposure = self.views[view]
         now = self.deformed()
         features, background = self.colours, [*self.update.background]
         if mask is not None and self.update.weights.mask > 0:
@@ -344,8 +325,11 @@ class _Scene:
             image.new_tensor(background),
             GSPLAT if self.update.on_cuda else DEFAULT,
         ).features
-        weights = self.update.weights
-        terms = [weights.image * losses.image_loss(picture[..., :3], image)]
+        weights, colour = self.update.weights, picture[..., :3]
+        if exposure is not None:
+            colour = colour * exposure[:, 0] + exposure[:, 1]
+        terms = [weights.image * losses.image_loss(colour, image)]
+        self.psnr = losses.psnr(colour.detach(), image)
         if mask is not None and weights.mask > 0:
             terms.append(weights.mask * losses.image_loss(picture[..., 3:], mask))
         if weights.soft_colour > 0:
@@ -370,7 +354,7 @@ class _Scene:
         return terms
 
     @torch.no_grad()
-    def result(self, gaussians: Gaussians, history: list[float]) -> Updated:
+    def result(self, gaussians: Gaussians, history: list[float], psnr: list[float]) -> Updated:
         """Θ_t and the parameters, as numpy."""
 
         def array(tensor: Tensor) -> NDArray[np.float32]:
@@ -387,4 +371,4 @@ class _Scene:
         )
         layers = [ClusterArrays(*(array(tensor) for tensor in layer.params)) for layer in self.layers]
         own = DeltaArrays(*(array(tensor) for tensor in self.deltas))
-        return Updated(state, array(now.turns), layers, own, history)
+        return Updated(state, array(now.turns), layers, own, history, psnr)

@@ -7,11 +7,12 @@ a point on a circle goes on along the circle, and so do the clusters of finer la
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.deformation_cpu import CpuDeformation
+from scas4d_core.hierarchy import Hierarchy
 from scas4d_core.settings import UpdateSettings
 
 Array = NDArray[np.float32]
@@ -40,6 +41,14 @@ def rotate(r: NDArray[np.floating], vectors: NDArray[np.floating]) -> Float:
     return turned
 
 
+class Parameters(Protocol):
+    """What a deformation learns, wherever: ``clusters`` per layer [K, 10], columns r, t, c, s; ``deltas`` [M, 9]."""
+
+    hierarchy: Hierarchy
+    clusters: list[Array]
+    deltas: Array
+
+
 @dataclass(frozen=True, eq=False)
 class Motion:
     """A motion that was found, to start the next from.
@@ -56,7 +65,7 @@ class Motion:
     seconds: float
 
     @classmethod
-    def of(cls, deformation: CpuDeformation, seconds: float) -> Motion:
+    def of(cls, deformation: Parameters, seconds: float) -> Motion:
         """Read what a deformation found. What the Gaussians of a finest cluster add in common becomes its own shift."""
         hierarchy = deformation.hierarchy
         turns = [values[:, :3].astype(np.float64) for values in deformation.clusters]
@@ -79,7 +88,7 @@ class Motion:
         return cls(turns, shifts, rest, seconds)
 
 
-def warm_start(deformation: CpuDeformation, motion: Motion | None, seconds: float, settings: UpdateSettings) -> None:
+def warm_start(deformation: Parameters, motion: Motion | None, seconds: float, settings: UpdateSettings) -> None:
     """Set the parameters to the motion before, per unit of time; scaling (c, s) and Δs start at the identity."""
     for values in [*deformation.clusters, deformation.deltas]:
         values[:] = 0

@@ -1,0 +1,40 @@
+"""Whether the device that the settings name can be had."""
+
+from __future__ import annotations
+
+import importlib.util
+
+
+class DeviceError(RuntimeError):
+    """A device that is not there; the message says what to do."""
+
+
+def require_device(device: str) -> None:
+    """Return where the update can run on ``device``.
+
+    Args:
+        device: "cpu" or "cuda".
+
+    Raises:
+        DeviceError: "cuda" without torch, a torch built for CUDA, a GPU, or gsplat.
+    """
+    if device == "cpu":
+        return
+    otherwise = "or choose device 'cpu'"
+    for package in ("torch", "gsplat"):
+        if importlib.util.find_spec(package) is None:
+            raise DeviceError(
+                f"device {device!r}: {package} is not installed; run pip install 'scas4d[cuda]', {otherwise}"
+            )
+    import torch
+
+    if torch.version.cuda is None:
+        raise DeviceError(
+            f"device {device!r}: torch {torch.__version__} is built without CUDA; "
+            f"install a CUDA build from pytorch.org, {otherwise}"
+        )
+    if not torch.cuda.is_available():
+        raise DeviceError(
+            f"device {device!r}: torch {torch.__version__} finds no GPU; "
+            f"see whether nvidia-smi lists one and its driver knows CUDA {torch.version.cuda}, {otherwise}"
+        )

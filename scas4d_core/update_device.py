@@ -1,0 +1,142 @@
+"""One frame's update on a torch device: ``update_torch`` behind the interface of ``update.FrameUpdate``.
+
+On "cuda" gsplat rasterizes; on "cpu" the dense twin does, which is slow and exact and there for tests. The order of
+views, the samples, the rates, the hierarchy and the warm start are those of the CPU. Not yet run on a GPU.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from scas4d_core import update_torch
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.hierarchy import Hierarchy
+from scas4d_core.neighbours import Neighbours
+from scas4d_core.settings import SceneSettings, UpdateSettings
+from scas4d_core.update import Stopwatch, Updated
+from scas4d_core.update_plan import Rates, first_lengths, plan_samples, plan_views
+from scas4d_core.update_torch import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchUpdate
+from scas4d_core.views import LABEL, TrainingView, ViewFactory
+from scas4d_core.warm_start import Motion, warm_start
+
+Array = NDArray[np.float32]
+
+
+@dataclass(eq=False)
+class Tables:
+    """``warm_start.Parameters`` on the host."""
+
+    hierarchy: Hierarchy
+    clusters: list[Array]
+    deltas: Array
+
+    @classmethod
+    def identity(cls, hierarchy: Hierarchy) -> Tables:
+        """Zeros."""
+        clusters = [np.zeros((size, 10), np.float32) for size in hierarchy.sizes]
+        return cls(hierarchy, clusters, np.zeros((len(hierarchy.rows), 9), np.float32))
+
+    @classmethod
+    def of(cls, hierarchy: Hierarchy, found: update_torch.Updated) -> Tables:
+        """What an update found."""
+        clusters = [np.concatenate([p.r, p.t, p.c, p.s[:, None]], axis=1) for p in found.layers]
+        return cls(hierarchy, clusters, np.concatenate(found.deltas, axis=1))
+
+    def split(self) -> tuple[list[ClusterArrays], DeltaArrays]:
+        """The same as ``update_torch`` takes it."""
+        layers = [ClusterArrays(v[:, :3], v[:, 3:6], v[:, 6:9], v[:, 9]) for v in self.clusters]
+        return layers, DeltaArrays(self.deltas[:, :3], self.deltas[:, 3:6], self.deltas[:, 6:])
+
+
+class DeviceUpdate:
+    """The ``Updater`` of a torch device; its arguments are those of ``FrameUpdate``, and the device and dtype."""
+
+    def __init__(
+        self,
+        factory: ViewFactory,
+        scene: SceneSettings,
+        settings: UpdateSettings,
+        hierarchy: Hierarchy,
+        neighbours: Neighbours | None,
+        first: Gaussians,
+        device: str = "cuda",
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        self.settings = settings
+        self.hierarchy = hierarchy
+        self._factory = factory
+        self._update = TorchUpdate(
+            moving=hierarchy.rows,
+            labels=[labels.astype(np.int64) for labels in hierarchy.labels],
+            graph=_graph(neighbours, len(hierarchy.rows)),
+            first_lengths=first_lengths(hierarchy, first),
+            rates=Rates.of(settings, len(hierarchy.sizes), factory.rig.radius),
+            weights=_weights(settings, neighbours is not None),
+            max_scale=settings.max_scale,
+            background=scene.background,
+            cluster_map=settings.cluster_map,
+            device=device,
+            dtype=dtype,
+        )
+
+    def run(
+        self, previous: Gaussians, views: list[TrainingView], motion: Motion | None, seconds: float, seed: int
+    ) -> Updated:
+        """Find D_t and apply it, see ``update.Updater.run``."""
+        settings, hierarchy = self.settings, self.hierarchy
+        rng = np.random.default_rng([settings.seed, seed])
+        watch = Stopwatch()
+        pictures = plan_views(self._factory, views, settings, rng)
+        samples = plan_samples(len(hierarchy.rows), settings.neighbour_sample, rng)
+        tables = Tables.identity(hierarchy)
+        warm_start(tables, motion, seconds, settings)
+        start, deltas = tables.split()
+        distinct = {id(view): view for view in pictures}
+        place = {key: index for index, key in enumerate(distinct)}
+        watch.lap("start")
+        found = self._update.run(
+            previous,
+            [self._on_device(view) for view in distinct.values()],
+            [place[id(view)] for view in pictures],
+            start=start,
+            deltas=deltas,
+            rows=[samples[iteration % len(samples)] for iteration in range(settings.iterations)],
+        )
+        watch.lap("iterations")
+        motion = Motion.of(Tables.of(hierarchy, found), seconds)
+        watch.lap("commit")
+        return Updated(found.gaussians, motion, found.losses, found.psnr, watch.seconds)
+
+    def _on_device(self, view: TrainingView) -> update_torch.TrainingView:
+        """The view as ``update_torch`` takes it; a picture smaller than its camera's is a coarse one."""
+        camera = self._factory.rig[view.name]
+        if (camera.width, camera.height) != (view.camera.width, view.camera.height):
+            camera = camera.scaled(self.settings.coarse_scale)
+        target = np.moveaxis(view.target, 0, -1)
+        mask = target[..., LABEL] if target.shape[-1] > LABEL else None
+        return update_torch.TrainingView(camera, target[..., :LABEL], mask, view.exposure[:LABEL])
+
+
+def _graph(neighbours: Neighbours | None, count: int) -> Graph:
+    """The neighbours; without any, an empty graph that no term reads."""
+    if neighbours is None:
+        return Graph(np.zeros((count, 0), np.int64), np.zeros((count, 0)), np.zeros((count, 0)))
+    return Graph(neighbours.index.astype(np.int64), neighbours.weights, neighbours.distances)
+
+
+def _weights(settings: UpdateSettings, tied: bool) -> TermWeights:
+    """The weights of the terms; those between neighbours only where there are any."""
+    given = settings.weights
+    return TermWeights(
+        image=given.image,
+        mask=given.mask,
+        rigidity=given.rigidity if tied else 0.0,
+        isometry=given.isometry if tied else 0.0,
+        rotation=given.rotation if tied else 0.0,
+        scale=given.scale,
+        soft_colour=given.soft_colour,
+    )

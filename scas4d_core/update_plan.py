@@ -1,0 +1,81 @@
+"""What each iteration of an update looks at, and how far it steps: the same on every device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import cos, pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.hierarchy import Hierarchy
+from scas4d_core.settings import UpdateSettings
+from scas4d_core.views import TrainingView, ViewFactory, view_order
+
+STANDARD_RADIUS_M = 4.0
+"""The scene radius for which the translation rates of the layers are given."""
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's rates per iteration; a rate of 0 leaves the parameter where it starts.
+
+    Attributes:
+        layers: (rotation r, translation t in metres, scaling c and s), one a layer, coarse to fine.
+        position, rotation, scale, colour: of Δp in metres, ΔR, Δs, RGB.
+        end: all rates fall to this fraction in the last iteration, along half a cosine; 1 keeps them.
+        beta1, beta2: Adam's decays.
+    """
+
+    layers: tuple[tuple[float, float, float], ...]
+    position: float
+    rotation: float
+    scale: float
+    colour: float
+    end: float = 1.0
+    beta1: float = 0.9
+    beta2: float = 0.999
+
+    def factor(self, iteration: int, iterations: int) -> float:
+        """Share of the rates in an iteration counted from 0."""
+        done = iteration / max(1, iterations - 1)
+        return self.end + (1 - self.end) * 0.5 * (1 + cos(pi * done))
+
+    @classmethod
+    def of(cls, settings: UpdateSettings, layers: int, radius: float) -> Rates:
+        """The rates of a scene of ``radius`` metres whose hierarchy has so many layers."""
+        named = [settings.layer_rates[min(k, len(settings.layer_rates) - 1)] for k in range(layers)]
+        return cls(
+            layers=tuple((r.rotation, r.translation * radius / STANDARD_RADIUS_M, r.scaling) for r in named),
+            position=settings.rate_position * radius,
+            rotation=settings.rate_rotation,
+            scale=settings.rate_scale,
+            colour=settings.rate_colour,
+            end=settings.rate_end,
+            beta1=settings.beta1,
+            beta2=settings.beta2,
+        )
+
+
+def plan_views(
+    factory: ViewFactory, views: list[TrainingView], settings: UpdateSettings, rng: np.random.Generator
+) -> list[TrainingView]:
+    """The view of each iteration, in random rounds: coarser pictures first, where the settings say so."""
+    order = view_order(len(views), settings.iterations, rng)
+    coarse = order[: round(settings.coarse_until * settings.iterations)]
+    small = {index: factory.coarser(views[index], settings.coarse_scale) for index in set(coarse)}
+    return [small[index] for index in coarse] + [views[index] for index in order[len(coarse) :]]
+
+
+def plan_samples(count: int, size: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:
+    """Disjoint random sets of at most ``size`` of ``count`` Gaussians that cover all: each iteration takes the next."""
+    order = rng.permutation(count)
+    size = min(size, max(count, 1))
+    return [np.sort(order[k : k + size]) for k in range(0, max(count, 1), size)]
+
+
+def first_lengths(hierarchy: Hierarchy, first: Gaussians) -> NDArray[np.float32]:
+    """[M, 3] metres, lengths of the moving Gaussians' axes at frame 0, which the scale loss lets them have."""
+    lengths: NDArray[np.float32] = np.sqrt(np.square(first.factors[hierarchy.rows]).sum(axis=1))
+    return lengths
