@@ -22,6 +22,9 @@ from scas4d_core.tracks import ALPHA_OF_A_SURFACE, Tracks
 
 Array = NDArray[np.float32]
 
+MOST_LABEL = 254
+"""Parts are painted into 8 bits, 0 being nothing."""
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -82,15 +85,23 @@ class Committed:
         return View(colour, alpha, depth, parts)
 
     def _parts_picture(self, gaussians: Gaussians, labels: NDArray[Any], inside: Camera) -> NDArray[np.uint8]:
-        """[H, W] the label whose Gaussians weigh most in the pixel, plus 1."""
-        count = int(labels.max()) + 2
-        weights = np.zeros((len(gaussians), -(-count // GROUP) * GROUP), np.float32)
-        weights[np.arange(len(gaussians)), labels + 1] = 1
-        picture = self._rasterizer.forward(
-            gaussians.means, gaussians.factors, gaussians.opacities, weights, CameraArrays.of(inside),
-            np.zeros(weights.shape[1], np.float32),
-        )  # fmt: skip
-        found: NDArray[np.uint8] = picture.features.argmax(axis=0).astype(np.uint8)
+        """[H, W] the label whose Gaussians weigh most in the pixel, plus 1; as many labels a pass as colours have."""
+        if labels.shape != (len(gaussians),) or not ((labels >= -1) & (labels <= MOST_LABEL)).all():
+            raise ValueError(
+                f"labels {labels.shape} must be [{len(gaussians)}], one a Gaussian, each in -1...{MOST_LABEL}"
+            )
+        found = np.zeros((inside.height, inside.width), np.uint8)
+        most = np.full(found.shape, -1.0, np.float32)
+        black = np.zeros(GROUP, np.float32)
+        for first in range(-1, int(labels.max(initial=-1)) + 1, GROUP):
+            weights = (labels[:, None] == np.arange(first, first + GROUP)).astype(np.float32)
+            picture = self._rasterizer.forward(
+                gaussians.means, gaussians.factors, gaussians.opacities, weights, CameraArrays.of(inside), black
+            )
+            best = picture.features.max(axis=0)
+            wins = best > most
+            found[wins] = (first + 1 + picture.features.argmax(axis=0))[wins]
+            most[wins] = best[wins]
         found[picture.rest > 1 - ALPHA_OF_A_SURFACE] = 0
         return found
 

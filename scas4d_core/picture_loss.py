@@ -97,3 +97,13 @@ class PictureLoss:
         gradients = self.rasterizer.backward(g_image, g_alpha, self._detached)
         lap("render backward")
         return gradients
+
+    def coverage(self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView) -> Array:
+        """[N] pixels' worth of blending weight of each Gaussian in a view; the gradient of a channel's sum."""
+        self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background)
+        g_image, g_alpha = self.rasterizer.gradient_buffers()
+        g_image[:] = 0
+        g_image[LABEL, : view.camera.height, : view.camera.width] = 1
+        weights = self.rasterizer.backward(g_image, g_alpha, LABEL).features[:, LABEL].copy()
+        g_image[:] = 0
+        return weights

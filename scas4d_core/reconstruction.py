@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from math import inf, isfinite
 from time import perf_counter
 
 import numpy as np
@@ -22,7 +23,7 @@ from scas4d_core.neighbours import build_neighbours
 from scas4d_core.settings import Settings
 from scas4d_core.static_scene import StaticResult, fit_static_scene
 from scas4d_core.update import FrameUpdate, Updated, Updater
-from scas4d_core.views import TrainingView, ViewFactory
+from scas4d_core.views import TrainingView, ViewFactory, pictures_of
 from scas4d_core.warm_start import Motion
 
 __all__ = ["FrameReport", "Progress", "Reconstruction", "StepError", "View"]
@@ -77,6 +78,7 @@ class Reconstruction(Committed):
         self.settings = settings
         self.rig = rig
         self._factory = ViewFactory(rig)
+        self._sizes: dict[str, tuple[int, int]] = {}
         self._exposures: dict[str, NDArray[np.float32]] = {}
         self.static: StaticResult | None = None
         self._motion: Motion | None = None
@@ -106,11 +108,15 @@ class Reconstruction(Committed):
 
         Raises:
             DeviceError: the settings' device cannot be had here.
+            ValueError: a time that is not finite, or pictures of another size.
         """
+        if not isfinite(frame.time):
+            raise ValueError(f"frame {frame.index}: time {frame.time} s must be finite")
         require_device(settings.device)
         world = rig.world_frame(settings.scene.metres_per_unit)
         scaled = rig_inside(world, rig.scaled(settings.scene.image_scale).cameras)
         self = cls(settings, scaled, world, History() if history is None else history)
+        self._sizes = {camera.name: (camera.width, camera.height) for camera in rig.cameras}
         result = static or self._fit_static(rig, self._scaled(frame), points, progress or (lambda _: None))
         self.static = result
         self._exposures = result.exposures
@@ -149,18 +155,23 @@ class Reconstruction(Committed):
         if frame.index <= last:
             raise StepError(f"frame {frame.index} is not after the last committed frame {last}")
         seconds = frame.time - self.history.time(last)
-        if not seconds > 0:
+        if not 0 < seconds < inf:
             raise StepError(f"frame {frame.index}: time {frame.time} s is not after {self.history.time(last)} s")
         started = perf_counter()
         try:
-            views = self._factory.views(self._scaled(frame), self._exposures, self.settings.update.use_masks)
+            views = self._factory.views(self._scaled(frame), self._exposures, self._uses_masks)
         except ValueError as error:
             raise StepError(str(error)) from error
         decoded = perf_counter() - started
         updated = self._update(views, seconds, frame.index)
-        self._motion = updated.motion
         self.history.append(frame.index, frame.time, updated.gaussians)
+        self._motion = updated.motion
         return self._report(frame, updated, decoded)
+
+    @property
+    def _uses_masks(self) -> bool:
+        """Whether updates look at masks."""
+        return self.settings.update.use_masks and self.settings.update.weights.mask > 0
 
     def _update(self, views: list[TrainingView], seconds: float, seed: int) -> Updated:
         assert self._updater is not None
@@ -192,12 +203,13 @@ class Reconstruction(Committed):
         if self.settings.scene.image_scale == 1.0:
             return frame
         sizes = {camera.name: (camera.width, camera.height) for camera in self.rig.cameras}
-        images = {name: resize_area(frame.images[name], size) for name, size in sizes.items() if name in frame.images}
-        masks = {
-            name: (resize_area(255 * frame.masks[name], size) >= 128).astype(np.uint8)
-            for name, size in sizes.items()
-            if name in frame.masks
-        }
+        images, masks = {}, {}
+        for name, size in sizes.items():
+            if name in frame.images:
+                image, mask = pictures_of(frame, name, self._sizes[name])
+                images[name] = resize_area(image, size)
+                if mask is not None:
+                    masks[name] = (resize_area(255 * mask, size) >= 128).astype(np.uint8)
         return Frame(frame.index, frame.time, images, masks)
 
     def _report(self, frame: Frame, updated: Updated, decoded: float) -> FrameReport:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -13,7 +13,7 @@ NotNegative = Annotated[float, Field(ge=0)]
 class Model(BaseModel):
     """Settings do not change once read, and an unknown name is an error."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class SceneSettings(Model):
@@ -25,11 +25,6 @@ class SceneSettings(Model):
     image_scale: float = Field(1.0, gt=0, le=1, description="Pictures are resized by this before anything else.")
     background: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0), description="RGB in 0…1 behind everything; black, as in the captures of the field."
-    )
-    floor: tuple[float, float, float, float] | None = Field(
-        None,
-        description="Plane (a, b, c, d) of the floor in the user's world, a·x+b·y+c·z+d > 0 below it; "
-        "foreground below the floor is pushed up. None: the scene has no floor term.",
     )
 
 
@@ -48,6 +43,10 @@ class StaticSettings(Model):
         "budget decides how many are, hardest pulled first.",
     )
     prune_opacity: NotNegative = Field(0.01, description="Less opaque Gaussians are removed while densifying.")
+    min_views: int = Field(2, ge=0, description="What fewer training cameras than this see is removed.")
+    seen_pixels: NotNegative = Field(
+        0.05, description="Pixels' worth of blending weight from which a camera counts as seeing a Gaussian."
+    )
     exposure: bool = Field(
         False, description="Learn a colour gain and offset per training camera (held-out cameras are scored raw)."
     )
@@ -82,8 +81,6 @@ class Weights(Model):
     rotation: NotNegative = Field(4.0, description="Likewise.")
     scale: NotNegative = Field(10.0, description="Likewise, the paper's 0.48 to 0.05.")
     soft_colour: NotNegative = Field(0.01, description="Dynamic3DGaussians; the paper does not give it.")
-    floor: NotNegative = Field(2.0, description="Dynamic3DGaussians; only where the scene names a floor.")
-    background: NotNegative = Field(20.0, description="Dynamic3DGaussians; only where standing Gaussians may move.")
 
 
 class UpdateSettings(Model):
@@ -103,7 +100,11 @@ class UpdateSettings(Model):
             LayerRates(rotation=0.01, translation=0.002, scaling=0.002),
             LayerRates(rotation=0.005, translation=0.001, scaling=0.002),
         ),
+        min_length=1,
         description="One per layer, coarse to fine; with more layers the last is repeated.",
+    )
+    cold_start: float = Field(
+        1.0, ge=1, description="Factor on the layers' rates where there is no motion to start from: further to go."
     )
     rate_position: Positive = Field(1.6e-4, description="Δp, per metre of scene radius.")
     rate_rotation: Positive = Field(0.002, description="ΔR, in units of tan(angle/2).")
@@ -129,6 +130,13 @@ class UpdateSettings(Model):
     weights: Weights = Field(default_factory=Weights)
     use_masks: bool = Field(True, description="Use the frame's masks where it has any.")
     seed: int = Field(0, ge=0, description="Seed of the order of views and of the sampled neighbours.")
+
+    @field_validator("clusters")
+    @classmethod
+    def _ascend(cls, clusters: tuple[int, ...]) -> tuple[int, ...]:
+        if any(size < 1 for size in clusters) or list(clusters) != sorted(set(clusters)):
+            raise ValueError(f"clusters {clusters} must be at least 1 and ascend from the coarsest layer to the finest")
+        return clusters
 
 
 class Settings(Model):

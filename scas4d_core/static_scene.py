@@ -126,6 +126,8 @@ class StaticTrainer:
             if settings.densify_from <= done <= until and done % settings.densify_every == 0:
                 share = (done - settings.densify_from) / max(until - settings.densify_from, 1)
                 self.control_density(round(start + (settings.max_gaussians - start) * min(1.0, share + 0.1)))
+            if done == until or done == (until + settings.iterations) // 2:
+                self.remove_unseen()
             if progress is not None:
                 progress(done, losses[-1])
         return losses
@@ -179,7 +181,7 @@ class StaticTrainer:
         settings = self.settings
         opacity = 1 / (1 + np.exp(-self.parameters[:, 10]))
         score = self._screen / np.maximum(self._seen, 1)
-        keep = opacity >= settings.prune_opacity
+        keep = opacity >= min(settings.prune_opacity, float(np.median(opacity)))  # never more than half at once
         room = max(0, min(target, settings.max_gaussians) - int(keep.sum()))
         score = np.where(keep & (score >= settings.densify_gradient), score, 0)
         chosen = np.argsort(-score, kind="stable")[: min(room, int((score > 0).sum()))]
@@ -189,14 +191,31 @@ class StaticTrainer:
         clone = chosen[largest[chosen] <= median]
         halves = [self._half(split), self._half(split)]
         keep[split] = False
-        old = np.flatnonzero(keep)
-        added = [self.parameters[clone], *halves]
+        self._take(np.flatnonzero(keep), [self.parameters[clone], *halves])
+
+    def remove_unseen(self) -> None:
+        """Remove what fewer than ``min_views`` cameras see.
+
+        What no camera sees is free to be anything and shows once the scene moves; what one alone sees is a floater
+        that explains that camera's picture and spoils every other.
+        """
+        activation.activate(self.parameters, self._means, self._factors, self._opacities, self._features)
+        counts = np.zeros(len(self.parameters), np.int64)
+        for view in self.views:
+            seen = self._loss.coverage(self._means, self._factors, self._opacities, self._features, view)
+            counts += seen > self.settings.seen_pixels
+        keep = counts >= min(self.settings.min_views, len(self.views))
+        if keep.any():
+            self._take(np.flatnonzero(keep), [])
+
+    def _take(self, rows: NDArray[np.int64], added: list[Array]) -> None:
+        """Keep some rows with their moments and append others with none."""
         fresh = np.zeros((sum(map(len, added)), activation.COLUMNS), np.float32)
-        first, second = self._first[old], self._second[old]
-        self.parameters = np.ascontiguousarray(np.concatenate([self.parameters[old], *added]))
+        first = np.concatenate([self._first[rows], fresh])
+        second = np.concatenate([self._second[rows], fresh])
+        self.parameters = np.ascontiguousarray(np.concatenate([self.parameters[rows], *added]))
         self._reset_moments()
-        self._first[:] = np.concatenate([first, fresh])
-        self._second[:] = np.concatenate([second, fresh])
+        self._first, self._second = first, second
         self._allocate()
 
     def _half(self, rows: NDArray[np.int64]) -> Array:
@@ -244,7 +263,8 @@ def fit_static_scene(
     if len(positions) == 0:
         raise ValueError("the first cloud holds no point; give points, masks, or more overlapping cameras")
     rng = np.random.default_rng(settings.seed)
-    parameters = initial_parameters(positions, colours, foreground, settings.initial_gaussians, rng)
+    limit = min(settings.initial_gaussians, settings.max_gaussians)
+    parameters = initial_parameters(positions, colours, foreground, limit, rng)
     trainer = StaticTrainer(factory, views, parameters, scene, settings)
     losses = trainer.train(progress)
     exposures = {view.name: view.exposure[:3].copy() for view in views} if settings.exposure else {}

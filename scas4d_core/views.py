@@ -69,17 +69,12 @@ class ViewFactory:
             if name not in frame.images:
                 continue
             camera = CameraArrays.of(self.rig[name])
-            image = frame.images[name]
-            if image.shape != (camera.height, camera.width, 3):
-                raise ValueError(
-                    f"frame {frame.index}, camera {name!r}: picture is {image.shape[1]}x{image.shape[0]}, "
-                    f"the rig says {camera.width}x{camera.height}"
-                )
-            masked = use_masks and name in frame.masks
+            image, mask = pictures_of(frame, name, (camera.width, camera.height), use_masks)
+            masked = mask is not None
             target = np.empty((3 + masked, camera.height, camera.width), np.float32)
             np.multiply(np.moveaxis(image, -1, 0), np.float32(1 / 255), out=target[:3])
             if masked:
-                target[3] = frame.masks[name]
+                target[3] = mask
             exposure = np.tile(np.array([1, 0], np.float32), (3 + masked, 1))
             exposure[:3] = exposures.get(name, exposure[:3])
             views.append(self._view(name, camera, target, exposure))
@@ -103,6 +98,26 @@ class ViewFactory:
         means, squares = np.empty_like(target), np.empty_like(target)
         image_loss.target_moments(target, self.scratch(*target.shape), means, squares)
         return TrainingView(name, camera, target, means, squares, exposure)
+
+
+def pictures_of(
+    frame: Frame, name: str, size: tuple[int, int], use_masks: bool = True
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+    """A camera's picture [H, W, 3] and mask [H, W] (None where there is none), of the size (width, height).
+
+    Raises:
+        ValueError: they are of another size.
+    """
+    width, height = size
+    image = frame.images[name]
+    mask = frame.masks[name] if use_masks and name in frame.masks else None
+    for what, array, shape in (("picture", image, (height, width, 3)), ("mask", mask, (height, width))):
+        if array is not None and array.shape != shape:
+            raise ValueError(
+                f"frame {frame.index}, camera {name!r}: {what} is {'x'.join(map(str, array.shape[1::-1]))} "
+                f"(array {array.shape}), the rig says {width}x{height} (array {shape})"
+            )
+    return image, mask
 
 
 def view_order(count: int, iterations: int, rng: np.random.Generator) -> Sequence[int]:

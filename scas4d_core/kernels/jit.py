@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -11,9 +10,6 @@ import numpy as np
 from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
-
-# Threads that wait must sleep: spinning ones cost multiples when anything else wants their core, and gain nothing here.
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 # LLVM unrolls short loops before it vectorizes loops; unrolled, the rows of 16 pixels stay scalar (measured: blending
 # 3 times slower). Loops over channels (at most 8) may still be unrolled.

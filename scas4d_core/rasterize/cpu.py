@@ -172,13 +172,15 @@ class CpuRasterizer:
         Padded to whole tiles like the forward buffers. They hold 0 when first given out for a size of picture; the
         padding must keep it.
         """
-        image, rest = self._last[13], self._last[14]
+        camera, image, rest = self._last[3], self._last[13], self._last[14]
         g_image = self._buffer("g_image", image.shape)
         g_alpha = self._buffer("g_alpha", rest.shape)
-        if self._gradient_shape != image.shape:
+        # Pictures of another size may have the same tiles: their gradients would stay in the padding.
+        shape = (len(image), camera.height, camera.width)
+        if self._gradient_shape != shape:
             g_image[:] = 0
             g_alpha[:] = 0
-            self._gradient_shape = image.shape
+            self._gradient_shape = shape
         return g_image, g_alpha
 
     def backward(self, g_image: Array, g_alpha: Array, detached: int = -1) -> Gradients:
