@@ -111,3 +111,30 @@ def table(
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(page(rows))
+
+
+@app.command()
+def kernels(
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; the bars are for robot.")],
+    out: Annotated[Path | None, typer.Option(help="Write the page here, as Markdown.")] = None,
+    store: Annotated[Path, typer.Option(help="Folder of the study, for `scas4d bench table`.")] = STUDY,
+    preset: Annotated[str, typer.Option(help="Named settings.")] = "scas4d",
+    frames: Annotated[int, typer.Option(min=3, help="Of the run that is timed; the first update does not count.")] = 8,
+    repeats: Annotated[int, typer.Option(min=1, help="Of the rasterizer and of its arithmetic.")] = 9,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="A setting, as update.clusters=[1280]. May be repeated."),
+    ] = None,
+) -> None:
+    """Measures the CPU kernels: rasterizer against its arithmetic, update against its passes, peak memory.
+
+    Leave the machine alone meanwhile; NUMBA_NUM_THREADS sets the threads. Frame 0 is fitted anew, for its memory.
+    """
+    from scas4d_core.bench import kernels as of_kernels
+    from scas4d_core.bench.quality import settings_of
+
+    settings = settings_of(preset, overrides=changes or ())
+    row = of_kernels.study(capture, settings, store, frames=frames, repeats=repeats)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(of_kernels.page(row))
