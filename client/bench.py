@@ -100,7 +100,7 @@ def table(
 
     A row counts where its settings are exactly those of today's presets; of several, the one with most frames.
     """
-    from scas4d_core.bench.bars import bar_table, count_words, judge, page, read_study
+    from scas4d_core.bench.bars import bar_table, count_words, judge, left_out, page, read_study
 
     if not study.is_dir():
         raise typer.BadParameter(f"{study} is no folder; measure first: scas4d bench bars CAPTURES --out {study}")
@@ -108,6 +108,8 @@ def table(
     verdicts = judge(rows)
     print(bar_table(verdicts))
     print(f"\n{count_words(verdicts)}.")
+    if others := left_out(study, rows):
+        print(f"{others} rows of the study are not used: other settings than today's presets, or fewer frames.")
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(page(rows))
@@ -138,3 +140,23 @@ def kernels(
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(of_kernels.page(row))
+
+
+@app.command()
+def device(
+    gaussians: Annotated[int, typer.Option(min=100, help="That move; a quarter as many stand.")] = 8000,
+    size: Annotated[int, typer.Option(min=16, help="Pixels, side of the six pictures.")] = 384,
+    iterations: Annotated[int, typer.Option(min=1, help="Of the update.")] = 20,
+    repeats: Annotated[int, typer.Option(min=1, help="Of each stage, after a first call that compiles.")] = 5,
+    out: Annotated[Path | None, typer.Option(help="Write the table here, as Markdown.")] = None,
+) -> None:
+    """Compares the GPU with the CPU stage by stage, on a scene made up for it; fails where they disagree."""
+    from scas4d_core.bench import device as of_device
+
+    text, agree = of_device.run(gaussians=gaussians, size=size, iterations=iterations, repeats=repeats)
+    typer.echo(text)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(text + "\n")
+    if not agree:
+        raise typer.Exit(1)

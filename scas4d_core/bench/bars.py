@@ -205,6 +205,12 @@ def read_study(folder: Path) -> dict[tuple[str, str], Row]:
     return rows
 
 
+def left_out(folder: Path, rows: Rows) -> int:
+    """How many finished rows in the folder of a study belong to no run as it is set today, or are not its longest."""
+    used = {row.get("key") for row in rows.values()}
+    return sum("error" not in row and row["key"] not in used for row in Store(folder).rows())
+
+
 def page(rows: Rows) -> str:
     """The page of the documentation: commands, machine, date, the table of the bars, and the rows behind it."""
     verdicts = judge(rows)
@@ -241,12 +247,14 @@ sides have. The definitions of the metrics are in `scas4d_core/metrics` and `sca
 
 ## Rows
 
-{markdown(behind)}
-
-Median seconds of an update by stage:
-
-{stage_table(behind)}
+{_behind(behind)}
 """
+
+
+def _behind(rows: Sequence[Row]) -> str:
+    if not rows:
+        return "None yet."
+    return f"{markdown(rows)}\n\nMedian seconds of an update by stage:\n\n{stage_table(rows)}"
 
 
 def _value(row: Row, metric: str, updates: int) -> float | None:

@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 from client.cli import app
 from scas4d_core.bench import runs
-from scas4d_core.bench.bars import BARS, KERNELS, Bar, bar_table, count_words, judge, page, read_study
+from scas4d_core.bench.bars import BARS, KERNELS, Bar, bar_table, count_words, judge, left_out, page, read_study
 from scas4d_core.bench.quality import Job
 from scas4d_core.bench.runs import CAPTURES, RUNS, measure_runs, measured_runs
 from scas4d_core.bench.store import Store
@@ -138,6 +138,7 @@ def test_only_rows_of_todays_settings_count_and_the_longest_of_them(tmp_path):
         ("scas4d", "robot"): 31.0,
         ("robot-unaided", "robot"): 0,
     }
+    assert left_out(tmp_path, found) == 3
 
 
 def test_runs_differ_in_what_they_say_they_do(tmp_path):
