@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from scas4d_core.settings import Settings, UpdateSettings
+from scas4d_core.settings import Settings, UpdateSettings, Weights
 
 PRESETS: dict[str, Settings] = {
     "scas4d": Settings(),
-    # Per-Gaussian updates with the authors' rates (reference: Dynamic3DGaussians, train.py).
+    # Per-Gaussian updates with the authors' terms, weights and rates (Dynamic3DGaussians, train.py).
     "dynamic3dgs": Settings(
-        update=UpdateSettings(clusters=(), rate_rotation=0.001, rate_scale=0.0, rate_colour=0.0025, momentum=1.0)
+        update=UpdateSettings(
+            clusters=(),
+            rate_rotation=0.001,
+            rate_scale=0.0,
+            rate_end=1.0,
+            beta1=0.9,
+            beta2=0.999,
+            momentum=1.0,
+            cold_start=1.0,
+            weights=Weights(mask=3.0, scale=0.0),
+        )
     ),
 }
 

@@ -75,7 +75,9 @@ class Weights(Model):
     """Weights of the terms. A term with weight 0 is not computed."""
 
     image: Positive = Field(1.0, description="0.8 L1 + 0.2 (1 − SSIM).")
-    mask: NotNegative = Field(3.0, description="The same form on the rendered label; only where masks are given.")
+    mask: NotNegative = Field(
+        0.3, description="The same form on the rendered label, where masks are given; their hard edges pull a little off."
+    )
     rigidity: NotNegative = Field(4.0, description="Dynamic3DGaussians; with image 1, the paper's 0.19 to 0.05.")
     isometry: NotNegative = Field(2.0, description="Likewise.")
     rotation: NotNegative = Field(4.0, description="Likewise.")
@@ -96,15 +98,15 @@ class UpdateSettings(Model):
     )
     layer_rates: tuple[LayerRates, ...] = Field(
         (
+            LayerRates(rotation=0.04, translation=0.008, scaling=0.002),
             LayerRates(rotation=0.02, translation=0.004, scaling=0.002),
             LayerRates(rotation=0.01, translation=0.002, scaling=0.002),
-            LayerRates(rotation=0.005, translation=0.001, scaling=0.002),
         ),
         min_length=1,
         description="One per layer, coarse to fine; with more layers the last is repeated.",
     )
     cold_start: float = Field(
-        1.0, ge=1, description="Factor on the layers' rates where there is no motion to start from: further to go."
+        2.0, ge=1, description="Factor on the layers' rates where there is no motion to start from: further to go."
     )
     rate_position: Positive = Field(1.6e-4, description="Δp, per metre of scene radius.")
     rate_rotation: Positive = Field(0.002, description="ΔR, in units of tan(angle/2).")
@@ -115,10 +117,12 @@ class UpdateSettings(Model):
     )
     coarse_scale: float = Field(0.5, gt=0, le=1, description="Their size: less to render, and a wider basin.")
     rate_end: float = Field(
-        1.0, gt=0, le=1, description="All rates decay to this fraction over the frame (cosine); 1: constant."
+        0.05, gt=0, le=1, description="All rates decay to this fraction over the frame (cosine); 1: constant."
     )
-    beta1: float = Field(0.9, ge=0, lt=1, description="Adam's first decay.")
-    beta2: float = Field(0.999, ge=0, lt=1, description="Adam's second decay.")
+    beta1: float = Field(0.8, ge=0, lt=1, description="Adam's first decay.")
+    beta2: float = Field(
+        0.95, ge=0, lt=1, description="Adam's second decay; 100 iterations are too few for the usual 0.999."
+    )
     warm_start: float = Field(1.0, ge=0, le=1, description="Share of the previous deformation that starts the next.")
     momentum: float = Field(
         0.0, ge=0, le=1, description="Share of what the layers leave of the previous motion that Δp starts from."
