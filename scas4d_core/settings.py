@@ -76,7 +76,7 @@ class Weights(Model):
 
     image: Positive = Field(1.0, description="0.8 L1 + 0.2 (1 − SSIM).")
     mask: NotNegative = Field(
-        0.3, description="The same form on the rendered label, where masks are given; their hard edges pull a little off."
+        0.3, description="The same form on the rendered label, where masks are given; their hard edges pull it off."
     )
     rigidity: NotNegative = Field(4.0, description="Dynamic3DGaussians; with image 1, the paper's 0.19 to 0.05.")
     isometry: NotNegative = Field(2.0, description="Likewise.")

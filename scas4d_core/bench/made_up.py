@@ -1,0 +1,74 @@
+"""A scene made up for comparisons: a coloured ball over a floor, seen by six cameras around it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scas4d_core.cameras import Camera, Rig
+from scas4d_core.captures.frame import Frame
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
+
+SHIFT, TURN = np.array([0.015, 0.01, -0.01]), 0.05
+"""Metres, and radians about the vertical, from the first frame to the second."""
+
+
+def rig(size: int) -> Rig:
+    """Six square cameras of ``size`` pixels that look at the origin, three above and three below; y is down."""
+    lens = np.array([[1.25 * size, 0, size / 2], [0, 1.25 * size, size / 2], [0, 0, 1]])
+    cameras = []
+    for k in range(6):
+        angle = np.pi * k / 3
+        eye = np.array([1.3 * np.sin(angle), 0.45 * (-1) ** k, 1.3 * np.cos(angle)])
+        z = -eye / np.linalg.norm(eye)
+        x = np.cross([0, 1, 0], z) / np.linalg.norm(np.cross([0, 1, 0], z))
+        pose = np.eye(4)
+        pose[:3, :3] = [x, np.cross(z, x), z]
+        pose[:3, 3] = -pose[:3, :3] @ eye
+        cameras.append(Camera(f"c{k}", lens, pose, size, size))
+    return Rig(tuple(cameras))
+
+
+def ball_on_a_floor(count: int, rng: np.random.Generator) -> Gaussians:
+    """A ball of 0.25 m of ``count`` moving Gaussians and a quarter as many that stand, wide enough to cover."""
+    standing, total = count // 4, count + count // 4
+    normals = rng.normal(size=(count, 3))
+    ball = 0.25 * normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    floor = rng.uniform(-0.6, 0.6, (standing, 3))
+    floor[:, 1] = 0.3
+    widths = np.concatenate([np.full(count, 0.9 / np.sqrt(count)), np.full(standing, 1.2 / np.sqrt(standing))])
+    axes = np.linalg.qr(rng.normal(size=(total, 3, 3)))[0]
+    lengths = widths[:, None] * np.exp(rng.normal(0, 0.3, (total, 3)))
+    return Gaussians(
+        means=np.concatenate([ball, floor]).astype(np.float32),
+        factors=(axes * lengths[:, None, :]).astype(np.float32),
+        rotations=np.tile(np.array([1, 0, 0, 0], np.float32), (total, 1)),
+        opacities=rng.uniform(0.3, 0.9, total).astype(np.float32),
+        colours=rng.uniform(0.05, 0.95, (total, 3)).astype(np.float32),
+        foreground=np.where(np.arange(total) < count, 0.98, 0.02).astype(np.float32),
+        ids=np.arange(total),
+    )
+
+
+def moved(before: Gaussians) -> Gaussians:
+    """What moves, turned about the vertical and shifted."""
+    c, s = np.cos(TURN), np.sin(TURN)
+    turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    means, factors, rows = before.means.copy(), before.factors.copy(), before.moving
+    means[rows] = before.means[rows] @ turn.T + SHIFT
+    factors[rows] = turn @ before.factors[rows]
+    return before.replace(means=means, factors=factors)
+
+
+def photograph(gaussians: Gaussians, cameras: Rig) -> Frame:
+    """Frame 1 at 1 s: the pictures and masks of a rig of the inside world, as the CPU renders them."""
+    images, masks = {}, {}
+    features = np.concatenate([gaussians.colours, gaussians.foreground[:, None]], axis=1)
+    for camera in cameras.cameras:
+        picture = CpuRasterizer().forward(
+            gaussians.means, gaussians.factors, gaussians.opacities, features, CameraArrays.of(camera),
+            np.zeros(4, np.float32),
+        )  # fmt: skip
+        images[camera.name] = (255 * np.moveaxis(picture.features[:3], 0, -1).clip(0, 1)).round().astype(np.uint8)
+        masks[camera.name] = (picture.features[3] > 0.5).astype(np.uint8)
+    return Frame(1, 1.0, images, masks)
