@@ -139,7 +139,10 @@ def _micro_forward(splats: Any, features: Any, limits: Any, image: Any) -> None:
                 lanes[3, k] += weight[k] * f1
                 lanes[4, k] += weight[k] * f2
                 lanes[5, k] += weight[k] * f3
-    image[:] = state
+    for row in range(TILE):
+        for channel in range(2 + CHANNELS):
+            for k in range(TILE):
+                image[row, channel, k] = state[row, channel, k]
 
 
 @kernel  # type: ignore[untyped-decorator]
@@ -147,8 +150,10 @@ def _micro_backward(splats: Any, features: Any, limits: Any, image: Any, out: An
     floor, cap, stop = limits[0], limits[1], limits[2]
     state = np.empty((TILE, 2 + CHANNELS, TILE), np.float32)  # per row: light alive, remaining, gradients
     sums = np.empty((SUMS, TILE), np.float32)  # over rows: 1, dy, dy^2; this row: dot, weight; features
-    state[:] = image
-    state[:, 0] = ONE
+    for row in range(TILE):
+        for channel in range(2 + CHANNELS):
+            for k in range(TILE):
+                state[row, channel, k] = image[row, channel, k] if channel > 0 else ONE
     for i in range(GAUSSIANS):
         mx, my = splats[i, MEAN_X], splats[i, MEAN_Y]
         a, b, c, opacity = splats[i, CONIC_A], splats[i, CONIC_B], splats[i, CONIC_C], splats[i, OPACITY]
@@ -186,7 +191,9 @@ def _micro_backward(splats: Any, features: Any, limits: Any, image: Any, out: An
                 sums[6, k] += sums[4, k] * lanes[3, k]
                 sums[7, k] += sums[4, k] * lanes[4, k]
                 sums[8, k] += sums[4, k] * lanes[5, k]
-        out[i] = sums
+        for column in range(SUMS):
+            for k in range(TILE):
+                out[i, column, k] = sums[column, k]
 
 
 @parallel_kernel  # type: ignore[untyped-decorator]

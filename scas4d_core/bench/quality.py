@@ -62,7 +62,9 @@ class Job:
     def variant(self) -> str:
         """What is the same over captures: preset, iterations and everything else that is set."""
         update = self.settings.update
-        given = {"frames": self.frames, "masks": self.masks, "points": self.points}
+        given: Row = {"frames": self.frames, "masks": self.masks, "points": self.points}
+        if self.lpips:
+            given["lpips"] = True
         return (
             f"{self.preset}-{update.iterations}-s{update.seed}-{digest(self.settings.model_dump(mode='json'), given)}"
         )

@@ -264,6 +264,26 @@ def test_the_study_measures_saves_and_goes_on_where_it_stopped(capture_folder, t
         quality.run([capture_folder], tmp_path, ["scas4d"], iterations=[7], masks=False, report=lines.append)
 
 
+def test_frame_0_alone_without_help(capture_folder, tmp_path, stand_in):
+    stand_in(Perfect)
+    lines: list[str] = []
+    (row,) = quality.run([capture_folder], tmp_path, frames=1, masks=False, points=False, report=lines.append)
+    assert row["updates"] == 0
+    assert row["given"] == {"frames": 1, "masks": False, "points": False}
+    assert row["psnr_first"] > 80
+    assert "psnr" not in row
+    assert "track_3d_median" not in row
+    assert "| plates | scas4d | 100 | no masks, no points |" in lines[-1]
+
+
+def test_changes_are_what_differs_from_the_preset(tmp_path):
+    job = quality.Job(tmp_path, "scas4d", quality.settings_of("scas4d", 300, 5, ["update.clusters=[64]"]), points=False)
+    assert job.changes == "update.clusters=[64], no points"
+    assert quality.Job(tmp_path, "scas4d", quality.settings_of("scas4d", 300, 5)).changes == ""
+    keys = {dataclasses.replace(job, **other).key for other in ({}, {"masks": False}, {"frames": 3}, {"lpips": True})}
+    assert len(keys) == 4
+
+
 def test_a_row_that_fails_says_so_and_is_tried_again(tmp_path, monkeypatch):
     lines: list[str] = []
     (row,) = quality.run([tmp_path / "nowhere"], tmp_path / "out", report=lines.append)  # in a process of its own
