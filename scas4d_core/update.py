@@ -150,9 +150,9 @@ class FrameUpdate:
 
     def _optimizers(self, colours: Array, cold: bool) -> list[Adam]:
         """One per table: each layer of clusters, the Gaussians' own deltas, the colours. Moments start at zero."""
-        rates, deformation = self._rates, self._deformation
-        faster = self.settings.cold_start if cold else 1.0
-        columns = [[faster * r] * 3 + [faster * t] * 3 + [scaling] * 4 for r, t, scaling in rates.layers]
+        deformation = self._deformation
+        rates = self._rates.hurried(self.settings.cold_start) if cold else self._rates
+        columns = [[r] * 3 + [t] * 3 + [scaling] * 4 for r, t, scaling in rates.layers]
         columns.append([rates.position] * 3 + [rates.rotation] * 3 + [rates.scale] * 3)
         columns.append([rates.colour] * 3)
         tables = [*deformation.clusters, deformation.deltas, colours]

@@ -6,7 +6,7 @@ views, the samples, the rates, the hierarchy and the warm start are those of the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -94,11 +94,14 @@ class DeviceUpdate:
         samples = plan_samples(len(hierarchy.rows), settings.neighbour_sample, rng)
         tables = Tables.identity(hierarchy)
         warm_start(tables, motion, seconds, settings)
+        update = self._update
+        if motion is None:
+            update = replace(update, rates=update.rates.hurried(settings.cold_start))
         start, deltas = tables.split()
         distinct = {id(view): view for view in pictures}
         place = {key: index for index, key in enumerate(distinct)}
         watch.lap("start")
-        found = self._update.run(
+        found = update.run(
             previous,
             [self._on_device(view) for view in distinct.values()],
             [place[id(view)] for view in pictures],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, pi
 
 import numpy as np
@@ -41,6 +41,10 @@ class Rates:
         """Share of the rates in an iteration counted from 0."""
         done = iteration / max(1, iterations - 1)
         return self.end + (1 - self.end) * 0.5 * (1 + cos(pi * done))
+
+    def hurried(self, factor: float) -> Rates:
+        """Layers that turn and shift faster: where there is no motion to start from there is further to go."""
+        return replace(self, layers=tuple((factor * r, factor * t, scaling) for r, t, scaling in self.layers))
 
     @classmethod
     def of(cls, settings: UpdateSettings, layers: int, radius: float) -> Rates:
