@@ -254,7 +254,8 @@ sides have. The definitions of the metrics are in `scas4d_core/metrics` and `sca
 def _behind(rows: Sequence[Row]) -> str:
     if not rows:
         return "None yet."
-    return f"{markdown(rows)}\n\nMedian seconds of an update by stage:\n\n{stage_table(rows)}"
+    stages = stage_table(rows)
+    return markdown(rows) + (f"\n\nMedian seconds of an update by stage:\n\n{stages}" if stages else "")
 
 
 def _value(row: Row, metric: str, updates: int) -> float | None:

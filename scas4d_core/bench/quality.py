@@ -161,7 +161,9 @@ def run_jobs(jobs: Sequence[Job], out: Path, *, again: bool = False, report: Rep
         else:
             report(f"[{number}/{len(jobs)}] {job.key}: measured already")
         rows.append(row)
-    table = markdown(with_means(rows)) + "\n\nMedian seconds of an update by stage:\n\n" + stage_table(rows)
+    table = markdown(with_means(rows))
+    if stages := stage_table(rows):
+        table += f"\n\nMedian seconds of an update by stage:\n\n{stages}"
     (store.folder / "table.md").write_text(table + "\n")
     report(table)
     return rows

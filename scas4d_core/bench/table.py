@@ -65,8 +65,10 @@ def markdown(rows: Iterable[Row], columns: Sequence[Column] = QUALITY) -> str:
 
 
 def stage_table(rows: Sequence[Row]) -> str:
-    """A Markdown table of the seconds by stage of the rows that have updates, slowest stage first."""
+    """A Markdown table of the seconds by stage of the rows that have updates, slowest stage first; empty for none."""
     timed = [row for row in rows if row.get("seconds_stages")]
+    if not timed:
+        return ""
     names = dict.fromkeys(name for row in timed for name in row["seconds_stages"])
     slowest = sorted(names, key=lambda name: -sum(row["seconds_stages"].get(name, 0.0) for row in timed))
     lines = [

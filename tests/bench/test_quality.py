@@ -274,6 +274,7 @@ def test_frame_0_alone_without_help(capture_folder, tmp_path, stand_in):
     assert "psnr" not in row
     assert "track_3d_median" not in row
     assert "| plates | scas4d | 100 | no masks, no points |" in lines[-1]
+    assert "by stage" not in lines[-1]
 
 
 def test_changes_are_what_differs_from_the_preset(tmp_path):
