@@ -132,7 +132,9 @@ def test_only_rows_of_todays_settings_count_and_the_longest_of_them(tmp_path):
     unmasked["given"]["masks"] = False
     store.put(unmasked)
     store.put(made_row("scas4d", "cloth", [36.0, 40.0]) | {"error": "out of memory"})
-    store.put(made_row("robot-unaided", "robot", [35.5]))
+    first_alone = made_row("robot-unaided", "robot", [35.5])
+    first_alone["settings"]["update"]["warm_start"] = 0.123
+    store.put(first_alone)
     found = measured_runs(store)
     assert {place: row["psnr"] for place, row in found.items()} == {
         ("scas4d", "robot"): 31.0,
