@@ -16,7 +16,7 @@ def require_device(device: str) -> None:
         device: "cpu" or "cuda".
 
     Raises:
-        DeviceError: "cuda" without torch, a torch built for CUDA, a GPU, or gsplat.
+        DeviceError: "cuda" without torch, gsplat, a torch built for CUDA, a GPU, or the compiler that gsplat needs.
     """
     if device == "cpu":
         return
@@ -37,4 +37,11 @@ def require_device(device: str) -> None:
         raise DeviceError(
             f"device {device!r}: torch {torch.__version__} finds no GPU; "
             f"see whether nvidia-smi lists one and its driver knows CUDA {torch.version.cuda}, {otherwise}"
+        )
+    from torch.utils.cpp_extension import CUDA_HOME
+
+    if CUDA_HOME is None and importlib.util.find_spec("gsplat.csrc") is None:
+        raise DeviceError(
+            f"device {device!r}: gsplat compiles its kernels at first use and finds no nvcc; install the CUDA toolkit "
+            f"{torch.version.cuda} and set CUDA_HOME to it, {otherwise}"
         )

@@ -31,9 +31,16 @@ class SceneSettings(Model):
 class StaticSettings(Model):
     """Frame 0: 3D Gaussian Splatting with adaptive density control."""
 
-    iterations: int = Field(2000, ge=1, description="Iterations of frame 0, one training view each.")
-    max_gaussians: int = Field(25_000, ge=1, description="Budget of Gaussians; densification stops there.")
-    initial_gaussians: int = Field(15_000, ge=1, description="At most this many points of the first cloud are used.")
+    iterations: int = Field(3000, ge=1, description="Iterations of frame 0, one training view each.")
+    max_gaussians: int | None = Field(
+        None,
+        ge=1,
+        description="Budget of Gaussians; densification stops there. None: 0.34 for each pixel of a training picture and "
+        "0.27 more for each that is not background, at most 100,000: 25,000 for an object at 256x256, 40,000 for a room.",
+    )
+    initial_share: float = Field(
+        0.6, gt=0, le=1, description="Share of the budget that the first cloud may take; a random part of it, if larger."
+    )
     densify_from: int = Field(200, ge=0, description="First iteration that densifies; before, gradients are noise.")
     densify_every: int = Field(100, ge=1, description="Iterations between densifications.")
     densify_until: float = Field(0.6, ge=0, le=1, description="Fraction of the iterations after which none is added.")
@@ -111,7 +118,10 @@ class UpdateSettings(Model):
     rate_position: Positive = Field(1.6e-4, description="Δp, per metre of scene radius.")
     rate_rotation: Positive = Field(0.002, description="ΔR, in units of tan(angle/2).")
     rate_scale: NotNegative = Field(0.001, description="Δs, log.")
-    rate_colour: NotNegative = Field(0.0025, description="RGB.")
+    rate_colour: NotNegative = Field(0.0025, description="RGB of what moves.")
+    rate_colour_standing: NotNegative = Field(
+        0.01, description="RGB of what stands: light and shadows wander over it, and there is no motion to mistake it for."
+    )
     coarse_until: float = Field(
         0.0, ge=0, le=1, description="Share of the iterations, at the start, that render coarser pictures."
     )

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels import activation
-from scas4d_core.kernels.adam import adam
+from scas4d_core.kernels.adam import EVERY_ROW, adam
 from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.settings import SceneSettings, StaticSettings
 from scas4d_core.views import TrainingView, ViewFactory, view_order
@@ -76,6 +76,24 @@ def initial_parameters(
     return parameters
 
 
+PER_PIXEL, PER_COVERED_PIXEL, LARGEST_BUDGET = 0.34, 0.27, 100_000
+"""The rule for the budget of Gaussians, see ``StaticSettings.max_gaussians``. Detail lies on objects: a picture that is
+mostly background asks for nearly as many Gaussians as a full one. Beyond the largest an update takes seconds."""
+
+PLAIN = 2 / 255
+"""A pixel this near the background's colour is background."""
+
+
+def budget(views: list[TrainingView], scene: SceneSettings, settings: StaticSettings) -> int:
+    """How many Gaussians the scene may have."""
+    if settings.max_gaussians is not None:
+        return settings.max_gaussians
+    background = np.array(scene.background, np.float32)[:, None, None]
+    pixels = float(np.mean([view.camera.width * view.camera.height for view in views]))
+    covered = float(np.mean([(np.abs(view.target[:3] - background).max(axis=0) > PLAIN).mean() for view in views]))
+    return min(LARGEST_BUDGET, max(1, int(pixels * (PER_PIXEL + PER_COVERED_PIXEL * covered))))
+
+
 class StaticTrainer:
     """Fits Gaussians to the views of one frame."""
 
@@ -90,6 +108,7 @@ class StaticTrainer:
         self.settings = settings
         self.views = views
         self.parameters = parameters
+        self.budget = budget(views, scene, settings)
         self.radius = factory.rig.radius
         self._loss = PictureLoss(factory, scene.background, 1.0, settings.weight_mask, mask_moves=False)
         self._masked = any(len(view.target) > 3 for view in views)
@@ -125,7 +144,7 @@ class StaticTrainer:
             done = iteration + 1
             if settings.densify_from <= done <= until and done % settings.densify_every == 0:
                 share = (done - settings.densify_from) / max(until - settings.densify_from, 1)
-                self.control_density(round(start + (settings.max_gaussians - start) * min(1.0, share + 0.1)))
+                self.control_density(round(start + (self.budget - start) * min(1.0, share + 0.1)))
             if done == until or done == (until + settings.iterations) // 2:
                 self.remove_unseen()
             if progress is not None:
@@ -145,7 +164,7 @@ class StaticTrainer:
         self._screen += np.sqrt(np.square(gradients.screen * width).sum(axis=1))
         self._seen += visible
         adam(
-            self.parameters, self._gradients, self._first, self._second, self._rates(iteration), BETA1, BETA2,
+            self.parameters, self._gradients, self._first, self._second, self._rates(iteration), EVERY_ROW, BETA1, BETA2,
             iteration + 1,
         )  # fmt: skip
         if self.settings.exposure:
@@ -171,7 +190,7 @@ class StaticTrainer:
         rates = np.full(2, self.settings.rate_exposure, np.float32)
         gradient = self._loss.exposure_gradient[: len(view.exposure)].copy()
         gradient[3:] = 0
-        adam(view.exposure, gradient, moments[0], moments[1], rates, BETA1, BETA2, iteration + 1)
+        adam(view.exposure, gradient, moments[0], moments[1], rates, EVERY_ROW, BETA1, BETA2, iteration + 1)
         centre = np.mean([other.exposure[:3] for other in self.views], axis=0) - np.array([1, 0], np.float32)
         for other in self.views:
             other.exposure[:3] -= centre
@@ -182,7 +201,7 @@ class StaticTrainer:
         opacity = 1 / (1 + np.exp(-self.parameters[:, 10]))
         score = self._screen / np.maximum(self._seen, 1)
         keep = opacity >= min(settings.prune_opacity, float(np.median(opacity)))  # never more than half at once
-        room = max(0, min(target, settings.max_gaussians) - int(keep.sum()))
+        room = max(0, min(target, self.budget) - int(keep.sum()))
         score = np.where(keep & (score >= settings.densify_gradient), score, 0)
         chosen = np.argsort(-score, kind="stable")[: min(room, int((score > 0).sum()))]
         largest = self.parameters[:, SCALE].max(axis=1)
@@ -263,7 +282,7 @@ def fit_static_scene(
     if len(positions) == 0:
         raise ValueError("the first cloud holds no point; give points, masks, or more overlapping cameras")
     rng = np.random.default_rng(settings.seed)
-    limit = min(settings.initial_gaussians, settings.max_gaussians)
+    limit = max(1, int(settings.initial_share * budget(views, scene, settings)))
     parameters = initial_parameters(positions, colours, foreground, limit, rng)
     trainer = StaticTrainer(factory, views, parameters, scene, settings)
     losses = trainer.train(progress)

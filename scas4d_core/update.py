@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scas4d_core.deformation_cpu import CpuDeformation
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import Hierarchy
-from scas4d_core.kernels.adam import adam
+from scas4d_core.kernels.adam import EVERY_ROW, adam
 from scas4d_core.neighbours import Neighbours
 from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.settings import SceneSettings, UpdateSettings
@@ -38,10 +38,11 @@ class Stopwatch:
 
 
 class Adam:
-    """Adam over one table of parameters, with a rate per column."""
+    """Adam over one table of parameters, with a rate per column, times one per row where given."""
 
-    def __init__(self, parameters: Array, columns: list[float], rates: Rates) -> None:
+    def __init__(self, parameters: Array, columns: list[float], rates: Rates, by_row: Array = EVERY_ROW) -> None:
         self._parameters = parameters
+        self._by_row = by_row
         self._first, self._second = np.zeros_like(parameters), np.zeros_like(parameters)
         self._rates = np.array(columns, np.float32)
         self._beta1, self._beta2 = np.float32(rates.beta1), np.float32(rates.beta2)
@@ -49,7 +50,9 @@ class Adam:
     def step(self, gradients: Array, number: int, factor: float) -> None:
         """Step ``number`` (from 1), all rates times ``factor``."""
         rates = self._rates * np.float32(factor)
-        adam(self._parameters, gradients, self._first, self._second, rates, self._beta1, self._beta2, number)
+        adam(
+            self._parameters, gradients, self._first, self._second, rates, self._by_row, self._beta1, self._beta2, number
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +118,7 @@ class FrameUpdate:
         deformation.start(previous)
         warm_start(deformation, motion, seconds, settings)
         features = np.concatenate([previous.colours, previous.foreground[:, None]], axis=1)
-        colours = features[:, :3].copy()
+        colours = previous.colours.copy()
         optimizers = self._optimizers(colours, cold=motion is None)
         losses, psnr = [], []
         watch.lap("start")
@@ -150,13 +153,14 @@ class FrameUpdate:
 
     def _optimizers(self, colours: Array, cold: bool) -> list[Adam]:
         """One per table: each layer of clusters, the Gaussians' own deltas, the colours. Moments start at zero."""
-        deformation = self._deformation
-        rates = self._rates.hurried(self.settings.cold_start) if cold else self._rates
+        rates, deformation = self._rates.hurried(self.settings.cold_start if cold else 1.0), self._deformation
         columns = [[r] * 3 + [t] * 3 + [scaling] * 4 for r, t, scaling in rates.layers]
         columns.append([rates.position] * 3 + [rates.rotation] * 3 + [rates.scale] * 3)
-        columns.append([rates.colour] * 3)
-        tables = [*deformation.clusters, deformation.deltas, colours]
-        return [Adam(table, given, rates) for table, given in zip(tables, columns, strict=True)]
+        tables = [*deformation.clusters, deformation.deltas]
+        optimizers = [Adam(table, given, rates) for table, given in zip(tables, columns, strict=True)]
+        by_row = np.full(len(colours), rates.colour_standing, np.float32)
+        by_row[self.hierarchy.rows] = rates.colour
+        return [*optimizers, Adam(colours, [1.0] * 3, rates, by_row)]
 
     def _neighbour_terms(self, sample: NDArray[np.int64], g_means: Array) -> float:
         weights = self.settings.weights

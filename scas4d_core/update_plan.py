@@ -23,7 +23,7 @@ class Rates:
 
     Attributes:
         layers: (rotation r, translation t in metres, scaling c and s), one a layer, coarse to fine.
-        position, rotation, scale, colour: of Δp in metres, ΔR, Δs, RGB.
+        position, rotation, scale, colour: of Δp in metres, ΔR, Δs, RGB of what moves. colour_standing: RGB of the rest.
         end: all rates fall to this fraction in the last iteration, along half a cosine; 1 keeps them.
         beta1, beta2: Adam's decays.
     """
@@ -33,6 +33,7 @@ class Rates:
     rotation: float
     scale: float
     colour: float
+    colour_standing: float = 0.0
     end: float = 1.0
     beta1: float = 0.9
     beta2: float = 0.999
@@ -56,6 +57,7 @@ class Rates:
             rotation=settings.rate_rotation,
             scale=settings.rate_scale,
             colour=settings.rate_colour,
+            colour_standing=settings.rate_colour_standing,
             end=settings.rate_end,
             beta1=settings.beta1,
             beta2=settings.beta2,

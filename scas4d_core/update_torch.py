@@ -212,8 +212,9 @@ class _Scene:
     opacities: Tensor
     previous_colours: Tensor
     foreground: Tensor
-    colours: Tensor
+    free_colours: tuple[Tensor, Tensor]
     moving: Tensor
+    standing: Tensor
     layers: list[Layer]
     deltas: Deltas
     neighbours: Tensor
@@ -261,6 +262,7 @@ class _Scene:
             for view in views
         ]
         colours = floats(gaussians.colours)
+        standing = np.setdiff1d(np.arange(len(gaussians)), update.moving)
         graph = update.graph
         return cls(
             update=update,
@@ -270,8 +272,9 @@ class _Scene:
             opacities=floats(gaussians.opacities),
             previous_colours=colours,
             foreground=floats(gaussians.foreground),
-            colours=colours.clone(),
+            free_colours=(colours[integers(update.moving)], colours[integers(standing)]),
             moving=integers(update.moving),
+            standing=integers(standing),
             layers=layers,
             deltas=own,
             neighbours=integers(graph.neighbours),
@@ -280,6 +283,12 @@ class _Scene:
             first_lengths=floats(update.first_lengths),
             views=seen,
         )
+
+    @property
+    def colours(self) -> Tensor:
+        """[N, 3] RGB now: of what moves and of what stands, which learn at rates of their own."""
+        moving, standing = self.free_colours
+        return self.previous_colours.index_copy(0, self.moving, moving).index_copy(0, self.standing, standing)
 
     def indices(self, rows: NDArray[np.int64]) -> Tensor:
         """Rows on the device."""
@@ -294,7 +303,8 @@ class _Scene:
             (rates.position, [self.deltas.dp]),
             (rates.rotation, [self.deltas.dr]),
             (rates.scale, [self.deltas.ds]),
-            (rates.colour, [self.colours]),
+            (rates.colour, [self.free_colours[0]]),
+            (rates.colour_standing, [self.free_colours[1]]),
         ]
         learnt = [(rate, tensors) for rate, tensors in groups if rate > 0]
         for _, tensors in learnt:

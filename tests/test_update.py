@@ -27,7 +27,7 @@ from scas4d_core.views import TrainingView, ViewFactory
 BEFORE = make_box()
 AFTER = moved(BEFORE)
 RIG = make_rig()
-SETTINGS = UpdateSettings(clusters=(2, 12, 48), neighbour_falloff=200.0, rate_end=1.0)
+SETTINGS = UpdateSettings(clusters=(2, 12, 48), neighbour_falloff=200.0, rate_end=1.0, cold_start=1.0)
 CALM = SETTINGS.model_copy(update={"rate_end": 0.1})
 """Rates that fall: what is found is not blurred by the last steps."""
 
@@ -62,7 +62,7 @@ def errors(found: Gaussians, truth: Gaussians) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def found() -> Updated:
-    return update()
+    return update(CALM)
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ import importlib.util
 import numpy as np
 import pytest
 import torch
+import torch.utils.cpp_extension
 from box_scene import MOVING, make_box, make_rig, moved, take_frame, to_user
 
 from scas4d_core import device, reconstruction, update_device
@@ -209,6 +210,13 @@ def test_a_device_that_is_not_there_says_what_to_do(monkeypatch: pytest.MonkeyPa
     with pytest.raises(DeviceError, match=r"finds no GPU; see whether nvidia-smi .* CUDA 12\.8"):
         require_device("cuda")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.utils.cpp_extension, "CUDA_HOME", None)
+    with pytest.raises(DeviceError, match=r"finds no nvcc; install the CUDA toolkit 12\.8 and set CUDA_HOME"):
+        require_device("cuda")
+    found["gsplat.csrc"] = object()
+    require_device("cuda")
+    del found["gsplat.csrc"]
+    monkeypatch.setattr(torch.utils.cpp_extension, "CUDA_HOME", "/usr/local/cuda")
     require_device("cuda")
 
 

@@ -59,5 +59,5 @@ def test_adam_agrees_with_torch() -> None:
             leaves[k].grad = torch.tensor(gradient[:, k].astype(np.float64))
         optimizer.step()
         rates = np.array([0.1, 0.01], np.float32)
-        adam.adam(parameters, gradient, first, second, rates, np.float32(0.9), np.float32(0.99), step)
+        adam.adam(parameters, gradient, first, second, rates, adam.EVERY_ROW, np.float32(0.9), np.float32(0.99), step)
     np.testing.assert_allclose(parameters, np.stack([leaf.detach().numpy() for leaf in leaves], 1), atol=2e-6)
