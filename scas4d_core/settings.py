@@ -35,11 +35,12 @@ class StaticSettings(Model):
     max_gaussians: int | None = Field(
         None,
         ge=1,
-        description="Budget of Gaussians; densification stops there. None: 0.34 for each pixel of a training picture and "
-        "0.27 more for each that is not background, at most 100,000: 25,000 for an object at 256x256, 40,000 for a room.",
+        description="Budget of Gaussians; densification stops there. None: 0.34 for each pixel of a training picture "
+        "and 0.27 more for each that is not background, at most 100,000: 25,000 for an object at 256x256, 40,000 for "
+        "a room.",
     )
     initial_share: float = Field(
-        0.6, gt=0, le=1, description="Share of the budget that the first cloud may take; a random part of it, if larger."
+        0.6, gt=0, le=1, description="Share of the budget that the first cloud may take; of a larger one a random part."
     )
     densify_from: int = Field(200, ge=0, description="First iteration that densifies; before, gradients are noise.")
     densify_every: int = Field(100, ge=1, description="Iterations between densifications.")
@@ -120,7 +121,8 @@ class UpdateSettings(Model):
     rate_scale: NotNegative = Field(0.001, description="Δs, log.")
     rate_colour: NotNegative = Field(0.0025, description="RGB of what moves.")
     rate_colour_standing: NotNegative = Field(
-        0.01, description="RGB of what stands: light and shadows wander over it, and there is no motion to mistake it for."
+        0.01,
+        description="RGB of what stands: light and shadows wander over it, and no motion can be mistaken for them.",
     )
     coarse_until: float = Field(
         0.0, ge=0, le=1, description="Share of the iterations, at the start, that render coarser pictures."

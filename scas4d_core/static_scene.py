@@ -164,8 +164,8 @@ class StaticTrainer:
         self._screen += np.sqrt(np.square(gradients.screen * width).sum(axis=1))
         self._seen += visible
         adam(
-            self.parameters, self._gradients, self._first, self._second, self._rates(iteration), EVERY_ROW, BETA1, BETA2,
-            iteration + 1,
+            self.parameters, self._gradients, self._first, self._second, self._rates(iteration), EVERY_ROW, BETA1,
+            BETA2, iteration + 1,
         )  # fmt: skip
         if self.settings.exposure:
             self._step_exposure(view, iteration)

@@ -51,7 +51,8 @@ class Adam:
         """Step ``number`` (from 1), all rates times ``factor``."""
         rates = self._rates * np.float32(factor)
         adam(
-            self._parameters, gradients, self._first, self._second, rates, self._by_row, self._beta1, self._beta2, number
+            self._parameters, gradients, self._first, self._second, rates, self._by_row, self._beta1, self._beta2,
+            number,
         )  # fmt: skip
 
 

@@ -53,9 +53,7 @@ def committed(*states: Gaussians) -> Committed:
     return Committed(history, WORLD)
 
 
-@pytest.mark.parametrize(
-    ("normal", "bias"), [([0.0, 0, -1], 1e-4), ([0.3, 0.1, -1], 0.008), ([-0.5, 0.4, -1], 0.016)]
-)
+@pytest.mark.parametrize(("normal", "bias"), [([0.0, 0, -1], 1e-4), ([0.3, 0.1, -1], 0.008), ([-0.5, 0.4, -1], 0.016)])
 def test_depth_of_a_plane_is_its_depth_in_the_users_units(normal: list[float], bias: float) -> None:
     """A Gaussian has one depth, its centre's, and nearer ones weigh more: tilted surfaces come out a little near."""
     n = np.array(normal) / np.linalg.norm(normal)

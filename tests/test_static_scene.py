@@ -162,5 +162,3 @@ def test_progress_counts_every_iteration() -> None:
         factory, views, *cloud(), None, SceneSettings(), short, lambda done, loss: seen.append((done, loss))
     )
     assert seen == list(enumerate(result.losses, start=1))
-
-

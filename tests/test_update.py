@@ -34,9 +34,7 @@ CALM = SETTINGS.model_copy(update={"rate_end": 0.1})
 
 def tied(settings: UpdateSettings, gaussians: Gaussians) -> tuple[Hierarchy, Neighbours]:
     hierarchy = build_hierarchy(gaussians.means, gaussians.moving, settings.clusters, settings.smallest_cluster)
-    return hierarchy, build_neighbours(
-        gaussians.means[hierarchy.rows], settings.neighbours, settings.neighbour_falloff
-    )
+    return hierarchy, build_neighbours(gaussians.means[hierarchy.rows], settings.neighbours, settings.neighbour_falloff)
 
 
 def prepare(
@@ -200,7 +198,12 @@ def twin_iteration(fused: Iteration, settings: UpdateSettings, masks: bool) -> t
         ),
         first_lengths=np.linalg.norm(BEFORE.factors[rows].astype(np.float64), axis=1),
         rates=Rates(
-            layers=((1.0, 1.0, 1.0),) * len(fused.hierarchy.sizes), position=1, rotation=1, scale=1, colour=1, colour_standing=1
+            layers=((1.0, 1.0, 1.0),) * len(fused.hierarchy.sizes),
+            position=1,
+            rotation=1,
+            scale=1,
+            colour=1,
+            colour_standing=1,
         ),
         weights=update_torch.TermWeights(**terms),
         max_scale=settings.max_scale,

@@ -35,7 +35,9 @@ def test_cascade_and_deltas_agree_with_the_twin(kind: str, points: int, sizes: t
     factors = (0.05 * rng.normal(size=(points, 3, 3))).astype(np.float32)
     parameters = [(0.3 * rng.normal(size=(size, 10))).astype(np.float32) for size in sizes]
     own = (0.2 * rng.normal(size=(points, 9))).astype(np.float32)
-    g_means, g_factors, g_turns = (rng.normal(size=(points, *shape)).astype(np.float32) for shape in ((3,), (3, 3), (4,)))
+    g_means, g_factors, g_turns = (
+        rng.normal(size=(points, *shape)).astype(np.float32) for shape in ((3,), (3, 3), (4,))
+    )
     bound = np.full((points, 3), 0.08, np.float32)
 
     # The twin.
@@ -62,7 +64,8 @@ def test_cascade_and_deltas_agree_with_the_twin(kind: str, points: int, sizes: t
 
     # The kernels.
     about_origin = np.float32(kind == "published")
-    carried = [(x, np.tile(np.eye(3, dtype=np.float32).ravel(), (points, 1)), np.tile(np.float32([1, 0, 0, 0]), (points, 1)))]
+    nothing = np.tile(np.eye(3, dtype=np.float32).ravel(), (points, 1)), np.tile(np.float32([1, 0, 0, 0]), (points, 1))
+    carried = [(x, *nothing)]
     tables = []
     for labels_k, values in zip(labels, parameters, strict=True):
         table = np.empty((len(values), cascade.TABLE), np.float32)

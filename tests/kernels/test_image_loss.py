@@ -52,7 +52,8 @@ def test_a_picture_equal_to_its_target_has_no_loss() -> None:
     scratch = np.zeros((6, 1, 30, 20), np.float32)
     means, squares = np.empty_like(target), np.empty_like(target)
     image_loss.target_moments(target, scratch, means, squares)
-    g_image, rows, g_exposure = np.empty_like(target), np.empty((1, 20, 2), np.float32), np.empty((1, 20, 2), np.float32)
+    g_image = np.empty_like(target)
+    rows, g_exposure = np.empty((2, 1, 20, 2), np.float32)
     exposure, weights = np.array([[1.0, 0.0]], np.float32), np.ones(1, np.float32)
     image_loss.image_loss(target, exposure, target, means, squares, weights, scratch, g_image, rows, g_exposure)
     assert abs(rows[..., 0].sum()) < 1e-6
