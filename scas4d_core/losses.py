@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import functools
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -149,6 +151,11 @@ def scale_loss(factors: Tensor, first_lengths: Tensor, max_scale: float) -> Tens
         max_scale: metres.
     """
     return (axis_lengths(factors) - first_lengths.clamp_min(max_scale)).clamp_min(0).mean()
+
+
+def floor_loss(means: Tensor, plane: Sequence[float]) -> Tensor:
+    """Mean metres of ``means`` [M, 3] below the plane (a, b, c, d): where a·x + b·y + c·z + d is positive."""
+    return (means @ means.new_tensor(plane[:3]) + plane[3]).clamp(min=0).mean()
 
 
 def soft_colour_loss(colours: Tensor, previous: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.captures.images import resize_area
 from scas4d_core.committed import Committed, View
 from scas4d_core.device import require_device
+from scas4d_core.floor import floor_inside
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import build_hierarchy
 from scas4d_core.history import History
@@ -190,7 +191,10 @@ class Reconstruction(Committed):
             if tied
             else None
         )
-        given = (self._factory, self.settings.scene, settings, hierarchy, neighbours, gaussians)
+        scene = self.settings.scene
+        if scene.floor is not None:
+            scene = scene.model_copy(update={"floor": floor_inside(scene.floor, self.world)})
+        given = (self._factory, scene, settings, hierarchy, neighbours, gaussians)
         if self.settings.device == "cpu":
             self._updater = FrameUpdate(*given)
         else:

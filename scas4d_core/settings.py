@@ -26,6 +26,11 @@ class SceneSettings(Model):
     background: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0), description="RGB in 0…1 behind everything; black, as in the captures of the field."
     )
+    floor: tuple[float, float, float, float] | None = Field(
+        None,
+        description="Plane (a, b, c, d) of the floor in the user's world; a·x + b·y + c·z + d > 0 lies below it, and what "
+        "moves is kept above. None: the scene has no floor term.",
+    )
 
 
 class StaticSettings(Model):
@@ -90,6 +95,7 @@ class Weights(Model):
     isometry: NotNegative = Field(2.0, description="Likewise.")
     rotation: NotNegative = Field(4.0, description="Likewise.")
     scale: NotNegative = Field(10.0, description="Likewise, the paper's 0.48 to 0.05.")
+    floor: NotNegative = Field(2.0, description="Dynamic3DGaussians; only where the scene names a floor.")
     soft_colour: NotNegative = Field(0.01, description="Dynamic3DGaussians; the paper does not give it.")
 
 

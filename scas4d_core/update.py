@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.deformation_cpu import CpuDeformation
+from scas4d_core.floor import floor_term
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import Hierarchy
 from scas4d_core.kernels.adam import EVERY_ROW, adam
@@ -103,6 +104,7 @@ class FrameUpdate:
         self._factory = factory
         self._rates = Rates.of(settings, len(hierarchy.sizes), factory.rig.radius)
         weights = settings.weights
+        self._floor = scene.floor if weights.floor > 0 else None
         self._picture = PictureLoss(factory, scene.background, weights.image, weights.mask)
         bounds = np.maximum(first_lengths(hierarchy, first), np.float32(settings.max_scale))
         self._deformation = CpuDeformation(hierarchy, neighbours, bounds, settings.cluster_map)
@@ -133,6 +135,10 @@ class FrameUpdate:
             loss = self._picture.image_part + self._picture.mask_part
             psnr.append(self._picture.psnr)
             loss += self._neighbour_terms(samples[iteration % len(samples)], gradients.means)
+            if self._floor is not None:
+                loss += floor_term(
+                    self._floor, deformation.means, self.hierarchy.rows, settings.weights.floor, gradients.means
+                )
             watch.lap("neighbours")
             weight = settings.weights.scale
             loss += weight * deformation.backward(gradients.means, gradients.factors, weight)

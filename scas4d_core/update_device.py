@@ -79,6 +79,7 @@ class DeviceUpdate:
             max_scale=settings.max_scale,
             background=scene.background,
             cluster_map=settings.cluster_map,
+            floor=scene.floor,
             device=device,
             dtype=dtype,
         )
@@ -142,4 +143,5 @@ def _weights(settings: UpdateSettings, tied: bool) -> TermWeights:
         rotation=given.rotation if tied else 0.0,
         scale=given.scale,
         soft_colour=given.soft_colour,
+        floor=given.floor,
     )

@@ -89,6 +89,7 @@ class TermWeights:
     rotation: float = 4.0
     scale: float = 10.0
     soft_colour: float = 0.01
+    floor: float = 0.0
 
 
 class Updated(NamedTuple):
@@ -124,6 +125,7 @@ class TorchUpdate:
         max_scale: metres; longer axes are held at their length of frame 0.
         background: RGB behind everything.
         cluster_map: form of equation (6).
+        floor: plane inside, see ``floor.floor_inside``, or None.
         device: "cpu" rasterizes with the twin, "cuda" with gsplat.
         dtype: torch.float32, or torch.float64 on the CPU.
     """
@@ -137,6 +139,7 @@ class TorchUpdate:
     max_scale: float = 0.02
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     cluster_map: ClusterMap = "centred"
+    floor: tuple[float, float, float, float] | None = None
     device: str = "cpu"
     dtype: torch.dtype = torch.float32
 
@@ -361,6 +364,8 @@ class _Scene:
             terms.append(weights.rotation * losses.rotation_loss(now.turns, *graph, rows))
         if weights.scale > 0:
             terms.append(weights.scale * losses.scale_loss(now.factors, self.first_lengths, self.update.max_scale))
+        if self.update.floor is not None and weights.floor > 0:
+            terms.append(weights.floor * losses.floor_loss(now.means, self.update.floor))
         return terms
 
     @torch.no_grad()
