@@ -18,6 +18,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.history import History
 from scas4d_core.kernels.blend import GROUP
 from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
+from scas4d_core.rasterize.limits import DEFAULT, Limits
 from scas4d_core.tracks import ALPHA_OF_A_SURFACE, Tracks
 
 Array = NDArray[np.float32]
@@ -46,10 +47,10 @@ class View:
 class Committed:
     """Reads a history. Cameras and points are in the user's world; ``index`` None is the newest frame."""
 
-    def __init__(self, history: History, world: WorldFrame) -> None:
+    def __init__(self, history: History, world: WorldFrame, limits: Limits = DEFAULT) -> None:
         self.history = history
         self.world = world
-        self._rasterizer = CpuRasterizer()
+        self._rasterizer = CpuRasterizer(limits)
 
     def render(
         self,

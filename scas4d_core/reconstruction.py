@@ -21,6 +21,7 @@ from scas4d_core.hierarchy import build_hierarchy
 from scas4d_core.history import History
 from scas4d_core.initial_points import initial_points
 from scas4d_core.neighbours import build_neighbours
+from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import Settings
 from scas4d_core.static_scene import StaticResult, fit_static_scene
 from scas4d_core.update import FrameUpdate, Updated, Updater
@@ -75,7 +76,7 @@ class Reconstruction(Committed):
     """
 
     def __init__(self, settings: Settings, rig: Rig, world: WorldFrame, history: History) -> None:
-        super().__init__(history, world)
+        super().__init__(history, world, scene_limits(settings.scene.near, rig.radius))
         self.settings = settings
         self.rig = rig
         self._factory = ViewFactory(rig)

@@ -26,6 +26,11 @@ class SceneSettings(Model):
     background: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0), description="RGB in 0…1 behind everything; black, as in the captures of the field."
     )
+    near: Positive | Literal["auto"] = Field(
+        default="auto",
+        description="Metres; nothing nearer to a camera is drawn. 'auto': a tenth of the rig's radius. Nothing in the "
+        "pictures tells how it looks right before a camera that nobody else sees, and one stray Gaussian there hides all.",
+    )
     floor: tuple[float, float, float, float] | None = Field(
         None,
         description="Plane (a, b, c, d) of the floor in the user's world; a·x + b·y + c·z + d > 0 lies below it, and what "

@@ -13,6 +13,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels import activation
 from scas4d_core.kernels.adam import EVERY_ROW, adam
 from scas4d_core.picture_loss import PictureLoss
+from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import SceneSettings, StaticSettings
 from scas4d_core.views import TrainingView, ViewFactory, view_order
 
@@ -110,7 +111,8 @@ class StaticTrainer:
         self.parameters = parameters
         self.budget = budget(views, scene, settings)
         self.radius = factory.rig.radius
-        self._loss = PictureLoss(factory, scene.background, 1.0, settings.weight_mask, mask_moves=False)
+        limits = scene_limits(scene.near, self.radius)
+        self._loss = PictureLoss(factory, scene.background, 1.0, settings.weight_mask, False, limits)
         self._masked = any(len(view.target) > 3 for view in views)
         self._rng = np.random.default_rng(settings.seed)
         self._reset_moments()

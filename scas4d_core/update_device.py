@@ -16,6 +16,7 @@ from scas4d_core import update_torch
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import Hierarchy
 from scas4d_core.neighbours import Neighbours
+from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.update import Stopwatch, Updated
 from scas4d_core.update_plan import Rates, first_lengths, plan_samples, plan_views
@@ -80,6 +81,7 @@ class DeviceUpdate:
             background=scene.background,
             cluster_map=settings.cluster_map,
             floor=scene.floor,
+            near=scene_limits(scene.near, factory.rig.radius).near,
             device=device,
             dtype=dtype,
         )

@@ -126,6 +126,7 @@ class TorchUpdate:
         background: RGB behind everything.
         cluster_map: form of equation (6).
         floor: plane inside, see ``floor.floor_inside``, or None.
+        near: metres; nothing nearer to a camera is drawn.
         device: "cpu" rasterizes with the twin, "cuda" with gsplat.
         dtype: torch.float32, or torch.float64 on the CPU.
     """
@@ -140,6 +141,7 @@ class TorchUpdate:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     cluster_map: ClusterMap = "centred"
     floor: tuple[float, float, float, float] | None = None
+    near: float = DEFAULT.near
     device: str = "cpu"
     dtype: torch.dtype = torch.float32
 
@@ -336,7 +338,7 @@ class _Scene:
             features,
             camera,
             image.new_tensor(background),
-            GSPLAT if self.update.on_cuda else DEFAULT,
+            (GSPLAT if self.update.on_cuda else DEFAULT)._replace(near=self.update.near),
         ).features
         weights, colour = self.update.weights, picture[..., :3]
         if exposure is not None:

@@ -103,9 +103,12 @@ class CoreEngine:
         import numba
 
         from scas4d_core.committed import Committed
+        from scas4d_core.rasterize.limits import scene_limits
 
         numba.set_num_threads(1)
-        return Committed(history, rig.world_frame(settings.scene.metres_per_unit))
+        world = rig.world_frame(settings.scene.metres_per_unit)
+        limits = scene_limits(settings.scene.near, rig.radius * world.metres_per_unit)
+        return Committed(history, world, limits)
 
 
 def core_engine() -> Engine:

@@ -27,6 +27,22 @@ class Limits(NamedTuple):
     tangent_margin: float = 0.3
 
 
+NEAR_SHARE = 0.1
+"""Of the rig's radius: how near to a camera something may be drawn, where the scene leaves it open."""
+
+
+def scene_limits(near: float | str, rig_radius: float) -> Limits:
+    """The constants of a scene.
+
+    Args:
+        near: metres, or "auto" for ``NEAR_SHARE`` of the rig's radius.
+        rig_radius: metres.
+    """
+    if isinstance(near, str):
+        near = max(Limits().near, NEAR_SHARE * rig_radius)
+    return Limits(near=near)
+
+
 DEFAULT = Limits()
 GSPLAT = Limits(alpha_cap=0.999)
 """gsplat 1.5.3, for comparisons with it."""
