@@ -29,12 +29,12 @@ class SceneSettings(Model):
     near: Positive | Literal["auto"] = Field(
         default="auto",
         description="Metres; nothing nearer to a camera is drawn. 'auto': a tenth of the rig's radius. Nothing in the "
-        "pictures tells how it looks right before a camera that nobody else sees, and one stray Gaussian there hides all.",
+        "pictures tells how it looks right before a camera that is not there, and one stray Gaussian hides all.",
     )
     floor: tuple[float, float, float, float] | None = Field(
         None,
-        description="Plane (a, b, c, d) of the floor in the user's world; a·x + b·y + c·z + d > 0 lies below it, and what "
-        "moves is kept above. None: the scene has no floor term.",
+        description="Plane (a, b, c, d) of the floor in the user's world; a·x + b·y + c·z + d > 0 lies below it, and "
+        "what moves is kept above. None: the scene has no floor term.",
     )
 
 
