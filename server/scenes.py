@@ -321,7 +321,7 @@ class Scene:
         finally:
             self._asked.pop(number, None)
         if isinstance(answer, Refused):
-            remedy = "the log of the service has the traceback" if answer.fault else "change what the sentence names"
+            remedy = "the log of the service says more" if answer.fault else "change what the sentence names"
             raise Problem(500 if answer.fault else 422, answer.detail, remedy=remedy)
         return answer
 
@@ -333,15 +333,20 @@ class Scene:
     def _renderer_ended(self, reason: str) -> None:
         # It holds nothing that is not on disk: what was asked fails, and a new one takes over.
         log.error("scene %s: the reader is gone: %s", self.id, reason)
+        self._refuse_all(f"the reader is gone: {reason}")
+        self._renderer = self._placement.start(renderer.main, self.spec, self._from_renderer, self._renderer_ended)
+
+    def _refuse_all(self, reason: str) -> None:
+        """Nobody is left to answer what was asked."""
         for number, future in self._asked.items():
             if not future.done():
-                future.set_result(Refused(number, f"the reader is gone: {reason}", fault=True))
-        self._renderer = self._placement.start(renderer.main, self.spec, self._from_renderer, self._renderer_ended)
+                future.set_result(Refused(number, reason, fault=True))
 
     async def stop(self) -> None:
         """Ends both processes."""
         seconds = self.server.stop_seconds
         await asyncio.gather(self._worker.stop(seconds), self._renderer.stop(seconds))
+        self._refuse_all("the scene has ended")
 
 
 class Scenes:

@@ -49,10 +49,15 @@ class Worker:
         self.engine = load_engine(spec.engine)
         self.states = History(spec.states)
         self.reconstruction: Reconstruction | None = None
+        self.fault = ""
         self._progress_at = 0.0
 
     def take(self, message: FrameReady) -> None:
         """Reconstructs one frame."""
+        if self.fault:  # frames that waited behind a first frame that failed: none of them is a first frame
+            message.file.unlink(missing_ok=True)
+            self.connection.send(SetAside(message.index, self.fault, fatal=True))
+            return
         self.connection.send(Started(message.index))
         dropped: dict[str, str] = {}
         try:
@@ -64,8 +69,9 @@ class Worker:
         except Exception as error:  # whatever the engine raises, the service goes on and says so
             log.exception("scene %s, frame %d", self.spec.folder.name, message.index)
             reason = f"{type(error).__name__}: {error}"
-            # Without a first frame there is nothing to go on from.
-            self.connection.send(SetAside(message.index, reason, dropped, fatal=self.reconstruction is None))
+            if self.reconstruction is None:  # without a first frame there is nothing to go on from
+                self.fault = f"frame {message.index} could not be reconstructed: {reason}"
+            self.connection.send(SetAside(message.index, reason, dropped, fatal=bool(self.fault)))
         finally:
             message.file.unlink(missing_ok=True)
 

@@ -12,7 +12,7 @@ import numpy as np
 from scas4d_core import tracks
 from scas4d_core.gaussians import Gaussians
 
-SLOW, RAISES, DIES = 200, 250, 251
+SLOW, SLOW_RAISES, RAISES, DIES = 200, 201, 250, 251
 SLOW_S = 2.0
 STEP_M = 0.125
 
@@ -39,9 +39,9 @@ class Report:
 
 def obey(frame):
     red = int(next(iter(frame.images.values()))[0, 0, 0])
-    if red == SLOW:
+    if red in (SLOW, SLOW_RAISES):
         time.sleep(SLOW_S)
-    if red == RAISES:
+    if red in (RAISES, SLOW_RAISES):
         raise FloatingPointError("the fake was told to raise")
     if red == DIES:
         os._exit(7)

@@ -95,6 +95,18 @@ def test_a_first_frame_that_fails_fails_the_scene(http, sdk, scene):
     assert "told to raise" in problem(put(http, scene, 1, pictures()), 409)["detail"]
 
 
+def test_frames_that_waited_behind_a_failed_first_one_do_not_bring_the_scene_back(sdk, scene):
+    sdk.put_frame(scene, 0, pictures(fakes.SLOW_RAISES))
+    sdk.put_frame(scene, 1, pictures())  # is taken: frame 0 is still at work
+    until = time.monotonic() + 10
+    while sdk.frame(scene, 1).state != "set_aside":
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    status = sdk.scene(scene)
+    assert (status.state, status.committed) == ("failed", 0)
+    assert "told to raise" in status.error
+
+
 def test_a_worker_that_dies_fails_its_scene_and_no_other(sdk, scene):
     sdk.put_frame(scene, 0, pictures())
     sdk.wait(scene, 0)
