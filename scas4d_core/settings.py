@@ -65,8 +65,10 @@ class StaticSettings(Model):
     seen_pixels: NotNegative = Field(
         0.05, description="Pixels' worth of blending weight from which a camera counts as seeing a Gaussian."
     )
-    exposure: bool = Field(
-        False, description="Learn a colour gain and offset per training camera (held-out cameras are scored raw)."
+    exposure: bool | Literal["auto"] = Field(
+        default="auto",
+        description="Learn a colour gain and offset per training camera (held-out cameras are scored raw). 'auto': give "
+        "it up after 30 % of the iterations where the cameras turn out alike: then it only fits noise.",
     )
     rate_position: Positive = Field(1.6e-4, description="Adam rate of means at the start, per metre of scene radius.")
     rate_position_end: Positive = Field(1.6e-6, description="The same at the end; the decay is exponential.")

@@ -25,6 +25,9 @@ MEAN, QUATERNION, SCALE, OPACITY, COLOUR, LABEL = (
 )  # fmt: skip
 
 INITIAL_OPACITY = 0.1
+EXPOSURE_TRIAL, EXPOSURE_SPREAD = 0.3, 0.015
+"""Share of the iterations after which exposure terms are judged, and the standard deviation of the gains over cameras
+below which they go. Measured after 900 iterations: 0.004 and 0.007 where there is no difference, 0.033 on a real rig."""
 SPLIT_SHRINK = 1.6
 """A split Gaussian's halves are smaller by this (3DGS)."""
 
@@ -116,6 +119,7 @@ class StaticTrainer:
         self._masked = any(len(view.target) > 3 for view in views)
         self._rng = np.random.default_rng(settings.seed)
         self._reset_moments()
+        self.exposing = settings.exposure is not False
         self._exposure_moments = {view.name: np.zeros((2, *view.exposure.shape), np.float32) for view in views}
 
     def _reset_moments(self) -> None:
@@ -149,6 +153,8 @@ class StaticTrainer:
                 self.control_density(round(start + (self.budget - start) * min(1.0, share + 0.1)))
             if done == until or done == (until + settings.iterations) // 2:
                 self.remove_unseen()
+            if settings.exposure == "auto" and done == round(EXPOSURE_TRIAL * settings.iterations):
+                self._judge_exposure()
             if progress is not None:
                 progress(done, losses[-1])
         return losses
@@ -169,7 +175,7 @@ class StaticTrainer:
             self.parameters, self._gradients, self._first, self._second, self._rates(iteration), EVERY_ROW, BETA1,
             BETA2, iteration + 1,
         )  # fmt: skip
-        if self.settings.exposure:
+        if self.exposing:
             self._step_exposure(view, iteration)
         return self._loss.image_part + self._loss.mask_part
 
@@ -196,6 +202,14 @@ class StaticTrainer:
         centre = np.mean([other.exposure[:3] for other in self.views], axis=0) - np.array([1, 0], np.float32)
         for other in self.views:
             other.exposure[:3] -= centre
+
+    def _judge_exposure(self) -> None:
+        """Give up the gains and offsets where they hardly differ from camera to camera."""
+        gains = np.array([view.exposure[:3, 0] for view in self.views])
+        if gains.std(axis=0).mean() < EXPOSURE_SPREAD:
+            self.exposing = False
+            for view in self.views:
+                view.exposure[:] = (1, 0)
 
     def control_density(self, target: int) -> None:
         """Remove what is all but transparent; clone or split those the pictures pull hardest, up to ``target``."""
@@ -288,5 +302,5 @@ def fit_static_scene(
     parameters = initial_parameters(positions, colours, foreground, limit, rng)
     trainer = StaticTrainer(factory, views, parameters, scene, settings)
     losses = trainer.train(progress)
-    exposures = {view.name: view.exposure[:3].copy() for view in views} if settings.exposure else {}
+    exposures = {view.name: view.exposure[:3].copy() for view in views} if trainer.exposing else {}
     return StaticResult(trainer.gaussians(), exposures, losses)
