@@ -125,9 +125,10 @@ def evaluate(
     frames: Frames = None,
     preset: Preset = "scas4d",
     changes: Changes = None,
+    again: bench.Again = False,
 ) -> None:
-    """Reconstructs a capture in this process and prints its scores on the test cameras and ground truth."""
-    bench.quality([capture], out=out, frames=frames, preset=[preset], changes=changes)
+    """Prints a capture's scores on its test cameras and ground truth; reconstructs it unless `out` has them already."""
+    bench.quality([capture], out=out, frames=frames, preset=[preset], changes=changes, again=again)
 
 
 def _loopback(host: str) -> bool:

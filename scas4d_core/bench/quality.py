@@ -159,7 +159,8 @@ def run_jobs(jobs: Sequence[Job], out: Path, *, again: bool = False, report: Rep
             if "error" in row:
                 report(f"    failed: {row['error']}")
         else:
-            report(f"[{number}/{len(jobs)}] {job.key}: measured already")
+            other = "" if row.get("core") == core_version() else ", with other sources of the core"
+            report(f"[{number}/{len(jobs)}] {job.key}: measured already{other}")
         rows.append(row)
     table = markdown(with_means(rows))
     if stages := stage_table(rows):

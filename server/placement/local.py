@@ -85,6 +85,7 @@ class LocalProcess:
         with self._reaping:
             self._process.join()
             code = self._process.exitcode
+        self._outbox.put(None)  # nobody may ever call stop: the other thread ends with the process
         self._call(self._on_end, f"its process ended by itself (exit code {code})")
 
     def _call(self, function: Callable[[Any], None], argument: Any) -> None:

@@ -258,6 +258,10 @@ def test_the_study_measures_saves_and_goes_on_where_it_stopped(capture_folder, t
 
     stand_in(NeverAgain)
     assert quality.run([capture_folder], tmp_path, ["scas4d"], iterations=[7], report=lines.append) == rows[:1]
+    assert any(line.endswith("measured already") for line in lines)
+    monkeypatch.setattr(quality, "core_version", lambda: "another")
+    quality.run([capture_folder], tmp_path, ["scas4d"], iterations=[7], report=lines.append)
+    assert any(line.endswith("measured already, with other sources of the core") for line in lines)
     with pytest.raises(AssertionError):
         quality.run([capture_folder], tmp_path, ["scas4d"], iterations=[8], report=lines.append)
     with pytest.raises(AssertionError):
