@@ -9,14 +9,22 @@ from box_scene import held_out_camera, make_box, make_rig, photograph, take_fram
 from scas4d_core.captures.frame import Frame
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.settings import SceneSettings, StaticSettings
-from scas4d_core.static_scene import StaticResult, StaticTrainer, fit_static_scene, initial_parameters, logit
+from scas4d_core.static_scene import (
+    EXPOSURE_SPREAD,
+    StaticResult,
+    StaticTrainer,
+    fit_static_scene,
+    initial_parameters,
+    logit,
+)
 from scas4d_core.views import ViewFactory
 
 RIG = make_rig()
 BOX = make_box()
 SETTINGS = StaticSettings(
-    iterations=1000, max_gaussians=900, densify_from=50, densify_every=50, rate_colour=1e-2, rate_position=8e-4
-)
+    iterations=1000, max_gaussians=900, densify_from=50, densify_every=50, rate_colour=1e-2, rate_position=8e-4,
+    exposure=False,
+)  # fmt: skip
 
 
 def cloud() -> tuple[np.ndarray, np.ndarray]:
@@ -129,6 +137,19 @@ def test_exposures_of_the_cameras_are_recovered() -> None:
     assert found.mean() == pytest.approx(1, abs=1e-3)
     np.testing.assert_allclose(found, truth, atol=0.07)  # of up to 0.2 at the start
     assert np.abs([result.exposures[name][:, 1] for name in RIG.names]).max() < 0.02
+
+
+@pytest.mark.parametrize(("spread", "kept"), [(0.5 * EXPOSURE_SPREAD, False), (2.0 * EXPOSURE_SPREAD, True)])
+def test_exposures_are_given_up_where_the_cameras_are_alike(spread: float, kept: bool) -> None:
+    views = ViewFactory(RIG).views(take_frame(0, 0.0, BOX, RIG), {})
+    parameters = initial_parameters(*cloud(), None, 1000, np.random.default_rng(0))
+    settings = SETTINGS.model_copy(update={"exposure": "auto"})
+    trainer = StaticTrainer(ViewFactory(RIG), views, parameters, SceneSettings(), settings)
+    for view, side in zip(views, (-1, 1, -1, 1, -1, 1), strict=True):
+        view.exposure[:3] = (1 + side * spread, 0.02 * side)
+    trainer._judge_exposure()
+    assert trainer.exposing == kept
+    assert all((view.exposure == (1, 0)).all() for view in views) != kept
 
 
 def test_first_gaussians_are_as_wide_as_their_neighbours_are_far() -> None:
