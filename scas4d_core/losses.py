@@ -7,7 +7,6 @@ isometry and rotation terms it takes over. Every function returns a scalar of it
 from __future__ import annotations
 
 import functools
-
 from collections.abc import Sequence
 
 import torch

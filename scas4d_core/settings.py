@@ -67,8 +67,8 @@ class StaticSettings(Model):
     )
     exposure: bool | Literal["auto"] = Field(
         default="auto",
-        description="Learn a colour gain and offset per training camera (held-out cameras are scored raw). 'auto': give "
-        "it up after 30 % of the iterations where the cameras turn out alike: then it only fits noise.",
+        description="Learn a colour gain and offset per training camera (held-out cameras are scored raw). 'auto': "
+        "give it up after 30 % of the iterations where the cameras turn out alike: then it only fits noise.",
     )
     rate_position: Positive = Field(1.6e-4, description="Adam rate of means at the start, per metre of scene radius.")
     rate_position_end: Positive = Field(1.6e-6, description="The same at the end; the decay is exponential.")
@@ -96,7 +96,7 @@ class Weights(Model):
 
     image: Positive = Field(1.0, description="0.8 L1 + 0.2 (1 − SSIM).")
     mask: NotNegative = Field(
-        0.3, description="The same form on the rendered label, where masks are given; their hard edges pull it off."
+        0.4, description="The same form on the rendered label, where masks are given; their hard edges pull it off."
     )
     rigidity: NotNegative = Field(4.0, description="Dynamic3DGaussians; with image 1, the paper's 0.19 to 0.05.")
     isometry: NotNegative = Field(2.0, description="Likewise.")
