@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ def reconstruct(folder: Path, out: Path, *, frames: int | None, preset: str, cha
         changes: what differs, as ``update.iterations=200``.
     """
     from scas4d_core.bench.quality import settings_of
+    from scas4d_core.history import History
     from scas4d_core.ply import write_ply
     from scas4d_core.reconstruction import Reconstruction
 
@@ -33,12 +35,17 @@ def reconstruct(folder: Path, out: Path, *, frames: int | None, preset: str, cha
     count = min(frames or capture.frame_count, capture.frame_count)
     rig = capture.test_rig or capture.rig
     cameras = rig.cameras if capture.test_rig is not None else rig.cameras[:1]
+    if (out / "states" / "fixed.npz").exists():  # of an earlier run, like the pictures beside it
+        shutil.rmtree(out / "states")
+    history = History(out / "states")
     with Bars() as bars:
 
         def told(progress: Any) -> None:
             bars(progress.stage, progress.done, progress.total)
 
-        reconstruction = Reconstruction.start(given.rig, given.frame(0), settings, points=given.points, progress=told)
+        reconstruction = Reconstruction.start(
+            given.rig, given.frame(0), settings, points=given.points, progress=told, history=history
+        )
         for index in range(count):
             if index:
                 reconstruction.step(given.frame(index))
@@ -52,7 +59,5 @@ def reconstruct(folder: Path, out: Path, *, frames: int | None, preset: str, cha
                 scores.append(pictures.psnr(true, render))
                 pictures.save(out / f"camera_{camera.name}" / f"{index:06d}.png", pictures.comparison(true, render))
             console.print(f"frame {index}: {np.mean(scores):.2f} dB")
-    last = reconstruction.history.indices[-1]
-    reconstruction.history.save(out / "states")
-    write_ply(out / "last.ply", reconstruction.history.gaussians(last), reconstruction.world)
+    write_ply(out / "last.ply", history.gaussians(history.indices[-1]), reconstruction.world)
     console.print(f"pictures, states and last.ply: {out}")
