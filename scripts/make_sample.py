@@ -1,6 +1,6 @@
 """Makes samples/robot: fewer cameras and no tail of a capture in the Dynamic3DGaussians layout.
 
-    python scripts/make_sample.py CAPTURE samples/robot --cameras 16 --tests 2 --frames 13
+    python scripts/make_sample.py CAPTURE samples/robot --cameras 16 --tests 2 --frames 14
 
 Frames are cut from the end only. Camera ids stay as they are, so that ``visible`` in gt_tracks.npz stays indexed by
 them; pictures, masks and labels are copied byte by byte.
@@ -44,7 +44,7 @@ def main() -> None:
     parser.add_argument("target", type=Path)
     parser.add_argument("--cameras", type=int, default=16)
     parser.add_argument("--tests", type=int, default=2)
-    parser.add_argument("--frames", type=int, default=13)
+    parser.add_argument("--frames", type=int, default=14)
     options = parser.parse_args()
     kept: dict[str, list[int]] = {}
     for file, count in (("train_meta.json", options.cameras), ("test_meta.json", options.tests)):
