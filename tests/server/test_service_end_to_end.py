@@ -19,7 +19,7 @@ CAPTURE = Path(__file__).parents[2] / "samples" / "robot"
 FRAMES = 3
 SETTINGS = {
     "scene": {"image_scale": 0.25},
-    "static": {"iterations": 300, "initial_gaussians": 1500, "max_gaussians": 2500},
+    "static": {"iterations": 300, "max_gaussians": 2500},
     "update": {"iterations": 30},
 }
 
