@@ -15,6 +15,7 @@ PRESETS: dict[str, Settings] = {
             rate_end=1.0,
             beta1=0.9,
             beta2=0.999,
+            rate_colour_standing=0.0025,
             momentum=1.0,
             cold_start=1.0,
             weights=Weights(mask=3.0, scale=0.0),

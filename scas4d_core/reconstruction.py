@@ -166,6 +166,9 @@ class Reconstruction(Committed):
             raise StepError(str(error)) from error
         decoded = perf_counter() - started
         updated = self._update(views, seconds, frame.index)
+        for name in ("means", "factors", "colours"):
+            if not np.isfinite(getattr(updated.gaussians, name)).all():
+                raise StepError(f"frame {frame.index}: the update left NaN or infinity in {name}; nothing is committed")
         self.history.append(frame.index, frame.time, updated.gaussians)
         self._motion = updated.motion
         return self._report(frame, updated, decoded)

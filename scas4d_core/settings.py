@@ -37,6 +37,13 @@ class SceneSettings(Model):
         "what moves is kept above. None: the scene has no floor term.",
     )
 
+    @field_validator("floor")
+    @classmethod
+    def _points_somewhere(cls, floor: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if floor is not None and not any(floor[:3]):
+            raise ValueError(f"floor {floor} has no direction; give (a, b, c, d) with (a, b, c) pointing down")
+        return floor
+
 
 class StaticSettings(Model):
     """Frame 0: 3D Gaussian Splatting with adaptive density control."""
@@ -76,7 +83,7 @@ class StaticSettings(Model):
     rate_opacity: Positive = Field(5e-2, description="Adam rate of opacity logits.")
     rate_scale: Positive = Field(5e-3, description="Adam rate of log scales.")
     rate_rotation: Positive = Field(2e-3, description="Adam rate of quaternions.")
-    rate_exposure: Positive = Field(1e-3, description="Adam rate of log gain and offset.")
+    rate_exposure: Positive = Field(1e-3, description="Adam rate of gain and offset.")
     weight_mask: NotNegative = Field(
         3.0, description="Weight of the mask loss where masks are given; in frame 0 it teaches the labels only."
     )

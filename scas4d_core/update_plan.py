@@ -75,10 +75,16 @@ def plan_views(
 
 
 def plan_samples(count: int, size: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:
-    """Disjoint random sets of at most ``size`` of ``count`` Gaussians that cover all: each iteration takes the next."""
+    """Disjoint random sets of ``size`` of ``count`` Gaussians that cover all: each iteration takes the next.
+
+    A rest of less than a quarter of that joins the set before it: alone, a few Gaussians would carry the whole weight.
+    """
     order = rng.permutation(count)
     size = min(size, max(count, 1))
-    return [np.sort(order[k : k + size]) for k in range(0, max(count, 1), size)]
+    cuts = list(range(size, count, size))
+    if cuts and 4 * (count - cuts[-1]) < size:
+        cuts.pop()
+    return [np.sort(part) for part in np.split(order, cuts)]
 
 
 def first_lengths(hierarchy: Hierarchy, first: Gaussians) -> NDArray[np.float32]:

@@ -19,6 +19,10 @@ Array = NDArray[np.float32]
 Float = NDArray[np.float64]
 
 
+LONGEST_PREDICTION = 3.0
+"""Times the interval it was found in that a motion is carried on for: after a longer gap it says little."""
+
+
 def quaternion_products(a: Array, b: Array) -> Array:
     """[M, 4] a∘b (w, x, y, z): first b, then a."""
     aw, ax, ay, az = a.T
@@ -56,12 +60,13 @@ class Motion:
     Attributes:
         turns: per layer [K, 3] axis · tan(angle/2). shifts: per layer [K, 3] metres, relative to the layer above; both
             in the axes that the cluster has turned to.
-        rest: [M, 3] metres, Δp less what the finest clusters have taken of it. seconds: it took.
+        rest: [M, 3] metres, Δp less what the finest clusters have taken of it. own_turns: [M, 3] Δr. seconds: it took.
     """
 
     turns: list[Float]
     shifts: list[Float]
     rest: Float
+    own_turns: Float
     seconds: float
 
     @classmethod
@@ -85,7 +90,7 @@ class Motion:
                 turns[below] = rotate(turns[k][parents], turns[below])
                 shifts[below] = rotate(turns[k][parents], shifts[below])
             shifts[k] = rotate(turns[k], shifts[k])
-        return cls(turns, shifts, rest, seconds)
+        return cls(turns, shifts, rest, deformation.deltas[:, 3:6].astype(np.float64), seconds)
 
 
 def warm_start(deformation: Parameters, motion: Motion | None, seconds: float, settings: UpdateSettings) -> None:
@@ -94,8 +99,9 @@ def warm_start(deformation: Parameters, motion: Motion | None, seconds: float, s
         values[:] = 0
     if motion is None:
         return
-    share = settings.warm_start * seconds / motion.seconds
+    share = settings.warm_start * min(seconds / motion.seconds, LONGEST_PREDICTION)
     for values, turns, shifts in zip(deformation.clusters, motion.turns, motion.shifts, strict=True):
         values[:, :3] = share * turns
         values[:, 3:6] = share * shifts
     deformation.deltas[:, :3] = share * settings.momentum * motion.rest
+    deformation.deltas[:, 3:6] = share * settings.momentum * motion.own_turns
