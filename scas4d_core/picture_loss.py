@@ -98,12 +98,24 @@ class PictureLoss:
         lap("render backward")
         return gradients
 
-    def coverage(self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView) -> Array:
-        """[N] pixels' worth of blending weight of each Gaussian in a view; the gradient of a channel's sum."""
+    def coverage(
+        self,
+        means: Array,
+        factors: Array,
+        opacities: Array,
+        features: Array,
+        view: TrainingView,
+        pixels: Array | float = 1.0,
+    ) -> Array:
+        """[N] pixels' worth of blending weight of each Gaussian in a view; the gradient of a channel's sum.
+
+        Args:
+            pixels: [H, W] what each pixel counts.
+        """
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background)
         g_image, g_alpha = self.rasterizer.gradient_buffers()
         g_image[:] = 0
-        g_image[LABEL, : view.camera.height, : view.camera.width] = 1
+        g_image[LABEL, : view.camera.height, : view.camera.width] = pixels
         weights = self.rasterizer.backward(g_image, g_alpha, LABEL).features[:, LABEL].copy()
         g_image[:] = 0
         return weights

@@ -20,7 +20,9 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import build_hierarchy
 from scas4d_core.history import History
 from scas4d_core.initial_points import initial_points
+from scas4d_core.motion_labels import moving_between
 from scas4d_core.neighbours import build_neighbours
+from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import Settings
 from scas4d_core.static_scene import StaticResult, fit_static_scene
@@ -29,6 +31,9 @@ from scas4d_core.views import TrainingView, ViewFactory, pictures_of
 from scas4d_core.warm_start import Motion
 
 __all__ = ["FrameReport", "Progress", "Reconstruction", "StepError", "View"]
+
+NEW_LABELS = 0.01
+"""Share of all Gaussians that must be found moving anew before the hierarchy is built again."""
 
 REPORTED_ITERATIONS = 24
 """The report's training loss is a mean over this many last iterations: about one round of a rig's cameras."""
@@ -84,6 +89,11 @@ class Reconstruction(Committed):
         self._exposures: dict[str, NDArray[np.float32]] = {}
         self.static: StaticResult | None = None
         self._motion: Motion | None = None
+        self._masked = True
+        self._labels: NDArray[np.bool_] | None = None
+        self._seen: list[TrainingView] = []
+        limits = scene_limits(settings.scene.near, rig.radius)
+        self._picture = PictureLoss(self._factory, settings.scene.background, 1.0, 0.0, limits=limits)
         self._updater: Updater | None = None
 
     @classmethod
@@ -122,6 +132,9 @@ class Reconstruction(Committed):
         result = static or self._fit_static(rig, self._scaled(frame), points, progress or (lambda _: None))
         self.static = result
         self._exposures = result.exposures
+        self._masked = len(frame.masks) > 0
+        if not self._masked:
+            self._seen = self._factory.views(self._scaled(frame), {}, use_masks=False)
         self._prepare(result.gaussians)
         self.history.append(frame.index, frame.time, result.gaussians)
         return self
@@ -165,12 +178,15 @@ class Reconstruction(Committed):
         except ValueError as error:
             raise StepError(str(error)) from error
         decoded = perf_counter() - started
+        self._learn_what_moves(views)
         updated = self._update(views, seconds, frame.index)
         for name in ("means", "factors", "colours"):
             if not np.isfinite(getattr(updated.gaussians, name)).all():
                 raise StepError(f"frame {frame.index}: the update left NaN or infinity in {name}; nothing is committed")
         self.history.append(frame.index, frame.time, updated.gaussians)
         self._motion = updated.motion
+        if not self._masked:
+            self._seen = views
         return self._report(frame, updated, decoded)
 
     @property
@@ -178,9 +194,29 @@ class Reconstruction(Committed):
         """Whether updates look at masks."""
         return self.settings.update.use_masks and self.settings.update.weights.mask > 0
 
+    def _learn_what_moves(self, views: list[TrainingView]) -> None:
+        """Where frame 0 had no mask, the pictures tell what moves; what has moved once stays in the hierarchy.
+
+        The labels become part of the state with the commit of this frame. A hierarchy of other Gaussians is a new one:
+        the motion before does not fit it, and the update starts cold.
+        """
+        if self._masked or not self._seen:
+            return
+        state = self._state(None)
+        found = moving_between(state, self._seen, views, self._picture)
+        known = np.zeros(len(state), np.bool_) if self._labels is None else self._labels
+        if (found & ~known).sum() > NEW_LABELS * len(state):
+            self._labels = found | known
+            self._motion = None
+            self._prepare(self._labelled(self.history.gaussians(self.history.indices[0])))
+
+    def _labelled(self, gaussians: Gaussians) -> Gaussians:
+        """The Gaussians with the labels learnt from motion, where there are any."""
+        return gaussians if self._labels is None else gaussians.replace(foreground=self._labels.astype(np.float32))
+
     def _update(self, views: list[TrainingView], seconds: float, seed: int) -> Updated:
         assert self._updater is not None
-        return self._updater.run(self._state(None), views, self._motion, seconds, seed)
+        return self._updater.run(self._labelled(self._state(None)), views, self._motion, seconds, seed)
 
     def _prepare(self, gaussians: Gaussians) -> None:
         """The hierarchy and the neighbour graph of what moves."""

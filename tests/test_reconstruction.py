@@ -214,11 +214,12 @@ def test_automatic_scale_makes_the_rig_three_metres_wide() -> None:
     assert start(settings).rig.radius == pytest.approx(3.0)
 
 
-def test_without_masks_everything_moves() -> None:
+def test_without_masks_everything_moves_until_motion_tells() -> None:
     frames = [replace(frame, masks={}) for frame in FRAMES]
     scene = start(shortened(), frames[0])
     report = scene.step(frames[1])
-    assert report.moving == report.gaussians
+    assert scene.history.gaussians(frames[0].index).moving.all()
+    assert 0 < report.moving < report.gaussians
 
 
 def test_masks_that_weigh_nothing_or_are_not_used_are_not_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
