@@ -18,7 +18,7 @@ PRESETS: dict[str, Settings] = {
             rate_colour_standing=0.0025,
             momentum=1.0,
             cold_start=1.0,
-            weights=Weights(mask=3.0, scale=0.0),
+            weights=Weights(mask=3.0, mask_alone=3.0, scale=0.0),
         )
     ),
 }

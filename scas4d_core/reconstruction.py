@@ -192,7 +192,8 @@ class Reconstruction(Committed):
     @property
     def _uses_masks(self) -> bool:
         """Whether updates look at masks."""
-        return self.settings.update.use_masks and self.settings.update.weights.mask > 0
+        weights = self.settings.update.weights
+        return self.settings.update.use_masks and max(weights.mask, weights.mask_alone) > 0
 
     def _learn_what_moves(self, views: list[TrainingView]) -> None:
         """Where frame 0 had no mask, the pictures tell what moves; what has moved once stays in the hierarchy.

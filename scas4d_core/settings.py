@@ -103,7 +103,14 @@ class Weights(Model):
 
     image: Positive = Field(1.0, description="0.8 L1 + 0.2 (1 − SSIM).")
     mask: NotNegative = Field(
-        0.4, description="The same form on the rendered label, where masks are given; their hard edges pull it off."
+        1.0,
+        description="The same form on the rendered label, where masks are given and at least a tenth of the Gaussians "
+        "stands: it tells what moves from what does not.",
+    )
+    mask_alone: NotNegative = Field(
+        0.3,
+        description="The same where all but a few move: the picture has the silhouette already, and the masks' hard "
+        "edges pull it off.",
     )
     rigidity: NotNegative = Field(4.0, description="Dynamic3DGaussians; with image 1, the paper's 0.19 to 0.05.")
     isometry: NotNegative = Field(2.0, description="Likewise.")
@@ -127,8 +134,8 @@ class UpdateSettings(Model):
     layer_rates: tuple[LayerRates, ...] = Field(
         (
             LayerRates(rotation=0.04, translation=0.008, scaling=0.002),
-            LayerRates(rotation=0.02, translation=0.004, scaling=0.002),
-            LayerRates(rotation=0.01, translation=0.002, scaling=0.002),
+            LayerRates(rotation=0.005, translation=0.001, scaling=0.002),
+            LayerRates(rotation=0.001, translation=0.0002, scaling=0.002),
         ),
         min_length=1,
         description="One per layer, coarse to fine; with more layers the last is repeated.",

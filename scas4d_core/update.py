@@ -18,7 +18,7 @@ from scas4d_core.neighbours import Neighbours
 from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import SceneSettings, UpdateSettings
-from scas4d_core.update_plan import Rates, first_lengths, plan_samples, plan_views
+from scas4d_core.update_plan import Rates, first_lengths, mask_weight, plan_samples, plan_views
 from scas4d_core.views import TrainingView, ViewFactory
 from scas4d_core.warm_start import Motion, quaternion_products, warm_start
 
@@ -106,8 +106,9 @@ class FrameUpdate:
         self._rates = Rates.of(settings, len(hierarchy.sizes), factory.rig.radius)
         weights = settings.weights
         self._floor = scene.floor if weights.floor > 0 else None
+        mask = mask_weight(settings, len(hierarchy.rows), len(first))
         limits = scene_limits(scene.near, factory.rig.radius)
-        self._picture = PictureLoss(factory, scene.background, weights.image, weights.mask, limits=limits)
+        self._picture = PictureLoss(factory, scene.background, weights.image, mask, limits=limits)
         bounds = np.maximum(first_lengths(hierarchy, first), np.float32(settings.max_scale))
         self._deformation = CpuDeformation(hierarchy, neighbours, bounds, settings.cluster_map)
 

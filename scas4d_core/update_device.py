@@ -19,7 +19,7 @@ from scas4d_core.neighbours import Neighbours
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.update import Stopwatch, Updated
-from scas4d_core.update_plan import Rates, first_lengths, plan_samples, plan_views
+from scas4d_core.update_plan import Rates, first_lengths, mask_weight, plan_samples, plan_views
 from scas4d_core.update_torch import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchUpdate
 from scas4d_core.views import LABEL, TrainingView, ViewFactory
 from scas4d_core.warm_start import Motion, warm_start
@@ -76,7 +76,7 @@ class DeviceUpdate:
             graph=_graph(neighbours, len(hierarchy.rows)),
             first_lengths=first_lengths(hierarchy, first),
             rates=Rates.of(settings, len(hierarchy.sizes), factory.rig.radius),
-            weights=_weights(settings, neighbours is not None),
+            weights=_weights(settings, neighbours is not None, mask_weight(settings, len(hierarchy.rows), len(first))),
             max_scale=settings.max_scale,
             background=scene.background,
             cluster_map=settings.cluster_map,
@@ -134,12 +134,12 @@ def _graph(neighbours: Neighbours | None, count: int) -> Graph:
     return Graph(neighbours.index.astype(np.int64), neighbours.weights, neighbours.distances)
 
 
-def _weights(settings: UpdateSettings, tied: bool) -> TermWeights:
+def _weights(settings: UpdateSettings, tied: bool, mask: float) -> TermWeights:
     """The weights of the terms; those between neighbours only where there are any."""
     given = settings.weights
     return TermWeights(
         image=given.image,
-        mask=given.mask,
+        mask=mask,
         rigidity=given.rigidity if tied else 0.0,
         isometry=given.isometry if tied else 0.0,
         rotation=given.rotation if tied else 0.0,

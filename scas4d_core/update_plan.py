@@ -87,6 +87,16 @@ def plan_samples(count: int, size: int, rng: np.random.Generator) -> list[NDArra
     return [np.sort(part) for part in np.split(order, cuts)]
 
 
+STANDING_SHARE = 0.1
+"""Share of standing Gaussians from which a scene has a background that stands; below, labels are noise."""
+
+
+def mask_weight(settings: UpdateSettings, moving: int, count: int) -> float:
+    """Weight of the mask loss for a scene of ``count`` Gaussians of which so many move."""
+    stands = count - moving >= STANDING_SHARE * count
+    return settings.weights.mask if stands else settings.weights.mask_alone
+
+
 def first_lengths(hierarchy: Hierarchy, first: Gaussians) -> NDArray[np.float32]:
     """[M, 3] metres, lengths of the moving Gaussians' axes at frame 0, which the scale loss lets them have."""
     lengths: NDArray[np.float32] = np.sqrt(np.square(first.factors[hierarchy.rows]).sum(axis=1))

@@ -225,7 +225,7 @@ def test_without_masks_everything_moves_until_motion_tells() -> None:
 def test_masks_that_weigh_nothing_or_are_not_used_are_not_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     scenes = [
         start(shortened(use_masks=False)),
-        start(shortened(weights=Weights(mask=0))),
+        start(shortened(weights=Weights(mask=0, mask_alone=0))),
     ]
     bare = replace(FRAMES[1], masks={})
     for scene in scenes:
