@@ -34,7 +34,7 @@ SETTINGS = UpdateSettings(
 )  # fmt: skip
 """Everything that an update can be asked for, in few iterations: the dense twin is slow."""
 
-FIRST_LOSS = 1e-5
+FIRST_LOSS = 1e-4
 """Relative: before the first step only rounding differs."""
 LOSS, PSNR_DB, MEDIAN_M, WORST_M = 0.01, 0.2, 1e-3, 5e-3
 """Afterwards Adam's first steps are of full size whatever the gradient, and the neighbour terms have a kink where
