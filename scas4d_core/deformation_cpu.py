@@ -131,12 +131,6 @@ class CpuDeformation:
             )
         return float(self.excess.sum(dtype=np.float64)) / axes
 
-    @property
-    def start_points(self) -> Array:
-        """[M, 3] the moving means of Θ_{t−1}, in the hierarchy's order."""
-        points: Array = self._points[0]
-        return points
-
     def _carried(self, layer: int) -> tuple[Array, Array, Array]:
         """Points, Jacobians and rotations as they enter a layer."""
         return self._points[layer], self._jacobians[layer], self._rotations[layer]

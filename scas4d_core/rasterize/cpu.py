@@ -58,11 +58,34 @@ class Gradients(NamedTuple):
     screen: Array
 
 
+class ForwardPass(NamedTuple):
+    """What ``backward`` needs of the forward pass before it: its inputs, and buffers that are its until the next."""
+
+    means: Array
+    factors: Array
+    features: Array
+    camera: CameraArrays
+    depth_channel: int
+    splats: Array
+    counts: NDArray[np.int32]
+    offsets: NDArray[np.int64]
+    pair_used: NDArray[np.uint8]
+    starts: NDArray[np.int64]
+    items: NDArray[np.int32]
+    slots: NDArray[np.int32]
+    tile_order: NDArray[np.int64]
+    image: Array
+    rest: Array
+    used: NDArray[np.int32]
+    pairs: int
+
+
 class CpuRasterizer:
     """Renders any number of feature channels in one pass, and carries gradients back."""
 
     def __init__(self, limits: Limits = DEFAULT) -> None:
         self.limits = np.array(limits, dtype=np.float32)
+        self._last: ForwardPass
         self._buffers: dict[str, NDArray[Any]] = {}
         self._gradient_shape: tuple[int, ...] = ()
         self._histogram = np.empty(1 << tiles.RADIX_BITS, np.int64)
@@ -145,7 +168,7 @@ class CpuRasterizer:
             rest,
             used,
         )
-        self._last = (
+        self._last = ForwardPass(
             means,
             factors,
             features,
@@ -172,7 +195,7 @@ class CpuRasterizer:
         Padded to whole tiles like the forward buffers. They hold 0 when first given out for a size of picture; the
         padding must keep it.
         """
-        camera, image, rest = self._last[3], self._last[13], self._last[14]
+        camera, image, rest = self._last.camera, self._last.image, self._last.rest
         g_image = self._buffer("g_image", image.shape)
         g_alpha = self._buffer("g_alpha", rest.shape)
         # Pictures of another size may have the same tiles: their gradients would stay in the padding.
@@ -191,46 +214,29 @@ class CpuRasterizer:
             detached: a channel whose gradient reaches the features but not the geometry, or −1. Its plane of the
                 forward picture is cleared.
         """
-        (
-            means,
-            factors,
-            features,
-            camera,
-            depth_channel,
-            splats,
-            counts,
-            offsets,
-            pair_used,
-            starts,
-            items,
-            slots,
-            tile_order,
-            image,
-            rest,
-            used,
-            pairs,
-        ) = self._last
+        last = self._last
+        features, image = last.features, last.image
         if detached >= 0:
             # A channel that is zero everywhere pulls at nothing; its own gradient does not read its value.
             features = features.copy()
             features[:, detached] = 0
             image[detached] = 0
         count, channels = features.shape
-        records = self._buffer("records", (pairs, blend_kernels.FEATURES + channels))
+        records = self._buffer("records", (last.pairs, blend_kernels.FEATURES + channels))
         blend_kernels.blend_backward(
-            splats,
+            last.splats,
             features,
             (0,) * (channels // blend_kernels.GROUP),
-            starts,
-            items,
-            slots,
-            tile_order,
+            last.starts,
+            last.items,
+            last.slots,
+            last.tile_order,
             threads(),
-            (camera.width, camera.height),
+            (last.camera.width, last.camera.height),
             self.limits,
             image,
-            rest,
-            used,
+            last.rest,
+            last.used,
             g_image,
             g_alpha,
             records,
@@ -243,17 +249,17 @@ class CpuRasterizer:
             self._buffer("g_screen", (count, 2)),
         )
         projection.project_backward(
-            means,
-            factors,
-            camera.pose,
-            camera.lens,
+            last.means,
+            last.factors,
+            last.camera.pose,
+            last.camera.lens,
             self.limits,
-            splats,
-            counts,
-            offsets,
-            pair_used,
+            last.splats,
+            last.counts,
+            last.offsets,
+            last.pair_used,
             records,
-            depth_channel,
+            last.depth_channel,
             *gradients,
         )
         return gradients
@@ -261,17 +267,14 @@ class CpuRasterizer:
     @property
     def planes(self) -> Array:
         """[C, rows, stride] of the last forward pass, padded to whole tiles."""
-        planes: Array = self._last[13]
-        return planes
+        return self._last.image
 
     @property
     def splats(self) -> Array:
         """[N, 8] of the last forward pass, columns as in ``kernels.projection``."""
-        splats: Array = self._last[5]
-        return splats
+        return self._last.splats
 
     @property
     def counts(self) -> NDArray[np.int32]:
         """[N] tiles of each Gaussian in the last forward pass, 0 where culled."""
-        counts: NDArray[np.int32] = self._last[6]
-        return counts
+        return self._last.counts
