@@ -1,0 +1,70 @@
+"""Cameras and rigs on the wire."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from client.wire.base import MAX_CAMERAS, MAX_PIXELS_A_SIDE, CameraName, Model, Row3, Row4
+from scas4d_core.cameras import Camera, Rig
+
+
+class CameraModel(Model):
+    """A pinhole camera without distortion; OpenCV axes; pixel centres at +0.5."""
+
+    name: CameraName
+    intrinsics: Annotated[list[Row3], Field(min_length=3, max_length=3)] = Field(
+        description="[[fx,0,cx],[0,fy,cy],[0,0,1]] in pixels; the upper left corner of the picture is (0, 0)."
+    )
+    world_to_camera: Annotated[list[Row4], Field(min_length=4, max_length=4)] = Field(
+        description="X_cam = R X_world + t as [[R, t], [0, 1]], in the user's units."
+    )
+    width: int = Field(ge=1, le=MAX_PIXELS_A_SIDE, description="Pixels.")
+    height: int = Field(ge=1, le=MAX_PIXELS_A_SIDE, description="Pixels.")
+
+    @model_validator(mode="after")
+    def _can_be(self) -> CameraModel:
+        if self.name == "time" or self.name.startswith("mask."):
+            raise ValueError(f"camera name {self.name!r} is the name of another field of a frame; rename the camera")
+        self.camera()  # raises CameraError, a ValueError, for what cannot be a camera
+        return self
+
+    def camera(self) -> Camera:
+        """The camera of the core."""
+        return Camera(
+            self.name, np.array(self.intrinsics), np.array(self.world_to_camera), width=self.width, height=self.height
+        )
+
+    @classmethod
+    def of(cls, camera: Camera) -> CameraModel:
+        """The camera as it goes over the wire."""
+        return cls(
+            name=camera.name,
+            intrinsics=camera.intrinsics.tolist(),
+            world_to_camera=camera.world_to_camera.tolist(),
+            width=camera.width,
+            height=camera.height,
+        )
+
+
+class RigModel(Model):
+    """The cameras of a scene."""
+
+    axes: Literal["opencv"] = Field(description="x right, y down, z forward. The only choice; named so nobody guesses.")
+    cameras: Annotated[list[CameraModel], Field(min_length=1, max_length=MAX_CAMERAS)]
+
+    @model_validator(mode="after")
+    def _names_unique(self) -> RigModel:
+        self.rig()
+        return self
+
+    def rig(self) -> Rig:
+        """The rig of the core."""
+        return Rig(tuple(camera.camera() for camera in self.cameras))
+
+    @classmethod
+    def of(cls, rig: Rig) -> RigModel:
+        """The rig as it goes over the wire."""
+        return cls(axes="opencv", cameras=[CameraModel.of(camera) for camera in rig.cameras])

@@ -1,0 +1,78 @@
+"""Trajectories on the wire."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from client.wire.base import Model, Pixel, Row3
+from client.wire.rigs import CameraModel
+
+
+class TracksRequest(Model):
+    """Trajectories of what exactly one of ids, pixels and points names."""
+
+    ids: Annotated[list[int], Field(min_length=1)] | None = Field(default=None, description="Of Gaussians.")
+    pixels: Annotated[list[Pixel], Field(min_length=1)] | None = Field(
+        default=None, description="u v in the picture of `camera`; (0.5, 0.5) is the centre of the first pixel."
+    )
+    camera: CameraModel | str | None = Field(default=None, description="Where the pixels are: any, or one of the rig.")
+    points: Annotated[list[Row3], Field(min_length=1)] | None = Field(
+        default=None, description="x y z in the rig's world and units."
+    )
+    at: int | None = Field(default=None, ge=0, description="Frame of the pixels or points; the first committed.")
+    first: int | None = Field(default=None, ge=0, description="First frame; the first committed.")
+    last: int | None = Field(default=None, ge=0, description="Last frame, included; the last committed.")
+    project: list[CameraModel | str] = Field(
+        default_factory=list, max_length=64, description="Cameras to project into, with visibility."
+    )
+    format: Literal["json", "npz"] = "json"
+
+
+class TracksModel(Model):
+    """Trajectories of Q points over T frames, in the rig's world and units."""
+
+    frames: list[int] = Field(description="[T] indices.")
+    times: list[float] = Field(description="[T] seconds.")
+    ids: list[int] = Field(description="[Q] the Gaussian that carries the point; −1 where the query met nothing.")
+    confidence: list[float] = Field(description="[Q] 0…1.")
+    positions: list[list[list[float] | None]] = Field(description="[Q][T] x y z; null where there is none.")
+    visible: dict[str, list[list[bool]]] = Field(
+        default_factory=dict, description="By camera asked for, [Q][T]: in the picture and nothing in front."
+    )
+    pixels: dict[str, list[list[list[float] | None]]] = Field(
+        default_factory=dict, description="By camera asked for, [Q][T] u v; null behind the camera."
+    )
+
+
+def tracks_model(
+    frames: Sequence[int],
+    times: Sequence[float],
+    ids: NDArray[np.int64],
+    confidence: NDArray[np.float64],
+    positions: NDArray[Any],
+    pixels: dict[str, NDArray[Any]],
+    visible: dict[str, NDArray[np.bool_]],
+) -> TracksModel:
+    """Arrays [T, Q, …] to the lists [Q][T] of the wire; NaN becomes null."""
+
+    def lists(array: NDArray[Any]) -> list[list[list[float] | None]]:
+        finite = np.isfinite(array).all(axis=-1)
+        return [
+            [point.tolist() if ok else None for point, ok in zip(track, good, strict=True)]
+            for track, good in zip(array.swapaxes(0, 1), finite.T, strict=True)
+        ]
+
+    return TracksModel(
+        frames=list(frames),
+        times=list(times),
+        ids=ids.tolist(),
+        confidence=confidence.tolist(),
+        positions=lists(positions),
+        pixels={name: lists(uv) for name, uv in pixels.items()},
+        visible={name: seen.T.tolist() for name, seen in visible.items()},
+    )

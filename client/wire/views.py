@@ -1,0 +1,48 @@
+"""Novel views on the wire."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import Field
+
+from client.wire.base import Model
+from client.wire.rigs import CameraModel
+
+
+class RenderKind(StrEnum):
+    """What to render."""
+
+    COLOUR = "colour"
+    DEPTH = "depth"
+    ALPHA = "alpha"
+    PARTS = "parts"
+
+
+class RenderFormat(StrEnum):
+    """How the render is encoded."""
+
+    PNG = "png"
+    JPEG = "jpeg"
+    NPZ = "npz"
+
+
+Unit = Annotated[float, Field(ge=0, le=1)]
+
+
+class RenderRequest(Model):
+    """A novel view."""
+
+    camera: CameraModel | str = Field(description="Any camera in the rig's world, or the name of one of the rig.")
+    frame: int | None = Field(default=None, ge=0, description="Index of a committed frame; the last where not given.")
+    kinds: Annotated[list[RenderKind], Field(min_length=1, max_length=4)] = Field(
+        default_factory=lambda: [RenderKind.COLOUR],
+        description="PNG and JPEG take one; npz takes several. Depth is along z in the rig's units, NaN where nothing "
+        "is; as PNG it is 16 bit, 0 where nothing is, else 1…65535 from X-Depth-Near to X-Depth-Far.",
+    )
+    format: RenderFormat = RenderFormat.PNG
+    background: tuple[Unit, Unit, Unit] | None = Field(default=None, description="RGB; the scene's where not given.")
+    parts: int | None = Field(
+        default=None, ge=1, le=254, description="Number of parts; chosen by the scene where not given."
+    )
