@@ -98,6 +98,14 @@ class PictureLoss:
         lap("render backward")
         return gradients
 
+    def colour_shift(self, view: TrainingView) -> tuple[float, float, float]:
+        """Mean of the view's picture minus mean of what was rendered for it last, exposure included, RGB in 0…1."""
+        height, width = view.camera.height, view.camera.width
+        rendered = self.rasterizer.planes[:3, :height, :width].mean(axis=(1, 2), dtype=np.float64)
+        shown = view.exposure[:3, 0] * rendered + view.exposure[:3, 1]
+        red, green, blue = (view.target[:3].mean(axis=(1, 2), dtype=np.float64) - shown).tolist()
+        return red, green, blue
+
     def coverage(
         self,
         means: Array,

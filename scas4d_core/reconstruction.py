@@ -26,7 +26,7 @@ from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import Settings
 from scas4d_core.static_scene import StaticResult, fit_static_scene
-from scas4d_core.update import FrameUpdate, Updated, Updater
+from scas4d_core.update import CameraFit, FrameUpdate, Updated, Updater
 from scas4d_core.views import TrainingView, ViewFactory, pictures_of
 from scas4d_core.warm_start import Motion
 
@@ -61,6 +61,7 @@ class FrameReport:
         seconds: by stage. loss: each iteration's weighted sum. psnr: dB, over the training views of the last
             iterations, each as it was rendered then.
         moving, gaussians: how many Gaussians move, and are.
+        cameras: by name, how well each camera's picture was met when it was last rendered: a bumped camera shows.
     """
 
     index: int
@@ -71,6 +72,7 @@ class FrameReport:
     psnr: float
     moving: int
     gaussians: int
+    cameras: dict[str, CameraFit] = field(default_factory=dict)
 
 
 class Reconstruction(Committed):
@@ -267,4 +269,5 @@ class Reconstruction(Committed):
             psnr=float(np.mean(updated.psnr[-REPORTED_ITERATIONS:])),
             moving=len(self._updater.hierarchy.rows) if self._updater else 0,
             gaussians=len(updated.gaussians),
+            cameras=updated.cameras,
         )

@@ -58,11 +58,24 @@ class Adam:
         )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class CameraFit:
+    """How well one camera's picture was met, when it was last rendered.
+
+    Attributes:
+        psnr: dB. colour_shift: [3] mean of the picture minus mean of the render, RGB in 0…1; None where not measured.
+    """
+
+    psnr: float
+    colour_shift: tuple[float, float, float] | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Updated:
     """What an update leaves: Θ_t, the motion that warms the next start, and how it went.
 
-    ``losses`` holds each iteration's weighted sum, ``psnr`` the dB of the view it rendered.
+    ``losses`` holds each iteration's weighted sum, ``psnr`` the dB of the view it rendered; ``cameras`` how well each
+    camera was met, by name.
     """
 
     gaussians: Gaussians
@@ -70,6 +83,7 @@ class Updated:
     losses: list[float]
     psnr: list[float]
     seconds: dict[str, float]
+    cameras: dict[str, CameraFit] = field(default_factory=dict)
 
 
 class Updater(Protocol):
@@ -127,6 +141,8 @@ class FrameUpdate:
         colours = previous.colours.copy()
         optimizers = self._optimizers(colours, cold=motion is None)
         losses, psnr = [], []
+        cameras: dict[str, CameraFit] = {}
+        last = {view.name: iteration for iteration, view in enumerate(pictures)}
         watch.lap("start")
         for iteration, view in enumerate(pictures):
             deformation.forward()
@@ -137,6 +153,8 @@ class FrameUpdate:
             )
             loss = self._picture.image_part + self._picture.mask_part
             psnr.append(self._picture.psnr)
+            if last[view.name] == iteration:
+                cameras[view.name] = CameraFit(self._picture.psnr, self._picture.colour_shift(view))
             loss += self._neighbour_terms(samples[iteration % len(samples)], gradients.means)
             if self._floor is not None:
                 loss += floor_term(
@@ -156,7 +174,7 @@ class FrameUpdate:
             losses.append(loss)
             watch.lap("adam")
         deformation.forward()
-        updated = Updated(self._commit(previous, colours), Motion.of(deformation, seconds), losses, psnr, {})
+        updated = Updated(self._commit(previous, colours), Motion.of(deformation, seconds), losses, psnr, {}, cameras)
         watch.lap("commit")
         updated.seconds.update(watch.seconds)
         return updated

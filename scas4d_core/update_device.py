@@ -18,7 +18,7 @@ from scas4d_core.hierarchy import Hierarchy
 from scas4d_core.neighbours import Neighbours
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import SceneSettings, UpdateSettings
-from scas4d_core.update import Stopwatch, Updated
+from scas4d_core.update import CameraFit, Stopwatch, Updated
 from scas4d_core.update_plan import Rates, first_lengths, mask_weight, plan_samples, plan_views
 from scas4d_core.update_torch import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchUpdate
 from scas4d_core.views import LABEL, TrainingView, ViewFactory
@@ -115,7 +115,8 @@ class DeviceUpdate:
         watch.lap("iterations")
         motion = Motion.of(Tables.of(hierarchy, found), seconds)
         watch.lap("commit")
-        return Updated(found.gaussians, motion, found.losses, found.psnr, watch.seconds)
+        cameras = {view.name: CameraFit(psnr) for view, psnr in zip(pictures, found.psnr, strict=True)}
+        return Updated(found.gaussians, motion, found.losses, found.psnr, watch.seconds, cameras)
 
     def _on_device(self, view: TrainingView) -> update_torch.TrainingView:
         """The view as ``update_torch`` takes it; a picture smaller than its camera's is a coarse one."""

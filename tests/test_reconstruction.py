@@ -285,3 +285,16 @@ def test_per_gaussian_updates_run_as_well() -> None:
     scene = start(shortened(clusters=(), momentum=1.0))
     losses = [scene.step(frame).loss for frame in FRAMES[1:]]
     assert np.isfinite(losses).all()
+
+
+def test_the_report_shows_the_camera_whose_colours_changed() -> None:
+    reconstruction = start(shortened(iterations=20))
+    bumped = reconstruction.rig.names[1]
+    images = dict(FRAMES[1].images)
+    images[bumped] = np.clip(images[bumped].astype(int) + np.array([40, 0, 0]), 0, 255).astype(np.uint8)
+    cameras = reconstruction.step(replace(FRAMES[1], images=images)).cameras
+    assert set(cameras) == set(reconstruction.rig.names)
+    red = {name: fit.colour_shift[0] for name, fit in cameras.items() if fit.colour_shift}
+    others = [shift for name, shift in red.items() if name != bumped]
+    assert red[bumped] > 0.08 + max(others)  # the Gaussians' colours go part of the way, for all cameras
+    assert min(cameras, key=lambda name: cameras[name].psnr) == bumped
