@@ -47,6 +47,12 @@ async def render_by_name(
 
 async def answer(scene: Scene, server: ServerSettings, request: RenderRequest) -> Response:
     """Checks the request and asks the reader."""
+    found = await scene.ask(query_of(scene, server, request))
+    return Response(found.body, media_type=found.media_type, headers=found.headers)
+
+
+def query_of(scene: Scene, server: ServerSettings, request: RenderRequest) -> RenderQuery:
+    """The request, checked, as the reader takes it; `server.routes.stream` asks it too."""
     camera = scene.camera(request.camera) if isinstance(request.camera, str) else request.camera.camera()
     pixels = camera.width * camera.height
     if pixels > server.max_render_pixels:
@@ -69,8 +75,6 @@ async def answer(scene: Scene, server: ServerSettings, request: RenderRequest) -
     if request.format == RenderFormat.JPEG and kinds[0] in ("depth", "parts"):
         raise Problem(422, f"JPEG would change {kinds[0]}", field="format", value="jpeg", remedy="ask for png or npz")
     background = request.background or scene.spec.settings.scene.background
-    query = RenderQuery(
+    return RenderQuery(
         camera, scene.committed_frame(request.frame), kinds, request.format.value, background, request.parts
     )
-    found = await scene.ask(query)
-    return Response(found.body, media_type=found.media_type, headers=found.headers)

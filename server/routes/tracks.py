@@ -65,6 +65,12 @@ async def tracks(
 
 async def answer(scene: Scene, server: ServerSettings, request: TracksRequest) -> Response:
     """Checks the request and asks the reader."""
+    found = await scene.ask(query_of(scene, server, request))
+    return Response(found.body, media_type=found.media_type)
+
+
+def query_of(scene: Scene, server: ServerSettings, request: TracksRequest) -> TracksQuery:
+    """The request, checked, as the reader takes it; `server.routes.stream` asks it too."""
     kinds = {"ids": request.ids, "pixels": request.pixels, "points": request.points}
     asked = [(name, value) for name, value in kinds.items() if value is not None]
     if len(asked) != 1:
@@ -97,7 +103,7 @@ async def answer(scene: Scene, server: ServerSettings, request: TracksRequest) -
         raise Problem(422, "ids count from 0", field="ids", value=request.ids, remedy="give ids of Gaussians")
     if request.pixels is not None and request.camera is None:
         raise Problem(422, "pixels of which camera?", field="camera", remedy=f"one of {', '.join(scene.rig.names)}")
-    query = TracksQuery(
+    return TracksQuery(
         frames=frames,
         at=scene.committed_frame(scene.committed[0] if request.at is None else request.at, "at"),
         ids=None if request.ids is None else tuple(request.ids),
@@ -107,8 +113,6 @@ async def answer(scene: Scene, server: ServerSettings, request: TracksRequest) -
         project=tuple(_camera(scene, server, camera) for camera in request.project),
         format=request.format,
     )
-    found = await scene.ask(query)
-    return Response(found.body, media_type=found.media_type)
 
 
 def _camera(scene: Scene, server: ServerSettings, camera: CameraModel | str) -> Camera:
