@@ -9,13 +9,13 @@ import time
 from pathlib import Path
 from typing import Annotated
 
-import httpx
 import typer
 
 from client import __version__, bench
+from client.errors import ServiceError, ServiceUnreachable
 from client.overrides import overrides
 from client.progress import Bars, console
-from client.sdk import DEFAULT_URL, Client, ServiceError
+from client.sdk import DEFAULT_URL, Client
 from scas4d_core.captures import CaptureError, ImageError, open_capture
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Online 4D reconstruction of multi-camera rigs.")
@@ -162,8 +162,8 @@ def main() -> None:
         app()
     except (ServiceError, CaptureError, ImageError, RuntimeError, ValueError) as error:
         raise SystemExit(f"scas4d: {error}") from None
-    except httpx.TransportError as error:
-        raise SystemExit(f"scas4d: the service cannot be reached ({error}); start one with: scas4d serve") from None
+    except ServiceUnreachable as error:
+        raise SystemExit(f"scas4d: {error}; start one with: scas4d serve") from None
 
 
 if __name__ == "__main__":

@@ -7,16 +7,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 
 from client import pictures, rig
+from client.errors import ServiceError, ServiceUnreachable
 from client.progress import Bars, console
-from client.sdk import Client, ServiceError
+from client.sdk import Client
 from scas4d_core.captures import Capture
 
 START_S = 60.0
@@ -63,9 +63,9 @@ def _free(port: int) -> int:
 
 def _answers(url: str) -> bool:
     try:
-        with closing(Client(url)) as client:
-            return client._http.get("/health/ready", timeout=2).is_success
-    except httpx.TransportError:
+        with Client(url, outage=0) as client:
+            return client.ready().status == "ready"
+    except (ServiceError, ServiceUnreachable):
         return False
 
 

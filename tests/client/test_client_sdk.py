@@ -1,14 +1,15 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 
-import httpx
 import numpy as np
 import pytest
 from running import HEIGHT, WIDTH, make_rig, pictures
 
+from client.errors import FrameGap
 from client.rig import push
-from client.sdk import AsyncClient, Client, ServiceError
+from client.sdk import AsyncClient, Client
 from scas4d_core.captures import open_capture
 
 
@@ -45,15 +46,14 @@ def test_the_async_client_does_the_same(service):
         async with AsyncClient(service.url) as client:
             scene = await client.create_scene(make_rig(), name="async")
             await client.put_frame(scene.id, 0, pictures())
-            while (await client.frame(scene.id, 0)).state != "committed":
-                await asyncio.sleep(0.05)
+            assert (await client.wait(scene.id, 0, every=0.05)).state == "committed"
             view = await client.render(scene.id, make_rig().cameras[1])
             arrays = await client.render_arrays(scene.id, "c0", kinds=["depth"])
             tracks = await client.tracks(scene.id, points=np.zeros((1, 3)))
             parts = await client.parts(scene.id, 2)
             ply = await client.ply(scene.id, 0)
             assert scene.id in [other.id for other in await client.scenes()]
-            with pytest.raises(ServiceError, match="gap"):
+            with pytest.raises(FrameGap, match="gap"):
                 await client.put_frame(scene.id, 5, pictures())
             await client.delete_scene(scene.id)
             return view, arrays, tracks, parts, ply
@@ -66,77 +66,19 @@ def test_the_async_client_does_the_same(service):
     assert ply.startswith(b"ply")
 
 
-class Flaky(httpx.BaseTransport):
-    """Answers as it is told, then with 200."""
+def test_both_clients_have_the_same_methods():
+    def public(kind):
+        return {name: inspect.signature(value) for name, value in vars(kind).items() if not name.startswith("_")}
 
-    def __init__(self, *answers):
-        self.answers = list(answers)
-        self.requests = []
-
-    def handle_request(self, request):
-        self.requests.append(request.method)
-        answer = self.answers.pop(0) if self.answers else httpx.Response(200, json=OK)
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
-
-
-OK = {"scene": "s", "index": 0, "time": 0.0, "identity": "i"}
+    sync, parallel = public(Client), public(AsyncClient)
+    assert sync.keys() == parallel.keys()
+    calls = sync.keys() - {"close", "send", "watch", "wait"}
+    assert len(calls) > 15
+    for name in calls:
+        assert sync[name].parameters == parallel[name].parameters
+        assert vars(AsyncClient)[name].__doc__ == vars(Client)[name].__doc__ != None  # noqa: E711
+        assert inspect.iscoroutinefunction(vars(AsyncClient)[name])
 
 
-def flaky(*answers, patience=5.0):
-    client = Client("http://nowhere", patience=patience)
-    transport = Flaky(*answers)
-    client._http = httpx.Client(base_url="http://nowhere", transport=transport)
-    return client, transport
-
-
-def test_frames_are_sent_again_after_broken_connections_and_full_queues():
-    busy = httpx.Response(429, headers={"Retry-After": "0"}, json={})
-    client, transport = flaky(httpx.ReadError("cut"), busy, httpx.ConnectError("down"), busy)
-    assert client.put_frame("s", 0, {"c": b"x"}).identity == "i"
-    assert transport.requests == ["PUT"] * 5
-
-
-def test_creating_a_scene_is_not_sent_twice():
-    client, transport = flaky(httpx.ReadError("cut"))
-    with pytest.raises(httpx.ReadError):
-        client.create_scene(make_rig())
-    assert transport.requests == ["POST"]
-
-
-def test_creating_is_tried_again_where_nothing_was_sent():
-    client, transport = flaky(
-        httpx.ConnectError("down"), httpx.Response(422, json={"title": "t", "status": 422, "detail": "d"})
-    )
-    with pytest.raises(ServiceError, match="d"):
-        client.create_scene(make_rig())
-    assert transport.requests == ["POST", "POST"]
-
-
-def test_patience_and_tries_end():
-    busy = [
-        httpx.Response(429, headers={"Retry-After": "0"}, json={"title": "t", "status": 429, "detail": "full"})
-    ] * 99
-    client, transport = flaky(*busy, patience=0.35)
-    with pytest.raises(ServiceError, match="full"):
-        client.put_frame("s", 0, {"c": b"x"})
-    assert len(transport.requests) < 10
-    client, transport = flaky(*[httpx.ConnectError("down")] * 9)
-    with pytest.raises(httpx.ConnectError):
-        client.put_frame("s", 0, {"c": b"x"})
-
-
-def test_a_delete_that_was_lost_on_the_way_back_is_done():
-    gone = httpx.Response(404, json={"title": "t", "status": 404, "detail": "gone"})
-    client, _ = flaky(httpx.ReadError("cut"), gone)
-    client.delete_scene("s")
-    client, _ = flaky(gone)
-    with pytest.raises(ServiceError, match="gone"):
-        client.delete_scene("s")
-
-
-def test_an_answer_of_another_service_is_shown():
-    client, _ = flaky(httpx.Response(502, text="<html>bad gateway"))
-    with pytest.raises(ServiceError, match="bad gateway"):
-        client.scenes()
+def test_methods_say_what_they_take():
+    assert list(inspect.signature(Client("http://x").put_frame).parameters)[:3] == ["id", "index", "images"]

@@ -1,0 +1,12 @@
+"""What moves together."""
+
+from __future__ import annotations
+
+from client.calls.call import Call, path, reads
+from client.wire import PartsModel
+
+
+def parts(id: str, count: int | None = None) -> Call[PartsModel]:
+    """A part label for every Gaussian; `count` parts, or as many as a stated rule finds."""
+    arguments = {"params": {} if count is None else {"count": count}}
+    return Call("GET", path(id, "parts"), reads(PartsModel), arguments=arguments)

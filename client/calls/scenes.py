@@ -1,0 +1,71 @@
+"""Scenes: create, look at, pause, resume, delete; the cloud that frame 0 starts from."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.calls.call import NPZ, Call, body, nothing, path, reads
+from client.wire import PointsReceipt, RigModel, SceneCreate, SceneList, SceneStatus
+from scas4d_core.cameras import Rig
+from scas4d_core.captures import InitialPoints
+
+
+def create_scene(
+    rig: Rig,
+    *,
+    name: str = "",
+    preset: str = "scas4d",
+    settings: Mapping[str, Any] | None = None,
+    frames_per_second: float = 30.0,
+    **more: Any,
+) -> Call[SceneStatus]:
+    """A new scene. Never sent twice: that would make two.
+
+    Args:
+        rig: its cameras, at the size of the pictures that will be sent.
+        name: for people; the service makes the id.
+        preset: named settings.
+        settings: what differs from the preset, nested.
+        frames_per_second: frame n without a time of its own is taken at n / frames_per_second.
+        more: further fields of `SceneCreate`.
+    """
+    request = SceneCreate(
+        rig=RigModel.of(rig),
+        name=name,
+        preset=preset,
+        settings=dict(settings or {}),
+        frames_per_second=frames_per_second,
+        **more,
+    )
+    return Call("POST", path(), reads(SceneStatus), repeatable=False, arguments=body(request))
+
+
+def scenes() -> Call[list[SceneStatus]]:
+    """All scenes, oldest first."""
+    return Call("GET", path(), lambda response: SceneList.model_validate_json(response.content).scenes)
+
+
+def scene(id: str) -> Call[SceneStatus]:
+    """A scene's state, progress and queue."""
+    return Call("GET", path(id), reads(SceneStatus))
+
+
+def delete_scene(id: str) -> Call[None]:
+    """Ends a scene and removes all it has on disk."""
+    return Call("DELETE", path(id), nothing)
+
+
+def put_points(id: str, points: InitialPoints) -> Call[PointsReceipt]:
+    """The cloud that frame 0 starts from; before frame 0."""
+    arrays: dict[str, NDArray[Any]] = {"positions": points.positions, "colours": points.colours}
+    if points.foreground is not None:
+        arrays["foreground"] = points.foreground
+    file = io.BytesIO()
+    np.savez_compressed(file, allow_pickle=False, **arrays)
+    arguments = {"content": file.getvalue(), "headers": {"Content-Type": NPZ}}
+    return Call("PUT", path(id, "points"), reads(PointsReceipt), arguments=arguments)

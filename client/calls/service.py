@@ -1,0 +1,21 @@
+"""The service itself: is it there?"""
+
+from __future__ import annotations
+
+from client.calls.call import Call, reads
+from client.wire import Health
+
+
+def live() -> Call[Health]:
+    """Does the process answer?"""
+    return Call("GET", "/health/live", reads(Health))
+
+
+def ready() -> Call[Health]:
+    """Does the service take scenes?"""
+    return Call("GET", "/health/ready", reads(Health))
+
+
+def metrics() -> Call[str]:
+    """Counters and gauges in the text format of Prometheus."""
+    return Call("GET", "/metrics", lambda response: response.text)

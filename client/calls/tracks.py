@@ -1,0 +1,82 @@
+"""Trajectories of ids, of pixels, of points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from client.calls.call import Call, body, path, read_npz, reads, wire_camera
+from client.wire import TracksModel, TracksRequest
+from scas4d_core.cameras import Camera
+
+
+def tracks(
+    id: str,
+    *,
+    ids: Sequence[int] | None = None,
+    pixels: ArrayLike | None = None,
+    camera: Camera | str | None = None,
+    points: ArrayLike | None = None,
+    at: int | None = None,
+    frames: tuple[int, int] | None = None,
+    project: Sequence[Camera | str] = (),
+) -> Call[TracksModel]:
+    """Trajectories of exactly one of `ids`, `pixels` and `points`.
+
+    Args:
+        id: of the scene.
+        ids: of Gaussians.
+        pixels: [Q, 2] u v in the picture of `camera` at frame `at`; (0.5, 0.5) is the centre of the first pixel.
+        camera: where the pixels are.
+        points: [Q, 3] in the rig's world and units, at frame `at`.
+        at: the first committed frame where None.
+        frames: first and last, both included; all committed where None.
+        project: cameras to project into, with visibility.
+    """
+    request = _request(ids, pixels, camera, points, at, frames, project, "json")
+    return Call("POST", path(id, "tracks", "query"), reads(TracksModel), arguments=body(request))
+
+
+def tracks_arrays(
+    id: str,
+    *,
+    ids: Sequence[int] | None = None,
+    pixels: ArrayLike | None = None,
+    camera: Camera | str | None = None,
+    points: ArrayLike | None = None,
+    at: int | None = None,
+    frames: tuple[int, int] | None = None,
+    project: Sequence[Camera | str] = (),
+) -> Call[dict[str, NDArray[Any]]]:
+    """The same as the arrays of an npz: for many."""
+    request = _request(ids, pixels, camera, points, at, frames, project, "npz")
+    return Call("POST", path(id, "tracks", "query"), read_npz, arguments=body(request))
+
+
+def _request(
+    ids: Sequence[int] | None,
+    pixels: ArrayLike | None,
+    camera: Camera | str | None,
+    points: ArrayLike | None,
+    at: int | None,
+    frames: tuple[int, int] | None,
+    project: Sequence[Camera | str],
+    format: str,
+) -> TracksRequest:
+    first, last = frames or (None, None)
+    return TracksRequest.model_validate(
+        {
+            "ids": None if ids is None else [int(value) for value in ids],
+            "pixels": None if pixels is None else np.asarray(pixels, dtype=np.float64).tolist(),
+            "camera": None if camera is None else wire_camera(camera),
+            "points": None if points is None else np.asarray(points, dtype=np.float64).tolist(),
+            "at": at,
+            "first": first,
+            "last": last,
+            "project": [wire_camera(one) for one in project],
+            "format": format,
+        }
+    )

@@ -1,0 +1,89 @@
+"""Novel views from committed frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from numpy.typing import NDArray
+
+from client.calls.call import Call, body, path, read_npz, read_picture, wire_camera
+from client.wire import RenderRequest
+from scas4d_core.cameras import Camera
+
+Colour = tuple[float, float, float]
+
+
+def render(
+    id: str,
+    camera: Camera | str,
+    frame: int | None = None,
+    *,
+    kind: str = "colour",
+    format: str = "png",
+    background: Colour | None = None,
+    parts: int | None = None,
+) -> Call[NDArray[Any]]:
+    """One kind of view as a picture: [H, W, 3] uint8 for colour, else [H, W].
+
+    Args:
+        id: of the scene.
+        camera: any camera in the rig's world, or the name of one of the rig.
+        frame: a committed one; the last where None.
+        kind: colour, depth, alpha or parts.
+        format: how it crosses the wire: png, jpeg, …
+        background: RGB in 0…1; the scene's where None.
+        parts: how many parts to tell apart; by a stated rule where None.
+    """
+    arguments = _asks(camera, frame, [kind], format, background, parts)
+    return Call("POST", path(id, "render"), read_picture, arguments=arguments)
+
+
+def render_file(
+    id: str,
+    camera: Camera | str,
+    frame: int | None = None,
+    *,
+    kind: str = "colour",
+    format: str = "png",
+    background: Colour | None = None,
+    parts: int | None = None,
+) -> Call[bytes]:
+    """The same as the file that the service sends."""
+    arguments = _asks(camera, frame, [kind], format, background, parts)
+    return Call("POST", path(id, "render"), lambda response: response.content, arguments=arguments)
+
+
+def render_arrays(
+    id: str,
+    camera: Camera | str,
+    frame: int | None = None,
+    *,
+    kinds: Sequence[str] = ("colour",),
+    background: Colour | None = None,
+    parts: int | None = None,
+) -> Call[dict[str, NDArray[Any]]]:
+    """Several kinds of view as arrays by kind: colour 0…1, depth along z in the rig's units, alpha, parts."""
+    arguments = _asks(camera, frame, kinds, "npz", background, parts)
+    return Call("POST", path(id, "render"), read_npz, arguments=arguments)
+
+
+def _asks(
+    camera: Camera | str,
+    frame: int | None,
+    kinds: Sequence[str],
+    format: str,
+    background: Colour | None,
+    parts: int | None,
+) -> dict[str, Any]:
+    request = RenderRequest.model_validate(
+        {
+            "camera": wire_camera(camera),
+            "frame": frame,
+            "kinds": list(kinds),
+            "format": format,
+            "background": background,
+            "parts": parts,
+        }
+    )
+    return body(request)
