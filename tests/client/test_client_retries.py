@@ -1,4 +1,4 @@
-"""Retries: what is sent again, what never, and that the limits hold; nothing waits longer than fractions of a second."""
+"""Retries: what is sent again, what never, and that the limits hold."""
 
 from __future__ import annotations
 
