@@ -1,17 +1,18 @@
 """Θ_0 … Θ_t: the committed states of a scene, in memory or in a directory. Numpy only.
 
-On disk a history is ``fixed.npz`` (opacities and ids, written once) and one ``frame_<index>.npz`` a committed frame.
-Every file is written beside its place, synced and renamed, so that a file with its final name is whole; the
-directory listing is the only index there is.
+On disk a history is ``fixed.npz`` (opacities and ids, written once) and one ``frame_<index>.npz`` a committed frame,
+which holds its state, its time and its report. Every file is written beside its place, synced and renamed: a file with
+its final name is whole, the rename is the commit, and the directory listing is the only index there is. One process
+appends and deletes; others read, and see what it did with ``refresh``.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import re
-import zipfile
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.npz import clear_parts, read_npz, sync_folder, write_npz
 
 PER_FRAME = ("means", "rotations", "factors", "colours", "foreground")
 """Arrays of ``Gaussians`` that may differ from frame to frame."""
@@ -26,8 +28,14 @@ FIXED = ("opacities", "ids")
 """Arrays of ``Gaussians`` that a scene keeps after frame 0."""
 FRAMES_KEPT = 4
 """Frames of a history on disk that stay in memory: the newest, and the last ones asked for."""
+NEWEST_KEPT = 2
+"""Newest states that retention never deletes: should the last be damaged, the one before it is gone on from."""
 
 _FRAME_FILE = re.compile(r"frame_(\d{6,})\.npz")
+
+Arrays = dict[str, NDArray[Any]]
+Stamp = tuple[int, int]
+"""Bytes and time of change of a file, in ns: whether it is the one that was read."""
 
 
 class HistoryError(ValueError):
@@ -39,79 +47,192 @@ class History:
 
     Args:
         directory: where the frames are kept, made when missing; without it they stay in memory. A directory that
-            already holds a history is opened with ``History.load``.
+            already holds frames is opened with ``History.load`` or ``History.open``.
+
+    Attributes:
+        damaged: frames whose file cannot be read, with the reason; they are not among ``indices``.
 
     Raises:
-        HistoryError: ``directory`` already holds a history.
+        HistoryError: ``directory`` already holds frames.
     """
 
     def __init__(self, directory: Path | str | None = None) -> None:
         self.directory = None if directory is None else Path(directory)
-        self._fixed: dict[str, NDArray[Any]] = {}
+        self.damaged: dict[int, str] = {}
+        self._fixed: Arrays = {}
         self._times: dict[int, float] = {}
-        self._frames: OrderedDict[int, dict[str, NDArray[Any]]] = OrderedDict()
+        self._reports: dict[int, dict[str, Any]] = {}
+        self._stamps: dict[int, Stamp] = {}
+        self._frames: OrderedDict[int, Arrays] = OrderedDict()
         if self.directory is not None:
             self.directory.mkdir(parents=True, exist_ok=True)
-            if (self.directory / "fixed.npz").exists():
+            if self._listed():
                 raise HistoryError(f"{self.directory} already holds a history; open it with History.load or empty it")
 
     @classmethod
     def load(cls, directory: Path | str) -> History:
         """Opens the history in a directory; ``append`` goes on behind its last frame.
 
+        A frame that cannot be read is left out and named in ``damaged``.
+
         Raises:
-            HistoryError: no history there, or a file is damaged.
+            HistoryError: no history there, or the file that all frames need is damaged.
         """
         folder = Path(directory)
         if not (folder / "fixed.npz").exists():
             raise HistoryError(f"{folder} holds no history: fixed.npz is missing")
         history = cls()
         history.directory = folder
-        history._fixed = _read(folder / "fixed.npz", FIXED)
-        names = sorted((int(m[1]), f.name) for f in folder.iterdir() if (m := _FRAME_FILE.fullmatch(f.name)))
-        for index, name in names:
-            history._times[index] = float(_read(folder / name, ("time",))["time"])
+        history.refresh()
+        if history._stamps:
+            history._fixed = _read(folder / "fixed.npz", FIXED)
         return history
+
+    @classmethod
+    def open(cls, directory: Path | str) -> History:
+        """The history in a directory, or a new one where there is none; for the process that appends.
+
+        Raises:
+            HistoryError: as ``load``.
+        """
+        folder = Path(directory)
+        folder.mkdir(parents=True, exist_ok=True)
+        clear_parts(folder)
+        return cls.load(folder) if (folder / "fixed.npz").exists() else cls(folder)
 
     def save(self, directory: Path | str) -> None:
         """Writes a copy of this history into another directory, one frame at a time."""
         copy = History(directory)
         for index in self.indices:
-            copy.append(index, self._times[index], self.gaussians(index))
+            copy.append(index, self._times[index], self.gaussians(index), self.report(index))
 
-    def append(self, index: int, time: float, gaussians: Gaussians) -> None:
-        """Commits the state of one frame; when this returns it is on disk (where there is a directory).
+    def append(self, index: int, time: float, gaussians: Gaussians, report: Mapping[str, Any] | None = None) -> None:
+        """Commits the state of one frame with its report; when this returns both are on disk (if there is a directory).
 
         Args:
             index: frame number, above every index before it.
             time: seconds.
             gaussians: the state; same ids and opacities as in the first frame. The arrays are copied.
+            report: how the state came about, as JSON (finite numbers, strings, lists, mappings); see ``report``.
 
         Raises:
-            HistoryError: index not above the last, another number of Gaussians, other ids or opacities.
+            HistoryError: index not above the last, another number of Gaussians, other ids or opacities, or a report
+                that is no JSON.
         """
         if self._times and index <= self.indices[-1]:
             raise HistoryError(f"frame {index} comes after frame {self.indices[-1]}; append frames in rising order")
+        try:
+            said = json.dumps(dict(report or {}), allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise HistoryError(
+                f"frame {index}: the report is no JSON ({error}); give finite numbers, strings, lists, mappings"
+            ) from error
         arrays = gaussians.arrays()
-        if not self._fixed:
-            fixed = {name: np.array(arrays[name]) for name in FIXED}
-            if self.directory is not None:
-                _write(self.directory / "fixed.npz", fixed)
-            self._fixed = fixed
+        fixed = self._fixed or {name: np.array(arrays[name]) for name in FIXED}
         for name in FIXED:
-            if not np.array_equal(arrays[name], self._fixed[name]):
+            if not np.array_equal(arrays[name], fixed[name]):
                 raise HistoryError(
                     f"frame {index}: {name} differ from those of the first frame; they are fixed within one history"
                 )
-        count = len(self._fixed["ids"])
+        count = len(fixed["ids"])
         for name in PER_FRAME:
             if len(arrays[name]) != count:
                 raise HistoryError(f"frame {index}: {name} has {len(arrays[name])} rows; give {count}, one a Gaussian")
         frame = {name: np.array(arrays[name]) for name in PER_FRAME}
         if self.directory is not None:
-            _write(self._file(index), {**frame, "time": np.float64(time)})
+            if not self._fixed:
+                write_npz(self.directory / "fixed.npz", fixed)
+            file = self._file(index)
+            write_npz(file, {**frame, "time": np.float64(time), "report": np.frombuffer(said.encode(), np.uint8)})
+            self._stamps[index] = _stamp(file.stat())
+        else:
+            self._stamps[index] = (sum(array.nbytes for array in frame.values()), 0)
+        self._fixed = fixed
         self._times[index] = float(time)
+        if self.directory is None:
+            self._reports[index] = json.loads(said)
+        self.damaged.pop(index, None)
         self._keep(index, frame)
+
+    def refresh(self) -> tuple[list[int], list[int]]:
+        """Picks up what the process that writes this directory has done since; frames that are known stay unopened.
+
+        Returns:
+            The indices that are new (or written anew), and those that are gone.
+        """
+        if self.directory is None:
+            return [], []
+        listed = self._listed()
+        gone = [index for index in self._times if index not in listed]
+        changed = [index for index, stamp in listed.items() if self._stamps.get(index) != stamp]
+        for index in [*gone, *changed]:
+            self._forget(index)
+        self.damaged = {index: reason for index, reason in self.damaged.items() if index in listed}
+        added = []
+        for index in changed:
+            try:
+                self._times[index] = float(read_npz(self._file(index), ("time",))["time"])
+            except FileNotFoundError:  # deleted since it was listed
+                continue
+            except ValueError as error:
+                self.damaged[index] = str(error)
+            else:
+                self.damaged.pop(index, None)
+                added.append(index)
+            self._stamps[index] = listed[index]
+        self._times = dict(sorted(self._times.items()))
+        if added and not self._fixed:
+            self._fixed = _read(self.directory / "fixed.npz", FIXED)
+        return added, gone
+
+    def retain(self, *, last: int | None = None, size_bytes: int | None = None) -> list[int]:
+        """Deletes the oldest states until the rules hold; for the process that appends. No rule keeps all.
+
+        The first frame stays, because every update needs it, and so do the newest ``NEWEST_KEPT``, from which an
+        interrupted scene goes on, whatever the rule.
+
+        Args:
+            last: states to keep besides the first.
+            size_bytes: of all frames' files together.
+
+        Returns:
+            The indices deleted, rising.
+
+        Raises:
+            HistoryError: a rule below 1.
+        """
+        for name, rule in (("last", last), ("size_bytes", size_bytes)):
+            if rule is not None and rule < 1:
+                raise HistoryError(f"{name} is {rule}; keep at least 1, or give None to keep all")
+        candidates = self.indices[1:-NEWEST_KEPT]
+        surplus = 0 if last is None else max(0, len(self) - 1 - last)
+        excess = 0 if size_bytes is None else sum(size for size, _ in self._stamps.values()) - size_bytes
+        deleted: list[int] = []
+        for index in candidates:
+            if len(deleted) >= surplus and excess <= 0:
+                break
+            excess -= self._stamps[index][0]
+            if self.directory is not None:
+                self._file(index).unlink(missing_ok=True)
+            self._forget(index)
+            deleted.append(index)
+        return deleted
+
+    def cut(self, after: int) -> list[int]:
+        """Takes back every commit after frame ``after``; for the process that appends.
+
+        Returns:
+            The indices taken back, damaged ones among them, rising.
+        """
+        known = sorted(index for index in {*self._times, *self.damaged} if index > after)
+        for index in reversed(known):  # the newest first: a cut that is itself cut short leaves a history without gaps
+            if self.directory is not None:
+                self._file(index).unlink(missing_ok=True)
+            self._forget(index)
+            self.damaged.pop(index, None)
+        if known and self.directory is not None:
+            sync_folder(self.directory)
+        return known
 
     def __len__(self) -> int:
         return len(self._times)
@@ -131,6 +252,22 @@ class History:
         self._require(index)
         return self._times[index]
 
+    def report(self, index: int) -> dict[str, Any]:
+        """What was committed with the state of a frame about how it came about; empty where nothing was.
+
+        Raises:
+            HistoryError: the frame was not committed, or its file is damaged.
+        """
+        self._require(index)
+        if self.directory is None:
+            return dict(self._reports[index])
+        text = self._from_file(index, ("report",))["report"].tobytes()
+        try:
+            report: dict[str, Any] = json.loads(text)
+        except ValueError as error:
+            raise HistoryError(f"{self._file(index)}: its report is no JSON ({error})") from error
+        return report
+
     def gaussians(self, index: int) -> Gaussians:
         """The state of one committed frame; the arrays are the history's own and must not be written to.
 
@@ -140,7 +277,7 @@ class History:
         self._require(index)
         frame = self._frames.get(index)
         if frame is None:
-            frame = _read(self._file(index), PER_FRAME)
+            frame = self._from_file(index, PER_FRAME)
             self._keep(index, frame)
         else:
             self._frames.move_to_end(index)
@@ -170,7 +307,7 @@ class History:
         for row, index in enumerate(chosen):
             self._require(index)
             frame = self._frames.get(index)
-            array = frame[name] if frame is not None else _read(self._file(index), (name,))[name]
+            array = frame[name] if frame is not None else self._from_file(index, (name,))[name]
             if rows is not None:
                 array = array[rows]
             if result is None:
@@ -180,15 +317,45 @@ class History:
         return result
 
     def _require(self, index: int) -> None:
-        if index not in self._times:
-            held = f"{self.indices[0]} to {self.indices[-1]}" if self._times else "none yet"
-            raise HistoryError(f"frame {index} is not in the history; committed frames: {held}")
+        if index in self._times:
+            return
+        if index in self.damaged:
+            raise HistoryError(f"frame {index} cannot be read: {self.damaged[index]}")
+        held = f"{self.indices[0]} to {self.indices[-1]}" if self._times else "none yet"
+        raise HistoryError(f"frame {index} is not in the history; committed frames: {held}")
 
     def _file(self, index: int) -> Path:
         assert self.directory is not None
         return self.directory / f"frame_{index:06d}.npz"
 
-    def _keep(self, index: int, frame: dict[str, NDArray[Any]]) -> None:
+    def _listed(self) -> dict[int, Stamp]:
+        """The frames in the directory, rising."""
+        assert self.directory is not None
+        found: dict[int, Stamp] = {}
+        with os.scandir(self.directory) as entries:
+            for entry in entries:
+                if match := _FRAME_FILE.fullmatch(entry.name):
+                    try:
+                        found[int(match[1])] = _stamp(entry.stat())
+                    except FileNotFoundError:  # deleted meanwhile
+                        continue
+        return dict(sorted(found.items()))
+
+    def _from_file(self, index: int, names: Sequence[str]) -> Arrays:
+        try:
+            return _read(self._file(index), names)
+        except FileNotFoundError:
+            self._forget(index)  # the process that appends has deleted it
+            self._require(index)
+            raise
+
+    def _forget(self, index: int) -> None:
+        self._times.pop(index, None)
+        self._reports.pop(index, None)
+        self._stamps.pop(index, None)
+        self._frames.pop(index, None)
+
+    def _keep(self, index: int, frame: Arrays) -> None:
         self._frames[index] = frame
         if self.directory is not None:
             newest = self.indices[-1]
@@ -207,30 +374,13 @@ def moving_extent(gaussians: Gaussians) -> float:
     return float(np.max(high - low))
 
 
-def _write(path: Path, arrays: dict[str, Any]) -> None:
-    """Writes an npz that is either whole at ``path`` or not there: temporary file, sync, rename, sync of the folder."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with beside.open("wb") as file:
-            np.savez(file, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-    except BaseException:
-        beside.unlink(missing_ok=True)
-        raise
-    if os.name == "posix":  # elsewhere a directory cannot be opened to be synced
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+def _stamp(status: os.stat_result) -> Stamp:
+    return status.st_size, status.st_mtime_ns
 
 
-def _read(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Named arrays of an npz; zip's own checksums find damage."""
+def _read(path: Path, names: Sequence[str]) -> Arrays:
+    """Named arrays of an npz."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in names}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise HistoryError(f"{path}: no readable history file ({error}); restore it or start the scene anew") from error
+        return read_npz(path, names)
+    except ValueError as error:
+        raise HistoryError(f"{error}; restore it or start the scene anew") from error

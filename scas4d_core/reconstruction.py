@@ -1,24 +1,31 @@
-"""A ``Reconstruction`` holds Θ_t; ``step(frame)`` commits Θ_t = D_t(Θ_{t−1}), or raises and changes nothing."""
+"""A ``Reconstruction`` holds Θ_t; ``step(frame)`` commits Θ_t = D_t(Θ_{t−1}), or raises and changes nothing.
+
+A commit is one rename: a frame's state and report are in one file. What the next update needs beside it is on disk
+before (``checkpoint``), so that ``resume`` goes on after any end of the process, with the same bits on the CPU.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from math import inf, isfinite
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from math import inf, isfinite, nan
 from time import perf_counter
+from typing import Any
 
 import numpy as np
+from numba import get_num_threads
 from numpy.typing import NDArray
 
 from scas4d_core.cameras import Rig, WorldFrame, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.captures.images import resize_area
+from scas4d_core.checkpoint import Carried, CheckpointError, Checkpoints, digest
 from scas4d_core.committed import Committed, View
 from scas4d_core.device import require_device
 from scas4d_core.floor import floor_inside
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import build_hierarchy
-from scas4d_core.history import History
+from scas4d_core.history import History, HistoryError
 from scas4d_core.initial_points import initial_points
 from scas4d_core.motion_labels import moving_between
 from scas4d_core.neighbours import build_neighbours
@@ -26,11 +33,10 @@ from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import Settings
 from scas4d_core.static_scene import StaticResult, fit_static_scene
-from scas4d_core.update import CameraFit, FrameUpdate, Updated, Updater
+from scas4d_core.update import CameraFit, FrameUpdate, Updater
 from scas4d_core.views import TrainingView, ViewFactory, pictures_of
-from scas4d_core.warm_start import Motion
 
-__all__ = ["FrameReport", "Progress", "Reconstruction", "StepError", "View"]
+__all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "Resumed", "StepError", "View"]
 
 NEW_LABELS = 0.01
 """Share of all Gaussians that must be found moving anew before the hierarchy is built again."""
@@ -39,8 +45,16 @@ REPORTED_ITERATIONS = 24
 """The report's training loss is a mean over this many last iterations: about one round of a rig's cameras."""
 
 
+REPORTED_LOSSES = 100
+"""Of frame 0's thousands of losses the report keeps so many means at most."""
+
+
 class StepError(ValueError):
     """A frame that cannot be stepped to; the state is as it was."""
+
+
+class ResumeError(ValueError):
+    """A history that cannot be gone on from; the message says what is damaged."""
 
 
 @dataclass(frozen=True)
@@ -55,13 +69,14 @@ class Progress:
 
 @dataclass(frozen=True)
 class FrameReport:
-    """How the update of one frame went.
+    """How frame 0, or the update of a frame, went.
 
     Attributes:
-        seconds: by stage. loss: each iteration's weighted sum. psnr: dB, over the training views of the last
-            iterations, each as it was rendered then.
+        seconds: by stage. loss: each iteration's weighted sum; of frame 0 at most ``REPORTED_LOSSES`` means.
+        psnr: dB, over the training views of the last iterations, each as it was rendered then; NaN where not measured.
         moving, gaussians: how many Gaussians move, and are.
         cameras: by name, how well each camera's picture was met when it was last rendered: a bumped camera shows.
+        used: cameras whose pictures were there. dropped: cameras left out, with the reason, as the caller gave them.
     """
 
     index: int
@@ -73,13 +88,41 @@ class FrameReport:
     moving: int
     gaussians: int
     cameras: dict[str, CameraFit] = field(default_factory=dict)
+    used: list[str] = field(default_factory=list)
+    dropped: dict[str, str] = field(default_factory=dict)
+
+    def record(self) -> dict[str, Any]:
+        """The report as JSON: what is not finite is None."""
+        record = asdict(self)
+        record["psnr"] = self.psnr if isfinite(self.psnr) else None
+        record["loss"] = [loss if isfinite(loss) else None for loss in self.loss]
+        return record
+
+
+@dataclass(frozen=True)
+class Resumed:
+    """Where a scene was taken up again.
+
+    Attributes:
+        index: the commit that it goes on from.
+        undone: committed frames after it that were taken back; each has to be given again, or is lost.
+        faults: why, a sentence for each file that could not be used; empty after an ordinary end.
+        cold: the state is whole, but what the next update needs beside it is not: that starts without a motion, and
+            the scene is no longer bit-identical to one that was not disturbed.
+    """
+
+    index: int
+    undone: list[int]
+    faults: list[str]
+    cold: bool
 
 
 class Reconstruction(Committed):
-    """One scene, from frame 0 on. Made by ``start``.
+    """One scene, from frame 0 on. Made by ``start`` or, from what another process left on disk, by ``resume``.
 
     Attributes:
         rig: the training cameras inside, image-scaled. world: user's world to inside. history: what was committed.
+        report: of the last frame committed by this object. resumed: where it was taken up again, or None.
     """
 
     def __init__(self, settings: Settings, rig: Rig, world: WorldFrame, history: History) -> None:
@@ -90,13 +133,24 @@ class Reconstruction(Committed):
         self._sizes: dict[str, tuple[int, int]] = {}
         self._exposures: dict[str, NDArray[np.float32]] = {}
         self.static: StaticResult | None = None
-        self._motion: Motion | None = None
+        self.report: FrameReport | None = None
+        self.resumed: Resumed | None = None
         self._masked = True
-        self._labels: NDArray[np.bool_] | None = None
-        self._seen: list[TrainingView] = []
+        self._carried = Carried()
+        self._checkpoints = None if history.directory is None else Checkpoints(history.directory)
         limits = scene_limits(settings.scene.near, rig.radius)
         self._picture = PictureLoss(self._factory, settings.scene.background, 1.0, 0.0, limits=limits)
         self._updater: Updater | None = None
+
+    @classmethod
+    def _of(cls, rig: Rig, settings: Settings, history: History) -> Reconstruction:
+        """Without a frame yet; ``rig`` in the user's world."""
+        require_device(settings.device)
+        world = rig.world_frame(settings.scene.metres_per_unit)
+        scaled = rig_inside(world, rig.scaled(settings.scene.image_scale).cameras)
+        self = cls(settings, scaled, world, history)
+        self._sizes = {camera.name: (camera.width, camera.height) for camera in rig.cameras}
+        return self
 
     @classmethod
     def start(
@@ -109,6 +163,8 @@ class Reconstruction(Committed):
         progress: Callable[[Progress], None] | None = None,
         history: History | None = None,
         static: StaticResult | None = None,
+        dropped: Mapping[str, str] | None = None,
+        notes: Mapping[str, Any] | None = None,
     ) -> Reconstruction:
         """Reconstruct the first frame and commit it.
 
@@ -119,6 +175,7 @@ class Reconstruction(Committed):
             progress: told of each stage.
             history: where to commit to; in memory when left out.
             static: a frame 0 that was fitted before, taken as it is.
+            dropped, notes: see ``step``.
 
         Raises:
             DeviceError: the settings' device cannot be had here.
@@ -126,20 +183,108 @@ class Reconstruction(Committed):
         """
         if not isfinite(frame.time):
             raise ValueError(f"frame {frame.index}: time {frame.time} s must be finite")
-        require_device(settings.device)
-        world = rig.world_frame(settings.scene.metres_per_unit)
-        scaled = rig_inside(world, rig.scaled(settings.scene.image_scale).cameras)
-        self = cls(settings, scaled, world, History() if history is None else history)
-        self._sizes = {camera.name: (camera.width, camera.height) for camera in rig.cameras}
+        self = cls._of(rig, settings, History() if history is None else history)
+        began = perf_counter()
         result = static or self._fit_static(rig, self._scaled(frame), points, progress or (lambda _: None))
+        fitted = perf_counter()
         self.static = result
         self._exposures = result.exposures
         self._masked = len(frame.masks) > 0
-        if not self._masked:
-            self._seen = self._factory.views(self._scaled(frame), {}, use_masks=False)
-        self._prepare(result.gaussians)
-        self.history.append(frame.index, frame.time, result.gaussians)
+        self._updater, structure = self._prepared(result.gaussians)
+        seen = () if self._masked else self._factory.views(self._scaled(frame), {}, use_masks=False)
+        report = FrameReport(
+            index=frame.index,
+            time=frame.time,
+            iterations=len(result.losses),
+            seconds={"fit": fitted - began, "prepare": perf_counter() - fitted},
+            loss=_means(result.losses, REPORTED_LOSSES),
+            psnr=float(np.mean(result.psnr[-REPORTED_ITERATIONS:])) if result.psnr else nan,
+            moving=len(self._updater.hierarchy.rows),
+            gaussians=len(result.gaussians),
+            cameras=result.cameras,
+            used=[name for name in self.rig.names if name in frame.images],
+            dropped=dict(dropped or {}),
+        )
+        first = {
+            "masked": self._masked,
+            "exposures": {name: exposure.tolist() for name, exposure in result.exposures.items()},
+        }
+        self._commit(report, result.gaussians, Carried(seen=seen, structure=structure), {**first, **(notes or {})})
         return self
+
+    @classmethod
+    def resume(
+        cls, rig: Rig, settings: Settings, history: History, *, held: Callable[[int], bool] = lambda index: True
+    ) -> Reconstruction:
+        """Take a scene up again where its last commit left it; on the CPU it goes on with the same bits.
+
+        Where the newest state or its checkpoint is damaged, it goes on from the one before, and what came after is
+        taken back from the history: ``resumed.undone`` names the frames that have to be given again. If one of them is
+        not ``held``, a whole newest state is worth more than the same bits: it goes on from that with a cold start.
+
+        Args:
+            rig: training cameras, user's world, as given to ``start``. settings: as given to ``start``.
+            history: of the scene, on disk, opened with ``History.open``.
+            held: whether the pictures of a committed frame can be given again.
+
+        Raises:
+            ResumeError: the history has no frame, or its first state or every state is damaged.
+        """
+        if history.directory is None or not history.indices:
+            raise ResumeError("the history holds no committed frame; start the scene with its first frame")
+        self = cls._of(rig, settings, history)
+        first = history.indices[0]
+        try:
+            report = history.report(first)
+            self._masked = bool(report["masked"])
+            self._exposures = {name: np.array(e, np.float32) for name, e in report["exposures"].items()}
+            history.gaussians(first)
+        except (HistoryError, KeyError) as error:
+            raise ResumeError(f"the first frame, which every update needs, cannot be read ({error})") from error
+        self._take_up(held)
+        return self
+
+    def _take_up(self, held: Callable[[int], bool]) -> None:
+        """Find the commit to go on from, and cut the history after it."""
+        history = self.history
+        assert self._checkpoints is not None
+        faults = list(history.damaged.values())
+        whole: list[int] = []
+        carried: Carried | None = None
+        for index in reversed(history.indices):
+            try:
+                history.gaussians(index)
+                history.report(index)
+                whole.append(index)
+                carried = self._checkpoints.load(index, self._factory)
+                break
+            except (HistoryError, CheckpointError) as error:
+                faults.append(str(error))
+                if index not in self._checkpoints.indices() and whole:
+                    break  # so old that it has none any more: nothing before it has one either
+        if not whole:
+            raise ResumeError("no state can be read: " + "; ".join(faults))
+        later = sorted({*history.indices, *history.damaged})
+        if carried is None or not all(held(index) for index in later if index > whole[-1]):
+            index, carried = whole[0], None
+        else:
+            index = whole[-1]
+        labels = self._labels_of(index) if carried is None else carried.labels
+        self._updater, structure = self._prepared(self._labelled(history.gaussians(history.indices[0]), labels))
+        if carried is not None and carried.structure != structure:
+            faults.append("clusters came out otherwise than before: the next update starts without a motion")
+            carried = replace(carried, motion=None, structure=structure)
+            cold = True
+        else:
+            cold = carried is None
+        self._carried = carried or Carried(labels=labels, structure=structure)
+        undone = history.cut(index)
+        self.resumed = Resumed(index, undone, faults, cold)
+
+    def _labels_of(self, index: int) -> NDArray[np.bool_] | None:
+        """The labels learnt, as far as the state tells."""
+        moving = self.history.gaussians(index).moving
+        return None if self._masked or moving.all() else moving
 
     def _fit_static(
         self, rig: Rig, frame: Frame, points: InitialPoints | None, tell: Callable[[Progress], None]
@@ -162,11 +307,19 @@ class Reconstruction(Committed):
             lambda done, loss: tell(Progress("fitting frame 0", done, static.iterations, {"loss": loss})),
         )
 
-    def step(self, frame: Frame) -> FrameReport:
+    def step(
+        self, frame: Frame, *, dropped: Mapping[str, str] | None = None, notes: Mapping[str, Any] | None = None
+    ) -> FrameReport:
         """Update to a frame and commit.
 
+        Args:
+            frame: later than the last; with the pictures of some cameras or all.
+            dropped: cameras that the caller has left out, with the reason; committed with the report.
+            notes: further facts to commit with the report, as JSON; they stand beside its own.
+
         Raises:
-            StepError: not later than the last frame, no picture of the rig, or a picture of another size.
+            StepError: not later than the last frame, no picture of the rig, a picture of another size, or an update
+                that ended in numbers that are not finite.
         """
         last = self.history.indices[-1]
         if frame.index <= last:
@@ -180,16 +333,43 @@ class Reconstruction(Committed):
         except ValueError as error:
             raise StepError(str(error)) from error
         decoded = perf_counter() - started
-        self._learn_what_moves(views)
-        updated = self._update(views, seconds, frame.index)
+        updater, carried = self._learn_what_moves(views)
+        updated = updater.run(
+            self._labelled(self._state(None), carried.labels), views, carried.motion, seconds, frame.index
+        )
         for name in ("means", "factors", "colours"):
             if not np.isfinite(getattr(updated.gaussians, name)).all():
                 raise StepError(f"frame {frame.index}: the update left NaN or infinity in {name}; nothing is committed")
-        self.history.append(frame.index, frame.time, updated.gaussians)
-        self._motion = updated.motion
-        if not self._masked:
-            self._seen = views
-        return self._report(frame, updated, decoded)
+        report = FrameReport(
+            index=frame.index,
+            time=frame.time,
+            iterations=len(updated.losses),
+            seconds={"decode": decoded, **updated.seconds},
+            loss=updated.losses,
+            psnr=float(np.mean(updated.psnr[-REPORTED_ITERATIONS:])),
+            moving=len(updater.hierarchy.rows),
+            gaussians=len(updated.gaussians),
+            cameras=updated.cameras,
+            used=[view.name for view in views],
+            dropped=dict(dropped or {}),
+        )
+        how = {"cold": carried.motion is None, "relabelled": updater is not self._updater}
+        carried = replace(carried, motion=updated.motion, seen=() if self._masked else views)
+        self._commit(report, updated.gaussians, carried, {**how, **(notes or {})})
+        self._updater = updater
+        return report
+
+    def _commit(self, report: FrameReport, gaussians: Gaussians, carried: Carried, more: Mapping[str, Any]) -> None:
+        """The checkpoint first, then state and report in one rename."""
+        if self._checkpoints is not None:
+            self._checkpoints.save(report.index, carried)
+        resumed = None if self.resumed is None or self.report is not None else asdict(self.resumed)
+        record = {**report.record(), "threads": get_num_threads(), "resumed": resumed, **more}
+        self.history.append(report.index, report.time, gaussians, record)
+        if self._checkpoints is not None:
+            self._checkpoints.clean(self.history.indices)
+        self._carried = carried
+        self.report = report
 
     @property
     def _uses_masks(self) -> bool:
@@ -197,32 +377,31 @@ class Reconstruction(Committed):
         weights = self.settings.update.weights
         return self.settings.update.use_masks and max(weights.mask, weights.mask_alone) > 0
 
-    def _learn_what_moves(self, views: list[TrainingView]) -> None:
+    def _learn_what_moves(self, views: list[TrainingView]) -> tuple[Updater, Carried]:
         """Where frame 0 had no mask, the pictures tell what moves; what has moved once stays in the hierarchy.
 
         The labels become part of the state with the commit of this frame. A hierarchy of other Gaussians is a new one:
         the motion before does not fit it, and the update starts cold.
         """
-        if self._masked or not self._seen:
-            return
-        state = self._state(None)
-        found = moving_between(state, self._seen, views, self._picture)
-        known = np.zeros(len(state), np.bool_) if self._labels is None else self._labels
-        if (found & ~known).sum() > NEW_LABELS * len(state):
-            self._labels = found | known
-            self._motion = None
-            self._prepare(self._labelled(self.history.gaussians(self.history.indices[0])))
-
-    def _labelled(self, gaussians: Gaussians) -> Gaussians:
-        """The Gaussians with the labels learnt from motion, where there are any."""
-        return gaussians if self._labels is None else gaussians.replace(foreground=self._labels.astype(np.float32))
-
-    def _update(self, views: list[TrainingView], seconds: float, seed: int) -> Updated:
         assert self._updater is not None
-        return self._updater.run(self._labelled(self._state(None)), views, self._motion, seconds, seed)
+        carried = self._carried
+        if self._masked or not carried.seen:
+            return self._updater, carried
+        state = self._state(None)
+        found = moving_between(state, carried.seen, views, self._picture)
+        known = np.zeros(len(state), np.bool_) if carried.labels is None else carried.labels
+        if (found & ~known).sum() <= NEW_LABELS * len(state):
+            return self._updater, carried
+        labels = found | known
+        updater, structure = self._prepared(self._labelled(self.history.gaussians(self.history.indices[0]), labels))
+        return updater, replace(carried, labels=labels, motion=None, structure=structure)
 
-    def _prepare(self, gaussians: Gaussians) -> None:
-        """The hierarchy and the neighbour graph of what moves."""
+    def _labelled(self, gaussians: Gaussians, labels: NDArray[np.bool_] | None) -> Gaussians:
+        """The Gaussians with the labels learnt from motion, where there are any."""
+        return gaussians if labels is None else gaussians.replace(foreground=labels.astype(np.float32))
+
+    def _prepared(self, gaussians: Gaussians) -> tuple[Updater, int]:
+        """The updater for the hierarchy and the neighbour graph of what moves, and the digest of both."""
         settings = self.settings.update
         hierarchy = build_hierarchy(
             gaussians.means, gaussians.moving, settings.clusters, settings.smallest_cluster, settings.seed
@@ -234,16 +413,16 @@ class Reconstruction(Committed):
             if tied
             else None
         )
+        structure = digest(hierarchy, neighbours)
         scene = self.settings.scene
         if scene.floor is not None:
             scene = scene.model_copy(update={"floor": floor_inside(scene.floor, self.world)})
         given = (self._factory, scene, settings, hierarchy, neighbours, gaussians)
         if self.settings.device == "cpu":
-            self._updater = FrameUpdate(*given)
-        else:
-            from scas4d_core.update_device import DeviceUpdate  # torch is loaded only where it is used
+            return FrameUpdate(*given), structure
+        from scas4d_core.update_device import DeviceUpdate  # torch is loaded only where it is used
 
-            self._updater = DeviceUpdate(*given, device=self.settings.device)
+        return DeviceUpdate(*given, device=self.settings.device), structure
 
     def _scaled(self, frame: Frame) -> Frame:
         """The frame with its pictures at the size of ``rig``."""
@@ -259,15 +438,7 @@ class Reconstruction(Committed):
                     masks[name] = (resize_area(255 * mask, size) >= 128).astype(np.uint8)
         return Frame(frame.index, frame.time, images, masks)
 
-    def _report(self, frame: Frame, updated: Updated, decoded: float) -> FrameReport:
-        return FrameReport(
-            index=frame.index,
-            time=frame.time,
-            iterations=len(updated.losses),
-            seconds={"decode": decoded, **updated.seconds},
-            loss=updated.losses,
-            psnr=float(np.mean(updated.psnr[-REPORTED_ITERATIONS:])),
-            moving=len(self._updater.hierarchy.rows) if self._updater else 0,
-            gaussians=len(updated.gaussians),
-            cameras=updated.cameras,
-        )
+
+def _means(values: list[float], most: int) -> list[float]:
+    """At most so many means of consecutive values."""
+    return [float(np.mean(part)) for part in np.array_split(values, max(1, min(len(values), most))) if len(part)]

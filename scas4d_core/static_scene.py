@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from scas4d_core.kernels.adam import EVERY_ROW, adam
 from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import SceneSettings, StaticSettings
+from scas4d_core.update import CameraFit
 from scas4d_core.views import TrainingView, ViewFactory, view_order
 
 Array = NDArray[np.float32]
@@ -38,12 +39,15 @@ class StaticResult:
 
     Attributes:
         gaussians: Θ_0. exposures: [3, 2] gain and offset of each training camera, empty without exposure terms.
-        losses: the training loss of every iteration.
+        losses: the training loss of every iteration. psnr: dB of the view that each iteration rendered.
+        cameras: by name, how well each camera's picture was met when it was last rendered.
     """
 
     gaussians: Gaussians
     exposures: dict[str, Array]
     losses: list[float]
+    psnr: list[float] = field(default_factory=list)
+    cameras: dict[str, CameraFit] = field(default_factory=dict)
 
 
 def logit(probability: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -120,6 +124,8 @@ class StaticTrainer:
         self._rng = np.random.default_rng(settings.seed)
         self._reset_moments()
         self.exposing = settings.exposure is not False
+        self.psnr: list[float] = []
+        self.cameras: dict[str, CameraFit] = {}
         self._exposure_moments = {view.name: np.zeros((2, *view.exposure.shape), np.float32) for view in views}
 
     def _reset_moments(self) -> None:
@@ -163,6 +169,9 @@ class StaticTrainer:
         """One iteration: render the view, compare, carry back, Adam. Returns the loss."""
         activation.activate(self.parameters, self._means, self._factors, self._opacities, self._features)
         gradients = self._loss.evaluate(self._means, self._factors, self._opacities, self._features, view)
+        self.psnr.append(self._loss.psnr)
+        if iteration >= self.settings.iterations - len(self.views):
+            self.cameras[view.name] = CameraFit(self._loss.psnr, self._loss.colour_shift(view))
         activation.activate_backward(
             self.parameters, self._factors, self._opacities, self._features, gradients.means, gradients.factors,
             gradients.opacities, gradients.features, self._gradients,
@@ -303,4 +312,4 @@ def fit_static_scene(
     trainer = StaticTrainer(factory, views, parameters, scene, settings)
     losses = trainer.train(progress)
     exposures = {view.name: view.exposure[:3].copy() for view in views} if trainer.exposing else {}
-    return StaticResult(trainer.gaussians(), exposures, losses)
+    return StaticResult(trainer.gaussians(), exposures, losses, trainer.psnr, trainer.cameras)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -16,7 +16,7 @@ from scas4d_core.history import History
 
 if TYPE_CHECKING:
     from scas4d_core.committed import View
-    from scas4d_core.reconstruction import FrameReport, Progress
+    from scas4d_core.reconstruction import FrameReport, Progress, Resumed
     from scas4d_core.tracks import Tracks
 
 
@@ -24,9 +24,12 @@ class Reconstruction(Protocol):
     """What the worker process owns: see `scas4d_core.reconstruction.Reconstruction`."""
 
     history: History
+    resumed: Resumed | None
 
-    def step(self, frame: Frame) -> FrameReport:
-        """Finds the state of the next frame and commits it to the history."""
+    def step(
+        self, frame: Frame, *, dropped: Mapping[str, str] | None = None, notes: Mapping[str, Any] | None = None
+    ) -> FrameReport:
+        """Finds the state of the next frame and commits it to the history, with the report and what is given here."""
 
 
 class Reader(Protocol):
@@ -73,8 +76,13 @@ class Engine(Protocol):
         points: InitialPoints | None,
         progress: Callable[[Progress], None],
         history: History,
+        dropped: Mapping[str, str] | None = None,
+        notes: Mapping[str, Any] | None = None,
     ) -> Reconstruction:
-        """Reconstructs the first frame and commits it to the history."""
+        """Reconstructs the first frame and commits it to the history, with its report and what is given here."""
+
+    def resume(self, rig: Rig, settings: Any, history: History, *, held: Callable[[int], bool] = ...) -> Reconstruction:
+        """Goes on from the last commit of a history; `held`: whether a frame's pictures can be given again."""
 
     def reader(self, rig: Rig, settings: Any, history: History) -> Reader:
         """Reads what was committed to a history; made anew when the history has grown."""
@@ -92,11 +100,23 @@ class CoreEngine:
         points: InitialPoints | None,
         progress: Callable[[Progress], None],
         history: History,
+        dropped: Mapping[str, str] | None = None,
+        notes: Mapping[str, Any] | None = None,
     ) -> Reconstruction:
         """`Reconstruction.start`."""
         from scas4d_core.reconstruction import Reconstruction
 
-        return Reconstruction.start(rig, frame, settings, points=points, progress=progress, history=history)
+        return Reconstruction.start(
+            rig, frame, settings, points=points, progress=progress, history=history, dropped=dropped, notes=notes
+        )
+
+    def resume(
+        self, rig: Rig, settings: Any, history: History, *, held: Callable[[int], bool] = lambda index: True
+    ) -> Reconstruction:
+        """`Reconstruction.resume`."""
+        from scas4d_core.reconstruction import Reconstruction
+
+        return Reconstruction.resume(rig, settings, history, held=held)
 
     def reader(self, rig: Rig, settings: Any, history: History) -> Reader:
         """`Committed`, on one thread: the others belong to the update."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from types import SimpleNamespace
 
 import numpy as np
@@ -62,22 +62,30 @@ def state(points, index):
     )
 
 
-class FakeReconstruction:
-    def __init__(self, rig, frame, settings, points, progress, history):
-        obey(frame)
-        for done in range(3):
-            progress(Progress("fitting", done + 1, 3, {"psnr": 30.0}))
-        self.history = history
-        given = points.positions if points is not None else np.array([[0.0, 0, 0], [0.5, 0, 0]])
-        self.points = rig.world_frame().to_inside(given)
-        self.history.append(frame.index, frame.time, state(self.points, frame.index))
+@dataclass
+class Resumed:
+    index: int
+    undone: list[int]
+    faults: list[str]
+    cold: bool
 
-    def step(self, frame):
+
+class FakeReconstruction:
+    def __init__(self, points, history, resumed=None):
+        self.points = points
+        self.history = history
+        self.resumed = resumed
+
+    def commit(self, frame, dropped, notes):
+        count = len(self.points)
+        report = Report(frame.index, frame.time, 100, {"update": 0.01}, [0.5, 0.25], 31.5, count, count)
+        record = {**asdict(report), "used": list(frame.images), "dropped": dropped or {}, **(notes or {})}
+        self.history.append(frame.index, frame.time, state(self.points, frame.index), record)
+        return report
+
+    def step(self, frame, *, dropped=None, notes=None):
         obey(frame)
-        self.history.append(frame.index, frame.time, state(self.points, frame.index))
-        return Report(
-            frame.index, frame.time, 100, {"update": 0.01}, [0.5, 0.25], 31.5, len(self.points), len(self.points)
-        )
+        return self.commit(frame, dropped, notes)
 
 
 class FakeReader:
@@ -117,8 +125,20 @@ class FakeReader:
 
 
 class FakeEngine:
-    def start(self, rig, frame, settings, *, points, progress, history):
-        return FakeReconstruction(rig, frame, settings, points, progress, history)
+    def start(self, rig, frame, settings, *, points, progress, history, dropped=None, notes=None):
+        obey(frame)
+        for done in range(3):
+            progress(Progress("fitting", done + 1, 3, {"psnr": 30.0}))
+        given = points.positions if points is not None else np.array([[0.0, 0, 0], [0.5, 0, 0]])
+        scene = FakeReconstruction(rig.world_frame().to_inside(given), history)
+        scene.commit(frame, dropped, notes)
+        return scene
+
+    def resume(self, rig, settings, history, *, held=lambda index: True):
+        first, last = history.indices[0], history.indices[-1]
+        offset = np.array([STEP_M * first, 0, 0])
+        points = history.gaussians(first).means - offset
+        return FakeReconstruction(points, history, Resumed(last, [], [], False))
 
     def reader(self, rig, settings, history):
         return FakeReader(rig, history)
