@@ -10,21 +10,45 @@ from client.wire.base import Model
 
 
 class FrameReceipt(Model):
-    """The frame was taken and will be reconstructed in its turn. The same frame again gets the same receipt."""
+    """The frame is on disk and will be reconstructed in its turn. The same frame again gets the same receipt."""
 
     scene: str
     index: int
     time: float = Field(description="Seconds.")
-    identity: str = Field(description="SHA-256 over the sorted (camera, kind, SHA-256 of the file) and the time.")
+    identity: str = Field(description="BLAKE3 over the sorted (camera, kind, BLAKE3 of the file) and the time.")
+
+
+class PartReceipt(Model):
+    """One camera's files are on disk. The same again gets the same receipt, but for what came in since."""
+
+    scene: str
+    index: int
+    camera: str
+    received: list[str] = Field(description="Cameras whose picture is here, sorted.")
+    absent: list[str] = Field(description="Cameras whose picture is not.")
+    frame: FrameReceipt | None = Field(description="Of the whole frame, once it is closed.")
 
 
 class FrameState(StrEnum):
-    """Where a frame is."""
+    """Where a frame is. The last four are for ever."""
 
+    OPEN = "open"
     QUEUED = "queued"
     UPDATING = "updating"
     COMMITTED = "committed"
     SET_ASIDE = "set_aside"
+    MISSING = "missing"
+    SKIPPED = "skipped"
+
+
+FINISHED = frozenset({FrameState.COMMITTED, FrameState.SET_ASIDE, FrameState.MISSING, FrameState.SKIPPED})
+"""Nothing more happens to a frame in one of these."""
+
+
+class MissingRequest(Model):
+    """Declares a frame missing, for ever."""
+
+    reason: str = Field(default="", max_length=500, description="For people.")
 
 
 class FrameReportModel(Model):
@@ -32,9 +56,19 @@ class FrameReportModel(Model):
 
     scene: str
     index: int
-    time: float = Field(description="Seconds.")
-    state: FrameState
-    error: str | None = Field(default=None, description="Why the frame was set aside.")
+    time: float | None = Field(description="Seconds; null for a frame that was declared missing.")
+    state: FrameState = Field(
+        description="open: cameras are still sending. queued: on disk, waits. updating: at work. committed: its state "
+        "can be read. set_aside: it was taken and could not be reconstructed; `error` says why. missing: it was "
+        "declared missing. skipped: the queue was full and the scene skips to the newest."
+    )
+    error: str | None = Field(default=None, description="Why the frame was set aside, skipped, or is missing.")
+    identity: str | None = Field(default=None, description="As in its receipt; null where it never had one.")
+    attempts: int = Field(default=0, description="How often the worker died at this frame.")
+    held: bool = Field(default=False, description="Its pictures are still in the frame log.")
+    deleted: bool = Field(default=False, description="It was committed, and retention has deleted its state since.")
+    received: list[str] | None = Field(default=None, description="While open: cameras whose picture is here.")
+    used_cameras: list[str] = Field(default_factory=list, description="Cameras that the update saw.")
     dropped_cameras: dict[str, str] = Field(default_factory=dict, description="Camera left out → reason.")
     iterations: int | None = None
     seconds: dict[str, float] = Field(default_factory=dict, description="By stage.")

@@ -3,12 +3,55 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Any
+from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from client.wire.base import Model
+from client.wire.base import MAX_CAMERAS, Model
 from client.wire.rigs import RigModel
+
+
+class Retention(Model):
+    """What is kept of something that comes frame by frame: all of it, the last N frames, or the newest bytes."""
+
+    last: int | None = Field(default=None, ge=0, description="Frames. Not together with `bytes`.")
+    bytes: int | None = Field(default=None, ge=0, description="At most so many. Not together with `last`.")
+
+    @model_validator(mode="after")
+    def _one_rule(self) -> Retention:
+        if self.last is not None and self.bytes is not None:
+            raise ValueError("last and bytes are two rules; give one of them, or neither to keep all")
+        return self
+
+
+class IngestSettings(Model):
+    """How the scene takes frames, and what it keeps."""
+
+    queue_frames: int | None = Field(
+        default=None, ge=1, le=10_000, description="Frames acknowledged and not finished; the service's where null."
+    )
+    when_full: Literal["refuse", "skip"] = Field(
+        default="refuse",
+        description="refuse: 429 with Retry-After. skip: the new frame is taken, and those that wait are skipped.",
+    )
+    minimum_cameras: int | None = Field(
+        default=None,
+        ge=1,
+        le=MAX_CAMERAS,
+        description="A frame that has fewer pictures left is set aside; half of the rig's, rounded up, where null.",
+    )
+    part_seconds: float | None = Field(
+        default=None,
+        gt=0,
+        le=86_400,
+        description="A frame that cameras send one by one is closed so long after its first; never where null.",
+    )
+    keep_frames: Retention = Field(
+        default=Retention(last=32), description="Pictures as they came; those not yet committed are always kept."
+    )
+    keep_states: Retention = Field(
+        default=Retention(), description="Committed states; the first and the two newest are always kept."
+    )
 
 
 class SceneCreate(Model):
@@ -26,6 +69,7 @@ class SceneCreate(Model):
         le=10_000,
         description="Frame n without a time of its own is taken at n / frames_per_second.",
     )
+    ingest: IngestSettings = IngestSettings()
 
 
 class SceneState(StrEnum):
@@ -35,6 +79,7 @@ class SceneState(StrEnum):
     INITIALISING = "initialising"
     READY = "ready"
     UPDATING = "updating"
+    PAUSED = "paused"
     DEGRADED = "degraded"
     FAILED = "failed"
 
@@ -55,8 +100,9 @@ class SceneStatus(Model):
     name: str
     state: SceneState = Field(
         description="awaiting_first_frame: nothing to do yet. initialising: frame 0 is being reconstructed. ready: "
-        "idle, the last frame was committed whole. updating: a later frame is being reconstructed. degraded: the scene "
-        "goes on, but its last frame lost a camera or was set aside; `error` says why. failed: it takes no more frames."
+        "idle, the last frame was committed whole. updating: a later frame is being reconstructed. paused: it takes "
+        "frames and reconstructs none. degraded: the scene goes on, but its last frame lost a camera or was set aside, "
+        "or its worker is being restarted; `error` says why. failed: it takes no more frames."
     )
     error: str | None = None
     progress: ProgressModel | None = Field(default=None, description="While initialising.")
@@ -69,7 +115,20 @@ class SceneStatus(Model):
     first_committed: int | None
     last_committed: int | None
     gaussians: int | None
+    paused: bool = False
+    open_frames: list[int] = Field(
+        default_factory=list, description="Frames not closed yet, whose cameras send one by one."
+    )
+    set_aside: int = Field(default=0, description="Frames that were taken and could not be reconstructed.")
+    missing: int = Field(default=0, description="Frames that were declared missing.")
+    skipped: int = Field(default=0, description="Frames that were skipped because the queue was full.")
+    worker_deaths: int = Field(default=0, description="Since the service started.")
+    frames_held: int = Field(default=0, description="Frames whose pictures are in the frame log.")
+    frame_bytes: int = Field(default=0, description="Of the frame log on disk.")
+    states_deleted: int = Field(default=0, description="Committed states that retention has deleted.")
+    damage: list[str] = Field(default_factory=list, description="What was dropped as damaged when the service started.")
     created: str = Field(description="UTC, ISO 8601.")
+    ingest: IngestSettings = IngestSettings()
     settings: dict[str, Any]
 
 

@@ -1,0 +1,149 @@
+"""A frame as bytes, the same over HTTP and WebSocket: `S4DF`, a uint32 LE length, a JSON head, then the files.
+
+As the body of `PUT /v1/scenes/{id}/frames/{n}` its content type is `FRAME_MEDIA_TYPE`; over `WS …/ingest` it is one
+binary message. The head says which file is how long, and the files follow one after the other in that order, so
+that neither side has to look for boundaries:
+
+    offset  bytes  what
+    0       4      magic, the ASCII letters S4DF
+    4       4      length of the head, uint32, little-endian, at most `MAX_HEAD`
+    8       …      the head, `FrameHead` as UTF-8 JSON
+    …       …      the files' bytes, `size` each, nothing between or behind them
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import Field, FiniteFloat, ValidationError
+
+from client.wire.base import MAX_CAMERAS, CameraName, Model
+from client.wire.frames import FrameReceipt, PartReceipt
+from client.wire.service import ProblemDetails
+
+FRAME_MEDIA_TYPE = "application/vnd.scas4d.frame"
+MAGIC = b"S4DF"
+PREFIX = struct.Struct("<4sI")
+MAX_HEAD = 1 << 20
+"""Bytes; a head of 512 cameras with masks has some 100 kB."""
+MAX_INDEX = 1_000_000_000
+
+
+class FramingError(ValueError):
+    """Bytes that are no frame: the message names the fault and the remedy."""
+
+
+class FileKind(StrEnum):
+    """What a file is."""
+
+    IMAGE = "image"
+    MASK = "mask"
+
+
+class FrameFile(Model):
+    """One encoded file of a frame."""
+
+    camera: CameraName
+    kind: FileKind = FileKind.IMAGE
+    size: int = Field(ge=0, description="Bytes.")
+
+
+class FrameHead(Model):
+    """What a frame consists of."""
+
+    index: int = Field(ge=0, le=MAX_INDEX)
+    time: FiniteFloat | None = Field(default=None, description="Seconds; by the scene's frame rate where not given.")
+    files: Annotated[list[FrameFile], Field(min_length=1, max_length=2 * MAX_CAMERAS)]
+    part: bool = Field(
+        default=False,
+        description="These are the files of one camera, not the whole frame: as PUT …/frames/{n}/cameras/{c}.",
+    )
+
+
+class IngestAnswer(Model):
+    """Answers one binary message of `WS …/ingest`, as JSON text, in the order of the messages."""
+
+    index: int | None = Field(description="Of the frame; null where the message could not be read.")
+    status: int = Field(description="What the HTTP door would have answered: 202, 409, 422, 429, 507 …")
+    receipt: FrameReceipt | PartReceipt | None = Field(default=None, description="With status 202: it is on disk.")
+    problem: ProblemDetails | None = Field(default=None, description="Otherwise.")
+
+
+def frame_chunks(
+    index: int,
+    images: Mapping[str, bytes],
+    masks: Mapping[str, bytes] | None = None,
+    time: float | None = None,
+    *,
+    part: bool = False,
+) -> list[bytes]:
+    """A frame's bytes in pieces, none of them a copy of a file: prefix with head, then the files.
+
+    Args:
+        index: of the frame.
+        images: encoded, by camera.
+        masks: encoded, by camera; none where left out.
+        time: seconds; None leaves it to the scene's frame rate.
+        part: of one camera only.
+    """
+    kinds = ((FileKind.IMAGE, images), (FileKind.MASK, masks or {}))
+    named = [(camera, kind, data) for kind, files in kinds for camera, data in files.items()]
+    files = [FrameFile(camera=camera, kind=kind, size=len(data)) for camera, kind, data in named]
+    head = FrameHead(index=index, time=time, files=files, part=part).model_dump_json().encode()
+    return [PREFIX.pack(MAGIC, len(head)) + head, *(data for _, _, data in named)]
+
+
+def head_length(prefix: bytes | bytearray | memoryview) -> int:
+    """Bytes of the head, from the first `PREFIX.size` bytes.
+
+    Raises:
+        FramingError: they are not those of a frame.
+    """
+    if len(prefix) < PREFIX.size:
+        raise FramingError(f"ends after {len(prefix)} bytes, within its prefix; send the whole frame")
+    magic, length = PREFIX.unpack_from(prefix)
+    if magic != MAGIC:
+        raise FramingError(
+            f"begins with {bytes(magic).hex(' ')}, not with S4DF; send a frame as client.wire.framing does"
+        )
+    if length > MAX_HEAD:
+        raise FramingError(f"declares a head of {length} bytes; a head has at most {MAX_HEAD}")
+    return int(length)
+
+
+def parse_head(data: bytes | bytearray | memoryview) -> FrameHead:
+    """The head from its JSON.
+
+    Raises:
+        FramingError: no JSON, or not of the fields that a head has.
+    """
+    try:
+        return FrameHead.model_validate_json(bytes(data))
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"])
+        raise FramingError(f"head{'.' + field if field else ''}: {first['msg']}; correct the head") from None
+
+
+def parse_frame(data: bytes | bytearray | memoryview) -> tuple[FrameHead, list[memoryview]]:
+    """The head, and the bytes of each of its files, not copied.
+
+    Raises:
+        FramingError: truncated, longer than the head says, or no frame.
+    """
+    view = memoryview(data)
+    at = PREFIX.size + head_length(view[: PREFIX.size])
+    if at > len(view):
+        raise FramingError(f"ends after {len(view)} bytes, within its head; send the whole frame")
+    head = parse_head(view[PREFIX.size : at])
+    expected = at + sum(file.size for file in head.files)
+    if len(view) != expected:
+        raise FramingError(f"has {len(view)} bytes where its head says {expected}; send what the head says")
+    pieces = []
+    for file in head.files:
+        pieces.append(view[at : at + file.size])
+        at += file.size
+    return head, pieces

@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from client.wire.framing import MAX_HEAD, PREFIX, FramingError, frame_chunks, parse_frame
+
+IMAGES = {"c0": b"abc", "c1": b""}
+
+
+def test_a_frame_comes_back_as_it_was_sent():
+    data = b"".join(frame_chunks(7, IMAGES, {"c0": b"mm"}, 0.25, part=True))
+    head, pieces = parse_frame(data)
+    assert (head.index, head.time, head.part) == (7, 0.25, True)
+    assert [(file.camera, file.kind, bytes(piece)) for file, piece in zip(head.files, pieces, strict=True)] == [
+        ("c0", "image", b"abc"),
+        ("c1", "image", b""),
+        ("c0", "mask", b"mm"),
+    ]
+
+
+def test_files_are_not_copied_when_sent():
+    chunks = frame_chunks(0, IMAGES)
+    assert chunks[1] is IMAGES["c0"]
+
+
+def test_every_cut_and_what_is_too_much_is_refused():
+    data = b"".join(frame_chunks(7, IMAGES, time=0.25))
+    for length in range(len(data)):
+        with pytest.raises(FramingError):
+            parse_frame(data[:length])
+    with pytest.raises(FramingError, match="its head says"):
+        parse_frame(data + b"\0")
+
+
+def framed(head) -> bytes:
+    text = json.dumps(head).encode()
+    return PREFIX.pack(b"S4DF", len(text)) + text
+
+
+@pytest.mark.parametrize(
+    ("data", "match"),
+    [
+        (b"PK\3\4aaaaaaaa", "S4DF"),
+        (PREFIX.pack(b"S4DF", MAX_HEAD + 1), "at most"),
+        (framed([]), "head"),
+        (framed({"index": -1, "files": [{"camera": "a", "size": 0}]}), "head.index"),
+        (framed({"index": 0, "files": []}), "head.files"),
+        (framed({"index": 0, "files": [{"camera": "../a", "size": 0}]}), "head.files.0.camera"),
+        (framed({"index": 0, "files": [{"camera": "a", "size": -1}]}), "head.files.0.size"),
+        (framed({"index": 0, "time": float("nan"), "files": [{"camera": "a", "size": 0}]}), "head"),
+        (framed({"index": 0, "files": [{"camera": "a", "size": 0}], "more": 1}), "head.more"),
+    ],
+)
+def test_a_head_that_is_none_is_refused_by_name(data, match):
+    with pytest.raises(FramingError, match=match):
+        parse_frame(data)
