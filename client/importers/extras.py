@@ -1,0 +1,37 @@
+"""Packages that only the importers need, loaded when they are."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+INSTALL = "pip install 'scas4d[importers]'"
+
+
+class MissingExtra(RuntimeError):
+    """A package of the extra `importers` is not installed."""
+
+
+def load(module: str, *, needed: str) -> Any:
+    """The module; `needed` says for what.
+
+    Raises:
+        MissingExtra: it is not installed; the message names the extra.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as fault:
+        packages = {"cv2": "OpenCV (opencv-python-headless)", "av": "PyAV (av)"}
+        raise MissingExtra(
+            f"{needed} needs {packages.get(module, module)}, which cannot be imported ({fault}): {INSTALL}"
+        ) from fault
+
+
+def opencv() -> Any:
+    """OpenCV, for lenses with distortion."""
+    return load("cv2", needed="undoing a lens's distortion")
+
+
+def pyav() -> Any:
+    """PyAV, for video."""
+    return load("av", needed="reading video")

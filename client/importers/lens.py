@@ -1,0 +1,123 @@
+"""Lenses: the camera models of calibration tools, and cameras that have one. Numpy only.
+
+Pixels are counted as everywhere here: the centre of the first pixel is (0.5, 0.5), as in COLMAP and nerfstudio.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Camera, CameraError
+from scas4d_core.captures import CaptureError
+
+Float = NDArray[np.float64]
+
+PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""OpenCV's order; the radial factor is (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)."""
+FISHEYE = ("k1", "k2", "k3", "k4")
+"""θ_d = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)."""
+
+MODELS: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+}
+"""The models that are read, with their parameters in COLMAP's order."""
+
+
+@dataclass(frozen=True, eq=False)
+class LensCamera:
+    """A calibrated camera as it is, with its distortion.
+
+    Attributes:
+        name: identifies the camera within its rig.
+        model: one of `MODELS`.
+        intrinsics: [3, 3] in pixels, principal point from the upper left corner of the picture.
+        distortion: coefficients in OpenCV's order, [8] of `PERSPECTIVE` or [4] of `FISHEYE`.
+        world_to_camera: [4, 4], OpenCV axes.
+        width, height: picture size in pixels.
+    """
+
+    name: str
+    model: str
+    intrinsics: Float
+    distortion: Float
+    world_to_camera: Float
+    width: int
+    height: int
+
+    @property
+    def fisheye(self) -> bool:
+        """Is the distortion one of the angle?"""
+        return self.model == "OPENCV_FISHEYE"
+
+    @property
+    def straight(self) -> bool:
+        """Is it a pinhole camera already? (A fisheye without coefficients is not.)"""
+        return not self.fisheye and not self.distortion.any()
+
+    def pinhole(self, intrinsics: Float | None = None) -> Camera:
+        """The pinhole camera in its place, with other intrinsics where given.
+
+        Raises:
+            CameraError: it cannot be.
+        """
+        k = self.intrinsics if intrinsics is None else intrinsics
+        return Camera(self.name, k, self.world_to_camera, self.width, self.height)
+
+
+def lens_camera(
+    name: str,
+    model: str,
+    parameters: Mapping[str, float],
+    world_to_camera: Float,
+    size: tuple[int, int],
+    *,
+    source: str,
+) -> LensCamera:
+    """A camera from the parameters of its model by name (`MODELS`), checked.
+
+    Args:
+        name: of the camera.
+        model: of its lens.
+        parameters: by name; coefficients that are not there are 0.
+        world_to_camera: [4, 4], OpenCV axes.
+        size: (width, height) in pixels.
+        source: what to call the file in messages.
+
+    Raises:
+        CaptureError: the model is not one of those read, or the camera cannot be.
+    """
+    if model not in MODELS:
+        raise CaptureError(
+            f"{source}: camera {name!r} has the model {model}, which is not read; "
+            f"calibrate with one of {', '.join(MODELS)}"
+        )
+    known = set(MODELS[model]) | ({"k3"} if model == "OPENCV" else set())
+    strange = {key: value for key, value in parameters.items() if key not in known and value != 0}
+    if strange:
+        listed = ", ".join(f"{key} = {value:g}" for key, value in strange.items())
+        raise CaptureError(f"{source}: camera {name!r} has {listed}, which the model {model} has not; give FULL_OPENCV")
+    focal = {key: parameters.get(key, parameters.get("f", 0.0)) for key in ("fx", "fy")}
+    intrinsics = np.array(
+        [[focal["fx"], 0, parameters["cx"]], [0, focal["fy"], parameters["cy"]], [0, 0, 1]], dtype=np.float64
+    )
+    order = FISHEYE if model == "OPENCV_FISHEYE" else PERSPECTIVE
+    distortion = np.array([parameters.get(key, 0.0) for key in order], dtype=np.float64)
+    if not np.isfinite(distortion).all():
+        listed = ", ".join(key for key, value in zip(order, distortion, strict=True) if not np.isfinite(value))
+        raise CaptureError(f"{source}: camera {name!r}: {listed} is NaN or infinity; give finite numbers")
+    camera = LensCamera(name, model, intrinsics, distortion, np.asarray(world_to_camera, np.float64), *size)
+    try:
+        camera.pinhole()
+    except CameraError as fault:
+        raise CaptureError(f"{source}: {fault}") from fault
+    return camera
