@@ -11,10 +11,11 @@ from fastapi.responses import RedirectResponse
 
 from client import __version__
 from server import problems
+from server.hub import Hub
 from server.limits import BodyLimit
 from server.placement import Placement
 from server.placement.local import LocalPlacement
-from server.routes import frames, health, parts, points, render, scenes, tracks
+from server.routes import frames, health, parts, points, render, scenes, stream, tracks
 from server.scenes import Scenes
 from server.settings import ServerSettings
 
@@ -27,7 +28,8 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         settings.data.mkdir(parents=True, exist_ok=True)
-        app.state.scenes = Scenes(settings, placement or LocalPlacement())
+        app.state.hub = Hub(settings.max_subscribers, settings.stream_questions)
+        app.state.scenes = Scenes(settings, placement or LocalPlacement(), app.state.hub)
         yield
         await app.state.scenes.stop()
 
@@ -41,7 +43,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     app.state.settings = settings
     problems.install(app)
     app.add_middleware(BodyLimit, limit=int(settings.max_body_mb * 1e6))
-    for resource in (scenes, points, frames, render, tracks, parts, health):
+    for resource in (scenes, points, frames, render, tracks, parts, stream, health):
         app.include_router(resource.router)
 
     @app.get("/", include_in_schema=False)

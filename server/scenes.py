@@ -27,6 +27,7 @@ from scas4d_core.cameras import Camera
 from scas4d_core.settings import Settings
 from server import renderer, worker
 from server.frame_files import write_frame
+from server.hub import Event, FrameFinished, Hub, SceneChanged
 from server.messages import (
     Answer,
     Ask,
@@ -72,7 +73,7 @@ class Scene:
     """
 
     def __init__(
-        self, id: str, request: SceneCreate, settings: Settings, server: ServerSettings, placement: Placement
+        self, id: str, request: SceneCreate, settings: Settings, server: ServerSettings, placement: Placement, hub: Hub
     ) -> None:
         self.id = id
         self.request = request
@@ -96,6 +97,11 @@ class Scene:
         self._worker = placement.start(worker.main, self.spec, self._from_worker, self._worker_ended)
         self._renderer = placement.start(renderer.main, self.spec, self._from_renderer, self._renderer_ended)
         self._placement = placement
+        self._hub = hub
+
+    def _tell(self, event: Event) -> None:
+        """Tells who listens to the scene (`server.hub`); called at every change of its status or of a frame."""
+        self._hub.publish(self.id, event)
 
     @property
     def next_frame(self) -> int:
@@ -186,6 +192,7 @@ class Scene:
             report = FrameReportModel(scene=self.id, index=index, time=seconds, state=FrameState.QUEUED)
             self.frames[index] = FrameEntry(receipt, report)
             self._worker.send(FrameReady(index, seconds, file))
+            self._tell(SceneChanged())
             return receipt
 
     def _again(self, index: int, identity: str) -> FrameReceipt:
@@ -249,10 +256,12 @@ class Scene:
             case Started():
                 self.frames[message.index].report.state = FrameState.UPDATING
                 self.state = SceneState.UPDATING if self.committed else SceneState.INITIALISING
+                self._tell(SceneChanged())
             case Progressed():
                 self.progress = ProgressModel(
                     stage=message.stage, done=message.done, total=message.total, detail=message.detail
                 )
+                self._tell(SceneChanged())
             case Committed():
                 self._commit(message)
             case SetAside():
@@ -278,6 +287,7 @@ class Scene:
         if message.dropped:
             self.error = f"frame {message.index} was committed without " + "; ".join(message.dropped.values())
         self.state = SceneState.DEGRADED if message.dropped else SceneState.READY
+        self._tell(FrameFinished(report))
 
     def _set_aside(self, message: SetAside) -> None:
         self._finished += 1
@@ -288,12 +298,14 @@ class Scene:
         report.dropped_cameras = message.dropped
         self.error = f"frame {message.index} was set aside: {message.reason}"
         self.state = SceneState.FAILED if message.fatal else SceneState.DEGRADED
+        self._tell(FrameFinished(report))
         log.warning("scene %s: %s", self.id, self.error)
 
     def _worker_ended(self, reason: str) -> None:
         self.state = SceneState.FAILED
         self.error = f"the worker is gone: {reason}"
         self.progress = None
+        self._tell(SceneChanged())
         log.error("scene %s: %s", self.id, self.error)
 
     # Questions about what is committed.
@@ -352,9 +364,10 @@ class Scene:
 class Scenes:
     """All scenes of the service, by id."""
 
-    def __init__(self, server: ServerSettings, placement: Placement) -> None:
+    def __init__(self, server: ServerSettings, placement: Placement, hub: Hub) -> None:
         self.server = server
         self.placement = placement
+        self.hub = hub
         self.by_id: dict[str, Scene] = {}
 
     def create(self, request: SceneCreate, settings: Settings) -> Scene:
@@ -368,7 +381,7 @@ class Scenes:
                 remedy="delete a scene, or raise the limit",
                 headers={"Retry-After": "60"},
             )
-        scene = Scene(secrets.token_hex(6), request, settings, self.server, self.placement)
+        scene = Scene(secrets.token_hex(6), request, settings, self.server, self.placement, self.hub)
         self.by_id[scene.id] = scene
         return scene
 
@@ -382,6 +395,7 @@ class Scenes:
         """Ends the scene's processes and removes its folder."""
         scene = self[id]
         del self.by_id[id]
+        self.hub.close(id, "the scene was deleted")
         await scene.stop()
         await asyncio.to_thread(shutil.rmtree, scene.spec.folder, ignore_errors=True)
 

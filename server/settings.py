@@ -32,6 +32,16 @@ class ServerSettings(BaseModel):
     max_points: int = Field(default=2_000_000, ge=1, description="Of an initial cloud.")
     max_render_pixels: int = Field(default=8_000_000, ge=1, description="Of one novel view.")
     max_track_points: int = Field(default=1_000_000, ge=1, description="Points times frames of one track query.")
+    max_subscribers: int = Field(default=128, ge=1, description="Of the stream of one scene.")
+    max_subscriptions: int = Field(default=16, ge=1, description="Of one subscriber at a time.")
+    max_stream_message_kb: int = Field(
+        default=256, ge=1, description="Largest message of a subscriber: some 8000 pixels to track."
+    )
+    stream_questions: int = Field(
+        default=2,
+        ge=1,
+        description="Views, tracks and parts for subscribers that a scene's reader has before it at a time; more wait.",
+    )
     answer_seconds: float = Field(
         default=120.0, gt=0, description="A render, track or part query that takes longer gets 503."
     )

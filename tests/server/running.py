@@ -26,7 +26,7 @@ class Running:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
         self.app = create_app(settings)
-        config = uvicorn.Config(self.app, port=self.port, log_level="error", ws="none")
+        config = uvicorn.Config(self.app, port=self.port, log_level="error")
         self.server = uvicorn.Server(config)
         self.thread = threading.Thread(target=self.server.run)
         self.thread.start()

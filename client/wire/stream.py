@@ -1,0 +1,222 @@
+"""Subscriptions on the wire, protocol `scas4d.stream.v1`; docs/stream.md says the same in words.
+
+A client sends text messages, `ClientMessage`. The service sends text messages, and binary ones for bulk: the magic
+`S4DS`, the length of a JSON head as uint32 little-endian, the head, and the bytes that it describes.
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import StrEnum
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, TypeAdapter
+
+from client.wire.base import Model
+from client.wire.frames import FrameReportModel
+from client.wire.scenes import SceneStatus
+from client.wire.service import ProblemDetails
+from client.wire.tracks import TracksRequest
+from client.wire.views import RenderRequest
+
+STREAM_PROTOCOL = "scas4d.stream.v1"
+"""Offered as a WebSocket subprotocol; another version is another name."""
+
+MAGIC = b"S4DS"
+_PREFIX = struct.Struct("<4sI")
+
+SCENE_GONE = 4404
+"""Close code: the scene was deleted."""
+TOO_BIG = 1009
+"""Close code: a message larger than `StreamLimits.message_bytes`."""
+
+SubscriptionId = Annotated[str, Field(min_length=1, max_length=64, description="Chosen by the client.")]
+Tag = Annotated[
+    int | None,
+    Field(default=None, ge=0, le=2**53 - 1, description="Comes back with what was sent for this request."),
+]
+
+
+class Topic(StrEnum):
+    """What can be subscribed to."""
+
+    SCENE = "scene"
+    FRAMES = "frames"
+    RENDER = "render"
+    TRACKS = "tracks"
+    PARTS = "parts"
+
+
+class NoRequest(Model):
+    """Of topics without anything to choose."""
+
+
+class PartsSubscription(Model):
+    """Labels again and again."""
+
+    count: int | None = Field(default=None, ge=1, le=254, description="How many; chosen by a rule if not given.")
+    every: int = Field(
+        default=1,
+        ge=1,
+        le=1_000_000,
+        description="Frames from one to the next: finding parts takes the reader a while.",
+    )
+
+
+REQUESTS: dict[Topic, type[Model]] = {
+    Topic.SCENE: NoRequest,
+    Topic.FRAMES: NoRequest,
+    Topic.RENDER: RenderRequest,
+    Topic.TRACKS: TracksRequest,
+    Topic.PARTS: PartsSubscription,
+}
+"""What `request` is, by topic. `frame` null in a render follows the newest frame."""
+
+
+# From the client.
+
+
+class Subscribe(Model):
+    """Begins a subscription; under an id in use it takes the place of the one before."""
+
+    type: Literal["subscribe"] = "subscribe"
+    id: SubscriptionId
+    topic: Topic
+    request: dict[str, Any] = Field(default_factory=dict)
+    tag: Tag = None
+
+
+class Update(Model):
+    """Changes what a subscription asks for: the members given replace those before. A moved camera is one of these."""
+
+    type: Literal["update"] = "update"
+    id: SubscriptionId
+    request: dict[str, Any] = Field(default_factory=dict)
+    tag: Tag = None
+
+
+class Unsubscribe(Model):
+    """Ends a subscription."""
+
+    type: Literal["unsubscribe"] = "unsubscribe"
+    id: SubscriptionId
+
+
+ClientMessage = Annotated[Subscribe | Update | Unsubscribe, Field(discriminator="type")]
+CLIENT_MESSAGE: TypeAdapter[Subscribe | Update | Unsubscribe] = TypeAdapter(ClientMessage)
+
+
+# From the service, as text.
+
+
+class StreamLimits(Model):
+    """What the service bears from one client."""
+
+    subscriptions: int = Field(description="At a time.")
+    message_bytes: int = Field(description="Of one message of the client.")
+    render_pixels: int = Field(description="Of one view.")
+    track_points: int = Field(description="Points times frames of one tracks message.")
+
+
+class Hello(Model):
+    """The first message."""
+
+    type: Literal["hello"] = "hello"
+    protocol: str
+    scene: str
+    limits: StreamLimits
+
+
+class Subscribed(Model):
+    """A `subscribe` was taken."""
+
+    type: Literal["subscribed"] = "subscribed"
+    id: SubscriptionId
+
+
+class Unsubscribed(Model):
+    """Nothing more comes under this id."""
+
+    type: Literal["unsubscribed"] = "unsubscribed"
+    id: SubscriptionId
+
+
+class StreamProblem(Model):
+    """What was wrong. With an id: the subscription stays and waits for its next `update` or frame."""
+
+    type: Literal["error"] = "error"
+    id: SubscriptionId | None = None
+    tag: Tag = None
+    problem: ProblemDetails
+
+
+class SceneMessage(Model):
+    """The scene as it is now."""
+
+    type: Literal["scene"] = "scene"
+    id: SubscriptionId
+    missed: int = Field(description="Changes that this one took the place of, unsent.")
+    status: SceneStatus
+
+
+class FrameMessage(Model):
+    """What became of a frame: committed with its metrics, or why not."""
+
+    type: Literal["frame"] = "frame"
+    id: SubscriptionId
+    missed: int = Field(description="Finished frames that this one took the place of, unsent.")
+    report: FrameReportModel
+
+
+class Gone(Model):
+    """The scene was deleted; the service closes with 4404 next."""
+
+    type: Literal["gone"] = "gone"
+    reason: str
+
+
+ServerMessage = Annotated[
+    Hello | Subscribed | Unsubscribed | StreamProblem | SceneMessage | FrameMessage | Gone, Field(discriminator="type")
+]
+SERVER_MESSAGE: TypeAdapter[Hello | Subscribed | Unsubscribed | StreamProblem | SceneMessage | FrameMessage | Gone] = (
+    TypeAdapter(ServerMessage)
+)
+
+
+# From the service, as the head of a binary message.
+
+
+class BulkHead(Model):
+    """What the bytes after the head are."""
+
+    type: Literal["render", "tracks", "parts"]
+    id: SubscriptionId
+    tag: Tag = None
+    missed: int = Field(description="Frames and camera positions that this one took the place of.")
+    frame: int = Field(description="Of the render; the newest frame of the tracks; the newest that the parts know.")
+    first: int | None = Field(default=None, description="Of tracks: the first frame; earlier ones were sent before.")
+    media_type: str = Field(description="Of the bytes: as the same request over HTTP answers.")
+    headers: dict[str, str] = Field(
+        default_factory=dict, description="Those of the HTTP answer, lower case: x-depth-near …"
+    )
+
+
+def pack(head: Model, body: bytes) -> bytes:
+    """A binary message."""
+    text = head.model_dump_json(exclude_none=True).encode()
+    return b"".join((_PREFIX.pack(MAGIC, len(text)), text, body))
+
+
+def unpack(message: bytes) -> tuple[BulkHead, bytes]:
+    """Head and body of a binary message.
+
+    Raises:
+        ValueError: not one of ours.
+    """
+    if len(message) < _PREFIX.size:
+        raise ValueError(f"a binary message of {len(message)} bytes has no room for its head")
+    magic, length = _PREFIX.unpack_from(message)
+    if magic != MAGIC or _PREFIX.size + length > len(message):
+        raise ValueError(f"a binary message begins with {magic!r} and a head of {length} of its {len(message)} bytes")
+    head = BulkHead.model_validate_json(message[_PREFIX.size : _PREFIX.size + length])
+    return head, message[_PREFIX.size + length :]

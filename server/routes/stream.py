@@ -1,0 +1,96 @@
+"""Subscriptions over a WebSocket, protocol `scas4d.stream.v1` (docs/stream.md)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+
+from fastapi import APIRouter, WebSocket
+from starlette.websockets import WebSocketDisconnect, WebSocketState
+
+from client.wire.stream import SCENE_GONE, STREAM_PROTOCOL, TOO_BIG
+from server import problems
+from server.hub import Hub
+from server.problems import Problem
+from server.scenes import Scenes
+from server.settings import ServerSettings
+from server.subscriber import Subscriber
+
+router = APIRouter(prefix="/v1/scenes")
+
+log = logging.getLogger("scas4d.server")
+
+
+@router.websocket("/{id}/stream")
+async def stream(websocket: WebSocket, id: str) -> None:
+    """Scene state, finished frames, live views, tracks and parts, as the client subscribes to them."""
+    scenes: Scenes = websocket.app.state.scenes
+    server: ServerSettings = websocket.app.state.settings
+    hub: Hub = websocket.app.state.hub
+    try:
+        scene = scenes[id]
+        _require_protocol(websocket)
+        subscriber = hub.join(id, scene.ask, lambda room: Subscriber(scene, server, room))
+    except Problem as problem:  # the handshake is answered like any request: browsers see only that it failed
+        await websocket.send_denial_response(problems.answer(problem.document, problem.headers))
+        return
+    try:
+        await websocket.accept(subprotocol=STREAM_PROTOCOL)
+        await _serve(websocket, subscriber)
+    finally:
+        hub.leave(id, subscriber)
+        subscriber.close()
+
+
+def _require_protocol(websocket: WebSocket) -> None:
+    offered = websocket.scope["subprotocols"]
+    if STREAM_PROTOCOL not in offered:
+        raise Problem(
+            400,
+            "the client speaks no protocol that the service speaks",
+            field="Sec-WebSocket-Protocol",
+            value=", ".join(name for name in offered if not name.startswith("scas4d.ticket.")),
+            remedy=f"offer {STREAM_PROTOCOL}",
+        )
+
+
+async def _serve(websocket: WebSocket, subscriber: Subscriber) -> None:
+    """Until either side has enough."""
+    await subscriber.greet()
+    reading = asyncio.create_task(_read(websocket, subscriber))
+    writing = asyncio.create_task(_write(websocket, subscriber))
+    try:
+        await asyncio.wait((reading, writing), return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in (reading, writing):
+            task.cancel()
+        for ended in await asyncio.gather(reading, writing, return_exceptions=True):
+            if isinstance(ended, Exception) and not isinstance(ended, WebSocketDisconnect):
+                log.error("scene %s: a stream broke", subscriber.scene.id, exc_info=ended)
+
+
+async def _read(websocket: WebSocket, subscriber: Subscriber) -> None:
+    limit = subscriber.limits().message_bytes
+    while True:
+        message = await websocket.receive()
+        if message["type"] == "websocket.disconnect":
+            return
+        text = message.get("text")
+        if text is not None and len(text) > limit:  # characters: a bound on the bytes within a factor of four
+            await websocket.close(TOO_BIG, f"a message of {len(text)} characters; {limit} bytes are taken")
+            return
+        await subscriber.take(text)
+
+
+async def _write(websocket: WebSocket, subscriber: Subscriber) -> None:
+    async def send(message: str | bytes) -> None:
+        if isinstance(message, str):
+            await websocket.send_text(message)
+        else:
+            await websocket.send_bytes(message)
+
+    await subscriber.mailbox.empty_into(send)
+    if websocket.application_state == WebSocketState.CONNECTED:
+        with contextlib.suppress(RuntimeError):
+            await websocket.close(SCENE_GONE, "the scene was deleted")
