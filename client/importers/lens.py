@@ -88,7 +88,7 @@ def lens_camera(
     Args:
         name: of the camera.
         model: of its lens.
-        parameters: by name; coefficients that are not there are 0.
+        parameters: by name, two focal lengths also where the model has one; coefficients that are not there are 0.
         world_to_camera: [4, 4], OpenCV axes.
         size: (width, height) in pixels.
         source: what to call the file in messages.
@@ -101,7 +101,7 @@ def lens_camera(
             f"{source}: camera {name!r} has the model {model}, which is not read; "
             f"calibrate with one of {', '.join(MODELS)}"
         )
-    known = set(MODELS[model]) | ({"k3"} if model == "OPENCV" else set())
+    known = {*MODELS[model], "fx", "fy"} | ({"k3"} if model == "OPENCV" else set())
     strange = {key: value for key, value in parameters.items() if key not in known and value != 0}
     if strange:
         listed = ", ".join(f"{key} = {value:g}" for key, value in strange.items())

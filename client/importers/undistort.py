@@ -76,8 +76,8 @@ class Undistorter:
     def picture(self, picture: Picture) -> Picture:
         """[H, W, 3] as the lens saw it to [H, W, 3] as the pinhole would.
 
-        Lanczos: painted dots land within 0.02 pixels of where they belong; cubic interpolation shifts them by up to 0.08
-        and linear blurs.
+        Lanczos: painted dots land within 0.02 pixels of where they belong; cubic interpolation moves them by up to
+        0.08 and linear blurs.
         """
         return self._remapped(picture, "INTER_LANCZOS4")
 

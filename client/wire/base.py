@@ -9,10 +9,11 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 MAX_CAMERAS = 512
 MAX_PIXELS_A_SIDE = 16_384
 
+CAMERA_NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}$"
 CameraName = Annotated[
     str,
     Field(
-        pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}$",
+        pattern=CAMERA_NAME,
         description="Letters, digits, dot, dash, underscore; not `time`, and not beginning with `mask.`.",
     ),
 ]

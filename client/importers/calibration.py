@@ -1,0 +1,104 @@
+"""`Calibration`: the cameras of a rig as a calibration tool left them, whichever it was. Numpy only."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from client.importers.lens import LensCamera
+from client.wire.base import CAMERA_NAME
+from scas4d_core.captures import CaptureError, InitialPoints
+
+STILL_TOLERANCE = 1e-6
+"""Largest change of an entry of a pose or of the intrinsics that still counts as a camera standing still."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One picture that a calibration speaks of.
+
+    Attributes:
+        path: as the file names it.
+        lens: the camera that took it; `calibration` gives it its name.
+        time: seconds, where the file says.
+    """
+
+    path: PurePosixPath
+    lens: LensCamera
+    time: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A rig with its lenses.
+
+    Attributes:
+        source: the file or folder it was read from.
+        cameras: in natural order of their names.
+        views: by camera name the pictures that the calibration speaks of, in order of time.
+        points: a cloud that came with it, or None.
+        fps: frames per second, where the file says.
+    """
+
+    source: Path
+    cameras: tuple[LensCamera, ...]
+    views: Mapping[str, tuple[View, ...]]
+    points: InitialPoints | None = None
+    fps: float | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the cameras."""
+        return tuple(camera.name for camera in self.cameras)
+
+
+def natural(text: str) -> list[tuple[int, int, str]]:
+    """A key that puts cam2 before cam10."""
+    parts = re.split(r"(\d+)", text)
+    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts if part]
+
+
+def calibration(
+    source: Path, views: Sequence[View], *, points: InitialPoints | None = None, fps: float | None = None
+) -> Calibration:
+    """Views to cameras. A camera is called like the folder of its pictures or, where all lie in one, like its picture.
+
+    Raises:
+        CaptureError: no views, a camera that moves, or a name that cannot be.
+    """
+    if not views:
+        raise CaptureError(f"{source}: lists no camera")
+    one_folder = len({view.path.parent for view in views}) == 1
+    by_name: dict[str, list[View]] = {}
+    for view in views:
+        by_name.setdefault(view.path.stem if one_folder else view.path.parent.name, []).append(view)
+    cameras = []
+    for name in sorted(by_name, key=natural):
+        if not re.match(CAMERA_NAME, name) or name == "time" or name.startswith("mask."):
+            raise CaptureError(
+                f"{source}: camera {name!r} (of {by_name[name][0].path}): a camera's name has letters, digits, dots, "
+                "dashes and underscores, at most 64, and is not `time`; rename its pictures or their folder"
+            )
+        by_name[name].sort(key=lambda view: (view.time is not None, view.time or 0.0, natural(str(view.path))))
+        cameras.append(_still(source, name, by_name[name]))
+    return Calibration(source, tuple(cameras), {name: tuple(found) for name, found in by_name.items()}, points, fps)
+
+
+def _still(source: Path, name: str, views: Sequence[View]) -> LensCamera:
+    first = views[0].lens
+    for view in views[1:]:
+        for field in ("world_to_camera", "intrinsics", "distortion"):
+            old, new = getattr(first, field), getattr(view.lens, field)
+            if old.shape != new.shape or np.abs(new - old).max() > STILL_TOLERANCE * max(1.0, np.abs(old).max()):
+                raise CaptureError(
+                    f"{source}: camera {name!r} has another {field} in {view.path} than in {views[0].path}; a rig's "
+                    "cameras must stand still: calibrate with one picture a camera, or put each camera's pictures "
+                    "into a folder of its own"
+                )
+    return LensCamera(
+        name, first.model, first.intrinsics, first.distortion, first.world_to_camera, first.width, first.height
+    )

@@ -1,0 +1,256 @@
+"""Reads COLMAP models, text or binary: `cameras`, `images` and, where there is one, `points3D`. Numpy only.
+
+Poses are world to camera with OpenCV axes, as quaternion (w, x, y, z) and translation; principal points count from the
+upper left corner of the picture: both as here. (colmap.github.io/format.html; `src/colmap/scene/reconstruction_io.cc`.)
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.importers.calibration import Calibration, View, calibration
+from client.importers.lens import MODELS, LensCamera, lens_camera
+from scas4d_core.captures import CaptureError, InitialPoints
+
+Float = NDArray[np.float64]
+
+MODEL_IDS = {
+    0: "SIMPLE_PINHOLE",
+    1: "PINHOLE",
+    2: "SIMPLE_RADIAL",
+    3: "RADIAL",
+    4: "OPENCV",
+    5: "OPENCV_FISHEYE",
+    6: "FULL_OPENCV",
+    7: "FOV",
+    8: "SIMPLE_RADIAL_FISHEYE",
+    9: "RADIAL_FISHEYE",
+    10: "THIN_PRISM_FISHEYE",
+    11: "RAD_TAN_THIN_PRISM_FISHEYE",
+}
+LONGEST_NAME = 4096
+
+
+@dataclass(frozen=True)
+class _Camera:
+    model: str
+    width: int
+    height: int
+    parameters: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Image:
+    name: str
+    camera: int
+    quaternion: tuple[float, ...]
+    translation: tuple[float, ...]
+
+
+def is_model(folder: Path) -> bool:
+    """Do the files of a model lie in the folder?"""
+    return any((folder / f"cameras{end}").is_file() for end in (".bin", ".txt"))
+
+
+def read_colmap(folder: Path) -> Calibration:
+    """The rig of a model, and its cloud.
+
+    Raises:
+        CaptureError: a file is missing or broken, or a camera cannot be; the message names the file and the fault.
+    """
+    end = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
+    files = {name: folder / f"{name}{end}" for name in ("cameras", "images", "points3D")}
+    for name in ("cameras", "images"):
+        if not files[name].is_file():
+            raise CaptureError(f"{files[name]}: no such file, though {folder} has other files of a COLMAP model")
+    binary = end == ".bin"
+    cameras = _binary_cameras(files["cameras"]) if binary else _text_cameras(files["cameras"])
+    images = list(_binary_images(files["images"]) if binary else _text_images(files["images"]))
+    if not images:
+        raise CaptureError(f"{files['images']}: no picture was registered; calibrate again with more overlap")
+    points = None
+    if files["points3D"].is_file():
+        points = _cloud(list(_binary_points(files["points3D"]) if binary else _text_points(files["points3D"])))
+    views = [View(PurePosixPath(image.name.replace("\\", "/")), _lens(files, cameras, image)) for image in images]
+    return calibration(folder, views, points=points)
+
+
+def _lens(files: dict[str, Path], cameras: dict[int, _Camera], image: _Image) -> LensCamera:
+    camera = cameras.get(image.camera)
+    if camera is None:
+        raise CaptureError(
+            f"{files['images']}: picture {image.name} is of camera {image.camera}, which {files['cameras'].name} lacks"
+        )
+    q, t = np.array(image.quaternion), np.array(image.translation)
+    length = np.linalg.norm(q)
+    if not (np.isfinite(length) and abs(length - 1) < 1e-2 and np.isfinite(t).all()):
+        listed = " ".join(f"{value:g}" for value in (*image.quaternion, *image.translation))
+        raise CaptureError(f"{files['images']}: picture {image.name} has no pose ({listed}); q must have length 1")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = _rotation(q / length), t
+    names = MODELS.get(camera.model, ())
+    if names and len(names) != len(camera.parameters):
+        raise CaptureError(
+            f"{files['cameras']}: camera {image.camera} has {len(camera.parameters)} parameters; {camera.model} has "
+            f"{len(names)}: {', '.join(names)}"
+        )
+    parameters = dict(zip(names, camera.parameters, strict=False))
+    size = (camera.width, camera.height)
+    return lens_camera(image.name, camera.model, parameters, pose, size, source=str(files["cameras"]))
+
+
+def _rotation(q: Float) -> Float:
+    w, x, y, z = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _cloud(rows: list[tuple[float, ...]]) -> InitialPoints | None:
+    array = np.array(rows, dtype=np.float64).reshape(-1, 6)
+    array = array[np.isfinite(array).all(axis=1)]
+    if not len(array):
+        return None
+    return InitialPoints(array[:, :3], np.clip(array[:, 3:] / 255, 0, 1).astype(np.float32))
+
+
+# Text.
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    try:
+        with path.open(encoding="utf-8") as file:
+            for number, line in enumerate(file, 1):
+                if not line.startswith("#"):
+                    yield number, line.strip()
+    except (OSError, UnicodeDecodeError) as fault:
+        raise CaptureError(f"{path}: cannot be read as text ({fault})") from fault
+
+
+def _fields(path: Path, number: int, line: str, kinds: str, what: str) -> list[Any]:
+    """Words of a line: `i` whole number, `f` number, `s` text; the last kind holds for all that follow."""
+    words = line.split(maxsplit=len(kinds) - 1 if kinds.endswith("s") else -1)
+    if len(words) < len(kinds):
+        raise CaptureError(f"{path}: line {number} has {len(words)} fields; needed: {what}")
+    read = {"i": int, "f": float, "s": str}
+    try:
+        return [read[kinds[min(place, len(kinds) - 1)]](word) for place, word in enumerate(words)]
+    except ValueError as fault:
+        raise CaptureError(f"{path}: line {number}: {fault}; needed: {what}") from fault
+
+
+def _text_cameras(path: Path) -> dict[int, _Camera]:
+    cameras = {}
+    for number, line in _lines(path):
+        if line:
+            words = line.split(maxsplit=2)
+            if len(words) < 3:
+                raise CaptureError(f"{path}: line {number} has {len(words)} fields; needed: id MODEL width height …")
+            values = _fields(path, number, f"{words[0]} {words[2]}", "iiif", "id MODEL width height parameters")
+            cameras[values[0]] = _Camera(words[1], values[1], values[2], tuple(values[3:]))
+    return cameras
+
+
+def _text_images(path: Path) -> Iterator[_Image]:
+    # Every second line lists the picture's points, and may be empty.
+    is_image = True
+    for number, line in _lines(path):
+        if is_image and not line:
+            continue
+        if is_image:
+            values = _fields(path, number, line, "ifffffffis", "id qw qx qy qz tx ty tz camera name")
+            yield _Image(values[9], values[8], tuple(values[1:5]), tuple(values[5:8]))
+        is_image = not is_image
+
+
+def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
+    for number, line in _lines(path):
+        if line:
+            yield tuple(_fields(path, number, line, "ifffffff", "id x y z r g b error …")[1:7])
+
+
+# Binary, little-endian.
+
+
+class _Bytes:
+    """A file read piece by piece; says where it ends too early."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._data = path.read_bytes()
+        except OSError as fault:
+            raise CaptureError(f"{path}: cannot be read ({fault.strerror})") from fault
+        self._at = 0
+
+    def take(self, form: str, what: str) -> tuple[Any, ...]:
+        size = struct.calcsize("<" + form)
+        if self._at + size > len(self._data):
+            raise CaptureError(f"{self.path}: ends after {len(self._data)} bytes, within {what}; copy the file again")
+        values = struct.unpack_from("<" + form, self._data, self._at)
+        self._at += size
+        return values
+
+    def skip(self, size: int, what: str) -> None:
+        if self._at + size > len(self._data):
+            raise CaptureError(f"{self.path}: ends after {len(self._data)} bytes, within {what}; copy the file again")
+        self._at += size
+
+    def text(self, what: str) -> str:
+        end = self._data.find(b"\0", self._at, self._at + LONGEST_NAME)
+        if end < 0:
+            raise CaptureError(f"{self.path}: {what} has no end; is this a COLMAP {self.path.name}?")
+        text = self._data[self._at : end].decode("utf-8", "replace")
+        self._at = end + 1
+        return text
+
+
+def _binary_cameras(path: Path) -> dict[int, _Camera]:
+    file = _Bytes(path)
+    cameras = {}
+    (count,) = file.take("Q", "the number of cameras")
+    for number in range(count):
+        what = f"camera {number + 1} of {count}"
+        id, model, width, height = file.take("iiQQ", what)
+        name = MODEL_IDS.get(model)
+        if name not in MODELS:  # how many parameters follow is known only of models that are read
+            raise CaptureError(
+                f"{path}: camera {id} has the model {name or f'number {model}'}, which is not read; calibrate with one "
+                f"of {', '.join(MODELS)}"
+            )
+        cameras[id] = _Camera(name, width, height, file.take(f"{len(MODELS[name])}d", what))
+    return cameras
+
+
+def _binary_images(path: Path) -> Iterator[_Image]:
+    file = _Bytes(path)
+    (count,) = file.take("Q", "the number of pictures")
+    for number in range(count):
+        what = f"picture {number + 1} of {count}"
+        _, *pose, camera = file.take("i4d3di", what)
+        name = file.text(f"the name of {what}")
+        (points,) = file.take("Q", what)
+        file.skip(24 * points, what)
+        yield _Image(name, camera, tuple(pose[:4]), tuple(pose[4:]))
+
+
+def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
+    file = _Bytes(path)
+    (count,) = file.take("Q", "the number of points")
+    for number in range(count):
+        what = f"point {number + 1} of {count}"
+        _, x, y, z, r, g, b, _ = file.take("Q3d3Bd", what)
+        (track,) = file.take("Q", what)
+        file.skip(8 * track, what)
+        yield x, y, z, r, g, b

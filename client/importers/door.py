@@ -1,0 +1,106 @@
+"""`open_source`: the door for whatever a studio has; the files in the folder tell what it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from client.importers.calibration import Calibration
+from client.importers.colmap import is_model, read_colmap
+from client.importers.nerfstudio import FILE, read_transforms
+from client.importers.pictures import PictureFiles, folders_of, named_files
+from client.importers.source import CaptureSource, Encoding, ImportedSource, Pictures, Source
+from client.importers.videos import Videos, find_videos
+from scas4d_core.captures import CaptureError, open_capture
+from scas4d_core.captures.dynamic3dgs import TRAIN_META
+
+COLMAP_FOLDERS = ("sparse/0", "sparse", ".", "colmap/sparse/0", "colmap", "calibration")
+PicturesFrom = Literal["images", "videos", "named"]
+
+
+def open_source(
+    folder: Path | str,
+    *,
+    calibration: Path | None = None,
+    pictures: PicturesFrom | None = None,
+    fps: float | None = None,
+    encoding: Encoding = "jpeg",
+    use_masks: bool = True,
+) -> Source:
+    """A capture of any layout that is known (docs/captures.md).
+
+    Args:
+        folder: of the capture.
+        calibration: a transforms.json, or the folder of a COLMAP model; found in the folder where None.
+        pictures: from where: folders `images/<camera>/`, `videos/<camera>.mp4`, or the files that the calibration
+            names; where None, the latter if it names several a camera, else from what is there.
+        fps: frames per second, where the files do not say.
+        encoding: of pictures that have to be encoded anew: undistorted ones, and frames of videos.
+        use_masks: False to leave `masks/` (`seg/`) alone.
+
+    Raises:
+        CaptureError: no known layout, or a fault in one of the files; the message says what is missing.
+        MissingExtra: a lens or a video needs a package of the extra `importers`.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise CaptureError(f"{folder}: no such folder")
+    if fps is not None and not 0 < fps < 1e6:
+        raise CaptureError(f"fps {fps!r} must be a positive number of frames per second")
+    if calibration is None and (folder / TRAIN_META).exists():
+        return CaptureSource(open_capture(folder, fps=fps or 30.0, use_masks=use_masks))
+    found = read_calibration(folder, calibration)
+    seen = _pictures(folder, found, pictures)
+    masks = folder / "masks"
+    files = tuple(folders_of(masks, found, what="masks")) if use_masks and masks.is_dir() else ()
+    if files and isinstance(seen, PictureFiles):
+        seen.check_same_frames(files)
+    elif files and len(files) != seen.frame_count:
+        raise CaptureError(
+            f"{masks}: has masks of {len(files)} frames, and there are {seen.frame_count}; give one of every picture, "
+            "or none (--no-masks)"
+        )
+    return ImportedSource(folder.resolve().name, found, seen, masks=files, fps=fps, encoding=encoding)
+
+
+def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
+    """The rig: the one given, else transforms.json, else a COLMAP model in one of the usual places.
+
+    Raises:
+        CaptureError: there is none, or it cannot be read.
+    """
+    if given is not None:
+        if given.is_file() and given.suffix == ".json":
+            return read_transforms(given)
+        if given.is_dir() and is_model(given):
+            return read_colmap(given)
+        raise CaptureError(f"{given}: is neither a transforms.json nor the folder of a COLMAP model")
+    if (folder / FILE).is_file():
+        return read_transforms(folder / FILE)
+    for name in COLMAP_FOLDERS:
+        if is_model(folder / name):
+            return read_colmap(folder / name)
+    raise CaptureError(
+        f"{folder}: no known capture layout: no {TRAIN_META} (Dynamic3DGaussians), no {FILE} (nerfstudio), and no "
+        f"cameras.bin or cameras.txt (COLMAP) in {', '.join(COLMAP_FOLDERS)}; name the calibration with --calibration"
+    )
+
+
+def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | None) -> Pictures:
+    images, videos = folder / "images", folder / "videos"
+    has_images = images.is_dir() and any(path.is_dir() for path in images.iterdir())
+    if wanted == "named" or (wanted is None and min(len(views) for views in calibration.views.values()) > 1):
+        return PictureFiles(calibration, *named_files(folder, calibration))
+    if wanted is None and has_images and videos.is_dir():
+        raise CaptureError(
+            f"{folder}: has pictures in images/ and in videos/; say which: --pictures images or --pictures videos"
+        )
+    if wanted == "images" or (wanted is None and has_images):
+        if not images.is_dir():
+            raise CaptureError(f"{images}: no such folder; put each camera's pictures into images/<camera>/")
+        return PictureFiles(calibration, folders_of(images, calibration))
+    if wanted == "videos" or (wanted is None and videos.is_dir()):
+        if not videos.is_dir():
+            raise CaptureError(f"{videos}: no such folder; put each camera's video into videos/<camera>.mp4")
+        return Videos(calibration, find_videos(videos, calibration))
+    return PictureFiles(calibration, *named_files(folder, calibration))

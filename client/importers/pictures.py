@@ -1,0 +1,167 @@
+"""Frames from picture files: a folder a camera, or the files that the calibration names. Numpy and Pillow only.
+
+``images/<camera>/<frame>.jpg``: frames are in natural order of their names, and a frame's pictures are those of one
+name, whatever they end in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from client.importers.calibration import Calibration, natural
+from client.importers.source import Picture
+from scas4d_core.captures import CaptureError, ImageError, decode_image
+from scas4d_core.captures.images import picture_size
+
+SENT = (".jpg", ".jpeg", ".png", ".webp")
+"""What the service takes as it is."""
+READ = (*SENT, ".bmp")
+PICTURE_LIKE = (*READ, ".tif", ".tiff", ".exr", ".dng", ".raw", ".heic", ".gif", ".jp2", ".avif")
+SHOWN = 3
+
+
+class PictureFiles:
+    """[T] files by camera.
+
+    Raises:
+        CaptureError: the first picture of a camera cannot be read, or is not of the calibrated size.
+    """
+
+    fps: float | None = None
+    remarks: Sequence[str] = ()
+
+    def __init__(self, calibration: Calibration, files: Sequence[Mapping[str, Path]], times: Sequence[float] = ()):
+        self._files = files
+        self._times = times
+        self._sizes = {lens.name: (lens.width, lens.height) for lens in calibration.cameras}
+        self.frame_count = len(files)
+        for camera, size in self._sizes.items():
+            check_size(files[0][camera], camera, size)
+
+    def time(self, index: int) -> float | None:
+        """Seconds, where the calibration says."""
+        return self._times[index] if self._times else None
+
+    def file(self, index: int, camera: str) -> Path | None:
+        """The file, if the service takes its kind."""
+        path = self._files[index][camera]
+        return path if path.suffix.lower() in SENT else None
+
+    def decoded(self, index: int, camera: str) -> Picture:
+        """[H, W, 3]."""
+        return decode_image(self._files[index][camera], size=self._sizes[camera])
+
+    def check_same_frames(self, masks: Sequence[Mapping[str, Path]]) -> None:
+        """Masks must be called like the pictures.
+
+        Raises:
+            CaptureError: a mask or a picture is without the other.
+        """
+        for index in range(max(len(masks), len(self._files))):
+            picture = next(iter(self._files[index].values())) if index < len(self._files) else None
+            mask = next(iter(masks[index].values())) if index < len(masks) else None
+            if picture is None or mask is None or picture.stem != mask.stem:
+                raise CaptureError(
+                    f"frame {index}: its picture is {picture} and its mask {mask}; call masks like the pictures and "
+                    "give one of every picture, or none (--no-masks)"
+                )
+
+
+def check_size(path: Path, camera: str, size: tuple[int, int]) -> None:
+    """A picture must be as large as its camera was calibrated for."""
+    try:
+        found = picture_size(path)
+    except ImageError as fault:
+        raise CaptureError(str(fault)) from fault
+    if found != size:
+        raise CaptureError(
+            f"{path}: is {found[0]}x{found[1]} pixels, but camera {camera!r} was calibrated for {size[0]}x{size[1]}; "
+            "give the pictures at that size, or calibrate with these"
+        )
+
+
+def folders_of(root: Path, calibration: Calibration, *, what: str = "pictures") -> list[dict[str, Path]]:
+    """[T] the files of ``root/<camera>/``, one of each frame a camera.
+
+    Raises:
+        CaptureError: a camera has no folder, or a folder lacks a frame that others have.
+    """
+    by_camera: dict[str, dict[str, Path]] = {}
+    for camera in calibration.names:
+        folder = root / camera
+        if not folder.is_dir():
+            there = sorted((path.name for path in root.iterdir() if path.is_dir()), key=natural)
+            raise CaptureError(
+                f"{folder}: no such folder, but {calibration.source} has a camera {camera!r}; {root.name}/ has "
+                f"{_some(there) or 'no folders'}: name the folders like the cameras"
+            )
+        by_camera[camera] = _pictures_in(folder)
+        if not by_camera[camera]:
+            raise CaptureError(f"{folder}: has no {what}; give files ending in {', '.join(READ)}")
+    frames = sorted({frame for files in by_camera.values() for frame in files}, key=natural)
+    for camera, files in by_camera.items():
+        missing = [frame for frame in frames if frame not in files]
+        if missing:
+            others = next(name for name, found in by_camera.items() if missing[0] in found)
+            raise CaptureError(
+                f"{root / camera}: has no {what} of {len(missing)} of {len(frames)} frames ({_some(missing)}), which "
+                f"{others!r} has; a frame's pictures have one name in the folders of all cameras"
+            )
+    return [{camera: files[frame] for camera, files in by_camera.items()} for frame in frames]
+
+
+def _pictures_in(folder: Path) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        end = path.suffix.lower()
+        if path.name.startswith(".") or end not in PICTURE_LIKE:
+            continue
+        if end not in READ:
+            raise CaptureError(f"{path}: {end} is not read; give JPEG, PNG, WebP or BMP")
+        if path.stem in found:
+            raise CaptureError(f"{path}: {found[path.stem].name} is the same frame; leave one of them")
+        found[path.stem] = path
+    return found
+
+
+def named_files(folder: Path, calibration: Calibration) -> tuple[list[dict[str, Path]], list[float]]:
+    """[T] the files that the calibration names, and their times where it says: frame t is each camera's t-th.
+
+    Raises:
+        CaptureError: a file is not there, cameras have different numbers of pictures, or times differ.
+    """
+    counts = {camera: len(views) for camera, views in calibration.views.items()}
+    most = max(counts, key=lambda camera: counts[camera])
+    for camera, count in counts.items():
+        if count != counts[most]:
+            raise CaptureError(
+                f"{calibration.source}: camera {camera!r} has {count} pictures and {most!r} {counts[most]}; "
+                "give every camera one a frame"
+            )
+    frames: list[dict[str, Path]] = []
+    times: list[float] = []
+    for index in range(counts[most]):
+        views = {camera: calibration.views[camera][index] for camera in calibration.names}
+        files = {camera: _below(folder, calibration.source, str(view.path)) for camera, view in views.items()}
+        frames.append(files)
+        given = {camera: view.time for camera, view in views.items()}
+        if len(set(given.values())) > 1:
+            listed = ", ".join(f"{camera}: {time}" for camera, time in list(given.items())[:SHOWN])
+            raise CaptureError(f"{calibration.source}: frame {index} has pictures of different times ({listed}, …)")
+        now = next(iter(given.values()))
+        if now is not None:
+            times.append(now)
+    return frames, times if len(times) == len(frames) and len(frames) > 1 else []
+
+
+def _below(folder: Path, source: Path, name: str) -> Path:
+    for root in (folder, folder / "images", source.parent, source.parent / "images"):
+        path = root / name
+        if path.is_file() and path.resolve().is_relative_to(folder.resolve()):
+            return path
+    raise CaptureError(f"{folder / name}: no such file, but {source} names it")
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:SHOWN]) + (", …" if len(names) > SHOWN else "")

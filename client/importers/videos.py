@@ -1,0 +1,182 @@
+"""Frames from one video a camera, decoded by PyAV when they are looked at, exactly the frame asked for.
+
+The times of all frames are read from the packets, without decoding. A frame is found by going back to the key frame
+before it and decoding on until its own time comes; going forward frame by frame decodes each once.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.importers.calibration import Calibration
+from client.importers.extras import pyav
+from client.importers.source import Picture
+from scas4d_core.captures import CaptureError
+
+ENDS = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".mts", ".ts")
+RATE_TOLERANCE = 1e-3
+"""Largest relative difference of two cameras' rates: 29.97 and 30 differ by it."""
+
+
+class Video:
+    """One file.
+
+    Attributes:
+        times: [T] seconds of each frame since the first.
+        fps: mean frames per second.
+        size: (width, height) in pixels.
+
+    Raises:
+        CaptureError: no video, damaged, turned by its metadata, or fewer than one frame.
+        MissingExtra: PyAV is not there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._av = pyav()
+        self._lock = threading.Lock()
+        self._decoding: Iterator[Any] = iter(())
+        self._next = -1
+        try:
+            self._container = self._av.open(str(path))
+            if not self._container.streams.video:
+                raise CaptureError(f"{path}: has no video stream")
+            self._stream = self._container.streams.video[0]
+            self._stamps = sorted(
+                packet.pts for packet in self._container.demux(self._stream) if packet.pts is not None
+            )
+        except self._av.FFmpegError as fault:
+            raise CaptureError(f"{path}: cannot be read as video ({fault})") from fault
+        if not self._stamps:
+            raise CaptureError(f"{path}: has no frames with a time")
+        base = float(self._stream.time_base)
+        self.times: NDArray[np.float64] = (np.array(self._stamps) - self._stamps[0]) * base
+        self.size = (int(self._stream.codec_context.width), int(self._stream.codec_context.height))
+        rate = self._stream.average_rate or 0
+        self.fps = (len(self) - 1) / self.times[-1] if len(self) > 1 else float(rate)
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def frame(self, index: int) -> Picture:
+        """[H, W, 3] sRGB values of frame `index`.
+
+        Raises:
+            CaptureError: it cannot be decoded.
+        """
+        with self._lock:
+            wanted = self._stamps[index]
+            try:
+                if index != self._next:
+                    self._container.seek(wanted, stream=self._stream, backward=True)
+                    self._decoding = self._container.decode(self._stream)
+                for frame in self._decoding:
+                    if frame.pts == wanted:
+                        self._next = index + 1
+                        return self._pixels(frame)
+                    if frame.pts is not None and frame.pts > wanted:
+                        break
+            except self._av.FFmpegError as fault:
+                self._next = -1
+                raise CaptureError(f"{self.path}: frame {index} cannot be decoded ({fault})") from fault
+            self._next = -1
+            raise CaptureError(f"{self.path}: frame {index}, at {self.times[index]:.3f} s, cannot be decoded")
+
+    def _pixels(self, frame: Any) -> Picture:
+        if frame.rotation:
+            raise CaptureError(
+                f"{self.path}: its metadata turns the picture by {frame.rotation}°, and whether the calibration was of "
+                "turned pictures cannot be told; store the pixels as calibrated and drop the rotation"
+            )
+        picture: Picture = frame.to_ndarray(format="rgb24")
+        return picture
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._container.close()
+
+
+class Videos:
+    """One video a camera, of one rate, begun at one moment. The shortest says how many frames there are.
+
+    Raises:
+        CaptureError: a camera without a video, sizes or rates that differ from the calibration's or each other's.
+    """
+
+    def __init__(self, calibration: Calibration, files: Mapping[str, Path]) -> None:
+        self._videos = {camera: Video(files[camera]) for camera in calibration.names}
+        self.frame_count = min(len(video) for video in self._videos.values())
+        first = self._videos[calibration.names[0]]
+        self.fps: float | None = first.fps or None
+        for lens in calibration.cameras:
+            video = self._videos[lens.name]
+            if video.size != (lens.width, lens.height):
+                raise CaptureError(
+                    f"{video.path}: is {video.size[0]}x{video.size[1]} pixels, but camera {lens.name!r} was calibrated "
+                    f"for {lens.width}x{lens.height}; give the video at that size, or calibrate with it"
+                )
+            if abs(video.fps - first.fps) >= RATE_TOLERANCE * first.fps:
+                raise CaptureError(
+                    f"{video.path}: has {video.fps:.4g} frames per second, {first.path.name} {first.fps:.4g}; the "
+                    "cameras of a rig take their pictures together: convert the videos to one rate"
+                )
+        self._times = first.times
+        self._check_together(first)
+        self.remarks = [
+            f"{video.path.name} has {len(video) - self.frame_count} frames more than the shortest; they are left out"
+            for video in self._videos.values()
+            if len(video) > self.frame_count
+        ]
+
+    def _check_together(self, first: Video) -> None:
+        if self.frame_count < 2:
+            return
+        half = 0.5 / first.fps
+        for video in self._videos.values():
+            apart = np.abs(video.times[: self.frame_count] - first.times[: self.frame_count])
+            late = int(np.argmax(apart))
+            if apart[late] > half:
+                raise CaptureError(
+                    f"{video.path}: frame {late} is at {video.times[late]:.3f} s, that of {first.path.name} at "
+                    f"{first.times[late]:.3f} s: more than half a frame apart; frames were dropped, so cut or fill them"
+                )
+
+    def time(self, index: int) -> float | None:
+        """Seconds since the first frame."""
+        return float(self._times[index])
+
+    def file(self, index: int, camera: str) -> Path | None:
+        """None: a frame of a video has no file."""
+        return None
+
+    def decoded(self, index: int, camera: str) -> Picture:
+        """[H, W, 3]."""
+        return self._videos[camera].frame(index)
+
+
+def find_videos(folder: Path, calibration: Calibration) -> dict[str, Path]:
+    """``folder/<camera>.mp4`` (or another of `ENDS`) by camera.
+
+    Raises:
+        CaptureError: a camera has none, or two.
+    """
+    there = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDS)
+    found = {}
+    for camera in calibration.names:
+        own = [path for path in there if path.stem == camera]
+        if not own:
+            listed = ", ".join(path.name for path in there[:3]) or "no videos"
+            raise CaptureError(
+                f"{folder}: has no video of camera {camera!r} of {calibration.source}, only {listed}; "
+                f"name it {camera}.mp4"
+            )
+        if len(own) > 1:
+            raise CaptureError(f"{folder}: has {own[0].name} and {own[1].name} of one camera; leave one of them")
+        found[camera] = own[0]
+    return found
