@@ -22,6 +22,8 @@ from scas4d_core.captures import CaptureError
 ENDS = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".mts", ".ts")
 RATE_TOLERANCE = 1e-3
 """Largest relative difference of two cameras' rates: 29.97 and 30 differ by it."""
+ALIKE = 0.05
+"""Intervals between frames that differ by less are meant to be the same: stamps are rounded."""
 
 
 class Video:
@@ -63,6 +65,11 @@ class Video:
 
     def __len__(self) -> int:
         return len(self._stamps)
+
+    @property
+    def interval(self) -> float:
+        """Seconds between most frames and the next: dropped frames do not change it."""
+        return float(np.median(np.diff(self.times))) if len(self) > 1 else 0.0
 
     def frame(self, index: int) -> Picture:
         """[H, W, 3] sRGB values of frame `index`.
@@ -121,31 +128,31 @@ class Videos:
                     f"{video.path}: is {video.size[0]}x{video.size[1]} pixels, but camera {lens.name!r} was calibrated "
                     f"for {lens.width}x{lens.height}; give the video at that size, or calibrate with it"
                 )
-            if abs(video.fps - first.fps) >= RATE_TOLERANCE * first.fps:
-                raise CaptureError(
-                    f"{video.path}: has {video.fps:.4g} frames per second, {first.path.name} {first.fps:.4g}; the "
-                    "cameras of a rig take their pictures together: convert the videos to one rate"
-                )
         self._times = first.times
-        self._check_together(first)
+        for video in self._videos.values():
+            self._check_together(video, first)
         self.remarks = [
             f"{video.path.name} has {len(video) - self.frame_count} frames more than the shortest; they are left out"
             for video in self._videos.values()
             if len(video) > self.frame_count
         ]
 
-    def _check_together(self, first: Video) -> None:
-        if self.frame_count < 2:
-            return
-        half = 0.5 / first.fps
-        for video in self._videos.values():
-            apart = np.abs(video.times[: self.frame_count] - first.times[: self.frame_count])
-            late = int(np.argmax(apart))
-            if apart[late] > half:
+    def _check_together(self, video: Video, first: Video) -> None:
+        count = self.frame_count
+        if count > 1 and np.isclose(video.interval, first.interval, rtol=ALIKE):
+            apart = np.abs(video.times[:count] - first.times[:count])
+            late = int(np.argmax(apart > first.interval / 2))
+            if apart[late] > first.interval / 2:
                 raise CaptureError(
                     f"{video.path}: frame {late} is at {video.times[late]:.3f} s, that of {first.path.name} at "
-                    f"{first.times[late]:.3f} s: more than half a frame apart; frames were dropped, so cut or fill them"
+                    f"{first.times[late]:.3f} s, over half a frame apart: frames were dropped, or the rates differ "
+                    f"({video.fps:.5g} and {first.fps:.5g} frames per second); cut the videos before, or repair them"
                 )
+        if abs(video.fps - first.fps) >= RATE_TOLERANCE * first.fps:
+            raise CaptureError(
+                f"{video.path}: has {video.fps:.4g} frames per second, {first.path.name} {first.fps:.4g}; the "
+                "cameras of a rig take their pictures together: convert the videos to one rate"
+            )
 
     def time(self, index: int) -> float | None:
         """Seconds since the first frame."""
