@@ -81,6 +81,7 @@ class Feed(ABC):
             await self._mailbox.sent(self.id)
             self._changed.clear()
             if not (self.scene.committed and self.due()):
+                self._changes = 0
                 continue
             try:
                 await self._send_newest()
