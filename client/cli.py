@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import os
 import sys
 import time
@@ -30,24 +29,22 @@ Out = Annotated[Path, typer.Option(help="Where pictures go.")]
 
 @app.command()
 def serve(
-    host: Annotated[str, typer.Option(help="Address to listen at.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535)] = 8000,
-    data: Annotated[Path | None, typer.Option(help="Folder of the scenes; SCAS4D_DATA, else ./data.")] = None,
-    allow_remote: Annotated[bool, typer.Option(help="Listen beyond this machine, without any authentication.")] = False,
+    host: Annotated[
+        str | None, typer.Option(help="Address to listen at; beyond the loopback only with a token (SCAS4D_TOKEN).")
+    ] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="8000 where not set otherwise.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of the scenes; ./data where not set otherwise.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="TOML file of settings; docs/operations.md lists them. The environment wins.")
+    ] = None,
 ) -> None:
-    """Starts the service."""
-    if not (allow_remote or _loopback(host)):
-        raise typer.BadParameter(
-            f"{host} can be reached from other machines, and this version asks nobody who they are; "
-            "put an authenticating proxy before it and give --allow-remote",
-            param_hint="--host",
-        )
-    import uvicorn
-
-    from server.app import create_app
+    """Starts the service. What is not given here is read from the environment (SCAS4D_...), then from the file."""
+    if config is not None:
+        os.environ["SCAS4D_CONFIG"] = str(config)
+    from server.serve import serve as run
     from server.settings import ServerSettings
 
-    uvicorn.run(create_app(ServerSettings.from_environment(data=data)), host=host, port=port)
+    run(ServerSettings.from_environment(host=host, port=port, data=data))
 
 
 @app.command()
@@ -129,13 +126,6 @@ def evaluate(
 ) -> None:
     """Prints a capture's scores on its test cameras and ground truth; reconstructs it unless `out` has them already."""
     bench.quality([capture], out=out, frames=frames, preset=[preset], changes=changes, again=again)
-
-
-def _loopback(host: str) -> bool:
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _version(wanted: bool) -> None:

@@ -6,18 +6,27 @@ import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from fastapi import FastAPI
+from fastapi import APIRouter, FastAPI
 from fastapi.responses import RedirectResponse
+from starlette.middleware.cors import CORSMiddleware
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import WebSocketRoute
 
 from client import __version__
 from server import problems
+from server.auth import Door
 from server.hub import Hub
 from server.limits import BodyLimit
+from server.logs import AccessLog
 from server.placement import Placement
 from server.placement.local import LocalPlacement
-from server.routes import frames, health, parts, points, render, scenes, stream, tracks
+from server.problems import Problem
+from server.readiness import Readiness
+from server.routes import frames, health, metrics, parts, points, render, scenes, stream, tickets, tracks
 from server.scenes import Scenes
 from server.settings import ServerSettings
+from server.tickets import Tickets
 
 
 def create_app(settings: ServerSettings | None = None, placement: Placement | None = None) -> FastAPI:
@@ -29,8 +38,11 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         settings.data.mkdir(parents=True, exist_ok=True)
         app.state.hub = Hub(settings.max_subscribers, settings.stream_questions)
-        app.state.scenes = Scenes(settings, placement or LocalPlacement(), app.state.hub)
+        where = placement or LocalPlacement()
+        app.state.readiness = Readiness(settings, where)
+        app.state.scenes = Scenes(settings, where, app.state.hub)
         yield
+        await app.state.readiness.stop()
         await app.state.scenes.stop()
 
     app = FastAPI(
@@ -41,13 +53,43 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         responses=problems.RESPONSES,
     )
     app.state.settings = settings
+    app.state.tickets = Tickets(settings.ticket_seconds, settings.max_tickets)
     problems.install(app)
+    # The last one added is the first that a request meets.
     app.add_middleware(BodyLimit, limit=int(settings.max_body_mb * 1e6))
-    for resource in (scenes, points, frames, render, tracks, parts, stream, health):
+    if settings.allowed_origins:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.allowed_origins,
+            allow_methods=["*"],
+            allow_headers=["Authorization", "Content-Type"],
+            expose_headers=["*"],
+        )
+    app.add_middleware(Door, settings=settings, tickets=app.state.tickets)
+    app.add_middleware(AccessLog)
+    for resource in (scenes, points, frames, render, tracks, parts, stream, tickets, health, metrics):
         app.include_router(resource.router)
+        _answer_plain_requests(app, resource.router)
 
     @app.get("/", include_in_schema=False)
     async def root() -> RedirectResponse:
         return RedirectResponse("/docs")
 
     return app
+
+
+def _answer_plain_requests(app: FastAPI, router: APIRouter) -> None:
+    """At the address of a WebSocket, a request without an upgrade is told so (426), not that there is nothing."""
+
+    async def upgrade(request: Request) -> Response:
+        raise Problem(
+            426,
+            "this address is a WebSocket",
+            field="Upgrade",
+            remedy="connect with ws:// or wss://",
+            headers={"Upgrade": "websocket", "Connection": "Upgrade"},
+        )
+
+    for route in router.routes:
+        if isinstance(route, WebSocketRoute):
+            app.add_route(route.path, upgrade, methods=["GET"], include_in_schema=False)

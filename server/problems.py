@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any
@@ -12,12 +13,15 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
+from starlette.types import Receive, Scope, Send
 
 from client.wire import ProblemDetails
 
 MEDIA_TYPE = "application/problem+json"
 VALUE_LENGTH = 200
 """A value quoted in an answer is cut here: it may be a whole cloud."""
+
+JSON = re.compile(r"application/([\w.-]+\+)?json")
 
 log = logging.getLogger("scas4d.server")
 
@@ -70,6 +74,15 @@ def answer(document: ProblemDetails, headers: Mapping[str, str] | None = None) -
     return Response(body, document.status, dict(headers or {}), media_type=MEDIA_TYPE)
 
 
+async def refuse(problem: Problem, scope: Scope, receive: Receive, send: Send) -> None:
+    """Answers a request, or a WebSocket's handshake, from outside the routes."""
+    if scope["type"] == "websocket" and "websocket.http.response" not in scope.get("extensions", {}):
+        # The server cannot answer a handshake with a document: 1008 is a violated policy; a reason has 123 bytes.
+        await send({"type": "websocket.close", "code": 1008, "reason": str(problem.document.detail)[:120]})
+        return
+    await answer(problem.document, problem.headers)(scope, receive, send)
+
+
 def install(app: FastAPI) -> None:
     """Makes the application answer every error as a problem document."""
 
@@ -77,13 +90,17 @@ def install(app: FastAPI) -> None:
         assert isinstance(error, HTTPException)
         if isinstance(error, Problem):
             return answer(error.document, error.headers)
-        title = HTTPStatus(error.status_code).phrase
-        document = ProblemDetails(title=title, status=error.status_code, detail=str(error.detail))
-        return answer(document, error.headers)
+        return answer(_of_framework(request, error), error.headers)
 
     async def from_validation(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
         first = error.errors()[0]
+        given = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+        if first["loc"][0] == "body" and given and not JSON.fullmatch(given):
+            problem = Problem(
+                415, f"the body is {given}", field="Content-Type", value=given, remedy="send application/json"
+            )
+            return answer(problem.document)
         field = ".".join(str(part) for part in first["loc"])
         fault = first["msg"].removeprefix("Value error, ")
         others = len(error.errors()) - 1
@@ -107,27 +124,54 @@ def install(app: FastAPI) -> None:
         )
         return answer(document)
 
-    described = app.openapi
-
-    def openapi() -> dict[str, Any]:
-        """The document, with the media type that errors really have (FastAPI writes application/json)."""
-        document = described()
-        for operations in document["paths"].values():
-            for operation in operations.values():
-                for status in RESPONSES:
-                    content = operation["responses"].get(str(status), {}).get("content", {})
-                    if "application/json" in content:
-                        content[MEDIA_TYPE] = content.pop("application/json")
-        return document
-
-    app.openapi = openapi  # type: ignore[method-assign]
+    app.openapi = lambda: document(app)  # type: ignore[method-assign]
     app.add_exception_handler(HTTPException, from_problem)
     app.add_exception_handler(RequestValidationError, from_validation)
     app.add_exception_handler(Exception, from_fault)
 
 
+def _of_framework(request: Request, error: HTTPException) -> ProblemDetails:
+    """What Starlette and FastAPI refuse by themselves: no such path, no such method, a body that is no form."""
+    field = value = remedy = None
+    if error.status_code == 404:
+        field, value, remedy = "path", quoted(request.url.path), "GET /openapi.json lists all paths"
+    elif error.status_code == 405:
+        allowed = (error.headers or {}).get("Allow", "another")
+        field, value, remedy = "method", request.method, f"use {allowed}"
+    elif error.status_code == 400:
+        field, remedy = "body", "send the body that Content-Type says; the schema is at /openapi.json"
+    return ProblemDetails(
+        title=HTTPStatus(error.status_code).phrase,
+        status=error.status_code,
+        detail=str(error.detail),
+        field=field,
+        value=value,
+        remedy=remedy,
+    )
+
+
+def document(app: FastAPI) -> dict[str, Any]:
+    """The OpenAPI document, with what FastAPI does not know: the media type of errors, and the token."""
+    if app.openapi_schema is None:
+        written = FastAPI.openapi(app)
+        for path, operations in written["paths"].items():
+            for operation in operations.values():
+                for status in RESPONSES:
+                    content = operation["responses"].get(str(status), {}).get("content", {})
+                    if "application/json" in content:
+                        content[MEDIA_TYPE] = content.pop("application/json")
+                if path == "/health/live":
+                    operation["security"] = []
+        schemes = written.setdefault("components", {}).setdefault("securitySchemes", {})
+        schemes["bearer"] = {"type": "http", "scheme": "bearer", "description": "Where the service has a token."}
+        written["security"] = [{"bearer": []}]
+    assert app.openapi_schema is not None  # FastAPI.openapi keeps what it returns
+    return app.openapi_schema
+
+
 RESPONSES: dict[int | str, dict[str, Any]] = {
     "4XX": {"description": "What was wrong, with which value, and what to do.", "model": ProblemDetails},
+    "5XX": {"description": "The service failed, or cannot answer now.", "model": ProblemDetails},
     422: {"description": "A field that cannot be.", "model": ProblemDetails},
 }
 """For the OpenAPI document."""

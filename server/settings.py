@@ -1,25 +1,93 @@
-"""Settings of the service. Each can be given by the environment as SCAS4D_<NAME>."""
+"""Settings of the service: by argument, by environment (SCAS4D_<NAME>), by a TOML file (SCAS4D_CONFIG), by default.
+
+The first of these that names a setting decides. docs/operations.md has the table of all, written from here.
+"""
 
 from __future__ import annotations
 
+import ipaddress
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field, SecretStr, ValidationError, field_validator, model_validator
+from pydantic_settings import (
+    BaseSettings,
+    EnvSettingsSource,
+    NoDecode,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+    TomlConfigSettingsSource,
+)
+
+PREFIX = "SCAS4D_"
+CONFIG = "SCAS4D_CONFIG"
+"""Names the TOML file; no setting itself."""
+
+TOKEN = re.compile(r"[A-Za-z0-9._~+/=-]{16,512}")
+"""What can stand behind `Authorization: Bearer` (RFC 6750), and is long enough not to be guessed."""
+
+Names = Annotated[tuple[str, ...], NoDecode]
+"""Several names; in the environment with commas between."""
 
 
-class ServerSettings(BaseModel):
+class SettingsError(ValueError):
+    """A setting that cannot be: which, and what to do. Never quotes the value: it may be a secret."""
+
+
+class ServerSettings(BaseSettings):
     """What the one who runs the service may choose."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = SettingsConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True, env_prefix=PREFIX)
 
     data: Path = Field(default=Path("data"), description="Folder of the scenes; made when missing.")
     engine: str = Field(
         default="server.engine:core_engine",
         description="module:function that makes the engine of a scene, called once in each of its processes.",
     )
+
+    host: str = Field(
+        default="127.0.0.1", description="Address to listen at. Beyond the loopback only together with a token."
+    )
+    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen at; 0 takes a free one.")
+    token: SecretStr | None = Field(
+        default=None,
+        description="Every request but /health/live, the viewer's page and the API's description has to bear it "
+        "(Authorization: Bearer). None: whoever is on this machine may do everything.",
+    )
+    token_file: Path | None = Field(
+        default=None, description="File with the token, for those who mount secrets; not together with `token`."
+    )
+    allowed_hosts: Names = Field(
+        default=(),
+        description="Names under which the service may be addressed (Host), besides those of the loopback and the "
+        "address that it listens at: `studio.example`, or `studio.example:8443` for one port only. A name that is not "
+        "here is refused: it may be an attacker's, pointed at this machine.",
+    )
+    allowed_origins: Names = Field(
+        default=(),
+        description="Other sites whose pages may use the service, as `https://viewer.example`; pages of the service "
+        "itself always may.",
+    )
+    ticket_seconds: float = Field(
+        default=30.0, gt=0, le=3600, description="Life of a ticket for a browser's WebSocket; it is used once."
+    )
+    max_tickets: int = Field(default=1024, ge=1, description="Tickets that wait to be used; more get 429.")
+
+    log_format: Literal["json", "text"] = Field(default="json", description="One JSON object a line, or plain lines.")
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="info", description="info has a line a request."
+    )
+
     max_scenes: int = Field(default=8, ge=1, description="Each holds two processes and some hundred megabytes.")
+    max_scene_memory_mb: float | None = Field(
+        default=None,
+        gt=0,
+        description="A scene that is estimated (POST /v1/estimate) to take more is refused; the machine's memory where "
+        "not given.",
+    )
     queue_frames: int = Field(
         default=4, ge=1, description="Frames of a scene acknowledged and not finished; more get 429."
     )
@@ -48,14 +116,98 @@ class ServerSettings(BaseModel):
     stop_seconds: float = Field(
         default=5.0, gt=0, description="Grace for a worker to end by itself at shutdown and delete."
     )
+    warm_up: bool = Field(
+        default=True, description="Compile or load the kernels at start, in a process beside; /health/ready waits."
+    )
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """What is constructed here holds what is given; `from_environment` reads the environment and the file."""
+        return (init_settings,)
+
+    @field_validator("allowed_hosts", "allowed_origins", mode="before")
+    @classmethod
+    def _split(cls, value: Any) -> Any:
+        return tuple(name.strip() for name in value.split(",") if name.strip()) if isinstance(value, str) else value
+
+    @field_validator("allowed_origins")
+    @classmethod
+    def _origins(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for origin in value:
+            if not re.fullmatch(r"https?://[^/\s]+", origin):
+                raise ValueError("an origin is scheme://host or scheme://host:port, without a path")
+        return value
+
+    @model_validator(mode="after")
+    def _guarded(self) -> ServerSettings:
+        if self.token is not None and self.token_file is not None:
+            raise ValueError("token and token_file are two tokens; give one of them")
+        if self.token_file is not None and not self.token_file.is_file():
+            raise ValueError(f"token_file: there is no file {self.token_file}")
+        secret = self.secret
+        if secret is not None and not TOKEN.fullmatch(secret):
+            raise ValueError(
+                "the token has to be 16 to 512 of the characters A-Z a-z 0-9 . _ ~ + / = -; make one with: "
+                'python -c "import secrets; print(secrets.token_urlsafe(32))"'
+            )
+        if secret is None and not is_loopback(self.host):
+            raise ValueError(
+                f"host {self.host} can be reached from other machines, and there is no token; set SCAS4D_TOKEN or "
+                "SCAS4D_TOKEN_FILE, or listen at 127.0.0.1"
+            )
+        return self
+
+    @property
+    def secret(self) -> str | None:
+        """The token itself."""
+        if self.token_file is not None:
+            return self.token_file.read_text(encoding="utf-8", errors="replace").strip()
+        return None if self.token is None else self.token.get_secret_value()
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] | None = None, **given: object) -> ServerSettings:
-        """The defaults, overridden by the environment, overridden by what is given (None counts as not given)."""
+        """The defaults, overridden by the file, by the environment, by what is given (None counts as not given).
+
+        Raises:
+            SettingsError: names the setting and what to do.
+        """
         environment = os.environ if environment is None else environment
-        read = {
-            name: environment[f"SCAS4D_{name.upper()}"]
-            for name in cls.model_fields
-            if f"SCAS4D_{name.upper()}" in environment
-        }
-        return cls.model_validate(read | {name: value for name, value in given.items() if value is not None})
+        source = EnvSettingsSource(cls)
+        source.env_vars = {name.lower(): value for name, value in environment.items()}
+        read = source()
+        file = environment.get(CONFIG)
+        if file is not None and not Path(file).is_file():
+            raise SettingsError(f"{CONFIG}: there is no file {file}; name a TOML file")
+        try:
+            written = {} if file is None else TomlConfigSettingsSource(cls, toml_file=Path(file))()
+        except ValueError as error:  # tomllib's says line and column
+            raise SettingsError(f"{CONFIG}: {file} is no TOML ({error})") from None
+        try:
+            return cls.model_validate({**written, **read, **{n: v for n, v in given.items() if v is not None}})
+        except ValidationError as error:
+            first = error.errors(include_input=False)[0]
+            name = ".".join(str(part) for part in first["loc"])
+            known = "" if first["type"] != "extra_forbidden" else f"; the settings are {', '.join(cls.model_fields)}"
+            fault = first["msg"].removeprefix("Value error, ")
+            raise SettingsError((f"setting {name}: " if name else "") + fault + known) from None
+
+
+def unknown(environment: Mapping[str, str]) -> list[str]:
+    """Names that look like settings and are none: misspelt, most likely."""
+    known = {f"{PREFIX}{name.upper()}" for name in ServerSettings.model_fields} | {CONFIG}
+    return sorted(name for name in environment if name.upper().startswith(PREFIX) and name.upper() not in known)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether nothing but this machine reaches the address."""
+    try:
+        return host.lower() == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False

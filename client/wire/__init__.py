@@ -26,7 +26,7 @@ from client.wire.scenes import (
     SceneState,
     SceneStatus,
 )
-from client.wire.service import Health, ProblemDetails
+from client.wire.service import Health, ProblemDetails, Ticket
 from client.wire.tracks import TracksModel, TracksRequest, tracks_model
 from client.wire.views import RenderFormat, RenderKind, RenderRequest, Unit
 
@@ -66,6 +66,7 @@ __all__ = [
     "SceneList",
     "SceneState",
     "SceneStatus",
+    "Ticket",
     "TracksModel",
     "TracksRequest",
     "Unit",

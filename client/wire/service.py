@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from client.wire.base import Model
 
@@ -15,6 +15,17 @@ class Health(Model):
     status: Literal["live", "ready"]
     version: str
     scenes: int
+    ready_after: float | None = Field(
+        default=None, description="Seconds from the start of the service until its kernels were warmed up."
+    )
+
+
+class Ticket(Model):
+    """Opens one WebSocket from a browser, which cannot send a bearer token with it."""
+
+    ticket: str
+    subprotocol: str = Field(description="To offer in Sec-WebSocket-Protocol, beside that of the stream.")
+    seconds: float = Field(description="It lives so long.")
 
 
 class ProblemDetails(BaseModel):

@@ -21,7 +21,12 @@ class LocalProcess:
     """A spawned process. Two threads move its messages, so that the event loop never waits on a pipe."""
 
     def __init__(
-        self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[str], None]
+        self,
+        entry: Entry,
+        spec: Any,
+        on_message: Callable[[Any], None],
+        on_end: Callable[[str], None],
+        prepare: Callable[[], None] | None = None,
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._on_message = on_message
@@ -30,7 +35,7 @@ class LocalProcess:
         self._reaping = threading.Lock()  # two threads that wait for one process confuse multiprocessing
         self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._connection, theirs = _context.Pipe()
-        self._process = _context.Process(target=entry, args=(spec, theirs), daemon=True)
+        self._process = _context.Process(target=_run, args=(prepare, entry, spec, theirs), daemon=True)
         # Starting takes some 20 ms and blocks; it is done on the event loop, once a scene.
         self._process.start()
         theirs.close()
@@ -93,11 +98,24 @@ class LocalProcess:
             self._loop.call_soon_threadsafe(function, argument)
 
 
+def _run(prepare: Callable[[], None] | None, entry: Entry, spec: Any, connection: Connection[Any, Any]) -> None:
+    if prepare is not None:
+        prepare()
+    entry(spec, connection)
+
+
 class LocalPlacement:
-    """Runs every scene on this machine."""
+    """Runs every scene on this machine.
+
+    Args:
+        prepare: called first thing in every process, as to set up its logs; has to pickle.
+    """
+
+    def __init__(self, prepare: Callable[[], None] | None = None) -> None:
+        self.prepare = prepare
 
     def start(
         self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[str], None]
     ) -> LocalProcess:
         """Spawns the process."""
-        return LocalProcess(entry, spec, on_message, on_end)
+        return LocalProcess(entry, spec, on_message, on_end, self.prepare)

@@ -1,23 +1,25 @@
-"""Is the service there, and does it take scenes?"""
+"""Is the service there, and can it work?"""
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Request
 
 from client import __version__
 from client.wire import Health
+from server.readiness import Readiness
 from server.routes.access import AllScenes
 
-router = APIRouter(prefix="/health", tags=["health"])
+router = APIRouter(prefix="/health", tags=["service"])
 
 
 @router.get("/live")
 async def live(scenes: AllScenes) -> Health:
-    """The process answers."""
+    """The process answers. The only request that never asks for a token."""
     return Health(status="live", version=__version__, scenes=len(scenes.by_id))
 
 
 @router.get("/ready")
-async def ready(scenes: AllScenes) -> Health:
-    """The service takes scenes. Kernels are compiled by each scene's own process, at its first frame."""
-    return Health(status="ready", version=__version__, scenes=len(scenes.by_id))
+async def ready(request: Request, scenes: AllScenes) -> Health:
+    """The kernels are compiled and the service takes frames; `ready_after` says how long that took. 503 until then."""
+    readiness: Readiness = request.app.state.readiness
+    return Health(status="ready", version=__version__, scenes=len(scenes.by_id), ready_after=readiness.check())

@@ -41,9 +41,9 @@ class Running:
         self.thread.join(20)
 
 
-def fake_settings(folder):
+def fake_settings(folder, **changes):
     """Small limits, so that tests reach them."""
-    return ServerSettings(
+    given = dict(
         data=folder,
         engine="fakes:engine",
         queue_frames=2,
@@ -51,7 +51,9 @@ def fake_settings(folder):
         max_scenes=4,
         max_points=1000,
         max_track_points=5000,
+        warm_up=False,
     )
+    return ServerSettings(**given | changes)
 
 
 def make_rig(count=2):

@@ -1,0 +1,117 @@
+"""Structured logs: one JSON object a line on stderr, from every process of the service. No secret is ever in one."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import time
+from datetime import UTC, datetime
+from typing import Any, Literal
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+SECRETS = re.compile(r"(?i)(bearer\s+|scas4d\.ticket\.|(?:token|ticket)=)[^\s\"',;&]+")
+"""What follows is hidden wherever it appears: it comes from clients, and may turn up in any message."""
+
+_PLAIN = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName"}
+
+access = logging.getLogger("scas4d.access")
+
+
+def hidden(text: str) -> str:
+    """The text without tokens and tickets."""
+    return SECRETS.sub(r"\1***", text)
+
+
+class JsonFormatter(logging.Formatter):
+    """time, level, logger, message, process, what was given as `extra`, and the traceback of an exception."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One line."""
+        entry: dict[str, Any] = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+            "process": record.process,
+        }
+        entry |= {name: value for name, value in record.__dict__.items() if name not in _PLAIN}
+        if record.exc_info:
+            entry["exception"] = self.formatException(record.exc_info)
+        return hidden(json.dumps(entry, default=str))
+
+
+class TextFormatter(logging.Formatter):
+    """For people."""
+
+    def __init__(self) -> None:
+        super().__init__("%(asctime)s %(levelname)s %(name)s: %(message)s")
+
+    def format(self, record: logging.LogRecord) -> str:
+        """A line, or several with a traceback."""
+        more = " ".join(f"{name}={value}" for name, value in record.__dict__.items() if name not in _PLAIN)
+        return hidden(super().format(record) + (f" [{more}]" if more else ""))
+
+
+def configure(format: Literal["json", "text"] = "json", level: str = "info") -> None:
+    """Sends all logs of this process to stderr. Called first thing in the service and in each of its processes."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(JsonFormatter() if format == "json" else TextFormatter())
+    root = logging.getLogger()
+    root.handlers[:] = [handler]
+    root.setLevel(logging.WARNING)
+    for name in ("scas4d", "uvicorn"):
+        logging.getLogger(name).setLevel(level.upper())
+    # uvicorn logs a WebSocket with its whole address; `AccessLog` logs it without what follows the question mark.
+    logging.getLogger("uvicorn.error").addFilter(lambda record: '"WebSocket %s"' not in str(record.msg))
+
+
+class AccessLog:
+    """A line a request and a line a WebSocket: method, path (no query), status, seconds, bytes. No headers."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Passes the request on and logs how it ended."""
+        if scope["type"] not in ("http", "websocket") or not access.isEnabledFor(logging.INFO):
+            await self.app(scope, receive, send)
+            return
+        began = time.perf_counter()
+        status, taken, given = 0, 0, 0
+
+        async def receiving() -> Message:
+            nonlocal taken
+            message = await receive()
+            taken += len(message.get("body") or message.get("bytes") or message.get("text") or b"")
+            return message
+
+        async def sending(message: Message) -> None:
+            nonlocal status, given
+            if "status" in message:
+                status = message["status"]
+            elif message["type"] == "websocket.accept":
+                status = 101
+            given += len(message.get("body") or message.get("bytes") or message.get("text") or b"")
+            await send(message)
+
+        try:
+            await self.app(scope, receiving, sending)
+        finally:
+            method = scope.get("method", "WEBSOCKET")
+            access.info(
+                "%s %s %d",
+                method,
+                scope["path"],
+                status,
+                extra={
+                    "method": method,
+                    "path": scope["path"],
+                    "status": status,
+                    "seconds": round(time.perf_counter() - began, 4),
+                    "bytes_in": taken,
+                    "bytes_out": given,
+                    "client": (scope.get("client") or ("",))[0],
+                },
+            )

@@ -1,0 +1,99 @@
+"""What Prometheus reads at /metrics. Counters are counted where the thing happens; gauges are read when asked."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping
+from typing import Protocol
+
+from prometheus_client import CollectorRegistry, Counter, Histogram
+from prometheus_client.core import GaugeMetricFamily, Metric
+
+from client.wire import FrameReportModel, SceneState, SceneStatus
+from server.hub import Hub
+from server.settings import ServerSettings
+
+SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 4, 8, 16, 32, 64, 128, 256)
+
+registry = CollectorRegistry()
+"""Of this process, without the interpreter's own metrics."""
+
+FRAMES = Counter(
+    "scas4d_frames",
+    "Frames by what became of them: acknowledged, committed, set_aside, skipped, missing.",
+    ["state"],
+    registry=registry,
+)
+INGEST_BYTES = Counter("scas4d_ingest_bytes", "Encoded pictures and masks of acknowledged frames.", registry=registry)
+UPDATE_SECONDS = Histogram(
+    "scas4d_update_seconds", "A committed frame, by stage.", ["stage"], buckets=SECONDS, registry=registry
+)
+ANSWER_SECONDS = Histogram(
+    "scas4d_answer_seconds",
+    "From the question to the answer of a scene's reader, by kind (render, tracks, parts, ply) and outcome.",
+    ["kind", "outcome"],
+    buckets=SECONDS,
+    registry=registry,
+)
+STREAM_MISSED = Counter(
+    "scas4d_stream_missed",
+    "Messages that slow subscribers missed because a newer one took their place.",
+    registry=registry,
+)
+RESTARTS = Counter(
+    "scas4d_process_restarts",
+    "Processes of scenes that ended by themselves and were replaced.",
+    ["process"],
+    registry=registry,
+)
+for state in ("acknowledged", "committed", "set_aside", "skipped", "missing"):
+    FRAMES.labels(state)
+
+
+def finished(report: FrameReportModel) -> None:
+    """Counts a frame that ended, and what its update took."""
+    FRAMES.labels(report.state.value).inc()
+    for stage, seconds in report.seconds.items():
+        UPDATE_SECONDS.labels(stage).observe(seconds)
+
+
+class HasStatus(Protocol):
+    """A scene, as far as it is looked at here."""
+
+    def status(self) -> SceneStatus:
+        """As it is now."""
+
+
+class State:
+    """Gauges of a service: scenes, queues, subscribers, disk."""
+
+    def __init__(
+        self, settings: ServerSettings, scenes: Mapping[str, HasStatus], hub: Hub, ready_after: float | None
+    ) -> None:
+        self.settings = settings
+        self.scenes = scenes
+        self.hub = hub
+        self.ready_after = ready_after
+
+    def collect(self) -> Iterator[Metric]:
+        """As it is now."""
+        statuses = [scene.status() for scene in list(self.scenes.values())]
+        by_state = GaugeMetricFamily("scas4d_scenes", "Scenes by state.", labels=["state"])
+        for state in SceneState:
+            by_state.add_metric([state.value], sum(status.state == state for status in statuses))
+        yield by_state
+        for name, help, field in (
+            ("scas4d_queue_frames", "Frames acknowledged and not finished.", "queued"),
+            ("scas4d_committed_frames", "Frames that can be rendered and tracked.", "committed"),
+            ("scas4d_gaussians", "Gaussians.", "gaussians"),
+        ):
+            gauge = GaugeMetricFamily(name, help, labels=["scene"])
+            for status in statuses:
+                gauge.add_metric([status.id], getattr(status, field) or 0)
+            yield gauge
+        yield GaugeMetricFamily("scas4d_subscribers", "WebSockets that listen to scenes.", value=self.hub.count())
+        free = shutil.disk_usage(self.settings.data).free
+        yield GaugeMetricFamily("scas4d_disk_free_bytes", "On the disk of the data folder.", value=free)
+        if self.ready_after is not None:
+            help = "From the start of the service until its kernels were warmed up."
+            yield GaugeMetricFamily("scas4d_ready_after_seconds", help, value=self.ready_after)

@@ -1,0 +1,24 @@
+"""For Prometheus."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request
+from fastapi.responses import PlainTextResponse, Response
+from prometheus_client import CollectorRegistry
+from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
+
+from server import metrics as counted
+from server.readiness import Readiness
+from server.routes.access import AllScenes, TheSettings
+
+router = APIRouter(tags=["service"])
+
+
+@router.get("/metrics", response_class=PlainTextResponse)
+async def metrics(request: Request, scenes: AllScenes, settings: TheSettings) -> Response:
+    """Counters, histograms and gauges in the text format of Prometheus."""
+    readiness: Readiness = request.app.state.readiness
+    gauges = CollectorRegistry()
+    gauges.register(counted.State(settings, scenes.by_id, request.app.state.hub, readiness.after))
+    text = generate_latest(counted.registry) + generate_latest(gauges)
+    return Response(text, media_type=CONTENT_TYPE_PLAIN_0_0_4)

@@ -1,0 +1,18 @@
+"""Tickets for browsers' WebSockets."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request
+
+from client.wire import Ticket
+from server.tickets import SUBPROTOCOL, Tickets
+
+router = APIRouter(prefix="/v1/tickets", tags=["service"])
+
+
+@router.post("", status_code=201)
+async def issue(request: Request) -> Ticket:
+    """A ticket that opens one WebSocket within seconds; asked for with the token."""
+    tickets: Tickets = request.app.state.tickets
+    ticket = tickets.issue()
+    return Ticket(ticket=ticket, subprotocol=SUBPROTOCOL + ticket, seconds=tickets.seconds)
