@@ -64,8 +64,8 @@ def test_the_demo_starts_a_service_and_leaves_pictures(capture_folder, tmp_path)
 
 def test_serve_refuses_to_listen_beyond_this_machine():
     done = scas4d("serve", "--host", "0.0.0.0")
-    assert done.returncode == 2
-    assert "--allow-remote" in done.stderr
+    assert done.returncode == 1
+    assert "SCAS4D_TOKEN" in done.stderr
 
 
 @pytest.mark.parametrize(
