@@ -87,6 +87,9 @@ class Engine(Protocol):
     def reader(self, rig: Rig, settings: Any, history: History) -> Reader:
         """Reads what was committed to a history; made anew when the history has grown."""
 
+    def warm_up(self) -> None:
+        """Compiles or loads what the first frames would wait for; called once, in a process of its own."""
+
 
 class CoreEngine:
     """The method itself. Numba is imported where it is used: the door does without."""
@@ -117,6 +120,12 @@ class CoreEngine:
         from scas4d_core.reconstruction import Reconstruction
 
         return Reconstruction.resume(rig, settings, history, held=held)
+
+    def warm_up(self) -> None:
+        """`scas4d_core.warm_up`."""
+        from scas4d_core.warm_up import warm_up
+
+        warm_up()
 
     def reader(self, rig: Rig, settings: Any, history: History) -> Reader:
         """`Committed`, on one thread: the others belong to the update."""

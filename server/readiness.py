@@ -36,9 +36,7 @@ def main(engine: str, connection: Connection[Any, Any]) -> None:
     """The process: warms up, says so, ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        warm_up = getattr(load_engine(engine), "warm_up", None)
-        if warm_up is not None:
-            warm_up()
+        load_engine(engine).warm_up()
         connection.send(WarmedUp())
     except Exception as error:
         log.exception("the kernels could not be warmed up")

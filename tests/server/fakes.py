@@ -143,6 +143,10 @@ class FakeEngine:
     def reader(self, rig, settings, history):
         return FakeReader(rig, history)
 
+    def warm_up(self):
+        if "SCAS4D_FAKE_FAULT" in os.environ:
+            raise FloatingPointError("the fake was told to raise")
+
 
 def engine():
     return FakeEngine()

@@ -1,0 +1,63 @@
+"""Every kernel that a scene needs, compiled or loaded from the cache, before the first picture comes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scas4d_core.cameras import Camera, Rig
+from scas4d_core.captures import Frame, InitialPoints
+from scas4d_core.settings import Settings
+
+SIZE, BALL_M = 32, 0.4
+
+
+def warm_up() -> None:
+    """Reconstructs two frames of a ball, 32x32 pixels and a few dozen iterations, once with masks and once without.
+
+    Kernels are compiled for types, not for sizes: what this leaves in the cache (`kernels.jit`) serves all scenes.
+    """
+    from scas4d_core.reconstruction import Reconstruction
+
+    settings = Settings.model_validate({"static": {"iterations": 30, "densify_from": 5, "densify_every": 10}})
+    settings = settings.model_copy(update={"update": settings.update.model_copy(update={"iterations": 4})})
+    rig = _rig()
+    points = _points()
+    for masked in (True, False):
+        reconstruction = Reconstruction.start(rig, _frame(rig, 0, masked), settings, points=points)
+        for index in (1, 2):
+            reconstruction.step(_frame(rig, index, masked))
+        camera = rig.cameras[0]
+        reconstruction.render(camera)
+        reconstruction.tracks_of_pixels(camera, np.array([[SIZE / 2, SIZE / 2]]), 0, [0, 1])
+        reconstruction.parts(2)
+
+
+def _rig() -> Rig:
+    """Six cameras around the ball, at the height of its centre."""
+    lens = np.array([[1.2 * SIZE, 0, SIZE / 2], [0, 1.2 * SIZE, SIZE / 2], [0, 0, 1]])
+    cameras = []
+    for k in range(6):
+        c, s = np.cos(np.pi * k / 3), np.sin(np.pi * k / 3)
+        pose = np.eye(4)
+        pose[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
+        pose[2, 3] = 2.0
+        cameras.append(Camera(f"c{k}", lens, pose, SIZE, SIZE))
+    return Rig(tuple(cameras))
+
+
+def _frame(rig: Rig, index: int, masked: bool) -> Frame:
+    """A ball that moves to the right, pixel by pixel."""
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+    ball = np.hypot(rows - SIZE / 2, columns - SIZE / 2 - index) < BALL_M / 2.0 * 1.2 * SIZE
+    image = np.zeros((SIZE, SIZE, 3), np.uint8)
+    image[ball] = np.stack([8 * rows, 8 * columns, rows + columns], -1)[ball]
+    names = rig.names
+    masks = {name: ball.astype(np.uint8) for name in names} if masked else {}
+    return Frame(index, index / 30, {name: image for name in names}, masks)
+
+
+def _points() -> InitialPoints:
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(400, 3))
+    positions = BALL_M * normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return InitialPoints(positions, np.full((400, 3), 0.5, np.float32), None)
