@@ -1,149 +1,171 @@
 """Front-to-back blending of tiles, forward and backward. Twin: ``rasterize.twin.render``.
 
-Loops run over fixed rows of 16 pixels so that LLVM turns each statement into one vector instruction.
+A tile is 8×8 blocks of 4×4 pixels, and a block is one ``Lanes``. Of a Gaussian, the blocks that its support meets are
+visited (``tiles.cover``), in the order of their bits.
 """
 
 from __future__ import annotations
 
+from math import log2
+
 import numpy as np
 from numba import prange
 
+from scas4d_core.kernels import lanes
 from scas4d_core.kernels.jit import HALF, ONE, TWO, ZERO, inline, kernel, parallel_kernel
-from scas4d_core.kernels.projection import CONIC_A, CONIC_B, CONIC_C, MEAN_X, MEAN_Y, OPACITY, REACH, TILE
+from scas4d_core.kernels.projection import CONIC_A, CONIC_B, CONIC_C, LOG_OPACITY, MEAN_X, MEAN_Y, TILE
 
 # Columns of a pair's gradient record: sums over the tile's pixels of dL/dpower times the monomials of the offset
 # (dx, dy), then the features.
 SUM_1, SUM_X, SUM_Y, SUM_XX, SUM_XY, SUM_YY, FEATURES = range(7)
 
 GROUP = 4
-"""Channels are blended four at a time, written out: the compiler vectorizes along the pixels of a row only then."""
+"""Channels are blended four at a time, written out."""
 
-EXP_LOWEST = np.float32(-6.0)
-"""exp is needed for powers down to log(1/255) = -5.55 only: fainter is outside the support."""
+BLOCK = lanes.ACROSS
+BLOCKS = (TILE // BLOCK) ** 2
+BLOCK_X = np.array([BLOCK * (block >> 3) for block in range(BLOCKS)], np.float32)
+BLOCK_Y = np.array([BLOCK * (block & 7) for block in range(BLOCKS)], np.float32)
+AHEAD = 4
+"""Entries that a Gaussian's numbers are asked for before they are used: they lie anywhere in memory."""
+
+HALF_LOG2_E = np.float32(0.5 * 1.4426950408889634)
+"""Powers are of 2 inside: alpha = 2^(log2(opacity) − HALF_LOG2_E · quadratic form)."""
 
 
-@inline
-def exp_in_support(power):
-    """exp(power) for power in [-6, 0], relative error 3e-7: a polynomial on power/8, squared three times."""
-    x = max(power, EXP_LOWEST) * np.float32(0.125)
-    y = np.float32(1.0 / 5040.0)
-    y = y * x + np.float32(1.0 / 720.0)
-    y = y * x + np.float32(1.0 / 120.0)
-    y = y * x + np.float32(1.0 / 24.0)
-    y = y * x + np.float32(1.0 / 6.0)
-    y = y * x + HALF
-    y = y * x + ONE
-    y = y * x + ONE
-    y = y * y
-    y = y * y
-    return y * y
+def record_columns(channels: int) -> int:
+    """Columns of a gradient record: whole ``Lanes``."""
+    return -(-(FEATURES + channels) // lanes.COUNT) * lanes.COUNT
 
 
 @inline
-def rows_reached(splat, top):
-    """First and last (exclusive) row of a tile that the support's box meets."""
-    determinant = splat[CONIC_A] * splat[CONIC_C] - splat[CONIC_B] * splat[CONIC_B]
-    half = np.float32(np.sqrt(splat[REACH] * splat[CONIC_A] / max(determinant, np.float32(1e-30)))) + np.float32(0.01)
-    first = int(max(np.floor(splat[MEAN_Y] - half - HALF - top), ZERO))
-    last = int(min(np.ceil(splat[MEAN_Y] + half + HALF - top), np.float32(TILE)))
-    return first, max(first, last)
+def opened(cover):
+    """A cover without its lowest block."""
+    return cover & (cover - np.uint64(1))
 
 
 @inline
-def row_is_reached(a, b, c, reach, slope, low_x, dy):
-    """Whether the support meets a row of 16 pixel centres that begins ``low_x`` right of the Gaussian's centre.
+def fetch_ahead(entry, end, items, splats, features):
+    """Ask for the numbers of an entry further on."""
+    i = items[min(entry + AHEAD, end - 1)]
+    lanes.fetch(splats, i)
+    lanes.fetch(features, i)
 
-    ``slope`` is -b/a: along the row, the quadratic form is smallest at slope dy. ``reach`` allows for rounding.
-    """
-    dx = min(max(slope * dy, low_x), low_x + np.float32(TILE - 1))
-    return a * dx * dx + TWO * b * dx * dy + c * dy * dy <= reach
+
+@kernel
+def copy_blocks(plane, y_first, x_first, state, start, step, inward):
+    """Between a plane's tile and one plane of the blocks' state, which begins at ``start``, a block each ``step``."""
+    for column in range(TILE // BLOCK):
+        for row in range(TILE // BLOCK):
+            place = start + step * (column * (TILE // BLOCK) + row)
+            for y in range(BLOCK):
+                for x in range(BLOCK):
+                    if inward:
+                        state[place + BLOCK * y + x] = plane[y_first + BLOCK * row + y, x_first + BLOCK * column + x]
+                    else:
+                        plane[y_first + BLOCK * row + y, x_first + BLOCK * column + x] = state[place + BLOCK * y + x]
 
 
 @kernel
 def blend_task(
-    task, splats, features, groups, starts, items, tile_order, tasks, size, background, limits, image, rest, depths_used
+    task, splats, features, groups, starts, items, covers, tile_order, tasks, size, background, limits, image, rest
 ):
-    """The tiles of one task of ``blend``. Scratch arrays have constant shapes here, see ``groups``."""
-    floor, cap, stop = limits[0], limits[1], limits[2]
+    """The tiles of one task of ``blend``."""
+    cap, stop = limits[1], limits[2]
+    faintest = np.float32(log2(limits[0]))
     channels = GROUP * len(groups)
     tiles_x = (size[0] + TILE - 1) // TILE
-    # One array per purpose of the whole tile: with a single base the compiler needs no overlap checks.
-    state = np.empty((TILE, 2 + channels, TILE), np.float32)  # per row: light still alive, light left, colours
-    weight = np.empty(TILE, np.float32)
+    # Per block: light left, negative once the pixel is finished; colours.
+    step = lanes.COUNT * (1 + channels)
+    state = np.empty(BLOCKS * step + lanes.COUNT, np.float32)
+    base = lanes.aligned(state)
     for turn in range(task, tile_order.shape[0], tasks):
         tile = tile_order[turn]
-        x0 = np.float32((tile % tiles_x) * TILE) + HALF
-        top = np.float32((tile // tiles_x) * TILE)
-        state[:, :2] = ONE
-        state[:, 2:] = ZERO
-        used = 0
-        for entry in range(starts[tile], starts[tile + 1]):
-            i = items[entry]
-            used += 1
-            splat = splats[i]
-            mx, my = splat[MEAN_X], splat[MEAN_Y]
-            a, b, c, opacity = splat[CONIC_A], splat[CONIC_B], splat[CONIC_C], splat[OPACITY]
-            reach, slope = splat[REACH] * np.float32(1.0001) + np.float32(1e-4), -b / a
-            first, last = rows_reached(splat, top)
-            for row in range(first, last):
-                dy = top + np.float32(row) + HALF - my
-                if not row_is_reached(a, b, c, reach, slope, x0 - mx, dy):
-                    continue
-                lanes = state[row]
-                along = b * dy
-                constant = HALF * c * dy * dy
-                for k in range(TILE):
-                    dx = x0 + np.float32(k) - mx
-                    power = -(HALF * a * dx * dx + along * dx + constant)
-                    alpha = min(opacity * exp_in_support(power), cap)
-                    alpha = alpha if (alpha >= floor) & (power >= EXP_LOWEST) else ZERO
-                    before = lanes[0, k]
-                    after = before * (ONE - alpha)
-                    goes_on = after >= stop
-                    weight[k] = alpha * before if goes_on else ZERO
-                    lanes[1, k] = after if goes_on else lanes[1, k]
-                    lanes[0, k] = after if goes_on else ZERO
-                for group in range(2, 2 + channels, GROUP):
-                    f0, f1 = features[i, group - 2], features[i, group - 1]
-                    f2, f3 = features[i, group], features[i, group + 1]
-                    for k in range(TILE):
-                        lanes[group, k] += weight[k] * f0
-                        lanes[group + 1, k] += weight[k] * f1
-                        lanes[group + 2, k] += weight[k] * f2
-                        lanes[group + 3, k] += weight[k] * f3
-            if used % 16 == 0:
-                brightest = ZERO
-                for row in range(TILE):
-                    for k in range(TILE):
-                        brightest = max(brightest, state[row, 0, k])
-                if brightest == ZERO:
-                    break
-        depths_used[tile] = used
-        y_first = (tile // tiles_x) * TILE
         x_first = (tile % tiles_x) * TILE
-        for row in range(TILE):
-            for k in range(TILE):
-                rest[y_first + row, x_first + k] = state[row, 1, k]
+        y_first = (tile // tiles_x) * TILE
+        state[:] = ZERO
+        for block in range(BLOCKS):
+            lanes.store(state, base + block * step, lanes.fill(ONE))
+        unfinished = np.uint64(0xFFFFFFFFFFFFFFFF)
+        for entry in range(starts[tile], starts[tile + 1]):
+            left = covers[entry] & unfinished
+            seen = left
+            fetch_ahead(entry, starts[tile + 1], items, splats, features)
+            i = items[entry]
+            splat = splats[i]
+            a, b, c = splat[CONIC_A] * HALF_LOG2_E, splat[CONIC_B] * (TWO * HALF_LOG2_E), splat[CONIC_C] * HALF_LOG2_E
+            log_opacity = splat[LOG_OPACITY]
+            left_x = lanes.block_columns() + (np.float32(x_first) + HALF - splat[MEAN_X])
+            top_y = lanes.block_rows() + (np.float32(y_first) + HALF - splat[MEAN_Y])
+            while left != np.uint64(0):
+                block = lanes.lowest_bit(left)
+                left = opened(left)
+                dx = left_x + BLOCK_X[block]
+                dy = top_y + BLOCK_Y[block]
+                power = log_opacity - (a * dx * dx + (b * dx + c * dy) * dy)
+                place = base + block * step
+                before = lanes.load(state, place)
+                alpha = lanes.minimum(lanes.exp2(power), lanes.fill(cap))
+                weight = alpha * before
+                after = before - weight
+                drawn = (power >= faintest) & (after >= stop)
+                if not lanes.any_of(drawn):
+                    # Nothing to see, though pixels may end here. A visit that changes nothing is none for the backward;
+                    # a block that is finished is not visited again.
+                    bit = np.uint64(1) << np.uint64(block)
+                    ended = (power >= faintest) & (before > ZERO)
+                    if lanes.any_of(ended):
+                        before = lanes.choose(ended, ZERO - before, before)
+                        lanes.store(state, place, before)
+                    else:
+                        seen = seen & ~bit
+                    if not lanes.any_of(before > ZERO):
+                        unfinished = unfinished & ~bit
+                    continue
+                stopped = (power >= faintest) & (after < stop)
+                weight = lanes.choose(drawn, weight, lanes.fill(ZERO))
+                lanes.store(
+                    state,
+                    place,
+                    lanes.choose(stopped, ZERO - lanes.magnitude(before), lanes.choose(drawn, after, before)),
+                )
+                for group in range(0, channels, GROUP):
+                    at = place + lanes.COUNT * (1 + group)
+                    lanes.store(state, at, lanes.load(state, at) + weight * features[i, group])
+                    at += lanes.COUNT
+                    lanes.store(state, at, lanes.load(state, at) + weight * features[i, group + 1])
+                    at += lanes.COUNT
+                    lanes.store(state, at, lanes.load(state, at) + weight * features[i, group + 2])
+                    at += lanes.COUNT
+                    lanes.store(state, at, lanes.load(state, at) + weight * features[i, group + 3])
+            covers[entry] = seen
+            if unfinished == np.uint64(0):
+                covers[entry + 1 : starts[tile + 1]] = np.uint64(0)
+                break
+        for block in range(BLOCKS):
+            place = base + block * step
+            light = lanes.magnitude(lanes.load(state, place))
+            lanes.store(state, place, light)
             for channel in range(channels):
-                behind = background[channel]
-                for k in range(TILE):
-                    image[channel, y_first + row, x_first + k] = state[row, 2 + channel, k] + state[row, 1, k] * behind
+                at = place + lanes.COUNT * (1 + channel)
+                lanes.store(state, at, lanes.load(state, at) + light * background[channel])
+        copy_blocks(rest, y_first, x_first, state, base, step, False)
+        for channel in range(channels):
+            copy_blocks(image[channel], y_first, x_first, state, base + lanes.COUNT * (1 + channel), step, False)
 
 
 @parallel_kernel
-def blend(
-    splats, features, groups, starts, items, tile_order, tasks, size, background, limits, image, rest, depths_used
-):
+def blend(splats, features, groups, starts, items, covers, tile_order, tasks, size, background, limits, image, rest):
     """Blend every tile front to back.
 
     Args:
-        splats: [N, 8]; features: [N, C] float32, C a multiple of 4; starts [tiles + 1], items: tile lists.
-        groups: a tuple of C/4 numbers, whose length the compiler knows: only with scratch arrays of constant shape
-            does it see that their rows do not overlap (measured: 4 to 10 times faster).
+        splats: [N, 16]; features: [N, C] float32, C a multiple of 4; starts [tiles + 1], items: tile lists.
+        groups: a tuple of C/4 numbers, whose length the compiler knows.
+        covers: [entries] uint64, the blocks of the tile that the entry's support meets; left with those where it was
+            drawn.
         tile_order: [tiles] int64, tiles dealt to ``tasks`` in this order. size: (width, height) in pixels.
         background: [C]. limits: [6], the fields of ``Limits``.
         image: out [C, rows, stride] float32, padded to whole tiles. rest: out [rows, stride] transmittance left.
-        depths_used: out [tiles] int32, list entries looked at until every pixel was finished.
     """
     for task in prange(tasks):
         blend_task(
@@ -153,6 +175,7 @@ def blend(
             groups,
             starts,
             items,
+            covers,
             tile_order,
             tasks,
             size,
@@ -160,7 +183,6 @@ def blend(
             limits,
             image,
             rest,
-            depths_used,
         )
 
 
@@ -173,115 +195,119 @@ def blend_backward_task(
     starts,
     items,
     slots,
+    covers,
     tile_order,
     tasks,
     size,
     limits,
     image,
     rest,
-    depths_used,
     g_image,
     g_alpha,
     records,
 ):
-    """The tiles of one task of ``blend_backward``. Scratch arrays have constant shapes here, see ``groups``."""
-    floor, cap, stop = limits[0], limits[1], limits[2]
+    """The tiles of one task of ``blend_backward``."""
+    cap, stop = limits[1], limits[2]
+    faintest = np.float32(log2(limits[0]))
     channels = GROUP * len(groups)
+    columns = records.shape[1]
     tiles_x = (size[0] + TILE - 1) // TILE
-    state = np.empty((TILE, 2 + channels, TILE), np.float32)  # per row: light alive, remaining, gradients
-    sums = np.empty((5 + channels, TILE), np.float32)  # over rows: 1, dy, dy^2; this row: dot, weight; features
+    # Per block: light left, negative once the pixel is finished; what remains behind; incoming gradients.
+    step = lanes.COUNT * (2 + channels)
+    state = np.empty(BLOCKS * step + lanes.COUNT, np.float32)
+    base = lanes.aligned(state)
+    weights = np.empty((BLOCKS + 1) * lanes.COUNT, np.float32)
     for turn in range(task, tile_order.shape[0], tasks):
         tile = tile_order[turn]
         y_first = (tile // tiles_x) * TILE
         x_first = (tile % tiles_x) * TILE
-        x0 = np.float32(x_first) + HALF
-        top = np.float32(y_first)
-        for row in range(TILE):
-            for k in range(TILE):
-                state[row, 0, k] = ONE
-                state[row, 1, k] = -g_alpha[y_first + row, x_first + k] * rest[y_first + row, x_first + k]
-            for channel in range(channels):
-                for k in range(TILE):
-                    g = g_image[channel, y_first + row, x_first + k]
-                    state[row, 2 + channel, k] = g
-                    state[row, 1, k] += g * image[channel, y_first + row, x_first + k]
-        end = starts[tile] + depths_used[tile]
-        for entry in range(starts[tile], end):
+        copy_blocks(g_alpha, y_first, x_first, state, base, step, True)
+        copy_blocks(rest, y_first, x_first, state, base + lanes.COUNT, step, True)
+        for block in range(BLOCKS):
+            at = base + block * step + lanes.COUNT
+            lanes.store(state, at, ZERO - lanes.load(state, at) * lanes.load(state, at - lanes.COUNT))
+        for channel in range(channels):
+            copy_blocks(image[channel], y_first, x_first, state, base, step, True)
+            copy_blocks(g_image[channel], y_first, x_first, state, base + lanes.COUNT * (2 + channel), step, True)
+            for block in range(BLOCKS):
+                place = base + block * step
+                product = lanes.load(state, place) * lanes.load(state, place + lanes.COUNT * (2 + channel))
+                lanes.store(state, place + lanes.COUNT, lanes.load(state, place + lanes.COUNT) + product)
+        for block in range(BLOCKS):
+            lanes.store(state, base + block * step, lanes.fill(ONE))
+        for entry in range(starts[tile], starts[tile + 1]):
+            cover = covers[entry]
+            left = cover
+            fetch_ahead(entry, starts[tile + 1], items, splats, features)
+            lanes.fetch(records, slots[min(entry + AHEAD, starts[tile + 1] - 1)])
             i = items[entry]
             splat = splats[i]
-            mx, my = splat[MEAN_X], splat[MEAN_Y]
-            a, b, c, opacity = splat[CONIC_A], splat[CONIC_B], splat[CONIC_C], splat[OPACITY]
-            reach, slope = splat[REACH] * np.float32(1.0001) + np.float32(1e-4), -b / a
-            first, last = rows_reached(splat, top)
-            sums[:] = ZERO
-            for row in range(first, last):
-                dy = top + np.float32(row) + HALF - my
-                if not row_is_reached(a, b, c, reach, slope, x0 - mx, dy):
-                    continue
-                lanes = state[row]
-                along = b * dy
-                constant = HALF * c * dy * dy
-                for k in range(TILE):
-                    sums[3, k] = ZERO
-                for group in range(2, 2 + channels, GROUP):
-                    f0, f1 = features[i, group - 2], features[i, group - 1]
-                    f2, f3 = features[i, group], features[i, group + 1]
-                    for k in range(TILE):
-                        sums[3, k] += (
-                            f0 * lanes[group, k]
-                            + f1 * lanes[group + 1, k]
-                            + f2 * lanes[group + 2, k]
-                            + f3 * lanes[group + 3, k]
-                        )
-                for k in range(TILE):
-                    dx = x0 + np.float32(k) - mx
-                    power = -(HALF * a * dx * dx + along * dx + constant)
-                    free = opacity * exp_in_support(power)
-                    alpha = min(free, cap)
-                    alpha = alpha if (alpha >= floor) & (power >= EXP_LOWEST) else ZERO
-                    before = lanes[0, k]
-                    after = before * (ONE - alpha)
-                    goes_on = after >= stop
-                    weight = alpha * before if goes_on else ZERO
-                    dot = sums[3, k]
-                    behind = lanes[1, k] - weight * dot
-                    g = alpha * (before * dot - behind / (ONE - alpha))
-                    g = g if goes_on & (free < cap) else ZERO
-                    lanes[1, k] = behind
-                    lanes[0, k] = after if goes_on else ZERO
-                    sums[0, k] += g
-                    sums[1, k] += g * dy
-                    sums[2, k] += g * dy * dy
-                    sums[4, k] = weight
-                for group in range(2, 2 + channels, GROUP):
-                    for k in range(TILE):
-                        sums[group + 3, k] += sums[4, k] * lanes[group, k]
-                        sums[group + 4, k] += sums[4, k] * lanes[group + 1, k]
-                        sums[group + 5, k] += sums[4, k] * lanes[group + 2, k]
-                        sums[group + 6, k] += sums[4, k] * lanes[group + 3, k]
-            s0 = sx = sy = sxx = sxy = syy = ZERO
-            for k in range(TILE):
-                dx = x0 + np.float32(k) - mx
-                s0 += sums[0, k]
-                sx += sums[0, k] * dx
-                sy += sums[1, k]
-                sxx += sums[0, k] * dx * dx
-                sxy += sums[1, k] * dx
-                syy += sums[2, k]
-            record = records[slots[entry]]
-            record[SUM_1] = s0
-            record[SUM_X] = sx
-            record[SUM_Y] = sy
-            record[SUM_XX] = sxx
-            record[SUM_XY] = sxy
-            record[SUM_YY] = syy
-            for channel in range(channels):
-                total = ZERO
-                for k in range(TILE):
-                    total += sums[5 + channel, k]
-                record[FEATURES + channel] = total
-        for entry in range(end, starts[tile + 1]):
-            records[slots[entry]] = ZERO
+            a, b, c = splat[CONIC_A] * HALF_LOG2_E, splat[CONIC_B] * (TWO * HALF_LOG2_E), splat[CONIC_C] * HALF_LOG2_E
+            log_opacity = splat[LOG_OPACITY]
+            left_x = lanes.block_columns() + (np.float32(x_first) + HALF - splat[MEAN_X])
+            top_y = lanes.block_rows() + (np.float32(y_first) + HALF - splat[MEAN_Y])
+            s = lanes.fill(ZERO)
+            sx = sy = sxx = sxy = syy = s
+            t0 = t1 = t2 = t3 = s
+            while left != np.uint64(0):
+                block = lanes.lowest_bit(left)
+                left = opened(left)
+                dx = left_x + BLOCK_X[block]
+                dy = top_y + BLOCK_Y[block]
+                power = log_opacity - (a * dx * dx + (b * dx + c * dy) * dy)
+                place = base + block * step
+                before = lanes.load(state, place)
+                behind = lanes.load(state, place + lanes.COUNT)
+                g0 = lanes.load(state, place + 2 * lanes.COUNT)
+                g1 = lanes.load(state, place + 3 * lanes.COUNT)
+                g2 = lanes.load(state, place + 4 * lanes.COUNT)
+                g3 = lanes.load(state, place + 5 * lanes.COUNT)
+                dot = g0 * features[i, 0] + g1 * features[i, 1] + g2 * features[i, 2] + g3 * features[i, 3]
+                for group in range(GROUP, channels, GROUP):
+                    at = place + lanes.COUNT * (2 + group)
+                    dot += lanes.load(state, at) * features[i, group]
+                    dot += lanes.load(state, at + lanes.COUNT) * features[i, group + 1]
+                    dot += lanes.load(state, at + 2 * lanes.COUNT) * features[i, group + 2]
+                    dot += lanes.load(state, at + 3 * lanes.COUNT) * features[i, group + 3]
+                alpha = lanes.minimum(lanes.exp2(power), lanes.fill(cap))
+                weight = alpha * before
+                after = before - weight
+                drawn = (power >= faintest) & (after >= stop)
+                stopped = (power >= faintest) & (after < stop)
+                weight = lanes.choose(drawn, weight, lanes.fill(ZERO))
+                behind = behind - weight * dot
+                lanes.store(
+                    state,
+                    place,
+                    lanes.choose(stopped, ZERO - lanes.magnitude(before), lanes.choose(drawn, after, before)),
+                )
+                lanes.store(state, place + lanes.COUNT, behind)
+                g = weight * dot - behind * (alpha / (ONE - alpha))
+                g = lanes.choose(drawn & (alpha < cap), g, lanes.fill(ZERO))
+                gx, gy = g * dx, g * dy
+                s += g
+                sx += gx
+                sy += gy
+                sxx += gx * dx
+                sxy += gx * dy
+                syy += gy * dy
+                t0 += weight * g0
+                t1 += weight * g1
+                t2 += weight * g2
+                t3 += weight * g3
+                if channels > GROUP:
+                    lanes.store(weights, block * lanes.COUNT, weight)
+            record = slots[entry] * columns
+            lanes.store(records, record, lanes.sums_of((s, sx, sy, sxx, sxy, syy, t0, t1, t2, t3)))
+            for channel in range(GROUP, channels):
+                total = lanes.fill(ZERO)
+                left = cover
+                while left != np.uint64(0):
+                    block = lanes.lowest_bit(left)
+                    left = opened(left)
+                    g0 = lanes.load(state, base + block * step + lanes.COUNT * (2 + channel))
+                    total += lanes.load(weights, block * lanes.COUNT) * g0
+                records[slots[entry], FEATURES + channel] = lanes.sum_of(total)
 
 
 @parallel_kernel
@@ -292,25 +318,26 @@ def blend_backward(
     starts,
     items,
     slots,
+    covers,
     tile_order,
     tasks,
     size,
     limits,
     image,
     rest,
-    depths_used,
     g_image,
     g_alpha,
     records,
 ):
-    """Gradients of every pair of Gaussian and tile.
+    """Gradients of every entry, a pair of Gaussian and tile.
 
     Front to back, as forward: what lies behind entry i enters only through its product with the incoming gradient,
     one number a pixel, which is what remains of the total after the entries so far.
 
     Args:
+        slots: [entries] the pair of each. covers: [entries] as ``blend`` left them.
         g_image: [C, rows, stride] dL/dimage. g_alpha: [rows, stride] dL/dalpha, alpha = 1 - rest.
-        records: out [pairs, 6 + C] float32, columns above.
+        records: out [pairs, whole ``Lanes``] float32, columns above.
     """
     for task in prange(tasks):
         blend_backward_task(
@@ -321,13 +348,13 @@ def blend_backward(
             starts,
             items,
             slots,
+            covers,
             tile_order,
             tasks,
             size,
             limits,
             image,
             rest,
-            depths_used,
             g_image,
             g_alpha,
             records,

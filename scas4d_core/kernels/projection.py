@@ -6,21 +6,25 @@ A camera enters as ``pose`` [3, 4] float32 (world to camera, OpenCV axes) and ``
 
 from __future__ import annotations
 
-from math import log, sqrt
+from math import log, log2, sqrt
 
 import numpy as np
 from numba import prange
 
 from scas4d_core.kernels.jit import HALF, ONE, TWO, ZERO, inline, kernel, parallel_kernel
 
-TILE = 16
-"""Pixels along the side of a tile: a row of 16 float32 is one AVX-512 register."""
+TILE = 32
+"""Pixels along the side of a tile: 8 by 8 blocks of 4 by 4, a bit each in 64; their state fits into the first cache."""
 
 CHUNK = 256
 """Gaussians a task: enough work for a thread, few enough for balance."""
 
-# Columns of ``splats`` [N, 8], what the blending kernels read of a Gaussian.
+# Columns of ``splats`` [N, 16], what later kernels read of a Gaussian. REACH is the support's squared Mahalanobis
+# radius. At a column dx right of the centre, the support is at SLOPE dx ± sqrt(SPREAD (REACH - THIN dx²)) below it; it
+# is lowest at dx = LOWEST_X, highest at -LOWEST_X.
 MEAN_X, MEAN_Y, CONIC_A, CONIC_B, CONIC_C, OPACITY, REACH, DEPTH = range(8)
+LOG_OPACITY, SLOPE, SPREAD, THIN, LOWEST_X = range(8, 13)
+SPLAT_COLUMNS = 16
 
 
 @inline
@@ -45,7 +49,7 @@ def project(means, factors, opacities, pose, lens, limits, splats, rects, counts
     Args:
         means: [N, 3] float32 world. factors: [N, 3, 3] float32, Σ = F Fᵀ. opacities: [N] float32.
         pose, lens: the camera. limits: [6] float32, the fields of ``Limits`` in order.
-        splats: out [N, 8] float32, columns above; REACH is the support's squared Mahalanobis radius.
+        splats: out [N, 16] float32, columns above.
         rects: out [N, 4] int32, tiles x0, y0, x1, y1 (exclusive) of the support's box; empty where culled.
         counts: out [N] int32, tiles in the box.
     """
@@ -104,6 +108,10 @@ def project(means, factors, opacities, pose, lens, limits, splats, rects, counts
             splats[i, CONIC_B] = -sxy / determinant
             splats[i, CONIC_C] = sxx / determinant
             splats[i, OPACITY], splats[i, REACH] = opacity, reach
+            splats[i, LOG_OPACITY] = np.float32(log2(opacity))
+            splats[i, SLOPE], splats[i, SPREAD] = sxy / sxx, determinant / sxx
+            splats[i, THIN] = ONE / sxx
+            splats[i, LOWEST_X] = sxy * half_y / syy
             rects[i, 0], rects[i, 1], rects[i, 2], rects[i, 3] = x0, y0, x1, y1
             counts[i] = (x1 - x0) * (y1 - y0)
 
@@ -177,7 +185,7 @@ def project_backward(
     splats,
     counts,
     offsets,
-    pair_used,
+    pair_covers,
     records,
     depth_channel,
     g_means,
@@ -189,7 +197,7 @@ def project_backward(
     """Sum each Gaussian's pairs (in a fixed order) and carry the gradients to the world.
 
     Args:
-        records: [pairs, 6 + C] from ``blend_backward``; offsets [N + 1], pair_used [pairs].
+        records: [pairs, >= 6 + C] from ``blend_backward``; offsets [N + 1]; pair_covers [pairs].
         depth_channel: the feature channel that holds the depth of the centre, or -1.
         g_means [N, 3], g_factors [N, 3, 3], g_opacities [N], g_features [N, C]: out, float32; 0 where culled.
         g_screen: out [N, 2], dL/d(projected centre) per pixel, which density control reads.
@@ -205,7 +213,7 @@ def project_backward(
             any_pair = False
             if counts[i] > 0:
                 for pair in range(offsets[i], offsets[i + 1]):
-                    if pair_used[pair] != 0:
+                    if pair_covers[pair] != 0:
                         any_pair = True
                         for column in range(6 + channels):
                             sums[column] += records[pair, column]

@@ -5,34 +5,43 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from scas4d_core.kernels.jit import TWO, ZERO, inline, kernel, parallel_kernel
-from scas4d_core.kernels.projection import CHUNK, CONIC_A, CONIC_B, CONIC_C, DEPTH, MEAN_X, MEAN_Y, REACH, TILE
+from scas4d_core.kernels import lanes
+from scas4d_core.kernels.jit import HALF, ZERO, inline, kernel, parallel_kernel
+from scas4d_core.kernels.projection import (
+    CHUNK,
+    DEPTH,
+    LOWEST_X,
+    MEAN_X,
+    MEAN_Y,
+    REACH,
+    SLOPE,
+    SPREAD,
+    THIN,
+    TILE,
+)
 
 RADIX_BITS = 11
 
 
 @inline
-def tile_is_reached(splat, tile_x, tile_y):
-    """Whether the support (an ellipse) meets the tile's square of pixel centres: exact, so culling by it is."""
-    low_x = np.float32(tile_x * TILE) + np.float32(0.5) - splat[MEAN_X]
-    low_y = np.float32(tile_y * TILE) + np.float32(0.5) - splat[MEAN_Y]
-    high_x = low_x + np.float32(TILE - 1)
-    high_y = low_y + np.float32(TILE - 1)
-    a, b, c = splat[CONIC_A], splat[CONIC_B], splat[CONIC_C]
-    # The nearest corner direction: the form is smallest on the one or two edges that face the centre.
-    dx = min(max(ZERO, low_x), high_x)
-    dy = min(max(ZERO, low_y), high_y)
-    best = np.float32(3e38)
-    if dx == ZERO and dy == ZERO:
-        best = ZERO
-    if dx != ZERO:
-        y = min(max(-b * dx / c, low_y), high_y)
-        best = min(best, a * dx * dx + TWO * b * dx * y + c * y * y)
-    if dy != ZERO:
-        x = min(max(-b * dy / a, low_x), high_x)
-        best = min(best, a * x * x + TWO * b * x * dy + c * dy * dy)
+def cover(splat, tile_x, tile_y):
+    """The blocks of a tile that the support (an ellipse) meets: bit 8 x + y for column x and row y of blocks.
+
+    Exact, so culling by it is: block by block of a column, between the support's highest and lowest row there.
+    """
+    left = lanes.ramp(np.float32(tile_x * TILE) + HALF - splat[MEAN_X])
+    # Eight lanes for the upper ends of the columns of blocks, eight for the lower.
+    down = lanes.ends()
     # Rounding must not cull what the blending kernels would still draw.
-    return best <= splat[REACH] * np.float32(1.0001) + np.float32(1e-4)
+    reach = splat[REACH] * np.float32(1.0001) + np.float32(1e-4)
+    dx = lanes.minimum(lanes.maximum(down * splat[LOWEST_X], left), left + np.float32(lanes.ACROSS - 1))
+    room = reach - dx * dx * splat[THIN]
+    dy = dx * splat[SLOPE] + down * lanes.square_root(lanes.maximum(room * splat[SPREAD], lanes.fill(ZERO)))
+    # Rows whose centres are inside: from the ceiling of the upper end, to the floor of the lower.
+    row = down * lanes.floor(down * (dy + (splat[MEAN_Y] - HALF - np.float32(tile_y * TILE))))
+    row = lanes.choose(room >= ZERO, row, down * np.float32(-1e4))
+    row = lanes.minimum(lanes.maximum(row, lanes.fill(np.float32(-1.0))), lanes.fill(np.float32(TILE)))
+    return lanes.column_bits(row)
 
 
 @kernel
@@ -42,7 +51,7 @@ def depth_order(splats, counts, keys, order, keys_too, order_too, histogram):
     Depths are positive, so their float32 bits sort as integers; three stable passes of 11 bits.
 
     Args:
-        splats: [N, 8]; counts: [N] tiles of each, 0 where culled.
+        splats: [N, 16]; counts: [N] tiles of each, 0 where culled.
         keys, keys_too: scratch [N] uint32. order, order_too: [N] int32; the result is in ``order_too``.
         histogram: scratch [2048] int64.
 
@@ -94,66 +103,74 @@ def pair_offsets(counts, offsets):
 
 
 @parallel_kernel
-def reach_tiles(splats, rects, counts, offsets, pair_used):
-    """Mark which tiles of each Gaussian's box its support reaches.
+def cover_tiles(splats, rects, counts, offsets, covers):
+    """Find the blocks of each tile of each Gaussian's box that its support meets.
 
     Args:
         offsets: [N + 1] where each Gaussian's pairs begin (a pair per tile of its box, row by row).
-        pair_used: out [pairs] uint8: 1 where the tile is reached (other pairs have no gradient).
+        covers: out [pairs] uint64, see ``cover``; 0 where the tile is not reached (such pairs have no gradient).
     """
     count = counts.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):
         for i in range(task * CHUNK, min(count, (task + 1) * CHUNK)):
-            if counts[i] == 1:
-                pair_used[offsets[i]] = 1
-            elif counts[i] > 1:
-                pair = offsets[i]
-                for tile_y in range(rects[i, 1], rects[i, 3]):
-                    for tile_x in range(rects[i, 0], rects[i, 2]):
-                        pair_used[pair] = 1 if tile_is_reached(splats[i], tile_x, tile_y) else 0
-                        pair += 1
+            pair = offsets[i]
+            for tile_y in range(rects[i, 1], rects[i, 3]):
+                for tile_x in range(rects[i, 0], rects[i, 2]):
+                    covers[pair] = cover(splats[i], tile_x, tile_y)
+                    pair += 1
+
+
+@parallel_kernel
+def count_tiles(rects, order, visible, offsets, covers, tiles_x, tile_counts):
+    """Gaussians that reach each tile, ``tile_counts`` [tasks, tiles] int32: each task's share of the order."""
+    tasks = tile_counts.shape[0]
+    for task in prange(tasks):
+        tile_counts[task] = 0
+        for k in range(visible * task // tasks, visible * (task + 1) // tasks):
+            i = order[k]
+            pair = offsets[i]
+            for tile_y in range(rects[i, 1], rects[i, 3]):
+                for tile in range(tile_y * tiles_x + rects[i, 0], tile_y * tiles_x + rects[i, 2]):
+                    tile_counts[task, tile] += covers[pair] != 0
+                    pair += 1
 
 
 @kernel
-def count_tiles(rects, order, visible, offsets, pair_used, tiles_x, tile_counts):
-    """Gaussians that reach each tile, ``tile_counts`` [tiles] int32."""
-    tile_counts[:] = 0
-    for k in range(visible):
-        i = order[k]
-        pair = offsets[i]
-        for tile_y in range(rects[i, 1], rects[i, 3]):
-            for tile in range(tile_y * tiles_x + rects[i, 0], tile_y * tiles_x + rects[i, 2]):
-                tile_counts[tile] += pair_used[pair]
-                pair += 1
+def tile_offsets(tile_counts, starts, cursors):
+    """Where each tile's list begins, ``starts`` [tiles + 1], and each task's part of it, ``cursors`` [tasks, tiles].
 
-
-@kernel
-def tile_offsets(tile_counts, starts):
-    """Exclusive sums of ``tile_counts`` into ``starts`` [tiles + 1] int64; returns the total."""
+    Returns:
+        Entries of all lists.
+    """
     total = 0
-    for tile in range(tile_counts.shape[0]):
+    for tile in range(tile_counts.shape[1]):
         starts[tile] = total
-        total += tile_counts[tile]
-    starts[tile_counts.shape[0]] = total
+        for task in range(tile_counts.shape[0]):
+            cursors[task, tile] = total
+            total += tile_counts[task, tile]
+    starts[tile_counts.shape[1]] = total
     return total
 
 
-@kernel
-def fill_tiles(rects, order, visible, offsets, pair_used, tiles_x, starts, cursor, items, slots):
-    """Write the tile lists in depth order.
+@parallel_kernel
+def fill_tiles(rects, order, visible, offsets, covers, tiles_x, cursors, items, slots, entry_covers):
+    """Write the tile lists in depth order, each task its share, whose place ``tile_offsets`` has set aside.
 
     Args:
-        cursor: scratch [tiles] int64. items, slots: out [entries] int32: the Gaussian and its pair.
+        cursors: [tasks, tiles] int64, moved on. items, slots: out [entries] int32, the Gaussian and its pair.
+        entry_covers: out [entries] uint64.
     """
-    cursor[:] = starts[:-1]
-    for k in range(visible):
-        i = order[k]
-        pair = offsets[i]
-        for tile_y in range(rects[i, 1], rects[i, 3]):
-            for tile in range(tile_y * tiles_x + rects[i, 0], tile_y * tiles_x + rects[i, 2]):
-                if pair_used[pair] != 0:
-                    place = cursor[tile]
-                    items[place] = i
-                    slots[place] = pair
-                    cursor[tile] = place + 1
-                pair += 1
+    tasks = cursors.shape[0]
+    for task in prange(tasks):
+        for k in range(visible * task // tasks, visible * (task + 1) // tasks):
+            i = order[k]
+            pair = offsets[i]
+            for tile_y in range(rects[i, 1], rects[i, 3]):
+                for tile in range(tile_y * tiles_x + rects[i, 0], tile_y * tiles_x + rects[i, 2]):
+                    if covers[pair] != 0:
+                        place = cursors[task, tile]
+                        items[place] = i
+                        slots[place] = pair
+                        entry_covers[place] = covers[pair]
+                        cursors[task, tile] = place + 1
+                    pair += 1

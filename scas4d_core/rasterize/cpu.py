@@ -69,14 +69,14 @@ class ForwardPass(NamedTuple):
     splats: Array
     counts: NDArray[np.int32]
     offsets: NDArray[np.int64]
-    pair_used: NDArray[np.uint8]
+    pair_covers: NDArray[np.uint64]
     starts: NDArray[np.int64]
     items: NDArray[np.int32]
     slots: NDArray[np.int32]
+    covers: NDArray[np.uint64]
     tile_order: NDArray[np.int64]
     image: Array
     rest: Array
-    used: NDArray[np.int32]
     pairs: int
 
 
@@ -120,7 +120,7 @@ class CpuRasterizer:
         count, channels = features.shape
         width, height = camera.width, camera.height
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-        splats = self._buffer("splats", (count, 8))
+        splats = self._buffer("splats", (count, projection.SPLAT_COLUMNS))
         rects = self._buffer("rects", (count, 4), np.int32)
         counts = self._buffer("counts", (count,), np.int32)
         projection.project(means, factors, opacities, camera.pose, camera.lens, self.limits, splats, rects, counts)
@@ -138,35 +138,36 @@ class CpuRasterizer:
         )
         offsets = self._buffer("offsets", (count + 1,), np.int64)
         pairs = tiles.pair_offsets(counts, offsets)
-        pair_used = self._buffer("pair_used", (pairs,), np.uint8)
-        tiles.reach_tiles(splats, rects, counts, offsets, pair_used)
-        tile_counts = self._buffer("tile_counts", (tiles_x * tiles_y,), np.int32)
-        tiles.count_tiles(rects, order, visible, offsets, pair_used, tiles_x, tile_counts)
+        pair_covers = self._buffer("pair_covers", (pairs,), np.uint64)
+        tiles.cover_tiles(splats, rects, counts, offsets, pair_covers)
+        tasks = threads()
+        tile_counts = self._buffer("tile_counts", (tasks, tiles_x * tiles_y), np.int32)
+        tiles.count_tiles(rects, order, visible, offsets, pair_covers, tiles_x, tile_counts)
         starts = self._buffer("starts", (tiles_x * tiles_y + 1,), np.int64)
-        entries = tiles.tile_offsets(tile_counts, starts)
+        cursors = self._buffer("cursors", (tasks, tiles_x * tiles_y), np.int64)
+        entries = tiles.tile_offsets(tile_counts, starts, cursors)
         items = self._buffer("items", (entries,), np.int32)
         slots = self._buffer("slots", (entries,), np.int32)
-        cursor = self._buffer("cursor", (tiles_x * tiles_y,), np.int64)
-        tiles.fill_tiles(rects, order, visible, offsets, pair_used, tiles_x, starts, cursor, items, slots)
+        covers = self._buffer("covers", (entries,), np.uint64)
+        tiles.fill_tiles(rects, order, visible, offsets, pair_covers, tiles_x, cursors, items, slots, covers)
         # Heavy tiles first, dealt out in turn: the tasks end together.
-        tile_order = np.argsort(-tile_counts, kind="stable")
+        tile_order = np.argsort(starts[:-1] - starts[1:], kind="stable")
         image = self._buffer("image", (channels, tiles_y * TILE, tiles_x * TILE))
         rest = self._buffer("rest", (tiles_y * TILE, tiles_x * TILE))
-        used = self._buffer("used", (tiles_x * tiles_y,), np.int32)
         blend_kernels.blend(
             splats,
             features,
             (0,) * (channels // blend_kernels.GROUP),
             starts,
             items,
+            covers,
             tile_order,
-            threads(),
+            tasks,
             (width, height),
             background,
             self.limits,
             image,
             rest,
-            used,
         )
         self._last = ForwardPass(
             means,
@@ -177,14 +178,14 @@ class CpuRasterizer:
             splats,
             counts,
             offsets,
-            pair_used,
+            pair_covers,
             starts,
             items,
             slots,
+            covers,
             tile_order,
             image,
             rest,
-            used,
             pairs,
         )
         return Picture(image[:, :height, :width], rest[:height, :width])
@@ -222,7 +223,7 @@ class CpuRasterizer:
             features[:, detached] = 0
             image[detached] = 0
         count, channels = features.shape
-        records = self._buffer("records", (last.pairs, blend_kernels.FEATURES + channels))
+        records = self._buffer("records", (last.pairs, blend_kernels.record_columns(channels)))
         blend_kernels.blend_backward(
             last.splats,
             features,
@@ -230,13 +231,13 @@ class CpuRasterizer:
             last.starts,
             last.items,
             last.slots,
+            last.covers,
             last.tile_order,
             threads(),
             (last.camera.width, last.camera.height),
             self.limits,
             image,
             last.rest,
-            last.used,
             g_image,
             g_alpha,
             records,
@@ -257,7 +258,7 @@ class CpuRasterizer:
             last.splats,
             last.counts,
             last.offsets,
-            last.pair_used,
+            last.pair_covers,
             records,
             last.depth_channel,
             *gradients,
@@ -271,7 +272,7 @@ class CpuRasterizer:
 
     @property
     def splats(self) -> Array:
-        """[N, 8] of the last forward pass, columns as in ``kernels.projection``."""
+        """[N, 16] of the last forward pass, columns as in ``kernels.projection``."""
         return self._last.splats
 
     @property

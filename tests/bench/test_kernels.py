@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from scas4d_core.bench import kernels
-from scas4d_core.bench.pairs import GAUSSIANS, PAIRS, TILE, MicroKernel, blended_pairs
+from scas4d_core.bench.pairs import GAUSSIANS, PAIRS, SIDE, MicroKernel, blended_pairs
+from scas4d_core.kernels.blend import BLOCK
 from scas4d_core.kernels.projection import CONIC_A, CONIC_B, CONIC_C, DEPTH, MEAN_X, MEAN_Y, OPACITY
 from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
 from scas4d_core.rasterize.limits import DEFAULT
@@ -45,27 +46,34 @@ def test_pairs_are_those_that_the_rasterizer_blends():
 
 def test_the_micro_kernel_blends_and_carries_back_every_pair():
     micro = MicroKernel(2)
-    assert micro.run(3) == 3 * 2 * PAIRS == 3 * 2 * GAUSSIANS * TILE * TILE
-    y, x = np.mgrid[:TILE, :TILE]
+    assert micro.run(3) == 3 * 2 * PAIRS == 3 * 2 * GAUSSIANS * SIDE * SIDE
+    y, x = np.mgrid[:SIDE, :SIDE]
     alpha = np.array([alphas(splat, x, y) for splat in micro.splats])
-    assert (alpha > 0).all()  # no place in a row is idle
-    before = np.cumprod(np.concatenate([np.ones((1, TILE, TILE)), 1 - alpha]), axis=0)
+    assert (alpha > 0).all()  # no place in a block is idle
+    before = np.cumprod(np.concatenate([np.ones((1, SIDE, SIDE)), 1 - alpha]), axis=0)
     weights = alpha * before[:-1]
     colour = np.einsum("gyx,gc->cyx", weights, micro.features.astype(np.float64))
     assert before[-1].min() > DEFAULT.transmittance_stop
-    for image in micro.image:
-        np.testing.assert_allclose(image[:, 1], before[-1], rtol=1e-4)
-        np.testing.assert_allclose(np.moveaxis(image[:, 2:], 1, 0), colour, rtol=1e-4)
+    across = SIDE // BLOCK
+    for image in micro.image:  # blocks column by column, pixels of a block row by row
+        blocks = image.reshape(across, across, -1, BLOCK, BLOCK)
+        planes = blocks.transpose(2, 1, 3, 0, 4).reshape(-1, SIDE, SIDE)
+        np.testing.assert_allclose(planes[0], before[-1], rtol=1e-4)
+        np.testing.assert_allclose(planes[1:], colour, rtol=1e-4)
 
     # Backward takes the forward's colours as the incoming gradient and its light as what remains.
     dot = np.einsum("gc,cyx->gyx", micro.features.astype(np.float64), colour)
     behind = before[-1] - np.cumsum(weights * dot, axis=0)
     power_gradient = alpha * (before[:-1] * dot - behind / (1 - alpha))
-    dy = np.arange(TILE)[:, None] + 0.5 - micro.splats[:, MEAN_Y, None, None].astype(np.float64)
+    dy = np.arange(SIDE)[:, None] + 0.5 - micro.splats[:, MEAN_Y, None, None].astype(np.float64)
+    dx = np.arange(SIDE) + 0.5 - micro.splats[:, MEAN_X, None, None].astype(np.float64)
+    wanted = [power_gradient * factor for factor in (1, dx, dy, dx * dx, dx * dy, dy * dy)]
+    wanted += [weights * plane for plane in colour]
     for sums in micro.sums:
-        np.testing.assert_allclose(sums[:, 0], power_gradient.sum(axis=1), rtol=2e-3, atol=2e-3)
-        np.testing.assert_allclose(sums[:, 2], (power_gradient * dy**2).sum(axis=1), rtol=2e-3, atol=2e-2)
-        np.testing.assert_allclose(sums[:, 5], (weights * colour[0]).sum(axis=1), rtol=1e-3)
+        for column, terms in enumerate(wanted):
+            total = terms.sum(axis=(1, 2))
+            scale = np.abs(terms).sum(axis=(1, 2)).max()
+            np.testing.assert_allclose(sums[:, column].sum(axis=1), total, rtol=2e-3, atol=1e-4 * scale)
 
 
 def test_the_cloud_has_the_pairs_it_says():

@@ -1,0 +1,373 @@
+"""Sixteen float32 in one value: what a kernel does to sixteen pixels at once, written out.
+
+``Lanes`` is LLVM's ``<16 x float>``: one AVX-512 register, two of AVX2, four of NEON. Kernels add, subtract, multiply,
+divide and compare it like a number (a float32 beside it is spread over the lanes), and read and write it at a flat
+index of a contiguous array. Nothing depends on what the compiler's loop vectorizer makes of a loop.
+"""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
+
+from scas4d_core.kernels.jit import inline
+
+COUNT = 16
+"""Lanes of a value."""
+
+emitted: Any = intrinsic
+"""A function that kernels call and that writes its own instructions."""
+
+_FLOAT, _BYTE = ir.FloatType(), ir.IntType(8)
+_INT, _BIT, _LONG = ir.IntType(32), ir.IntType(1), ir.IntType(64)
+_FLOATS, _INTS, _BITS = (ir.VectorType(kind, COUNT) for kind in (_FLOAT, _INT, _BIT))
+
+
+class LanesType(types.Type):
+    """Sixteen float32."""
+
+    def __init__(self) -> None:
+        super().__init__(name="lanes")
+
+
+class LaneMaskType(types.Type):
+    """Sixteen truth values."""
+
+    def __init__(self) -> None:
+        super().__init__(name="lane_mask")
+
+
+lanes_type = LanesType()
+mask_type = LaneMaskType()
+
+
+@register_model(LanesType)
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, of: Any) -> None:
+        super().__init__(manager, of, _FLOATS)
+
+
+@register_model(LaneMaskType)
+class _LaneMaskModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, of: Any) -> None:
+        super().__init__(manager, of, _BITS)
+
+
+def _filled(builder: Any, scalar: Any) -> Any:
+    nothing = ir.Constant(_FLOATS, ir.Undefined)
+    first = builder.insert_element(nothing, scalar, _INT(0))
+    return builder.shuffle_vector(first, nothing, ir.Constant(_INTS, [0] * COUNT))
+
+
+def _constant(values: Any) -> Any:
+    return ir.Constant(_FLOATS, [float(value) for value in values])
+
+
+def _call(builder: Any, name: str, result: Any, arguments: Any) -> Any:
+    kind = ir.FunctionType(result, [argument.type for argument in arguments])
+    insert: Any = cgutils.get_or_insert_function
+    return builder.call(insert(builder.module, kind, name), arguments)
+
+
+@lower_cast(types.float32, LanesType)
+def _spread(context: Any, builder: Any, source: Any, target: Any, value: Any) -> Any:
+    return _filled(builder, value)
+
+
+def _operator(function: Any, result: Any, method: str, *how: str) -> None:
+    """Let ``function`` take two ``Lanes``, or one and a float32; ``method`` of the builder writes the instruction."""
+
+    class Template(AbstractTemplate):
+        key = function
+
+        def generic(self, arguments: Any, keywords: Any) -> Any:
+            if (
+                len(arguments) == 2
+                and lanes_type in arguments
+                and all(a in (lanes_type, types.float32) for a in arguments)
+            ):
+                return signature(result, lanes_type, lanes_type)
+            return None
+
+    infer_global(function)(Template)
+
+    @lower_builtin(function, lanes_type, lanes_type)
+    def lower(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return getattr(builder, method)(*how, *arguments)
+
+
+for _names, _method in (
+    (("add", "iadd"), "fadd"),
+    (("sub", "isub"), "fsub"),
+    (("mul",), "fmul"),
+    (("truediv",), "fdiv"),
+):
+    for _name in _names:
+        _operator(getattr(operator, _name), lanes_type, _method)
+for _name, _sign in (("lt", "<"), ("le", "<="), ("gt", ">"), ("ge", ">=")):
+    _operator(getattr(operator, _name), mask_type, "fcmp_ordered", _sign)
+
+
+class _And(AbstractTemplate):
+    key = operator.and_
+
+    def generic(self, arguments: Any, keywords: Any) -> Any:
+        return signature(mask_type, *arguments) if tuple(arguments) == (mask_type, mask_type) else None
+
+
+infer_global(operator.and_)(_And)
+
+
+@lower_builtin(operator.and_, mask_type, mask_type)
+def _lower_and(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return builder.and_(*arguments)
+
+
+@emitted
+def choose(typing_context: Any, mask: Any, yes: Any, no: Any) -> Any:
+    """``yes`` where the mask holds, ``no`` elsewhere."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.select(*arguments)
+
+    return lanes_type(mask_type, lanes_type, lanes_type), generate
+
+
+@emitted
+def any_of(typing_context: Any, mask: Any) -> Any:
+    """Whether the mask holds anywhere."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        bits = builder.bitcast(arguments[0], ir.IntType(COUNT))
+        return builder.icmp_unsigned("!=", bits, ir.IntType(COUNT)(0))
+
+    return types.boolean(mask_type), generate
+
+
+def _extreme(sign: str) -> Any:
+    def typed(typing_context: Any, x: Any, y: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            return builder.select(builder.fcmp_ordered(sign, *arguments), *arguments)
+
+        return lanes_type(lanes_type, lanes_type), generate
+
+    return typed
+
+
+minimum = emitted(_extreme("<"))
+maximum = emitted(_extreme(">"))
+
+
+def _unary(name: str) -> Any:
+    def typed(typing_context: Any, x: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            return _call(builder, f"llvm.{name}.v{COUNT}f32", _FLOATS, arguments)
+
+        return lanes_type(lanes_type), generate
+
+    return typed
+
+
+floor = emitted(_unary("floor"))
+nearest = emitted(_unary("rint"))
+square_root = emitted(_unary("sqrt"))
+magnitude = emitted(_unary("fabs"))
+
+
+def _fixed(values: Any) -> Any:
+    def typed(typing_context: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            return _constant(values)
+
+        return lanes_type(), generate
+
+    return typed
+
+
+ACROSS = 4
+"""Columns and rows of a block: the pixels of one ``Lanes``, row by row."""
+
+block_columns = emitted(_fixed([k % ACROSS for k in range(COUNT)]))
+block_rows = emitted(_fixed([k // ACROSS for k in range(COUNT)]))
+
+_eight_columns = emitted(_fixed([ACROSS * (k % 8) for k in range(COUNT)]))
+ends = emitted(_fixed([-1.0] * 8 + [1.0] * 8))
+"""-1 for the first eight lanes, 1 for the others."""
+
+
+@inline
+def ramp(start):
+    """``start`` and every fourth number after it, eight of them, twice."""
+    return _eight_columns() + start
+
+
+@emitted
+def fill(typing_context: Any, value: Any) -> Any:
+    """A float32 in every lane."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return _filled(builder, arguments[0])
+
+    return lanes_type(types.float32), generate
+
+
+def _place(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+    if not (isinstance(array_type, types.Array) and array_type.dtype == types.float32 and array_type.layout == "C"):
+        raise TypeError(f"Lanes are read from and written to C-contiguous float32 arrays; this is {array_type}")
+    data = cgutils.create_struct_proxy(array_type)(context, builder, value=array).data
+    return builder.bitcast(builder.gep(data, [index]), _FLOATS.as_pointer())
+
+
+@emitted
+def load(typing_context: Any, array: Any, index: Any) -> Any:
+    """The sixteen numbers from a flat index of a float32 array on; need not be aligned, must be inside."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        place = _place(context, builder, signature.args[0], *arguments)
+        return builder.load(place, align=4)
+
+    return lanes_type(array, types.int64), generate
+
+
+@emitted
+def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
+    """Write the lanes from a flat index on."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        place = _place(context, builder, signature.args[0], *arguments[:2])
+        builder.store(arguments[2], place, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, lanes_type), generate
+
+
+@inline
+def aligned(array):
+    """The first flat index of a float32 array whose address is a multiple of 64 bytes: of a ``Lanes``."""
+    return -(array.ctypes.data // 4) & (COUNT - 1)
+
+
+@emitted
+def fetch(typing_context: Any, array: Any, row: Any) -> Any:
+    """Have a row of a two-dimensional float32 array brought into the first-level cache; any row, inside or not."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        struct = cgutils.create_struct_proxy(signature.args[0])(context, builder, value=arguments[0])
+        stride = builder.extract_value(struct.strides, 0)
+        place = builder.gep(builder.bitcast(struct.data, _BYTE.as_pointer()), [builder.mul(arguments[1], stride)])
+        _call(builder, "llvm.prefetch.p0", ir.VoidType(), [place, _INT(0), _INT(3), _INT(1)])
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64), generate
+
+
+@emitted
+def _times_power_of_two(typing_context: Any, value: Any, whole: Any) -> Any:
+    """``value`` · 2^``whole``, by its exponent's bits."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        steps = builder.shl(builder.fptosi(arguments[1], _INTS), ir.Constant(_INTS, [23] * COUNT))
+        return builder.bitcast(builder.add(builder.bitcast(arguments[0], _INTS), steps), _FLOATS)
+
+    return lanes_type(lanes_type, lanes_type), generate
+
+
+@inline
+def exp2(x):
+    """2^x for x in [-126, 126], relative error 3e-7: a polynomial on [-1/2, 1/2]."""
+    whole = nearest(x)
+    part = x - whole
+    y = part * np.float32(1.3276470119986325e-3) + np.float32(9.675541319518366e-3)
+    y = y * part + np.float32(5.550713279290593e-2)
+    y = y * part + np.float32(2.4022119724211827e-1)
+    y = y * part + np.float32(6.931469670612127e-1)
+    y = y * part + np.float32(1.0)
+    return _times_power_of_two(y, whole)
+
+
+@emitted
+def column_bits(typing_context: Any, ends: Any) -> Any:
+    """The blocks between rows of pixels: an int64 with a byte per column of blocks, a bit per row of blocks.
+
+    Of column k (of 8), the rows from lane k to lane k + 8, whole numbers; none where the first is below the last. Rows
+    above -1 and below 32 only.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        eight = ir.VectorType(_INT, 8)
+        nothing = ir.Constant(_INTS, ir.Undefined)
+
+        def all_of(value: int) -> Any:
+            return ir.Constant(eight, [value] * 8)
+
+        whole = builder.fptosi(arguments[0], _INTS)
+        first = builder.shuffle_vector(whole, nothing, ir.Constant(eight, list(range(8))))
+        last = builder.shuffle_vector(whole, nothing, ir.Constant(eight, list(range(8, 16))))
+        first = builder.select(builder.icmp_signed(">", first, all_of(0)), first, all_of(0))
+        last = builder.select(builder.icmp_signed("<", last, all_of(31)), last, all_of(31))
+        some = builder.icmp_signed("<=", first, last)
+        two = all_of(2)
+        ones = builder.sub(builder.shl(two, builder.ashr(last, two)), builder.shl(all_of(1), builder.ashr(first, two)))
+        kept = builder.select(some, ones, all_of(0))
+        return builder.bitcast(builder.trunc(kept, ir.VectorType(ir.IntType(8), 8)), _LONG)
+
+    return types.uint64(lanes_type), generate
+
+
+@emitted
+def lowest_bit(typing_context: Any, bits: Any) -> Any:
+    """Number of the lowest bit set; the bits must not be 0."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.cttz(arguments[0], _BIT(1))
+
+    return types.int64(types.uint64), generate
+
+
+@emitted
+def sum_of(typing_context: Any, value: Any) -> Any:
+    """The sum over the lanes."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        total = arguments[0]
+        for length in (8, 4, 2, 1):
+            swapped = [k ^ length for k in range(COUNT)]
+            total = builder.fadd(total, builder.shuffle_vector(total, total, ir.Constant(_INTS, swapped)))
+        return builder.extract_element(total, _INT(0))
+
+    return types.float32(lanes_type), generate
+
+
+@emitted
+def sums_of(typing_context: Any, values: Any) -> Any:
+    """The sum over the lanes of each of up to sixteen ``Lanes`` in a tuple, in order; the last lanes are 0."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        given = [builder.extract_value(arguments[0], k) for k in range(len(values))]
+        # Halves of two values side by side and added make one; four times, and each lane is one value's sum.
+        length = COUNT
+        while length > 1:
+            half = length // 2
+            segments = [(value, start) for value in (0, COUNT) for start in range(0, COUNT, length)]
+            left = [value + start + k for value, start in segments for k in range(half)]
+            right = [value + start + half + k for value, start in segments for k in range(half)]
+            if len(given) % 2:
+                given.append(_constant([0] * COUNT))
+            given = [
+                builder.fadd(
+                    builder.shuffle_vector(a, b, ir.Constant(_INTS, left)),
+                    builder.shuffle_vector(a, b, ir.Constant(_INTS, right)),
+                )
+                for a, b in zip(given[::2], given[1::2], strict=True)
+            ]
+            length = half
+        return given[0]
+
+    return lanes_type(values), generate
