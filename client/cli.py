@@ -139,15 +139,8 @@ def options(version: Annotated[bool, typer.Option("--version", callback=_version
     """Runs before every command."""
 
 
-def kernel_cache() -> Path:
-    """Where compiled kernels are kept: NUMBA_CACHE_DIR, else scas4d/numba in the user's cache folder."""
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return Path(os.environ.setdefault("NUMBA_CACHE_DIR", str(home / "scas4d" / "numba")))
-
-
 def main() -> None:
     """The entry point: errors that a user can mend are one line, not a traceback."""
-    kernel_cache()
     try:
         app()
     except (ServiceError, CaptureError, ImageError, RuntimeError, ValueError) as error:

@@ -11,6 +11,10 @@ from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 
+from scas4d_core.kernels import cache
+
+cache.use(cache.base())
+
 # LLVM unrolls short loops before it vectorizes loops; unrolled, the rows of 16 pixels stay scalar (measured: blending
 # 3 times slower). Loops over channels (at most 8) may still be unrolled.
 llvm.set_option("scas4d", "-unroll-full-max-count=8")
