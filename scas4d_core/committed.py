@@ -50,6 +50,7 @@ class Committed:
     def __init__(self, history: History, world: WorldFrame, limits: Limits = DEFAULT) -> None:
         self.history = history
         self.world = world
+        self._limits = limits
         self._rasterizer = CpuRasterizer(limits)
 
     def render(
@@ -118,8 +119,10 @@ class Committed:
         return tracks_of_history.tracks_of_points(self.history, self.world, points, index, indices)
 
     def tracks_of_pixels(self, camera: Camera, uv: NDArray[Any], index: int, indices: Sequence[int]) -> Tracks:
-        """Trajectories of the surface points at pixels [Q, 2] of frame ``index``, through rendered depth."""
-        return tracks_of_history.tracks_of_pixels(self.history, self.world, camera, uv, index, indices, self._depth)
+        """Trajectories of the surface points at pixels [Q, 2] of frame ``index``."""
+        return tracks_of_history.tracks_of_pixels(
+            self.history, self.world, camera, uv, index, indices, self._depth, limits=self._limits
+        )
 
     def tracks_of_ids(self, ids: NDArray[Any], indices: Sequence[int]) -> Tracks:
         """Trajectories of Gaussians by id."""

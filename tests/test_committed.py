@@ -161,7 +161,7 @@ def test_tracks_through_pixels_follow_the_surface() -> None:
     uv = np.array([[24.0, 24.0], [20.5, 22.5], [1.0, 1.0]])
     tracks = scene.tracks_of_pixels(camera, uv, 0, [0, 1])
     assert np.isnan(tracks.positions[:, 2]).all()
-    assert tracks.confidence[2] == 0
+    assert np.all(tracks.confidence[:, 2] == 0)
     back, _ = camera.project(tracks.positions[0, :2])
     np.testing.assert_allclose(back, uv[:2], atol=0.05)
     before, after = (WORLD.to_inside(tracks.positions[t, :2]) for t in (0, 1))

@@ -82,18 +82,21 @@ def test_a_stray_carrier_does_not_take_the_point_with_it():
     # And the confidence says which points had carriers that disagree.
     calm, _ = rigid_history(size=4)
     before = tracks_of_points(calm, WORLD, expected[0], 0, FRAMES).confidence
-    rows, weights, _ = carriers(history.gaussians(0), points, 8, 0.003)
+    rows, weights, _ = carriers(history.gaussians(0), points, 32, 0.01)
     torn = (np.isin(rows, stray) * weights).sum(axis=1) > 0.1
     assert torn.sum() >= 5
-    assert np.all(several.confidence[torn] < 0.2 * before[torn])
+    assert np.all(several.confidence[-1, torn] < 0.2 * before[-1, torn])
+    np.testing.assert_allclose(several.confidence[0], before[0])  # in the frame asked for, all carriers agree
+    assert np.all(np.diff(several.confidence[:, torn], axis=0) < 0)  # and ever less from then on
 
 
 def test_confidence_is_coverage_where_carriers_agree():
     history, rest = rigid_history()
     points = np.vstack([truth(rest)[0][7], WORLD.to_user([[4.0, 4.0, 4.0]])])
     tracks = tracks_of_points(history, WORLD, points, 0, FRAMES)
-    assert tracks.confidence[0] > 0.89
-    assert tracks.confidence[1] < 1e-6
+    assert tracks.confidence.shape == (6, 2)
+    assert np.all(tracks.confidence[:, 0] > 0.89)
+    assert np.all(tracks.confidence[:, 1] < 1e-6)
     assert tracks.ids[0] == 7 * 3
 
 
@@ -159,41 +162,66 @@ def test_seen_forgives_a_pixel_at_an_edge():
     assert seen(np.stack([at_edge, off_edge])[None], [0], CAMERA, step, 0.5).tolist() == [[True, False]]
 
 
-def test_pixels_go_through_the_rendered_depth_and_report_what_met_no_surface():
-    history, _ = rigid_history()
-    camera = Camera(
+def sheet(z: float, half: float, opacity: float, id: int) -> Gaussians:
+    """One flat Gaussian that faces the camera, inside world."""
+    return Gaussians(
+        means=np.array([[0, 0, z]], np.float32),
+        factors=np.diag([half, half, 1e-3])[None].astype(np.float32),
+        rotations=np.array([[1, 0, 0, 0]], np.float32),
+        opacities=np.array([opacity], np.float32),
+        colours=np.zeros((1, 3), np.float32),
+        foreground=np.ones(1, np.float32),
+        ids=np.array([id], np.int64),
+    )
+
+
+def stacked(*parts: Gaussians) -> Gaussians:
+    return Gaussians(**{name: np.concatenate([p.arrays()[name] for p in parts]) for name in parts[0].arrays()})
+
+
+def test_pixels_go_along_their_rays_and_report_what_met_no_surface():
+    history = History()
+    for t in FRAMES:  # a small sheet 2 m away that sinks, in centimetres 200
+        state = sheet(2.0, 0.05, 0.9, 7)
+        history.append(t, t / 30, state.replace(means=state.means + np.array([0, 0.01 * t, 0], np.float32)))
+    user_camera = Camera(
         "c",
-        np.array([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]),
-        np.block([[np.eye(3), -(WORLD.origin - [0, 0, 200])[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]),
+        CAMERA.intrinsics,
+        np.block([[np.eye(3), -WORLD.origin[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]),
         64,
         48,
     )
+    asked: list[int] = []
 
     def depth(_: Camera, index: int) -> tuple[np.ndarray, np.ndarray]:
-        alpha = np.ones((48, 64))
-        alpha[:, :10] = 0
+        asked.append(index)
+        alpha = np.zeros((48, 64))
+        alpha[20:28, 28:36] = 1
         return np.full((48, 64), 190.0), alpha
 
-    uv = np.array([[32.3, 24.9], [5.5, 24.5], [8.5, 20.5]])  # the last misses the surface by two pixels
-    tracks = tracks_of_pixels(history, WORLD, camera, uv, 0, FRAMES, depth)
-    assert tracks.ids[1] == -1
-    assert tracks.confidence[1] == 0
+    uv = np.array([[32.3, 24.9], [5.5, 24.5], [37.5, 24.5]])  # the last misses the covered pixels by two
+    tracks = tracks_of_pixels(history, WORLD, user_camera, uv, 0, FRAMES, depth)
+    assert asked == [0, *FRAMES]  # once for what the rays missed, then for the visibility
+    assert tracks.ids.tolist() == [7, -1, 7]
+    assert np.all(tracks.confidence[:, 1] == 0)
     assert np.isnan(tracks.positions[:, 1]).all()
-    np.testing.assert_allclose(tracks.pixels(camera)[0, [0, 2]], uv[[0, 2]], atol=1e-3)
-    np.testing.assert_allclose(camera.project(tracks.positions[0, [0, 2]])[1], 190, atol=1e-3)
+    np.testing.assert_allclose(tracks.pixels(user_camera)[0, [0, 2]], uv[[0, 2]], atol=1e-3)
+    near = user_camera.project(tracks.positions[0, [0, 2]])[1]
+    np.testing.assert_allclose(near, [200, 190], atol=0.2)  # by its ray; by the covered pixel beside it
+    np.testing.assert_allclose(np.diff(tracks.positions[:, 0], axis=0), [[0, 1, 0]] * 5, atol=1e-3)
     assert tracks.visibility["c"].shape == (6, 3)
-    assert tracks.visibility["c"][0].tolist() == [True, False, True]
+    assert tracks.visibility["c"][0, 1] == np.False_
     strict = TracksSettings(pixel_reach=1)
-    assert tracks_of_pixels(history, WORLD, camera, uv, 0, FRAMES, depth, strict).ids[2] == -1
+    assert tracks_of_pixels(history, WORLD, user_camera, uv, 0, FRAMES, depth, strict).ids[2] == -1
     with pytest.raises(ValueError, match=r"pixel \[64\.0, 3\.0\] \(query 1\) lies outside"):
-        tracks_of_pixels(history, WORLD, camera, np.array([[1, 1], [64, 3]]), 0, FRAMES, depth)
+        tracks_of_pixels(history, WORLD, user_camera, np.array([[1, 1], [64, 3]]), 0, FRAMES, depth)
 
 
 def test_tracks_of_ids_are_the_means():
     history, rest = rigid_history()
     tracks = tracks_of_ids(history, WORLD, np.array([30, 0]), [4, 2])
     np.testing.assert_allclose(tracks.positions, truth(rest[[10, 0]])[[4, 2]], atol=1e-4)
-    with pytest.raises(HistoryError, match=r"ids \[31\]"):
+    with pytest.raises(ValueError, match=r"ids \[31\] are no Gaussians"):
         tracks_of_ids(history, WORLD, np.array([31]), [0])
 
 

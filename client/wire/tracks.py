@@ -39,7 +39,9 @@ class TracksModel(Model):
     frames: list[int] = Field(description="[T] indices.")
     times: list[float] = Field(description="[T] seconds.")
     ids: list[int] = Field(description="[Q] the Gaussian that carries the point; −1 where the query met nothing.")
-    confidence: list[float] = Field(description="[Q] 0…1.")
+    confidence: list[list[float]] = Field(
+        description="[Q][T] 0…1: how much the Gaussians that carry the point agree in that frame; docs/tracks.md."
+    )
     positions: list[list[list[float] | None]] = Field(description="[Q][T] x y z; null where there is none.")
     visible: dict[str, list[list[bool]]] = Field(
         default_factory=dict, description="By camera asked for, [Q][T]: in the picture and nothing in front."
@@ -71,7 +73,7 @@ def tracks_model(
         frames=list(frames),
         times=list(times),
         ids=ids.tolist(),
-        confidence=confidence.tolist(),
+        confidence=confidence.T.tolist(),
         positions=lists(positions),
         pixels={name: lists(uv) for name, uv in pixels.items()},
         visible={name: seen.T.tolist() for name, seen in visible.items()},
