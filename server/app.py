@@ -23,7 +23,7 @@ from server.placement import Placement
 from server.placement.local import LocalPlacement
 from server.problems import Problem
 from server.readiness import Readiness
-from server.routes import frames, health, metrics, parts, points, render, scenes, stream, tickets, tracks
+from server.routes import frames, health, ingest, metrics, parts, points, render, scenes, stream, tickets, tracks
 from server.scenes import Scenes
 from server.settings import ServerSettings
 from server.tickets import Tickets
@@ -41,6 +41,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         where = placement or LocalPlacement()
         app.state.readiness = Readiness(settings, where)
         app.state.scenes = Scenes(settings, where, app.state.hub)
+        await app.state.scenes.open()
         yield
         await app.state.readiness.stop()
         await app.state.scenes.stop()
@@ -67,7 +68,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         )
     app.add_middleware(Door, settings=settings, tickets=app.state.tickets)
     app.add_middleware(AccessLog)
-    for resource in (scenes, points, frames, render, tracks, parts, stream, tickets, health, metrics):
+    for resource in (scenes, points, frames, ingest, render, tracks, parts, stream, tickets, health, metrics):
         app.include_router(resource.router)
         _answer_plain_requests(app, resource.router)
 

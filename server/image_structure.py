@@ -5,9 +5,12 @@ JPEG by its segments to the end marker, PNG by its chunks with their checksums, 
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from dataclasses import dataclass
+
+_SCAN_END = re.compile(rb"\xff(?![\x00\xd0-\xd7\xff])(?=[\x00-\xff])", re.DOTALL)
 
 
 class StructureError(ValueError):
@@ -23,29 +26,34 @@ class ImageHeader:
     height: int
 
 
-def walk(data: bytes) -> ImageHeader:
+def walk(data: bytes | memoryview) -> ImageHeader:
     """The header of a file that is whole.
+
+    Args:
+        data: the file, one contiguous buffer of bytes; not copied.
 
     Raises:
         StructureError: another format, truncated, damaged, CMYK, animated, or of a bit depth that is not taken.
     """
-    if data[:3] == b"\xff\xd8\xff":
+    data = memoryview(data)
+    start = bytes(data[:12])
+    if start.startswith(b"\xff\xd8\xff"):
         return _jpeg(data)
-    if data[:8] == b"\x89PNG\r\n\x1a\n":
+    if start.startswith(b"\x89PNG\r\n\x1a\n"):
         return _png(data)
-    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+    if start[:4] == b"RIFF" and start[8:] == b"WEBP":
         return _webp(data)
-    raise StructureError(f"begins with {data[:8].hex(' ') or 'nothing'}: not a JPEG, PNG or WebP; send one of these")
+    raise StructureError(f"begins with {start[:8].hex(' ') or 'nothing'}: not a JPEG, PNG or WebP; send one of these")
 
 
 def _truncated(kind: str, size: int) -> StructureError:
     return StructureError(f"a {kind} that ends early, after {size} bytes; send the whole file")
 
 
-def _jpeg(data: bytes) -> ImageHeader:
+def _jpeg(data: memoryview) -> ImageHeader:
     at, header = 2, None
     while True:
-        while data[at : at + 2] == b"\xff\xff":  # fill bytes
+        while bytes(data[at : at + 2]) == b"\xff\xff":  # fill bytes
             at += 1
         if at + 2 > len(data):
             raise _truncated("JPEG", len(data))
@@ -67,23 +75,22 @@ def _jpeg(data: bytes) -> ImageHeader:
                 raise StructureError(f"a JPEG of {channels} channels of {bits} bits; send RGB or grey of 8 bits")
             header = ImageHeader("jpeg", width, height)
         at += 2 + length
-        if marker == 0xDA:  # entropy-coded data: to the next marker that is neither a stuffed zero nor a restart
-            while True:
-                at = data.find(b"\xff", at)
-                if at < 0 or at + 1 >= len(data):
-                    raise _truncated("JPEG", len(data))
-                if data[at + 1] == 0 or 0xD0 <= data[at + 1] <= 0xD7:
-                    at += 2
-                elif data[at + 1] == 0xFF:
-                    at += 1
-                else:
-                    break
+        if marker == 0xDA:
+            at = _end_of_scan(data, at)
     if header is None:
         raise StructureError("a JPEG without a frame header; the file is damaged: send it again")
     return header
 
 
-def _png(data: bytes) -> ImageHeader:
+def _end_of_scan(data: memoryview, at: int) -> int:
+    """Where the entropy-coded data from `at` on ends: the next marker that is no stuffed zero and no restart."""
+    found = _SCAN_END.search(data, at)
+    if found is None:
+        raise _truncated("JPEG", len(data))
+    return found.start()
+
+
+def _png(data: memoryview) -> ImageHeader:
     at, header, pixels = 8, None, False
     while True:
         if at + 12 > len(data):
@@ -109,7 +116,7 @@ def _png(data: bytes) -> ImageHeader:
     return header
 
 
-def _webp(data: bytes) -> ImageHeader:
+def _webp(data: memoryview) -> ImageHeader:
     size = struct.unpack("<I", data[4:8])[0] + 8
     if size > len(data):
         raise _truncated("WebP", len(data))

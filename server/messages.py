@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from client.wire import Retention
 from scas4d_core.cameras import Camera, Rig
 
 
@@ -20,11 +21,18 @@ class SceneSpec:
     folder: Path
     rig: Rig
     settings: Any
+    minimum_cameras: int = 1
+    keep_states: Retention = field(default_factory=Retention)
 
     @property
     def states(self) -> Path:
         """The folder of the committed states (`scas4d_core.history.History`)."""
         return self.folder / "states"
+
+    @property
+    def frames(self) -> Path:
+        """The folder of the frame log (`server.frame_store`)."""
+        return self.folder / "frames"
 
     @property
     def points(self) -> Path:
@@ -37,11 +45,15 @@ class SceneSpec:
 
 @dataclass(frozen=True)
 class FrameReady:
-    """The pictures of a frame lie in a file (`server.frame_files`)."""
+    """The pictures of a frame lie in records of the frame log (`server.frame_store`).
+
+    `identity` is checked where one record holds the whole frame; of several, one a camera, a damaged one is left out.
+    """
 
     index: int
     time: float
-    file: Path
+    files: tuple[str, ...]
+    identity: str
 
 
 @dataclass(frozen=True)
@@ -53,10 +65,33 @@ class Stop:
 
 
 @dataclass(frozen=True)
-class Started:
-    """A frame is at work."""
+class Ready:
+    """The worker takes frames. What it found committed: `indices`, those it could not read, and the newest's report.
+
+    `undone`: frames whose commit was taken back, to be given again. `faults`: why, a sentence each.
+    """
+
+    indices: tuple[int, ...] = ()
+    damaged: dict[int, str] = field(default_factory=dict)
+    report: dict[str, Any] = field(default_factory=dict)
+    undone: tuple[int, ...] = ()
+    faults: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Broken:
+    """What is committed cannot be gone on from."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Stalled:
+    """The frame cannot be committed for want of room on the disk; it is tried again in `seconds`."""
 
     index: int
+    reason: str
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -71,17 +106,14 @@ class Progressed:
 
 @dataclass(frozen=True)
 class Committed:
-    """The frame's state is on disk."""
+    """The frame's state is on disk, with `report` (as `History.report` gives it back).
+
+    `deleted`: states that retention deleted after it.
+    """
 
     index: int
-    time: float
-    iterations: int
-    seconds: dict[str, float]
-    loss: list[float]
-    psnr: float
-    moving: int
-    gaussians: int
-    dropped: dict[str, str] = field(default_factory=dict)
+    report: dict[str, Any]
+    deleted: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -94,19 +126,29 @@ class SetAside:
     fatal: bool = False
 
 
-# To the reader.
+# To the readers.
+
+
+@dataclass(frozen=True)
+class Refresh:
+    """Frames were committed, deleted or taken back."""
 
 
 @dataclass(frozen=True, eq=False)
 class RenderQuery:
-    """A view of a committed frame; `parts` is the number of parts where they are asked for and it is given."""
+    """A view of a committed frame.
+
+    `parts` is the number of parts where they are asked for and it is given; `labels` [N] are then the parts themselves.
+    """
 
     camera: Camera
     frame: int
     kinds: tuple[str, ...]
-    format: Literal["png", "jpeg", "npz"]
+    format: Literal["png", "jpeg", "webp", "npz", "float32"]
     background: tuple[float, float, float]
-    parts: int | None
+    parts: int | None = None
+    quality: int | None = None
+    labels: NDArray[np.int16] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,13 +176,20 @@ class PartsQuery:
 
 
 @dataclass(frozen=True)
+class LabelsQuery:
+    """Labels of all Gaussians as little-endian int16, in the order of the states."""
+
+    count: int | None
+
+
+@dataclass(frozen=True)
 class PlyQuery:
     """A committed frame as a 3DGS .ply."""
 
     frame: int
 
 
-Query = RenderQuery | TracksQuery | PartsQuery | PlyQuery
+Query = RenderQuery | TracksQuery | PartsQuery | LabelsQuery | PlyQuery
 
 
 @dataclass(frozen=True)
@@ -151,7 +200,7 @@ class Ask:
     query: Query
 
 
-# From the reader.
+# From the readers.
 
 
 @dataclass(frozen=True)
@@ -166,8 +215,8 @@ class Answer:
 
 @dataclass(frozen=True)
 class Refused:
-    """The query cannot be answered: the fault of the one who asked (`fault` False) or ours."""
+    """The query cannot be answered; `status` is that of the HTTP answer."""
 
     number: int
     detail: str
-    fault: bool = False
+    status: int = 422

@@ -1,10 +1,11 @@
-"""The process that owns a scene's `Reconstruction`: decodes frames, steps, commits, reports."""
+"""The process that owns a scene's `Reconstruction`: takes it up again, decodes frames, steps, commits, reports."""
 
 from __future__ import annotations
 
 import logging
 import os
 import signal
+import threading
 import time
 from multiprocessing.connection import Connection
 from typing import Any
@@ -13,12 +14,16 @@ import numpy as np
 
 from scas4d_core.captures import Frame, InitialPoints
 from scas4d_core.captures.images import ImageError, decode_image, decode_mask
-from scas4d_core.history import History
+from scas4d_core.history import History, HistoryError
+from server.disk import FolderLock, no_room
 from server.engine import Reconstruction, load_engine
-from server.frame_files import read_frame
-from server.messages import Committed, FrameReady, Progressed, SceneSpec, SetAside, Started, Stop
+from server.frame_store import FrameDamage, holds, read_pictures
+from server.ledger import frame_identity
+from server.messages import Broken, Committed, FrameReady, Progressed, Ready, SceneSpec, SetAside, Stalled, Stop
 
 PROGRESS_EVERY_S = 0.2
+PARENT_EVERY_S = 0.5
+STALL_S, LONGEST_STALL_S = 1.0, 30.0
 
 log = logging.getLogger("scas4d.worker")
 
@@ -26,109 +31,170 @@ log = logging.getLogger("scas4d.worker")
 def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     """Runs until told to stop, or until the service is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the service says when to stop
+    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
+    # A service that was killed leaves a worker in the middle of an update: two must not commit to one history.
+    lock = FolderLock(spec.folder / "worker.lock", wait=True)
     worker = Worker(spec, connection)
-    while True:
-        try:
-            message = connection.recv()
-        except (EOFError, OSError):
-            break
-        if isinstance(message, Stop):
-            break
-        worker.take(message)
+    try:
+        if worker.open():
+            while not isinstance(message := connection.recv(), Stop):
+                worker.take(message)
+    except (EOFError, OSError) as error:
+        if no_room(error):
+            raise
+    except _Stopped:
+        pass
     # Numerical libraries keep threads that can hang at exit, and all that matters is on disk.
     logging.shutdown()
+    lock.release()
     os._exit(0)
 
 
+def _end_with_parent(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(PARENT_EVERY_S)
+    os._exit(0)
+
+
+class _Stopped(Exception):
+    """Told to stop while waiting for room on the disk."""
+
+
 class Worker:
-    """One scene. Every frame ends as `Committed` or `SetAside`."""
+    """One scene. Every frame ends as `Committed` or `SetAside`, or with the process."""
 
     def __init__(self, spec: SceneSpec, connection: Connection[Any, Any]) -> None:
         self.spec = spec
         self.connection = connection
         self.engine = load_engine(spec.engine)
-        self.states = History(spec.states)
+        self.states: History | None = None
         self.reconstruction: Reconstruction | None = None
-        self.fault = ""
         self._progress_at = 0.0
 
+    def open(self) -> bool:
+        """Takes up what is committed and says so; False where it cannot be gone on from."""
+        try:
+            self.states = history = History.open(self.spec.states)
+            undone: tuple[int, ...] = ()
+            faults: tuple[str, ...] = ()
+            if history.indices:
+                self.reconstruction = self.engine.resume(
+                    self.spec.rig, self.spec.settings, history, held=lambda index: holds(self.spec.frames, index)
+                )
+                if self.reconstruction.resumed is not None:
+                    undone = tuple(self.reconstruction.resumed.undone)
+                    faults = tuple(self.reconstruction.resumed.faults)
+            report = history.report(history.indices[-1]) if history.indices else {}
+            self.connection.send(Ready(tuple(history.indices), dict(history.damaged), report, undone, faults))
+        except (HistoryError, ValueError) as error:  # what is damaged says so with a ValueError
+            log.exception("scene %s cannot be taken up again", self.spec.folder.name)
+            self.connection.send(Broken(f"{type(error).__name__}: {error}"))
+            return False
+        return True
+
     def take(self, message: FrameReady) -> None:
-        """Reconstructs one frame."""
-        if self.fault:  # frames that waited behind a first frame that failed: none of them is a first frame
-            message.file.unlink(missing_ok=True)
-            self.connection.send(SetAside(message.index, self.fault, fatal=True))
-            return
-        self.connection.send(Started(message.index))
+        """Reconstructs one frame; where the disk is full, again until there is room."""
+        stall = STALL_S
+        while True:
+            try:
+                self.connection.send(self.finish(message))
+                return
+            except Exception as error:  # whatever came of it, as zipfile closing what it could not write
+                if not no_room(error):
+                    raise
+                log.warning("scene %s, frame %d: %s", self.spec.folder.name, message.index, error)
+                self.connection.send(Stalled(message.index, str(error), stall))
+            if self.connection.poll(stall):  # nothing else comes while a frame is at work
+                raise _Stopped
+            stall = min(2 * stall, LONGEST_STALL_S)
+
+    def finish(self, message: FrameReady) -> Committed | SetAside:
+        """Commits a frame, or says why not.
+
+        Raises:
+            OSError: the disk is full; nothing is committed.
+        """
         dropped: dict[str, str] = {}
         try:
             frame, dropped = self.decode(message)
-            if not frame.images:
-                self.connection.send(SetAside(message.index, "no camera's picture could be decoded", dropped))
-                return
-            self.connection.send(self.reconstruct(frame, dropped))
+            least = self.spec.minimum_cameras
+            if len(frame.images) < least:
+                reason = f"{len(frame.images)} cameras' pictures are left, the scene's minimum is {least}"
+                return SetAside(message.index, reason, dropped)
+            return self.reconstruct(frame, dropped)
+        except FrameDamage as error:
+            return SetAside(message.index, f"its record in the frame log is damaged: {error}", dropped)
         except Exception as error:  # whatever the engine raises, the service goes on and says so
+            if no_room(error):
+                raise
             log.exception("scene %s, frame %d", self.spec.folder.name, message.index)
-            reason = f"{type(error).__name__}: {error}"
-            if self.reconstruction is None:  # without a first frame there is nothing to go on from
-                self.fault = f"frame {message.index} could not be reconstructed: {reason}"
-            self.connection.send(SetAside(message.index, reason, dropped, fatal=bool(self.fault)))
-        finally:
-            message.file.unlink(missing_ok=True)
+            # Without a first frame there is nothing to go on from.
+            first = self.reconstruction is None
+            return SetAside(message.index, f"{type(error).__name__}: {error}", dropped, fatal=first)
 
     def decode(self, message: FrameReady) -> tuple[Frame, dict[str, str]]:
-        """The frame, and the cameras left out of it with the reason."""
-        encoded, encoded_masks = read_frame(message.file)
+        """The frame, and the cameras left out of it with the reason.
+
+        Raises:
+            FrameDamage: the record that holds the whole frame cannot be used.
+        """
         images, masks, dropped = {}, {}, {}
+        faults: list[str] = []
+        encoded: dict[str, memoryview] = {}
+        encoded_masks: dict[str, memoryview] = {}
+        for name in message.files:
+            try:
+                pictures = read_pictures(self.spec.frames, name)
+            except FrameDamage as error:
+                if len(message.files) == 1:
+                    raise
+                faults.append(f"a record in the frame log is damaged: {error}")
+                continue
+            if len(message.files) == 1 and frame_identity(pictures.hashes, message.time) != message.identity:
+                raise FrameDamage(f"{name}: it holds other pictures than were acknowledged")
+            encoded.update(pictures.images)
+            encoded_masks.update(pictures.masks)
         for name, data in encoded.items():
             camera = self.spec.rig[name]
             size = (camera.width, camera.height)
             try:
-                image = decode_image(data, size=size, name=f"image of camera {name!r}")
+                image = decode_image(bytes(data), size=size, name=f"image of camera {name!r}")
                 if name in encoded_masks:
-                    masks[name] = decode_mask(encoded_masks[name], size=size, name=f"mask of camera {name!r}")
+                    mask = bytes(encoded_masks[name])
+                    masks[name] = decode_mask(mask, size=size, name=f"mask of camera {name!r}")
                 images[name] = image
             except ImageError as error:
                 dropped[name] = str(error)
+        for name in self.spec.rig.names:
+            if name not in encoded:
+                dropped[name] = "; ".join(faults) or f"camera {name!r} had sent nothing when the frame was closed"
         return Frame(message.index, message.time, images, masks), dropped
 
     def reconstruct(self, frame: Frame, dropped: dict[str, str]) -> Committed:
         """Runs the first frame or an update, and commits."""
-        began = time.perf_counter()
+        assert self.states is not None
         if self.reconstruction is None:
-            reconstruction = self.engine.start(
+            self.reconstruction = self.engine.start(
                 self.spec.rig,
                 frame,
                 self.spec.settings,
                 points=self.points(),
                 progress=self.progress,
                 history=self.states,
-            )
-            state = self.states.gaussians(frame.index)
-            self.reconstruction = reconstruction
-            seconds = {"total": time.perf_counter() - began}
-            return Committed(
-                frame.index,
-                frame.time,
-                iterations=self.spec.settings.static.iterations,
-                seconds=seconds,
-                loss=[],
-                psnr=float("nan"),
-                moving=int(state.moving.sum()),
-                gaussians=len(state),
                 dropped=dropped,
             )
-        report = self.reconstruction.step(frame)
-        return Committed(
-            frame.index,
-            frame.time,
-            iterations=report.iterations,
-            seconds={**report.seconds, "total": time.perf_counter() - began},
-            loss=[float(value) for value in report.loss],
-            psnr=float(report.psnr),
-            moving=report.moving,
-            gaussians=report.gaussians,
-            dropped=dropped,
-        )
+        else:
+            self.reconstruction.step(frame, dropped=dropped)
+        return Committed(frame.index, self.states.report(frame.index), tuple(self.retain()))
+
+    def retain(self) -> list[int]:
+        """Deletes old states by the scene's rule; what cannot be deleted now is next time."""
+        assert self.states is not None
+        rule = self.spec.keep_states
+        if rule.last is None and rule.bytes is None:
+            return []
+        last, size = (None if value is None else max(1, value) for value in (rule.last, rule.bytes))
+        return self.states.retain(last=last, size_bytes=size)
 
     def points(self) -> InitialPoints | None:
         """The initial cloud that was put before the first frame."""

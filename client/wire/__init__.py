@@ -1,7 +1,15 @@
 """What crosses the wire, once: the service imports these models, the SDK returns them. One file a resource."""
 
 from client.wire.base import MAX_CAMERAS, MAX_PIXELS_A_SIDE, CameraName, Model, Pixel, Row3, Row4
-from client.wire.frames import FINISHED, FrameReceipt, FrameReportModel, FrameState, MissingRequest, PartReceipt
+from client.wire.frames import (
+    FINISHED,
+    CameraFitModel,
+    FrameReceipt,
+    FrameReportModel,
+    FrameState,
+    MissingRequest,
+    PartReceipt,
+)
 from client.wire.framing import (
     FRAME_MEDIA_TYPE,
     FileKind,
@@ -35,6 +43,7 @@ __all__ = [
     "FRAME_MEDIA_TYPE",
     "MAX_CAMERAS",
     "MAX_PIXELS_A_SIDE",
+    "CameraFitModel",
     "CameraModel",
     "CameraName",
     "FileKind",

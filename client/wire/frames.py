@@ -51,6 +51,15 @@ class MissingRequest(Model):
     reason: str = Field(default="", max_length=500, description="For people.")
 
 
+class CameraFitModel(Model):
+    """How well one camera's picture was met, when it was last rendered: a bumped or changed camera shows."""
+
+    psnr: float | None = Field(description="dB.")
+    colour_shift: tuple[float, float, float] | None = Field(
+        default=None, description="Mean of the picture minus mean of the render, RGB in 0…1; null where not measured."
+    )
+
+
 class FrameReportModel(Model):
     """What became of a frame."""
 
@@ -74,5 +83,6 @@ class FrameReportModel(Model):
     seconds: dict[str, float] = Field(default_factory=dict, description="By stage.")
     loss: list[float] = Field(default_factory=list)
     psnr: float | None = Field(default=None, description="dB, training views of the last iterations.")
+    cameras: dict[str, CameraFitModel] = Field(default_factory=dict, description="By camera that the update saw.")
     moving: int | None = None
     gaussians: int | None = None

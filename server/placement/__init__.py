@@ -9,6 +9,18 @@ Entry = Callable[..., None]
 """Called in the process as entry(spec, connection); `connection` has recv and send of a multiprocessing Connection."""
 
 
+class Ended(str):
+    """Why a process is gone, as a sentence; `exit_code` as in multiprocessing: −N for signal N, None where unknown."""
+
+    exit_code: int | None
+
+    def __new__(cls, exit_code: int | None) -> Ended:
+        """The sentence for an exit code."""
+        self = super().__new__(cls, f"its process ended by itself (exit code {exit_code})")
+        self.exit_code = exit_code
+        return self
+
+
 class Process(Protocol):
     """A running process of a scene."""
 
@@ -23,7 +35,7 @@ class Placement(Protocol):
     """Starts processes."""
 
     def start(
-        self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[str], None]
+        self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[Ended], None]
     ) -> Process:
         """Starts a process.
 

@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from server.messages import Stop
-from server.placement import Entry
+from server.placement import Ended, Entry
 
 _context = multiprocessing.get_context("spawn")
 
@@ -25,7 +25,7 @@ class LocalProcess:
         entry: Entry,
         spec: Any,
         on_message: Callable[[Any], None],
-        on_end: Callable[[str], None],
+        on_end: Callable[[Ended], None],
         prepare: Callable[[], None] | None = None,
     ) -> None:
         self._loop = asyncio.get_running_loop()
@@ -91,7 +91,7 @@ class LocalProcess:
             self._process.join()
             code = self._process.exitcode
         self._outbox.put(None)  # nobody may ever call stop: the other thread ends with the process
-        self._call(self._on_end, f"its process ended by itself (exit code {code})")
+        self._call(self._on_end, Ended(code))
 
     def _call(self, function: Callable[[Any], None], argument: Any) -> None:
         with contextlib.suppress(RuntimeError):  # the event loop has closed
@@ -115,7 +115,7 @@ class LocalPlacement:
         self.prepare = prepare
 
     def start(
-        self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[str], None]
+        self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[Ended], None]
     ) -> LocalProcess:
         """Spawns the process."""
         return LocalProcess(entry, spec, on_message, on_end, self.prepare)

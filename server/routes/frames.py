@@ -2,88 +2,131 @@
 
 from __future__ import annotations
 
-import asyncio
-import io
-from typing import Any
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Request, Response
-from PIL import Image
-from starlette.datastructures import UploadFile
+from fastapi import APIRouter, Path, Query, Request, Response
+from starlette.requests import ClientDisconnect
 
-from client.wire import FrameReceipt, FrameReportModel
-from server.image_structure import StructureError, walk
+from client.wire import (
+    FRAME_MEDIA_TYPE,
+    FileKind,
+    FrameReceipt,
+    FrameReportModel,
+    MissingRequest,
+    PartReceipt,
+)
+from server.door import take_camera, take_file, take_form, take_framed
 from server.messages import PlyQuery
 from server.problems import Problem
 from server.routes.access import FrameIndex, TheScene
-from server.scenes import Scene
 
 router = APIRouter(prefix="/v1/scenes", tags=["frames"])
 
-MASK = "mask."
-EXIF_ORIENTATION = 0x0112
-
+BINARY = {"type": "string", "format": "binary"}
 BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
         "content": {
+            FRAME_MEDIA_TYPE: {"schema": {**BINARY, "description": "S4DF, as client/wire/framing.py writes it."}},
             "multipart/form-data": {
                 "schema": {
                     "type": "object",
                     "properties": {"time": {"type": "number", "description": "Seconds; optional."}},
                     "additionalProperties": {
-                        "type": "string",
-                        "format": "binary",
+                        **BINARY,
                         "description": "One file a camera, the field called like the camera; `mask.<camera>` optional.",
                     },
                 }
-            }
+            },
         },
     }
 }
+PICTURE: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            **{kind: {"schema": BINARY} for kind in ("image/jpeg", "image/png", "image/webp")},
+            FRAME_MEDIA_TYPE: {"schema": {**BINARY, "description": "Picture and mask of the camera at once."}},
+        },
+    }
+}
+CameraPath = Annotated[str, Path(max_length=64, description="Of the rig.")]
+Seconds = Annotated[
+    float | None, Query(allow_inf_nan=False, description="Of the frame; the first given by a camera holds for all.")
+]
 
 
 @router.put("/{id}/frames/{n}", status_code=202, openapi_extra=BODY)
 async def put(scene: TheScene, n: FrameIndex, request: Request) -> FrameReceipt:
-    """Takes frame n: one JPEG, PNG or WebP a camera, in order and without gaps.
+    """Takes frame n: one JPEG, PNG or WebP a camera, in order and without gaps. On disk when this answers.
 
-    The same frame again gets the same answer; other content under a known index is refused (409), as is a gap.
-    A full queue answers 429 with Retry-After.
+    The same frame again gets the same answer; other content under a known index is refused (409), as is a gap, with the
+    index expected. A full queue answers 429 with Retry-After, or skips where the scene says so; a full disk 507.
     """
-    if not request.headers.get("content-type", "").startswith("multipart/form-data"):
-        raise Problem(
-            415,
-            "a frame is multipart/form-data",
-            field="Content-Type",
-            value=request.headers.get("content-type", ""),
-            remedy="send one file a camera, the field called like the camera",
-        )
-    # A picture sent as a plain field (no file name) would be read as text: such fields are kept short.
-    async with request.form(max_files=2 * len(scene.rig) + 8, max_fields=8, max_part_size=4096) as form:
-        files: dict[str, bytes] = {}
-        time: float | None = None
-        for name, value in form.multi_items():
-            if name == "time" and isinstance(value, str):
-                time = _time(value)
-            elif isinstance(value, UploadFile):
-                if name in files:
-                    raise Problem(422, f"{name!r} is here twice", field=name, remedy="send one file a field")
-                files[name] = await value.read()
-            else:
-                raise Problem(
-                    422, f"{name!r} is no file", field=name, value=value, remedy="send it with a file name in its part"
-                )
-    images = {name: data for name, data in files.items() if not name.startswith(MASK)}
-    masks = {name.removeprefix(MASK): data for name, data in files.items() if name.startswith(MASK)}
-    await asyncio.to_thread(check_files, scene, images, masks)
-    return await scene.take_frame(n, images, masks, time)
+    kind = _media_type(request)
+    try:
+        if kind == FRAME_MEDIA_TYPE:
+            return await take_framed(scene, n, _body(request), _length(request))
+        if kind == "multipart/form-data":
+            return await take_form(scene, n, request)
+    except ClientDisconnect:
+        raise Problem(400, "the sender went away", field="body", remedy="send the frame again") from None
+    raise Problem(
+        415,
+        f"a frame is {FRAME_MEDIA_TYPE} or multipart/form-data",
+        field="Content-Type",
+        value=request.headers.get("content-type", ""),
+        remedy="send one file a camera, the field called like the camera",
+    )
+
+
+@router.put("/{id}/frames/{n}/cameras/{c}", status_code=202, openapi_extra=PICTURE)
+async def put_camera(
+    scene: TheScene,
+    n: FrameIndex,
+    c: CameraPath,
+    request: Request,
+    time: Seconds = None,
+    kind: Annotated[FileKind, Query(description="Send a mask before its picture, or both in one S4DF.")] = (
+        FileKind.IMAGE
+    ),
+) -> PartReceipt:
+    """Takes one camera's picture of frame n, where each camera has its own sender. On disk when this answers.
+
+    The frame closes when all cameras' pictures are in, on POST …/close, or at the scene's deadline. A camera may be
+    some frames ahead of the others; frames close in order.
+    """
+    try:
+        if _media_type(request) == FRAME_MEDIA_TYPE:
+            return await take_camera(scene, n, c, _body(request), _length(request))
+        return await take_file(scene, n, c, kind, time, await request.body())
+    except ClientDisconnect:
+        raise Problem(400, "the sender went away", field="body", remedy="send the picture again") from None
+
+
+@router.post("/{id}/frames/{n}/close", status_code=202)
+async def close(scene: TheScene, n: FrameIndex) -> FrameReceipt:
+    """Closes a frame that cameras send one by one, with those that are in; what comes later is refused."""
+    return await scene.ingest.close(n)
+
+
+@router.post("/{id}/frames/{n}/missing")
+async def missing(scene: TheScene, n: FrameIndex, request: MissingRequest | None = None) -> FrameReportModel:
+    """Declares the next frame missing, for ever, so that a rig that lost it goes on with the one after.
+
+    Pictures of it that cameras have sent are dropped. The update after it covers the longer time.
+    """
+    return await scene.ingest.declare_missing(n, "" if request is None else request.reason)
 
 
 @router.get("/{id}/frames/{n}")
 async def report(scene: TheScene, n: FrameIndex) -> FrameReportModel:
     """Where the frame is, and its numbers once it is committed."""
-    if n not in scene.frames:
+    found = await scene.report(n)
+    if found is None:
         raise Problem(404, f"frame {n} is not here", field="n", value=n, remedy=f"the next frame is {scene.next_frame}")
-    return scene.frames[n].report
+    return found
 
 
 @router.get(
@@ -97,74 +140,15 @@ async def ply(scene: TheScene, n: FrameIndex) -> Response:
     return Response(answer.body, media_type=answer.media_type)
 
 
-def check_files(scene: Scene, images: dict[str, bytes], masks: dict[str, bytes]) -> None:
-    """Every camera has one whole picture of its size; masks, where given, belong to all cameras."""
-    names = set(scene.rig.names)
-    for kind, files in (("camera", images), ("mask", masks)):
-        for name in sorted(set(files) - names):
-            raise Problem(
-                422,
-                f"the rig has no camera {name!r}",
-                field=name if kind == "camera" else MASK + name,
-                value=name,
-                remedy=f"the cameras are {', '.join(scene.rig.names)}",
-            )
-        missing = sorted(names - set(files))
-        if missing and (files or kind == "camera"):
-            field = missing[0] if kind == "camera" else MASK + missing[0]
-            raise Problem(
-                422,
-                f"no {'picture' if kind == 'camera' else 'mask'} of {len(missing)} cameras: {', '.join(missing)}",
-                field=field,
-                remedy="send one for every camera" + ("" if kind == "camera" else ", or no masks at all"),
-            )
-    for kind, files in (("", images), (MASK, masks)):
-        for name, data in files.items():
-            check_picture(scene, kind + name, name, data)
+def _media_type(request: Request) -> str:
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
-def check_picture(scene: Scene, field: str, name: str, data: bytes) -> None:
-    """A whole file of a kind that is taken, of the camera's size, not turned."""
-    camera = scene.rig[name]
-    try:
-        header = walk(data)
-    except StructureError as error:
-        fault = str(error)
-        raise Problem(
-            422, f"{field}: {fault}", field=field, value=f"{len(data)} bytes", remedy=fault.rpartition("; ")[2]
-        ) from None
-    if (header.width, header.height) != (camera.width, camera.height):
-        raise Problem(
-            422,
-            f"{field}: the picture is {header.width}x{header.height}, the camera {camera.width}x{camera.height}",
-            field=field,
-            value=f"{header.width}x{header.height}",
-            remedy="send pictures of the size the camera was calibrated for",
-        )
-    if field != name and header.format != "png":
-        raise Problem(
-            422, f"{field}: a mask as {header.format}", field=field, value=header.format, remedy="send masks as PNG"
-        )
-    if header.format == "jpeg" and (orientation := _orientation(data)) != 1:
-        raise Problem(
-            422,
-            f"{field}: EXIF orientation {orientation} would turn the picture",
-            field=field,
-            value=orientation,
-            remedy="store the pixels the way the camera was calibrated and drop the tag",
-        )
+def _body(request: Request) -> AsyncIterator[bytes]:
+    return request.stream()
 
 
-def _orientation(data: bytes) -> int:
-    try:
-        with Image.open(io.BytesIO(data), formats=["JPEG"]) as picture:  # reads the segments, decodes nothing
-            return int(picture.getexif().get(EXIF_ORIENTATION, 1))
-    except Exception:  # damaged metadata: the worker finds out what it means, and says so
-        return 1
-
-
-def _time(value: str) -> float:
-    try:
-        return float(value)
-    except ValueError:
-        raise Problem(422, "time is no number", field="time", value=value, remedy="give seconds") from None
+def _length(request: Request) -> int | None:
+    """Announced bytes of the body; the server has made sure that it is a number."""
+    length = request.headers.get("content-length")
+    return None if length is None or not length.isdigit() else int(length)

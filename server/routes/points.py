@@ -6,7 +6,6 @@ import asyncio
 import hashlib
 import io
 import zipfile
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,8 @@ from fastapi import APIRouter, Request
 from numpy.typing import NDArray
 
 from client.wire import PointsReceipt
+from scas4d_core.npz import write_npz
+from server.disk import full_disk, no_room
 from server.problems import Problem
 from server.routes.access import TheScene, TheSettings
 
@@ -48,7 +49,13 @@ async def put(scene: TheScene, server: TheSettings, request: Request) -> PointsR
                 field="points",
                 remedy="create a new scene and give the points before frame 0",
             )
-        await asyncio.to_thread(_write, scene.spec.points, arrays)
+        stored = {**arrays, "sha256": np.frombuffer(bytes.fromhex(sha256), np.uint8)}
+        try:
+            await asyncio.to_thread(write_npz, scene.spec.points, stored)
+        except Exception as error:
+            if no_room(error):
+                raise full_disk(error) from None
+            raise
         scene.points_sha256 = sha256
     return receipt
 
@@ -99,10 +106,3 @@ def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
             top = f"{arrays[name].min():g} … {arrays[name].max():g}"
             raise Problem(422, f"{name} has values {top}", field=name, value=top, remedy="give values in 0 … 1")
     return arrays
-
-
-def _write(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    beside = path.with_suffix(".part")
-    with beside.open("wb") as file:
-        np.savez(file, allow_pickle=False, **arrays)
-    beside.replace(path)

@@ -1,4 +1,4 @@
-"""Create, list, inspect, delete scenes."""
+"""Create, list, inspect, pause, resume, delete scenes."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
                 value=f"{camera.width}x{camera.height}",
                 remedy="send smaller pictures with the intrinsics to match, or raise SCAS4D_MAX_IMAGE_PIXELS",
             )
-    scene = scenes.create(request, settings)
+    scene = await scenes.create(request, settings)
     response.headers["Location"] = f"/v1/scenes/{scene.id}"
     return scene.status()
 
@@ -69,6 +69,20 @@ async def listed(scenes: AllScenes) -> SceneList:
 @router.get("/{id}")
 async def inspect(scene: TheScene) -> SceneStatus:
     """The scene's state, progress and queue."""
+    return scene.status()
+
+
+@router.post("/{id}/pause")
+async def pause(scene: TheScene) -> SceneStatus:
+    """Frames are taken and none is reconstructed, after the one at work; holds over a restart of the service."""
+    await scene.pause(True)
+    return scene.status()
+
+
+@router.post("/{id}/resume")
+async def resume(scene: TheScene) -> SceneStatus:
+    """The scene goes on with the frames that wait."""
+    await scene.pause(False)
     return scene.status()
 
 

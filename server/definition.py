@@ -1,0 +1,113 @@
+"""What a scene is: rig, settings, how it takes frames. Written once, before the scene is acknowledged."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from blake3 import blake3
+
+from client.wire import SceneCreate
+from scas4d_core.npz import sync_folder
+from scas4d_core.settings import Settings
+from server.facts import Created
+from server.journal import read_journal
+
+FORMAT = 1
+SCENE_FILE, JOURNAL_FILE, FRAMES_FOLDER = "scene.json", "journal.log", "frames"
+
+
+class DefinitionError(ValueError):
+    """A folder without a definition that can be read: says why."""
+
+
+@dataclass(frozen=True)
+class Definition:
+    """A scene as it was created. `settings` are the preset's with the request's changes, as they were then."""
+
+    id: str
+    created: datetime
+    request: SceneCreate
+    settings: Settings
+
+    def as_json(self) -> dict[str, Any]:
+        """For `scene.json` and the journal."""
+        return {
+            "format": FORMAT,
+            "id": self.id,
+            "created": self.created.isoformat(),
+            "request": self.request.model_dump(mode="json"),
+            "settings": self.settings.model_dump(mode="json"),
+        }
+
+    @classmethod
+    def of_json(cls, data: Any) -> Definition:
+        """The same back.
+
+        Raises:
+            DefinitionError: it is of another format, or not what this version takes.
+        """
+        try:
+            if data["format"] != FORMAT:
+                raise DefinitionError(f"it is of format {data['format']}; this version reads format {FORMAT}")
+            return cls(
+                data["id"],
+                datetime.fromisoformat(data["created"]).astimezone(UTC),
+                SceneCreate.model_validate(data["request"]),
+                Settings.model_validate(data["settings"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:  # pydantic's error is a ValueError
+            raise DefinitionError(f"the definition cannot be read: {error}") from None
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """A file that is whole and on disk at `path`, or not there: temporary file, sync, rename, sync of the folder."""
+    beside = path.with_suffix(".part")
+    try:
+        with beside.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
+    except BaseException:
+        beside.unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)
+
+
+def write_definition(folder: Path, definition: Definition) -> None:
+    """Writes `scene.json`: from here on the scene exists."""
+    text = json.dumps(definition.as_json(), indent=1)
+    write_whole(
+        folder / SCENE_FILE, json.dumps({"blake3": _digest(text), "scene": json.loads(text)}, indent=1).encode()
+    )
+
+
+def read_definition(folder: Path) -> tuple[Definition, str | None]:
+    """The definition in a scene's folder, from `scene.json` or else from the journal; and what was damaged, or None.
+
+    Raises:
+        FileNotFoundError: there is no `scene.json`: the scene was never acknowledged.
+        DefinitionError: it is in neither of them.
+    """
+    try:
+        data = json.loads((folder / SCENE_FILE).read_bytes())
+        if _digest(json.dumps(data["scene"], indent=1)) != data["blake3"]:
+            raise DefinitionError("it fails its checksum")
+        return Definition.of_json(data["scene"]), None
+    except FileNotFoundError:
+        raise
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        said = f"{SCENE_FILE} is damaged ({error})"
+    for fact in read_journal(folder / JOURNAL_FILE).facts:
+        if isinstance(fact, Created):
+            return Definition.of_json(fact.definition), f"{said}; taken from the journal"
+    raise DefinitionError(f"{said}, and the journal does not have it either")
+
+
+def _digest(text: str) -> str:
+    return blake3(text.encode()).hexdigest()

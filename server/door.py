@@ -1,0 +1,220 @@
+"""Bodies of requests and messages of WebSockets to frames of a scene: receive, check, write, acknowledge."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import AsyncIterator, Sequence
+
+from fastapi import Request
+from starlette.datastructures import UploadFile
+
+from client.wire import FileKind, FrameFile, FrameHead, FrameReceipt, PartReceipt
+from server.disk import full_disk, no_room
+from server.pictures import MASK, check_files, check_picture
+from server.problems import Problem
+from server.scene import Scene
+from server.upload import Received, Receiving, receive_framed
+
+
+async def take_framed(scene: Scene, index: int | None, body: AsyncIterator[bytes], length: int | None) -> FrameReceipt:
+    """A whole frame as S4DF. `index` is that of the address, None where the head alone says it."""
+    begun: list[int] = []
+
+    def begin(head: FrameHead) -> Receiving:
+        _agree(head, index)
+        check_files(scene.rig, head.files, whole=True)
+        keep = scene.ingest.expects(head)
+        if keep:
+            scene.ingest.coming(head.index)
+            begun.append(head.index)
+        return _receiving(scene, head, scene.ingest.time_of(head.index, head.time), keep)
+
+    try:
+        head, receiving = await receive_framed(_to_the_end(body), begin, length)
+        return await _taken(scene, head, receiving)
+    finally:
+        await _drain(body)
+        for number in begun:
+            scene.ingest.came(number)
+
+
+async def take_form(scene: Scene, index: int, request: Request) -> FrameReceipt:
+    """A whole frame as multipart/form-data: as easy to send as it is slow to read."""
+    # A picture sent as a plain field (no file name) would be read as text: such fields are kept short.
+    async with request.form(max_files=2 * len(scene.rig) + 8, max_fields=8, max_part_size=4096) as form:
+        given: dict[str, UploadFile] = {}
+        time: float | None = None
+        for name, value in form.multi_items():
+            if name == "time" and isinstance(value, str):
+                time = _seconds(value)
+            elif isinstance(value, UploadFile):
+                if name in given:
+                    raise Problem(422, f"{name!r} is here twice", field=name, remedy="send one file a field")
+                given[name] = value
+            else:
+                raise Problem(
+                    422, f"{name!r} is no file", field=name, value=value, remedy="send it with a file name in its part"
+                )
+        # Names that no camera can have are refused here, as the model of a file would not take them.
+        for name in given:
+            scene_camera(scene, name.removeprefix(MASK), name)
+        head = _head(index, time, [_file(name, upload.size or 0) for name, upload in given.items()], part=False)
+        check_files(scene.rig, head.files, whole=True)
+        keep = scene.ingest.expects(head)
+        if keep:
+            scene.ingest.coming(index)
+        try:
+            receiving = _receiving(scene, head, scene.ingest.time_of(index, time), keep)
+            await _feed(
+                receiving,
+                [(file, await upload.read()) for file, upload in zip(head.files, given.values(), strict=True)],
+            )
+            return await _taken(scene, head, receiving)
+        finally:
+            if keep:
+                scene.ingest.came(index)
+
+
+async def take_camera(
+    scene: Scene, index: int | None, camera: str | None, body: AsyncIterator[bytes], length: int | None
+) -> PartReceipt:
+    """One camera's picture and mask as S4DF."""
+    names: list[str] = []
+
+    def begin(head: FrameHead) -> Receiving:
+        _agree(head, index)
+        check_files(scene.rig, head.files, whole=False)
+        names.append(_one_camera(head, camera))
+        scene.ingest.expects_part(head, names[0])
+        return _receiving(scene, head.model_copy(update={"part": True}), head.time, head.index >= scene.next_frame)
+
+    try:
+        head, receiving = await receive_framed(_to_the_end(body), begin, length)
+        return await _part_taken(scene, head, names[0], receiving)
+    finally:
+        await _drain(body)
+
+
+async def take_file(
+    scene: Scene, index: int, camera: str, kind: FileKind, time: float | None, data: bytes
+) -> PartReceipt:
+    """One camera's picture or mask, the file as it is."""
+    scene_camera(scene, camera, "c")
+    head = _head(index, time, [FrameFile(camera=camera, kind=kind, size=len(data))], part=True)
+    scene.ingest.expects_part(head, camera)
+    receiving = _receiving(scene, head, time, index >= scene.next_frame)
+    await _feed(receiving, [(head.files[0], data)])
+    return await _part_taken(scene, head, camera, receiving)
+
+
+def scene_camera(scene: Scene, camera: str, field: str) -> None:
+    """Refuses a camera that the rig does not have."""
+    if camera not in scene.rig.names:
+        raise Problem(
+            422,
+            f"the rig has no camera {camera!r}",
+            field=field,
+            value=camera,
+            remedy=f"the cameras are {', '.join(scene.rig.names)}",
+        )
+
+
+def _head(index: int, time: float | None, files: Sequence[FrameFile], *, part: bool) -> FrameHead:
+    if not files:
+        raise Problem(422, "no picture is here", field="body", remedy="send one file a camera")
+    return FrameHead(index=index, time=time, files=list(files), part=part)
+
+
+def _file(field: str, size: int) -> FrameFile:
+    kind = FileKind.MASK if field.startswith(MASK) else FileKind.IMAGE
+    return FrameFile(camera=field.removeprefix(MASK), kind=kind, size=size)
+
+
+def _receiving(scene: Scene, head: FrameHead, seconds: float | None, keep: bool) -> Receiving:
+    return Receiving(
+        scene.spec.frames, head, seconds, lambda file, data: check_picture(scene.rig, file, data), keep=keep
+    )
+
+
+async def _feed(receiving: Receiving, files: Sequence[tuple[FrameFile, bytes]]) -> None:
+    try:
+        for file, data in files:
+            await receiving.file(file, memoryview(data))
+    except BaseException as error:
+        await receiving.abort()
+        if no_room(error) and isinstance(error, OSError):
+            raise full_disk(error) from None
+        raise
+
+
+async def _taken(scene: Scene, head: FrameHead, receiving: Receiving) -> FrameReceipt:
+    received = await _finished(receiving)
+    try:
+        return await scene.ingest.take(head, received)
+    finally:
+        if not received.kept:
+            await receiving.abort()
+
+
+async def _part_taken(scene: Scene, head: FrameHead, camera: str, receiving: Receiving) -> PartReceipt:
+    received = await _finished(receiving)
+    try:
+        return await scene.ingest.take_part(head, camera, received)
+    finally:
+        if not received.kept:
+            await receiving.abort()
+
+
+async def _finished(receiving: Receiving) -> Received:
+    try:
+        return await receiving.finish()
+    except BaseException as error:
+        await receiving.abort()
+        if no_room(error) and isinstance(error, OSError):
+            raise full_disk(error) from None
+        raise
+
+
+async def _to_the_end(body: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+    async for chunk in body:
+        yield chunk
+
+
+async def _drain(body: AsyncIterator[bytes]) -> None:
+    """Reads what is left of a body that is refused: a sender that is still sending would not see the answer."""
+    async for _ in body:
+        pass
+
+
+def _agree(head: FrameHead, index: int | None) -> None:
+    if index is not None and head.index != index:
+        raise Problem(
+            422,
+            f"the head says frame {head.index}, the address frame {index}",
+            field="head.index",
+            value=head.index,
+            remedy="send both alike",
+        )
+
+
+def _one_camera(head: FrameHead, camera: str | None) -> str:
+    names = sorted({file.camera for file in head.files})
+    if len(names) != 1 or camera not in (None, names[0]):
+        raise Problem(
+            422,
+            f"files of {', '.join(names)}",
+            field="head.files",
+            value=", ".join(names),
+            remedy="send the files of one camera" + ("" if camera is None else f", {camera!r}, as the address says"),
+        )
+    return names[0]
+
+
+def _seconds(value: str) -> float:
+    try:
+        seconds = float(value)
+    except ValueError:
+        seconds = math.nan
+    if not math.isfinite(seconds):
+        raise Problem(422, "time is no finite number", field="time", value=value, remedy="give seconds")
+    return seconds

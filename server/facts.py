@@ -1,0 +1,123 @@
+"""What the journal of a scene says: small facts, for ever. Everything known of a frame follows from them in order."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from client.wire import FileKind
+
+Hashes = dict[str, dict[FileKind, str]]
+"""BLAKE3 of each file, by camera and kind."""
+
+
+class _Fact(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class Created(_Fact):
+    """The scene's definition, once more: `scene.json` may be damaged."""
+
+    fact: Literal["created"] = "created"
+    definition: dict[str, Any]
+
+
+class Taken(_Fact):
+    """A whole frame was acknowledged: its pictures lie in `files` of the frame log, which are all on disk."""
+
+    fact: Literal["taken"] = "taken"
+    index: int
+    time: float
+    identity: str
+    files: tuple[str, ...]
+    closed_by: Literal["whole", "complete", "request", "deadline", "found"] = "whole"
+    """`found`: not told by the journal, which is damaged, but whole in the frame log at a start."""
+
+
+class PartTaken(_Fact):
+    """One camera's files of a frame that is open were acknowledged. `time` is None where the camera gave none."""
+
+    fact: Literal["part"] = "part"
+    index: int
+    time: float | None
+    camera: str
+    file: str
+    hashes: dict[FileKind, str]
+
+
+class Missing(_Fact):
+    """A frame was declared missing."""
+
+    fact: Literal["missing"] = "missing"
+    index: int
+    reason: str
+
+
+class Skipped(_Fact):
+    """Frames were skipped because frame `by` came and the queue was full."""
+
+    fact: Literal["skipped"] = "skipped"
+    frames: tuple[int, ...]
+    by: int
+
+
+class SetAside(_Fact):
+    """A frame could not be reconstructed. `fatal`: the scene cannot go on without it."""
+
+    fact: Literal["set_aside"] = "set_aside"
+    index: int
+    reason: str
+    dropped: dict[str, str] = Field(default_factory=dict)
+    fatal: bool = False
+
+
+class Died(_Fact):
+    """The worker died at a frame; `own`: through its own doing, not by a signal from outside."""
+
+    fact: Literal["died"] = "died"
+    index: int
+    reason: str
+    own: bool
+
+
+class FramesDeleted(_Fact):
+    """Retention deleted the pictures of frames."""
+
+    fact: Literal["frames_deleted"] = "frames_deleted"
+    frames: tuple[int, ...]
+
+
+class StatesDeleted(_Fact):
+    """Retention deleted committed states, or they were found damaged or gone (`reason`)."""
+
+    fact: Literal["states_deleted"] = "states_deleted"
+    frames: tuple[int, ...]
+    reason: str = "retention"
+
+
+class Paused(_Fact):
+    """The scene was paused, or told to go on."""
+
+    fact: Literal["paused"] = "paused"
+    paused: bool
+
+
+Fact = Annotated[
+    Created | Taken | PartTaken | Missing | Skipped | SetAside | Died | FramesDeleted | StatesDeleted | Paused,
+    Field(discriminator="fact"),
+]
+_adapter: TypeAdapter[Fact] = TypeAdapter(Fact)
+
+
+def parse_fact(head: object) -> Fact:
+    """A fact from a record's head.
+
+    Raises:
+        ValueError: it is none; says why.
+    """
+    try:
+        return _adapter.validate_python(head)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ValueError(f"{'.'.join(map(str, first['loc'])) or 'fact'}: {first['msg']}") from None

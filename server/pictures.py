@@ -1,0 +1,104 @@
+"""Whether the files of a frame are what its scene's rig takes, as far as a door can tell without decoding pixels."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+
+from PIL import Image
+
+from client.wire import FileKind, FrameFile
+from scas4d_core.cameras import Rig
+from server.image_structure import StructureError, walk
+from server.problems import Problem
+
+MASK = "mask."
+EXIF_ORIENTATION = 0x0112
+EXIF = b"Exif\0\0"
+
+
+def field_of(file: FrameFile) -> str:
+    """How a file is called in a form and in answers: `<camera>`, or `mask.<camera>`."""
+    return MASK + file.camera if file.kind == FileKind.MASK else file.camera
+
+
+def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
+    """Every camera once, of the rig; of a whole frame all of them, and masks of all or of none.
+
+    Raises:
+        Problem: 422, names the file.
+    """
+    names = set(rig.names)
+    seen: dict[FileKind, set[str]] = {FileKind.IMAGE: set(), FileKind.MASK: set()}
+    for file in files:
+        field = field_of(file)
+        if file.camera not in names:
+            raise Problem(
+                422,
+                f"the rig has no camera {file.camera!r}",
+                field=field,
+                value=file.camera,
+                remedy=f"the cameras are {', '.join(rig.names)}",
+            )
+        if file.camera in seen[file.kind]:
+            raise Problem(422, f"{field!r} is here twice", field=field, remedy="send one file a camera and kind")
+        seen[file.kind].add(file.camera)
+    if not whole:
+        return
+    for kind, given in seen.items():
+        missing = sorted(names - given)
+        if missing and (given or kind == FileKind.IMAGE):
+            image = kind == FileKind.IMAGE
+            raise Problem(
+                422,
+                f"no {'picture' if image else 'mask'} of {len(missing)} cameras: {', '.join(missing)}",
+                field=missing[0] if image else MASK + missing[0],
+                remedy="send one for every camera" + ("" if image else ", or no masks at all"),
+            )
+
+
+def check_picture(rig: Rig, file: FrameFile, data: memoryview) -> None:
+    """A whole file of a kind that is taken, of the camera's size, not turned.
+
+    Raises:
+        Problem: 422, names the file, what it is, and the remedy.
+    """
+    camera, field = rig[file.camera], field_of(file)
+    try:
+        header = walk(data)
+    except StructureError as error:
+        fault = str(error)
+        raise Problem(
+            422, f"{field}: {fault}", field=field, value=f"{len(data)} bytes", remedy=fault.rpartition("; ")[2]
+        ) from None
+    if (header.width, header.height) != (camera.width, camera.height):
+        raise Problem(
+            422,
+            f"{field}: the picture is {header.width}x{header.height}, the camera {camera.width}x{camera.height}",
+            field=field,
+            value=f"{header.width}x{header.height}",
+            remedy="send pictures of the size the camera was calibrated for",
+        )
+    if file.kind == FileKind.MASK and header.format != "png":
+        raise Problem(
+            422, f"{field}: a mask as {header.format}", field=field, value=header.format, remedy="send masks as PNG"
+        )
+    if header.format == "jpeg" and (orientation := _orientation(data)) != 1:
+        raise Problem(
+            422,
+            f"{field}: EXIF orientation {orientation} would turn the picture",
+            field=field,
+            value=orientation,
+            remedy="store the pixels the way the camera was calibrated and drop the tag",
+        )
+
+
+def _orientation(data: memoryview) -> int:
+    # Metadata stands before the pixels, each piece at most 64 kB; few cameras write more than one.
+    if EXIF not in bytes(data[: 1 << 17]):
+        return 1
+    try:
+        with Image.open(io.BytesIO(data), formats=["JPEG"]) as picture:  # reads the segments, decodes nothing
+            return int(picture.getexif().get(EXIF_ORIENTATION, 1))
+    except Exception:  # damaged metadata: the worker finds out what it means, and says so
+        return 1

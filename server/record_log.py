@@ -1,0 +1,153 @@
+"""Records on disk: checksummed, appended, found again after a cut at any byte and flipped bits.
+
+A record is a header, a head (JSON) and a body (raw bytes), and a checksum behind them:
+
+    bytes  what
+    4      magic S4DR
+    1      version of the format, 1
+    1      kind, `Kind`
+    2      nought
+    4      length of the head
+    8      index of the frame that it is about
+    8      length of the body
+    4      CRC-32 of the 28 bytes before and of the head
+    …      head, UTF-8 JSON
+    …      body
+    16     BLAKE3 of all before, cut to 128 bits
+
+All numbers are unsigned little-endian. The CRC makes a header that is found in the middle of damage worth believing, so
+that a reader can look for the next record; the BLAKE3 says that the record is what was written. The body may be written
+before its checksum is known: a frame goes to disk while it is received.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+from blake3 import blake3
+
+MAGIC = b"S4DR"
+VERSION = 1
+HEADER = struct.Struct("<4sBBHIQQ")
+CRC = struct.Struct("<I")
+PREFIX = HEADER.size + CRC.size
+CHECKSUM = 16
+MAX_HEAD = 1 << 22
+
+
+class Kind(IntEnum):
+    """What a record holds."""
+
+    FACT = 1
+    """What became of a frame or of the scene; all in the head."""
+    PICTURES = 2
+    """The encoded files of a frame, or of one camera of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """One record as read. `body` is a view into what was read."""
+
+    kind: int
+    index: int
+    head: Any
+    body: memoryview
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Bytes [start, end) that hold no whole record, and why.
+
+    `index` and `kind` are those of the record that was there, where its header can still be believed.
+    """
+
+    start: int
+    end: int
+    reason: str
+    index: int | None = None
+    kind: int | None = None
+    torn: bool = False
+    """It reaches the end of the log: an append that was cut short looks like this."""
+
+
+def opening(kind: int, index: int, head: Any, body_length: int) -> bytes:
+    """Header and head of a record; the body and then `RecordDigest.checksum` follow."""
+    text = json.dumps(head, separators=(",", ":"), allow_nan=False).encode()
+    header = HEADER.pack(MAGIC, VERSION, kind, 0, len(text), index, body_length)
+    return header + CRC.pack(zlib.crc32(text, zlib.crc32(header))) + text
+
+
+def checksum(*pieces: bytes | bytearray | memoryview) -> bytes:
+    """Of a record, given as consecutive pieces."""
+    digest = blake3()
+    for piece in pieces:
+        digest.update(piece)
+    return digest.digest(CHECKSUM)
+
+
+def encoded(kind: int, index: int, head: Any, body: bytes = b"") -> bytes:
+    """A whole record."""
+    start = opening(kind, index, head, len(body))
+    return start + body + checksum(start, body)
+
+
+def read_at(data: memoryview, at: int) -> tuple[Record | Damage, int]:
+    """What begins at a byte, and where it ends.
+
+    Returns:
+        The record, or the damage; where its header cannot be believed the damage ends at the next one that can.
+    """
+    header = data[at : at + HEADER.size]
+    if len(header) < HEADER.size or header[:4] != MAGIC:
+        return _skip(data, at, "no record begins here")
+    _, version, kind, nought, head_length, index, body_length = HEADER.unpack(header)
+    head_end = at + PREFIX + head_length
+    if version != VERSION or nought or head_length > MAX_HEAD or head_end > len(data):
+        return _skip(data, at, "the header is of another version, damaged, or cut")
+    head_bytes = data[at + PREFIX : head_end]
+    if CRC.unpack_from(data, at + HEADER.size)[0] != zlib.crc32(head_bytes, zlib.crc32(header)):
+        return _skip(data, at, "the header or head fails its checksum")
+    end = head_end + body_length + CHECKSUM
+    if end > len(data):
+        damage, after = _skip(data, at, f"ends after {len(data) - at} of {end - at} bytes")
+        return Damage(at, after, damage.reason, index, kind, damage.torn), after
+    if checksum(data[at : end - CHECKSUM]) != data[end - CHECKSUM : end]:
+        return Damage(at, end, "the record fails its checksum", index, kind), end
+    try:
+        head = json.loads(bytes(head_bytes))
+    except ValueError as error:  # whole, but written by something else
+        return Damage(at, end, f"the head is no JSON ({error})", index, kind), end
+    return Record(kind, index, head, data[head_end : end - CHECKSUM]), end
+
+
+def records(data: bytes | memoryview) -> Iterator[Record | Damage]:
+    """All that a log holds, in order: every whole record, and what lies between them."""
+    view = memoryview(data)
+    at = 0
+    while at < len(view):
+        found, at = read_at(view, at)
+        yield found
+
+
+def _skip(data: memoryview, at: int, reason: str) -> tuple[Damage, int]:
+    """Damage up to the next header that can be believed, or to the end."""
+    text = data.obj if isinstance(data.obj, bytes) and len(data.obj) == len(data) else bytes(data)
+    following = at
+    while (following := text.find(MAGIC, following + 1)) >= 0:
+        header = data[following : following + HEADER.size]
+        if len(header) < HEADER.size:
+            break
+        _, version, _, nought, head_length, _, _ = HEADER.unpack(header)
+        head_end = following + PREFIX + head_length
+        if version != VERSION or nought or head_length > MAX_HEAD or head_end > len(data):
+            continue
+        head = data[following + PREFIX : head_end]
+        if CRC.unpack_from(data, following + HEADER.size)[0] == zlib.crc32(head, zlib.crc32(header)):
+            return Damage(at, following, reason), following
+    return Damage(at, len(data), reason, torn=True), len(data)

@@ -1,0 +1,123 @@
+"""A scene found on disk: its journal, its frame log and its states brought together, and what does not fit said."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from client.wire import FrameState
+from scas4d_core.history import History, HistoryError
+from server.definition import FRAMES_FOLDER, JOURNAL_FILE
+from server.facts import Fact, PartTaken, SetAside, Taken
+from server.frame_store import FrameDamage, Pictures, frame_of, read_pictures, remove, stored
+from server.journal import read_journal
+from server.ledger import Ledger, frame_identity
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """A scene as its folder tells it.
+
+    Attributes:
+        good: bytes of the journal that are whole. facts: those that the journal lacks, applied already.
+        sizes: bytes of each record of the frame log. damage: what was dropped, a sentence each.
+    """
+
+    ledger: Ledger
+    good: int
+    facts: list[Fact]
+    sizes: dict[str, int]
+    damage: list[str]
+
+
+def recover(folder: Path, scene: str) -> Recovered:
+    """Reads a scene's folder. Removes what interrupted uploads left; appends nothing. Blocking."""
+    frames = folder / FRAMES_FOLDER
+    frames.mkdir(exist_ok=True)
+    told = read_journal(folder / JOURNAL_FILE)
+    ledger, damage = Ledger(scene), list(told.damage)
+    for fact in told.facts:
+        ledger.apply(fact)
+    sizes = stored(frames)
+    facts: list[Fact] = []
+    if told.damage:
+        for fact in _found(frames, sorted(_unnamed(ledger, sizes)), ledger):
+            facts.append(fact)
+            damage.append(f"frame {fact.index}: the journal does not name its record any more; taken as it was found")
+    debris = _unnamed(ledger, sizes)
+    remove(frames, debris)
+    sizes = {name: size for name, size in sizes.items() if name not in debris}
+    indices, damaged = _states(folder / "states", damage)
+    facts += ledger.reconcile(indices, damaged)
+    for index, entry in ledger.frames.items():
+        lost = [name for name in entry.files if name not in sizes]
+        if not lost:
+            continue
+        if entry.report.state == FrameState.QUEUED:
+            reason = f"its record is gone from the frame log: {', '.join(lost)}"
+            gone = SetAside(index=index, reason=reason)
+            damage.append(f"frame {index}: {reason}")
+            ledger.apply(gone)
+            facts.append(gone)
+        entry.files = tuple(name for name in entry.files if name in sizes)
+        entry.report.held = bool(entry.files)
+    return Recovered(ledger, told.good, facts, sizes, damage)
+
+
+def _unnamed(ledger: Ledger, sizes: dict[str, int]) -> set[str]:
+    """Records that no fact names."""
+    named = {name for entry in ledger.frames.values() for name in entry.files}
+    named |= {name for frame in ledger.open.values() for name in frame.files}
+    return set(sizes) - named
+
+
+def _found(folder: Path, names: list[str], ledger: Ledger) -> Iterator[Taken | PartTaken]:
+    """Whole records of frames whose facts the damaged journal has lost, applied.
+
+    Only where one record can be meant: two whole ones of a frame would leave open which was acknowledged.
+    """
+    for name in names:
+        index = frame_of(name)
+        entry = ledger.frames.get(index)
+        known = entry is not None and (entry.receipt is not None or entry.report.state != FrameState.SET_ASIDE)
+        if known or (entry is None and index != ledger.next_frame):
+            continue
+        try:
+            pictures = read_pictures(folder, name)
+        except FrameDamage:
+            continue
+        fact = _part(index, name, pictures) if pictures.part else _whole(index, name, pictures, ledger)
+        alone = pictures.part or sum(frame_of(other) == index for other in names) == 1
+        if fact is not None and alone:
+            ledger.apply(fact)
+            yield fact
+
+
+def _whole(index: int, name: str, pictures: Pictures, ledger: Ledger) -> Taken | None:
+    before = max(
+        (e.report.time for i, e in ledger.frames.items() if i < index and e.report.time is not None), default=None
+    )
+    if pictures.time is None or (before is not None and pictures.time <= before):
+        return None
+    identity = frame_identity(pictures.hashes, pictures.time)
+    return Taken(index=index, time=pictures.time, identity=identity, files=(name,), closed_by="found")
+
+
+def _part(index: int, name: str, pictures: Pictures) -> PartTaken | None:
+    if len(pictures.hashes) != 1:
+        return None
+    ((camera, kinds),) = pictures.hashes.items()
+    return PartTaken(index=index, time=pictures.time, camera=camera, file=name, hashes=kinds)
+
+
+def _states(folder: Path, damage: list[str]) -> tuple[list[int], dict[int, str]]:
+    """Committed states that can be read, and those that cannot."""
+    try:
+        history = History.load(folder)
+    except HistoryError as error:
+        if (folder / "fixed.npz").exists():
+            damage.append(f"the committed states cannot be read: {error}")
+        return [], {}
+    damage.extend(f"frame {index}: its state is damaged: {reason}" for index, reason in history.damaged.items())
+    return history.indices, dict(history.damaged)

@@ -1,0 +1,434 @@
+"""A scene: its state, the way of its frames through the worker, and what happens when that dies. On the event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Coroutine
+from pathlib import Path
+from typing import Any
+
+from client.wire import FrameReportModel, FrameState, ProgressModel, SceneState, SceneStatus
+from scas4d_core.cameras import Camera
+from server import reports, worker
+from server.definition import JOURNAL_FILE, Definition
+from server.disk import no_room
+from server.facts import Died, Fact, FramesDeleted, SetAside, StatesDeleted
+from server.frame_store import remove
+from server.hub import Event, FrameFinished, Hub, SceneChanged
+from server.ingest import Ingest
+from server.journal import Journal
+from server.ledger import FrameEntry
+from server.messages import Answer, Broken, Committed, FrameReady, Progressed, Query, Ready, SceneSpec, Stalled
+from server.messages import SetAside as SetAsideMessage
+from server.placement import Ended, Placement, Process
+from server.problems import Problem
+from server.readers import Readers
+from server.recovery import Recovered
+from server.retention import deletable
+from server.settings import ServerSettings
+from server.supervision import Supervision, given_up
+
+log = logging.getLogger("scas4d.server")
+
+AGAIN_S = 1.0
+"""A fact that the disk has no room for is written again after so long."""
+
+
+class Scene:
+    """One rig, one reconstruction.
+
+    Frames are numbered from 0 without gaps; a frame is acknowledged, waits in a bounded queue, and ends committed, set
+    aside, missing or skipped. What the scene knows of them is `ledger`; every change is in the journal first.
+
+    Args:
+        found: what its folder tells, of a new scene too.
+        damage: what was found damaged before.
+    """
+
+    def __init__(
+        self,
+        definition: Definition,
+        folder: Path,
+        found: Recovered,
+        server: ServerSettings,
+        placement: Placement,
+        hub: Hub,
+    ) -> None:
+        self.id, self.request, self.created = definition.id, definition.request, definition.created
+        self.rig = definition.request.rig.rig()
+        self.server = server
+        self.rules = definition.request.ingest
+        least = self.rules.minimum_cameras
+        self.minimum_cameras = -(-len(self.rig) // 2) if least is None else min(least, len(self.rig))
+        self.queue_limit = self.rules.queue_frames or server.queue_frames
+        self.spec = SceneSpec(
+            server.engine, folder, self.rig, definition.settings, self.minimum_cameras, self.rules.keep_states
+        )
+        self.ledger = found.ledger
+        self.sizes = found.sizes
+        self.damage = found.damage
+        self.journal = Journal(folder / JOURNAL_FILE, found.good)
+        self.supervision = Supervision()
+        self.progress: ProgressModel | None = None
+        self.points_sha256: str | None = None
+        self.gaussians: int | None = None
+        self.last_seconds = 1.0
+        self.door = asyncio.Lock()
+        self._trouble: str | None = None
+        """Why the scene is degraded: the last frame's, or that of the worker or the disk."""
+        self._at_work: int | None = None
+        self._ready = False
+        self._stopping = False
+        self._again: asyncio.TimerHandle | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._placement = placement
+        self._hub = hub
+        self._files = reports.ReportFiles(self.spec.states)
+        self.ingest = Ingest(self)
+        self._questions = Readers(self.spec, server, placement)
+        self._worker: Process
+        self._start_worker()
+        if found.facts:
+            self.background(self._write(*found.facts))
+
+    def _tell(self, event: Event) -> None:
+        """Tells who listens to the scene (`server.hub`); called at every change of its status or of a frame."""
+        self._hub.publish(self.id, event)
+
+    @property
+    def frames(self) -> dict[int, FrameEntry]:
+        """All frames that are closed, by index."""
+        return self.ledger.frames
+
+    @property
+    def committed(self) -> list[int]:
+        """Frames whose state can be read, rising."""
+        return self.ledger.committed
+
+    @property
+    def next_frame(self) -> int:
+        """The index that is closed next."""
+        return self.ledger.next_frame
+
+    @property
+    def queued(self) -> int:
+        """Frames acknowledged and not finished."""
+        return self.ledger.unfinished
+
+    @property
+    def error(self) -> str | None:
+        """Why the scene is failed or degraded."""
+        return self.ledger.fatal or self._trouble
+
+    @property
+    def state(self) -> SceneState:
+        """Where the scene is; see `SceneStatus`."""
+        if self.ledger.fatal is not None:
+            return SceneState.FAILED
+        if self._at_work is not None and self._ready:
+            started = self.committed or self.ledger.states_deleted
+            return SceneState.UPDATING if started else SceneState.INITIALISING
+        if self.ledger.paused:
+            return SceneState.PAUSED
+        if self._trouble is not None:
+            return SceneState.DEGRADED
+        if not self.ledger.frames and not self.ledger.open:
+            return SceneState.AWAITING
+        return SceneState.READY
+
+    def status(self) -> SceneStatus:
+        """The scene as it is now."""
+        ledger = self.ledger
+        return SceneStatus(
+            id=self.id,
+            name=self.request.name,
+            state=self.state,
+            error=self.error,
+            progress=self.progress,
+            cameras=list(self.rig.names),
+            has_points=self.points_sha256 is not None,
+            next_frame=ledger.next_frame,
+            queued=ledger.unfinished,
+            queue_limit=self.queue_limit,
+            committed=len(ledger.committed),
+            first_committed=ledger.committed[0] if ledger.committed else None,
+            last_committed=ledger.committed[-1] if ledger.committed else None,
+            gaussians=self.gaussians,
+            paused=ledger.paused,
+            open_frames=sorted(ledger.open),
+            set_aside=ledger.counts[FrameState.SET_ASIDE],
+            missing=ledger.counts[FrameState.MISSING],
+            skipped=ledger.counts[FrameState.SKIPPED],
+            worker_deaths=self.supervision.deaths,
+            frames_held=len(self.sizes),
+            frame_bytes=sum(self.sizes.values()),
+            states_deleted=ledger.states_deleted,
+            damage=self.damage,
+            created=self.created.isoformat(),
+            ingest=self.rules,
+            settings=self.spec.settings.model_dump(mode="json"),
+        )
+
+    def camera(self, name: str) -> Camera:
+        """A camera of the rig by name."""
+        if name not in self.rig.names:
+            raise Problem(
+                422,
+                f"the rig has no camera {name!r}",
+                field="camera",
+                value=name,
+                remedy=f"name one of {', '.join(self.rig.names)}, or give the camera itself",
+            )
+        return self.rig[name]
+
+    def committed_frame(self, index: int | None, field: str = "frame") -> int:
+        """The index, or the last one for None, checked to be committed."""
+        if not self.committed:
+            raise Problem(
+                409,
+                "no frame of this scene is committed yet",
+                field=field,
+                remedy="wait until `committed` in the scene's status is above 0",
+                state=self.state,
+            )
+        if index is None:
+            return self.committed[-1]
+        entry = self.frames.get(index)
+        if entry is None or entry.report.state != FrameState.COMMITTED or entry.report.deleted:
+            state = "not here" if entry is None else entry.report.state.value
+            said = "deleted by the scene's retention" if entry is not None and entry.report.deleted else state
+            raise Problem(
+                404,
+                f"frame {index} is {said}; only committed frames that are kept can be read",
+                field=field,
+                value=index,
+                remedy=f"ask for a committed frame, {self.committed[0]} to {self.committed[-1]}",
+            )
+        return index
+
+    async def report(self, index: int) -> FrameReportModel | None:
+        """What became of a frame, its numbers read from disk where they are not in memory; None: it is not known."""
+        entry = self.frames.get(index)
+        if entry is None:
+            parts = self.ledger.open.get(index)
+            if parts is None:
+                return None
+            return FrameReportModel(
+                scene=self.id, index=index, time=parts.time, state=FrameState.OPEN, received=parts.cameras, held=True
+            )
+        found = entry.report
+        if found.state == FrameState.COMMITTED and not found.deleted and found.iterations is None:
+            found = found.model_copy()
+            reports.fill(found, await asyncio.to_thread(self._files.read, index))
+        return found
+
+    async def ask(self, query: Query) -> Answer:
+        """The reader process's answer; see `Readers.ask`."""
+        return await self._questions.ask(query)
+
+    # The way of a frame.
+
+    def finished(self, report: FrameReportModel) -> None:
+        """A frame ended otherwise than by the worker."""
+        self._tell(FrameFinished(report))
+
+    def work(self) -> None:
+        """Gives the worker its next frame, if it can take one and one waits; called whenever that may have changed."""
+        self._tell(SceneChanged())
+        ledger = self.ledger
+        if not self._ready or self._at_work is not None or ledger.paused or ledger.fatal is not None:
+            return
+        waiting = ledger.waiting()
+        if not waiting:
+            return
+        index = waiting[0]
+        entry = ledger.frames[index]
+        assert entry.receipt is not None
+        ledger.move(index, FrameState.UPDATING)
+        self._at_work = index
+        self._worker.send(FrameReady(index, entry.receipt.time, entry.files, entry.receipt.identity))
+        self._tell(SceneChanged())
+
+    def _from_worker(self, message: Any) -> None:
+        match message:
+            case Ready():
+                self.background(self._taken_up(message))
+            case Progressed():
+                self.progress = ProgressModel(
+                    stage=message.stage, done=message.done, total=message.total, detail=message.detail
+                )
+                self._tell(SceneChanged())
+            case Committed():
+                self.background(self._commit(message))
+            case SetAsideMessage():
+                fact = SetAside(
+                    index=message.index, reason=message.reason, dropped=message.dropped, fatal=message.fatal
+                )
+                self.background(self._set_aside(fact))
+            case Stalled():
+                self._trouble = f"frame {message.index} waits for room on the disk: {message.reason}"
+                self._tell(SceneChanged())
+            case Broken():
+                self.ledger.fatal = f"what is committed cannot be gone on from: {message.reason}"
+                log.error("scene %s: %s", self.id, self.ledger.fatal)
+                self._tell(SceneChanged())
+
+    async def _taken_up(self, ready: Ready) -> None:
+        """The worker has taken up what is committed: what it found decides which frames are still to be done."""
+        newest = self.committed[-1] if self.committed else -1
+        facts = self.ledger.reconcile(ready.indices, ready.damaged)
+        for fault in ready.faults:
+            log.warning("scene %s: %s", self.id, fault)
+            self.damage.append(fault)
+        if facts:
+            await self._write(*facts)
+        if ready.indices and ready.report:
+            self._fill(ready.indices[-1], ready.report)
+            self._questions.refresh()
+            if ready.indices[-1] > newest:  # committed, and its worker was gone before it could say so
+                self._tell(FrameFinished(self.frames[ready.indices[-1]].report))
+        self._ready = True
+        self.work()
+
+    async def _commit(self, message: Committed) -> None:
+        self.supervision.committed()
+        self._at_work, self.progress = None, None
+        self.ledger.move(message.index, FrameState.COMMITTED)
+        self._fill(message.index, message.report)
+        report = self.frames[message.index].report
+        dropped = report.dropped_cameras
+        self._trouble = (
+            f"frame {message.index} was committed without " + "; ".join(dropped.values()) if dropped else None
+        )
+        self._questions.refresh()
+        self._tell(FrameFinished(report))
+        self._forget_old_reports()
+        self.work()
+        if message.deleted:
+            deleted = StatesDeleted(frames=message.deleted)
+            self.ledger.apply(deleted)
+            await self._write(deleted)
+        await self.retain()
+        await self.ingest.close_what_can_be()
+
+    async def _set_aside(self, fact: SetAside) -> None:
+        await self._write(fact)
+        self.ledger.apply(fact)
+        self._at_work, self.progress = None, None
+        self._trouble = f"frame {fact.index} was set aside: {fact.reason}"
+        if fact.fatal:
+            await self._fail_those_that_wait(fact)
+        log.warning("scene %s: %s", self.id, self._trouble)
+        self._tell(FrameFinished(self.frames[fact.index].report))
+        self.work()
+        await self.ingest.close_what_can_be()
+
+    async def _fail_those_that_wait(self, fatal: SetAside) -> None:
+        """Nothing will become of frames behind a first one that failed."""
+        reason = f"frame {fatal.index} could not be reconstructed: {fatal.reason}"
+        facts = [SetAside(index=index, reason=reason, fatal=True) for index in self.ledger.waiting()]
+        if facts:
+            await self._write(*facts)
+        for fact in facts:
+            self.ledger.apply(fact)
+            self._tell(FrameFinished(self.frames[fact.index].report))
+
+    def _fill(self, index: int, committed: dict[str, Any]) -> None:
+        report = self.frames[index].report
+        reports.fill(report, committed)
+        self.gaussians = report.gaussians
+        self.last_seconds = report.seconds.get("total", self.last_seconds)
+
+    def _forget_old_reports(self) -> None:
+        if len(self.committed) > reports.KEPT:
+            reports.strip(self.frames[self.committed[-1 - reports.KEPT]].report)
+
+    async def retain(self) -> None:
+        """Deletes pictures from the frame log by the scene's rule."""
+        gone = deletable(self.ledger, self.sizes, self.rules.keep_frames)
+        if not gone:
+            return
+        names = [name for index in gone for name in self.frames[index].files]
+        for name in names:
+            self.sizes.pop(name, None)
+        fact = FramesDeleted(frames=tuple(gone))
+        self.ledger.apply(fact)
+        await asyncio.to_thread(remove, self.spec.frames, names)
+        await self._write(fact)
+
+    async def _write(self, *facts: Fact) -> None:
+        """Appends facts that have happened and cannot be refused: again and again until there is room."""
+        while True:
+            try:
+                await self.journal.append(*facts)
+                return
+            except OSError as error:
+                if not no_room(error):
+                    raise
+                self._trouble = f"the journal waits for room on the disk: {error}"
+                self._tell(SceneChanged())
+                await asyncio.sleep(AGAIN_S)
+
+    # The worker's life.
+
+    def _start_worker(self) -> None:
+        self.supervision.started()
+        self._worker = self._placement.start(worker.main, self.spec, self._from_worker, self._worker_ended)
+
+    def _worker_ended(self, reason: Ended) -> None:
+        self._ready, self.progress = False, None
+        if self._stopping or self.ledger.fatal is not None:
+            return
+        own, delay = self.supervision.died(reason.exit_code)
+        self._trouble = f"the worker is gone: {reason}; it is started again in {delay:g} s"
+        log.error("scene %s: %s", self.id, self._trouble)
+        self.background(self._after_death(str(reason), own, delay))
+
+    async def _after_death(self, reason: str, own: bool, delay: float) -> None:
+        index, self._at_work = self._at_work, None
+        if index is not None and self.frames[index].report.state == FrameState.UPDATING:
+            self.ledger.move(index, FrameState.QUEUED)
+            death = Died(index=index, reason=reason, own=own)
+            self.ledger.apply(death)
+            await self._write(death)
+            # It may have died between its commit and saying so: the next worker tells, and only then is it given up.
+            fact = given_up(self.frames[index], death)
+            if fact is not None and not await asyncio.to_thread(self._is_committed, index):
+                await self._set_aside(fact)
+        self._tell(SceneChanged())
+        if not self._stopping:
+            self._again = asyncio.get_running_loop().call_later(delay, self._start_worker)
+
+    def _is_committed(self, index: int) -> bool:
+        return bool(self._files.read(index))
+
+    async def pause(self, paused: bool) -> None:
+        """Reconstructs nothing more after the frame at work; or goes on."""
+        await self.ingest.pause(paused)
+        self.work()
+
+    def background(self, coroutine: Coroutine[Any, Any, None]) -> None:
+        """In the background, in the order of the calls where they do not wait; the scene's end cancels it."""
+        task = asyncio.get_running_loop().create_task(coroutine)
+        self._tasks.add(task)
+        task.add_done_callback(self._done)
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self.ledger.fatal = f"the service failed: {type(error).__name__}: {error}"
+            log.error("scene %s", self.id, exc_info=error)
+            self._tell(SceneChanged())
+
+    async def stop(self) -> None:
+        """Ends both processes; what is on disk stays."""
+        self._stopping = True
+        if self._again is not None:
+            self._again.cancel()
+        self.ingest.stop()
+        for task in tuple(self._tasks):
+            task.cancel()
+        seconds = self.server.stop_seconds
+        await asyncio.gather(self._worker.stop(seconds), self._questions.stop(seconds))
+        await self.journal.close()
