@@ -1,0 +1,34 @@
+"""What a viewer needs to begin with: the rig, and what became of the frames so far."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query
+
+from client.wire import RigModel
+from client.wire.listings import FrameList
+from server.routes.access import TheScene
+
+router = APIRouter(prefix="/v1/scenes")
+
+MOST_FRAMES = 500
+"""Of one answer: each frame's report names every camera."""
+
+
+@router.get("/{id}/rig", tags=["scenes"])
+async def rig(scene: TheScene) -> RigModel:
+    """The cameras of the scene, as they were given."""
+    return scene.request.rig
+
+
+@router.get("/{id}/frames", tags=["frames"])
+async def frames(
+    scene: TheScene,
+    first: Annotated[int, Query(ge=0, le=1_000_000_000, description="Index of the first.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=MOST_FRAMES, description="So many at most.")] = MOST_FRAMES,
+) -> FrameList:
+    """What became of many frames, from `first` on; `next` says where to go on."""
+    indices = sorted(index for index in scene.frames if index >= first)
+    reports = [scene.frames[index].report.model_copy(update={"loss": []}) for index in indices[:limit]]
+    return FrameList(frames=reports, next=indices[limit] if len(indices) > limit else None)

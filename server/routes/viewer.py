@@ -1,0 +1,52 @@
+"""The viewer's page: files as they are, no build step, nothing from anywhere else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fastapi import APIRouter
+from starlette.responses import FileResponse, RedirectResponse, Response
+
+from server.problems import Problem
+
+router = APIRouter(include_in_schema=False)
+
+FOLDER = Path(__file__).parents[1] / "viewer"
+MEDIA_TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
+FILES = {file.name: file for file in FOLDER.iterdir() if file.suffix in MEDIA_TYPES}
+"""What is served: these names and no others."""
+
+HEADERS = {
+    # No inline script or style, nothing from another site, no frames: what a rig or a scene is called stays text.
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-cache",  # asked for again each time, by its tag: an update of the service shows at once
+}
+
+
+@router.get("/")
+@router.get("/viewer/")
+async def page() -> Response:
+    """The page."""
+    return _answer("index.html")
+
+
+@router.get("/viewer")
+async def elsewhere() -> Response:
+    """Where people look for it."""
+    return RedirectResponse("/viewer/")
+
+
+@router.get("/viewer/{name}")
+async def file(name: str) -> Response:
+    """What the page is made of."""
+    return _answer(name)
+
+
+def _answer(name: str) -> Response:
+    found = FILES.get(name)
+    if found is None:
+        raise Problem(404, f"the viewer has no file {name!r}", field="name", value=name, remedy="open /viewer/")
+    return FileResponse(found, media_type=MEDIA_TYPES[found.suffix], headers=HEADERS)

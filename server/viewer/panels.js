@@ -1,0 +1,112 @@
+// The panels beside the view: the scene's state, the queue, the cameras' health.
+
+export const STATES = {
+  awaiting_first_frame: "Waiting for its first frame",
+  initialising: "Reconstructing the first frame",
+  ready: "Ready",
+  updating: "Updating",
+  paused: "Paused",
+  degraded: "Degraded",
+  failed: "Failed",
+};
+
+const number = new Intl.NumberFormat("en");
+
+export function node(name, attributes = {}, ...children) {
+  const made = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
+    else if (value !== null && value !== false) made.setAttribute(key, value === true ? "" : value);
+  }
+  made.append(...children);
+  return made;
+}
+
+export function showFacts(list, status) {
+  const facts = [
+    ["Frames", `${number.format(status.committed)} committed`],
+    ["Gaussians", status.gaussians === null ? "none yet" : number.format(status.gaussians)],
+    ["Cameras", number.format(status.cameras.length)],
+  ];
+  for (const [key, words] of [["set_aside", "set aside"], ["missing", "declared missing"], ["skipped", "skipped"]]) {
+    if (status[key]) facts.push([words[0].toUpperCase() + words.slice(1), number.format(status[key])]);
+  }
+  if (status.worker_deaths) facts.push(["Worker restarts", number.format(status.worker_deaths)]);
+  list.replaceChildren(...facts.flatMap(([name, value]) => [node("dt", {}, name), node("dd", {}, value)]));
+}
+
+/** One box a place in the queue; the words say the same. */
+export function showQueue(box, words, status) {
+  const places = Math.min(status.queue_limit, 24);
+  const taken = Math.ceil(places * status.queued / status.queue_limit);
+  box.replaceChildren(...Array.from({ length: places }, (_, i) => node("span", { class: i < taken ? "taken" : "free" })));
+  const full = status.queued >= status.queue_limit;
+  words.textContent = status.queued
+    ? `${status.queued} of ${status.queue_limit} waiting${full ? ": full, senders are asked to wait" : ""}`
+    : `Empty; frame ${status.next_frame} is next`;
+  box.classList.toggle("full", full);
+}
+
+const median = (values) => {
+  const sorted = [...values].sort((a, b) => a - b);
+  return sorted.length ? (sorted[(sorted.length - 1) >> 1] + sorted[sorted.length >> 1]) / 2 : null;
+};
+
+const BELOW_DB = 4;
+const SHIFT = 0.02;
+
+/** What looks wrong with a camera beside the others and beside itself before; empty where nothing does. */
+export function complaints(name, report, reports) {
+  const fit = report.cameras?.[name];
+  if (!fit) return name in (report.dropped_cameras ?? {}) ? [`left out of this frame: ${report.dropped_cameras[name]}`] : [];
+  const found = [];
+  const others = Object.entries(report.cameras).filter(([other]) => other !== name).map(([, one]) => one.psnr);
+  const middle = median(others.filter((value) => value !== null));
+  const before = reports.filter((one) => one.index < report.index).slice(-20).map((one) => one.cameras?.[name]);
+  const own = median(before.map((one) => one?.psnr).filter((value) => value != null));
+  // Some cameras always see more detail than others: a camera is held against itself where it has a past.
+  const usual = own ?? middle;
+  if (usual !== null && fit.psnr !== null && usual - fit.psnr > BELOW_DB) {
+    found.push(`its picture is met ${(usual - fit.psnr).toFixed(1)} dB worse than ${own === null ? "the others'" : "before"}: moved, dirty or out of focus?`);
+  }
+  if (fit.colour_shift) {
+    const past = before.filter((one) => one?.colour_shift);
+    const usually = [0, 1, 2].map((k) => median(past.map((one) => one.colour_shift[k])) ?? 0);
+    const moved = Math.max(...fit.colour_shift.map((value, k) => Math.abs(value - usually[k])));
+    if (moved > SHIFT) found.push(`its colours are off by ${(100 * moved).toFixed(1)} %: exposure or white balance?`);
+  }
+  return found;
+}
+
+/** A row a camera: how well its picture was met, how its colours differ, and what looks wrong. */
+export function showCameras(body, summary, names, report, reports, lookFrom) {
+  const fits = report?.cameras ?? {};
+  const known = Object.values(fits).map((fit) => fit.psnr).filter((value) => value !== null);
+  const [low, high] = [Math.min(...known, 20), Math.max(...known, 40)];
+  let troubled = 0;
+  const rows = names.map((name, index) => {
+    const fit = fits[name];
+    const found = report ? complaints(name, report, reports) : [];
+    troubled += found.length > 0;
+    const meter = node("span", { class: "meter" }, node("span", {}));
+    if (fit && fit.psnr !== null) meter.firstChild.style.width = `${Math.max(3, 100 * (fit.psnr - low) / (high - low))}%`;
+    const shift = fit?.colour_shift;
+    const swatch = node("span", { class: "swatch", title: shift ? `red, green, blue: ${shift.map((v) => `${(100 * v).toFixed(1)} %`).join(", ")}` : "not measured" });
+    // Around middle grey and ten times stronger: a shift of one hundredth can be seen.
+    if (shift) swatch.style.background = `rgb(${shift.map((v) => Math.round(128 + 1280 * v)).join(" ")})`;
+    const words = found.length ? found.join("; ") : "";
+    return node("tr", { class: found.length ? "bad" : null },
+      node("th", { scope: "row" }, node("button", { type: "button", class: "link", title: `Look through camera ${name}`, onclick: () => lookFrom(index) }, name)),
+      node("td", {}, meter),
+      node("td", { class: "figure" }, fit && fit.psnr !== null ? fit.psnr.toFixed(1) : "–"),
+      node("td", {}, swatch),
+      node("td", { class: "figure" }, shift ? `${(100 * Math.max(...shift.map(Math.abs))).toFixed(1)} %` : "–"),
+      node("td", { class: "words", title: words }, found.length ? "⚠ look" : fit ? "good" : "no figures"));
+  });
+  body.replaceChildren(...rows);
+  const complaint = report && names.flatMap((name) => complaints(name, report, reports).map((one) => `Camera ${name}: ${one}`));
+  summary.textContent = !report || !known.length ? "Figures come with the first update."
+    : troubled ? complaint.slice(0, 3).join(" ") + (complaint.length > 3 ? ` … and ${complaint.length - 3} more.` : "")
+    : `All ${names.length} cameras look as they did before.`;
+  summary.classList.toggle("warning", troubled > 0);
+}

@@ -1,0 +1,43 @@
+// Requests to the service. Whatever fails is an Error whose message is a sentence for a person.
+
+const KEY = "scas4d.token";
+
+export class ServiceError extends Error {
+  constructor(problem) {
+    const end = problem.detail.endsWith(".") ? "" : ".";
+    super(sentence(problem.detail + end + (problem.remedy ? ` To mend it: ${problem.remedy}.` : "")));
+    this.status = problem.status;
+  }
+}
+
+const sentence = (text) => text.charAt(0).toUpperCase() + text.slice(1);
+
+export const token = {
+  get: () => sessionStorage.getItem(KEY),
+  set: (value) => sessionStorage.setItem(KEY, value),
+  forget: () => sessionStorage.removeItem(KEY),
+};
+
+export async function call(method, path, body) {
+  const headers = {};
+  if (token.get()) headers.Authorization = `Bearer ${token.get()}`;
+  if (body !== undefined) headers["Content-Type"] = "application/json";
+  let response;
+  try {
+    response = await fetch(path, { method, headers, body: body === undefined ? undefined : JSON.stringify(body) });
+  } catch {
+    throw new ServiceError({ status: 0, detail: "the service does not answer" });
+  }
+  if (response.ok) return response.status === 204 ? null : response.json();
+  const problem = await response.json().catch(() => null);
+  throw new ServiceError(problem?.detail ? problem
+    : { status: response.status, detail: `the service answered ${response.status} ${response.statusText}` });
+}
+
+export const scenePath = (id) => `/v1/scenes/${encodeURIComponent(id)}`;
+
+/** Subprotocol of a ticket for one WebSocket: a browser cannot send a token with it. None where none is asked for. */
+export async function ticket() {
+  if (!token.get()) return null;
+  return (await call("POST", "/v1/tickets")).subprotocol;
+}

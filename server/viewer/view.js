@@ -1,0 +1,242 @@
+// The live view: a picture that the service renders for the camera that the user moves.
+
+import { Orbit, project, readCamera } from "./geometry.js";
+import { paintDepth } from "./colours.js";
+import { drawFrusta, drawTracks } from "./overlay.js";
+
+const SETTLE_MS = 220;
+const TARGET_MS = 90;
+const CLICK_PX = 4;
+const EMPTY = [16, 19, 24];
+const MODES = {
+  colour: { kinds: ["colour"], format: "jpeg" },
+  depth: { kinds: ["depth"], format: "float32" },
+  parts: { kinds: ["parts"], format: "png" },
+  alpha: { kinds: ["alpha"], format: "png" },
+};
+
+export class LiveView {
+  /** @param on { pick(u, v, camera, frame), shown(info), turned() } */
+  constructor(canvas, overlay, on) {
+    this.canvas = canvas;
+    this.overlay = overlay;
+    this.on = on;
+    this.mode = "colour";
+    this.parts = null;
+    this.frame = null;
+    this.showFrusta = false;
+    this.tracks = [];
+    this.largest = 8e6;
+    this.listen();
+    new ResizeObserver(() => this.moved()).observe(canvas.parentElement);
+  }
+
+  /** Begins with a scene: its rig, its stream. */
+  open(stream, rig) {
+    this.stream = stream;
+    this.rig = rig.cameras.map(readCamera);
+    this.orbit = new Orbit(this.rig);
+    this.tag = 0;
+    this.asked = new Map();
+    this.shown = null;
+    this.coarse = 1;
+    this.frame = null;
+    this.clear();
+    this.request("subscribe");
+  }
+
+  close() {
+    this.stream = null;
+    clearTimeout(this.settle);
+    this.clear();
+  }
+
+  clear() {
+    this.shown = null;
+    this.picture = null;
+    for (const canvas of [this.canvas, this.overlay]) canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height);
+  }
+
+  setMode(mode) {
+    this.mode = mode;
+    this.moved(true);
+  }
+
+  setParts(count) {
+    this.parts = count;
+    if (this.mode === "parts") this.moved(true);
+  }
+
+  setFrame(frame) {
+    this.frame = frame;
+    this.moved(true);
+  }
+
+  /** Looks through a camera of the rig. */
+  lookFrom(index) {
+    this.orbit.from(this.rig[index]);
+    this.moved();
+  }
+
+  // Asking.
+
+  size(share) {
+    const box = this.canvas.parentElement.getBoundingClientRect();
+    const dense = Math.min(window.devicePixelRatio || 1, 1.5) * share;
+    let [width, height] = [Math.max(16, box.width * dense), Math.max(16, box.height * dense)];
+    const over = Math.sqrt(width * height / Math.min(this.largest, 1.4e6));
+    if (over > 1) [width, height] = [width / over, height / over];
+    return [Math.round(width), Math.round(height)];
+  }
+
+  /** The camera, the size or the mode is another: a quick picture now, a sharp one when it rests. */
+  moved(sharp = false) {
+    if (!this.stream) return;
+    this.request("update", sharp ? 1 : this.coarse);
+    clearTimeout(this.settle);
+    if (!sharp && this.coarse < 1) this.settle = setTimeout(() => this.request("update", 1), SETTLE_MS);
+    this.on.turned?.();
+  }
+
+  request(verb, share = 1) {
+    const [width, height] = this.size(share);
+    const camera = this.orbit.camera(width, height);
+    const request = { camera, frame: this.frame, parts: this.mode === "parts" ? this.parts : null, ...MODES[this.mode] };
+    this.asked.set(++this.tag, { camera, mode: this.mode, at: performance.now(), share });
+    if (this.asked.size > 64) this.asked.delete(this.asked.keys().next().value);
+    if (verb === "subscribe") this.stream.subscribe("view", "render", request, this.tag);
+    else this.stream.update("view", request, this.tag);
+  }
+
+  // Showing.
+
+  async receive(head, bytes) {
+    const asked = this.asked.get(head.tag);
+    if (!asked) return;
+    const first = !asked.answered;
+    asked.answered = true;
+    const number = this.latest = (this.latest || 0) + 1;
+    const painted = await this.decode(asked, head, bytes);
+    // Decoding takes turns: a newer picture may have been painted meanwhile.
+    if (number < (this.painted || 0) || !this.stream) return;
+    this.painted = number;
+    const { width, height } = asked.camera;
+    this.canvas.width = width;
+    this.canvas.height = height;
+    const context = this.canvas.getContext("2d");
+    if (painted.image) context.putImageData(painted.image, 0, 0);
+    else context.drawImage(painted.bitmap, 0, 0);
+    const milliseconds = first ? performance.now() - asked.at : null;
+    if (first && head.missed === 0) this.adapt(milliseconds, asked.share);
+    this.shown = { camera: asked.camera, frame: head.frame, mode: asked.mode, tag: head.tag };
+    this.draw();
+    this.on.shown({ ...this.shown, milliseconds, width, height, near: painted.near, far: painted.far });
+  }
+
+  async decode(asked, head, bytes) {
+    if (asked.mode === "depth") {
+      const { width, height } = asked.camera;
+      return paintDepth(new Float32Array(bytes.slice().buffer), width, height, EMPTY);
+    }
+    return { bitmap: await createImageBitmap(new Blob([bytes], { type: head.media_type })) };
+  }
+
+  /** The size of pictures while the camera moves follows from how long they take. */
+  adapt(milliseconds, share) {
+    const wanted = share * Math.sqrt(TARGET_MS / Math.max(milliseconds, 1));
+    this.coarse = Math.max(0.3, Math.min(1, 0.6 * this.coarse + 0.4 * wanted));
+  }
+
+  /** Tracks and the rig, over the picture that is shown and with its camera. */
+  draw() {
+    const box = this.canvas.parentElement.getBoundingClientRect();
+    const dense = window.devicePixelRatio || 1;
+    this.overlay.width = Math.round(box.width * dense);
+    this.overlay.height = Math.round(box.height * dense);
+    if (!this.shown) return;
+    const context = this.overlay.getContext("2d");
+    const camera = readCamera(this.shown.camera);
+    const [sx, sy] = [this.overlay.width / camera.width, this.overlay.height / camera.height];
+    const place = (point) => {
+      const seen = project(camera, point);
+      return seen && [seen[0] * sx, seen[1] * sy];
+    };
+    if (this.showFrusta) drawFrusta(context, place, this.rig, this.orbit.rig.radius, dense);
+    drawTracks(context, place, this.tracks, this.shown.frame, dense);
+  }
+
+  // The user's hands.
+
+  listen() {
+    const canvas = this.overlay;
+    const fingers = new Map();
+    let travelled = 0;
+    canvas.addEventListener("pointerdown", (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      fingers.set(event.pointerId, [event.clientX, event.clientY]);
+      travelled = fingers.size > 1 ? Infinity : 0;
+    });
+    canvas.addEventListener("pointermove", (event) => {
+      const before = fingers.get(event.pointerId);
+      if (!before || !this.stream) return;
+      const [dx, dy] = [event.clientX - before[0], event.clientY - before[1]];
+      travelled += Math.abs(dx) + Math.abs(dy);
+      if (fingers.size === 2) this.pinch(fingers, event);
+      fingers.set(event.pointerId, [event.clientX, event.clientY]);
+      if (fingers.size === 2 || travelled < CLICK_PX) return;
+      const height = canvas.getBoundingClientRect().height;
+      if (event.buttons & 6 || event.shiftKey) this.orbit.pan(-dx / height, -dy / height);
+      else this.orbit.turn(-2.6 * dx / height, 2.6 * dy / height);
+      this.moved();
+    });
+    const lift = (event) => {
+      const known = fingers.delete(event.pointerId);
+      if (known && event.type === "pointerup" && event.button === 0 && travelled < CLICK_PX) this.click(event);
+    };
+    canvas.addEventListener("pointerup", lift);
+    canvas.addEventListener("pointercancel", lift);
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      if (!this.stream) return;
+      this.orbit.zoom(Math.exp(Math.max(-0.5, Math.min(0.5, event.deltaY / (event.deltaMode ? 10 : 500)))));
+      this.moved();
+    }, { passive: false });
+    canvas.addEventListener("keydown", (event) => this.key(event));
+  }
+
+  pinch(fingers, event) {
+    const [[, other]] = [...fingers].filter(([id]) => id !== event.pointerId);
+    const before = fingers.get(event.pointerId);
+    const spread = (a, b) => Math.hypot(a[0] - b[0], a[1] - b[1]) || 1;
+    const now = [event.clientX, event.clientY];
+    this.orbit.zoom(spread(before, other) / spread(now, other));
+    const height = this.overlay.getBoundingClientRect().height;
+    this.orbit.pan(-(now[0] - before[0]) / 2 / height, -(now[1] - before[1]) / 2 / height);
+    this.moved();
+  }
+
+  key(event) {
+    const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+    if (!this.stream || event.ctrlKey || event.altKey || event.metaKey) return;
+    if (arrows[event.key]) {
+      const [x, y] = arrows[event.key];
+      if (event.shiftKey) this.orbit.pan(0.05 * x, 0.05 * y);
+      else this.orbit.turn(0.08 * x, -0.08 * y);
+    } else if (event.key === "+" || event.key === "=") this.orbit.zoom(0.9);
+    else if (event.key === "-") this.orbit.zoom(1 / 0.9);
+    else if (event.key === "Home" || event.key === "0") this.orbit.from(this.rig[0]);
+    else return;
+    event.preventDefault();
+    this.moved();
+  }
+
+  click(event) {
+    if (!this.shown) return;
+    const box = this.overlay.getBoundingClientRect();
+    const { camera, frame } = this.shown;
+    const u = (event.clientX - box.left) / box.width * camera.width;
+    const v = (event.clientY - box.top) / box.height * camera.height;
+    this.on.pick(u, v, camera, frame);
+  }
+}
