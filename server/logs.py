@@ -100,14 +100,16 @@ class AccessLog:
             await self.app(scope, receiving, sending)
         finally:
             method = scope.get("method", "WEBSOCKET")
+            # As it was sent: percent-encoded, so that no path breaks a line.
+            path = scope.get("raw_path", scope["path"].encode()).decode("latin-1")
             access.info(
                 "%s %s %d",
                 method,
-                scope["path"],
+                path,
                 status,
                 extra={
                     "method": method,
-                    "path": scope["path"],
+                    "path": path,
                     "status": status,
                     "seconds": round(time.perf_counter() - began, 4),
                     "bytes_in": taken,

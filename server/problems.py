@@ -13,6 +13,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
+from starlette.routing import compile_path
 from starlette.types import Receive, Scope, Send
 
 from client.wire import ProblemDetails
@@ -90,7 +91,10 @@ def install(app: FastAPI) -> None:
         assert isinstance(error, HTTPException)
         if isinstance(error, Problem):
             return answer(error.document, error.headers)
-        return answer(_of_framework(request, error), error.headers)
+        headers = dict(error.headers or {})
+        if error.status_code == 405:  # Starlette names the methods of the first route at this address only
+            headers["Allow"] = ", ".join(methods(request.app, request.url.path)) or headers.get("Allow", "")
+        return answer(_of_framework(request, error.status_code, str(error.detail), headers), headers)
 
     async def from_validation(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
@@ -130,20 +134,31 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(Exception, from_fault)
 
 
-def _of_framework(request: Request, error: HTTPException) -> ProblemDetails:
+def methods(app: FastAPI, path: str) -> list[str]:
+    """The methods that the document has for an address."""
+    return sorted(
+        {
+            method.upper()
+            for template, operations in document(app)["paths"].items()
+            if compile_path(template)[0].match(path)
+            for method in operations
+        }
+    )
+
+
+def _of_framework(request: Request, status: int, detail: str, headers: Mapping[str, str]) -> ProblemDetails:
     """What Starlette and FastAPI refuse by themselves: no such path, no such method, a body that is no form."""
     field = value = remedy = None
-    if error.status_code == 404:
+    if status == 404:
         field, value, remedy = "path", quoted(request.url.path), "GET /openapi.json lists all paths"
-    elif error.status_code == 405:
-        allowed = (error.headers or {}).get("Allow", "another")
-        field, value, remedy = "method", request.method, f"use {allowed}"
-    elif error.status_code == 400:
+    elif status == 405:
+        field, value, remedy = "method", request.method, f"use {headers.get('Allow') or 'another'}"
+    elif status == 400:
         field, remedy = "body", "send the body that Content-Type says; the schema is at /openapi.json"
     return ProblemDetails(
-        title=HTTPStatus(error.status_code).phrase,
-        status=error.status_code,
-        detail=str(error.detail),
+        title=HTTPStatus(status).phrase,
+        status=status,
+        detail=detail,
         field=field,
         value=value,
         remedy=remedy,
@@ -157,9 +172,8 @@ def document(app: FastAPI) -> dict[str, Any]:
         for path, operations in written["paths"].items():
             for operation in operations.values():
                 for status in RESPONSES:
-                    content = operation["responses"].get(str(status), {}).get("content", {})
-                    if "application/json" in content:
-                        content[MEDIA_TYPE] = content.pop("application/json")
+                    if str(status) in operation["responses"]:
+                        operation["responses"][str(status)]["content"] = {MEDIA_TYPE: {"schema": PROBLEM}}
                 if path == "/health/live":
                     operation["security"] = []
         schemes = written.setdefault("components", {}).setdefault("securitySchemes", {})
@@ -175,3 +189,4 @@ RESPONSES: dict[int | str, dict[str, Any]] = {
     422: {"description": "A field that cannot be.", "model": ProblemDetails},
 }
 """For the OpenAPI document."""
+PROBLEM = {"$ref": "#/components/schemas/ProblemDetails"}
