@@ -100,6 +100,14 @@ class ServerSettings(BaseSettings):
     max_points: int = Field(default=2_000_000, ge=1, description="Of an initial cloud.")
     max_render_pixels: int = Field(default=8_000_000, ge=1, description="Of one novel view.")
     max_track_points: int = Field(default=1_000_000, ge=1, description="Points times frames of one track query.")
+    max_track_json_points: int = Field(
+        default=100_000, ge=1, description="The same where the answer is JSON, some 100 bytes each; npz takes more."
+    )
+    max_track_views: int = Field(
+        default=4096,
+        ge=1,
+        description="Cameras times frames of one track query in which visibility is asked: a depth picture each.",
+    )
     max_subscribers: int = Field(default=128, ge=1, description="Of the stream of one scene.")
     max_subscriptions: int = Field(default=16, ge=1, description="Of one subscriber at a time.")
     max_stream_message_kb: int = Field(

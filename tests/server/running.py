@@ -51,6 +51,8 @@ def fake_settings(folder, **changes):
         max_scenes=4,
         max_points=1000,
         max_track_points=5000,
+        max_track_json_points=4000,
+        max_track_views=60,
         warm_up=False,
     )
     return ServerSettings(**given | changes)

@@ -1,0 +1,59 @@
+"""Tracks in the layout of TAPVid-3D's npz files, so that its tools read them as predictions.
+
+The names and axes are those that the benchmark's own evaluation reads (google-deepmind/tapnet,
+``tapvid3d/evaluation/evaluate_model.py``). Points are in the axes of one camera (OpenCV: x right, y down, z forward),
+in metres.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Camera
+
+
+def tapvid3d(
+    positions: NDArray[Any],
+    visibility: NDArray[np.bool_],
+    camera: Camera,
+    queried: int,
+    *,
+    metres_per_unit: float = 1.0,
+    pixels: NDArray[Any] | None = None,
+) -> dict[str, NDArray[Any]]:
+    """The arrays of one file; there are no pictures in it (``images_jpeg_bytes``), which predictions need not have.
+
+    Args:
+        positions: [T, Q, 3] user's world and units, NaN where there is none.
+        visibility: [T, Q] in the camera.
+        camera: user's world.
+        queried: the row of T in which the points were asked for; −1 where that frame is not among them.
+        metres_per_unit: metres in a unit of the user's world.
+        pixels: [Q, 2] that were asked for; without them, where the camera has the points in that row.
+
+    Returns:
+        ``tracks_XYZ`` [T, Q, 3] float32, metres in the camera's axes. ``visibility`` [T, Q] bool. ``queries_xyt``
+        [Q, 3] float32: u, v (pixel centres at +0.5) and the row of T; NaN where u, v are unknown.
+        ``fx_fy_cx_cy`` [4] float32. ``extrinsics_w2c`` [T, 4, 4] float32: user's world, in metres, to camera.
+
+    Raises:
+        ValueError: shapes do not fit.
+    """
+    if positions.ndim != 3 or visibility.shape != positions.shape[:2]:
+        raise ValueError(f"positions {positions.shape} must be [T, Q, 3] and visibility {visibility.shape} [T, Q]")
+    turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    count = positions.shape[1]
+    if pixels is None:
+        pixels = camera.project(positions[queried])[0] if queried >= 0 else np.full((count, 2), np.nan)
+    extrinsics = np.eye(4)
+    extrinsics[:3, :3], extrinsics[:3, 3] = turn, shift * metres_per_unit
+    return {
+        "tracks_XYZ": ((positions @ turn.T + shift) * metres_per_unit).astype(np.float32),
+        "visibility": visibility,
+        "queries_xyt": np.concatenate([pixels, np.full((count, 1), queried)], axis=1).astype(np.float32),
+        "fx_fy_cx_cy": np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float32),
+        "extrinsics_w2c": np.repeat(extrinsics[None], len(positions), axis=0).astype(np.float32),
+    }
