@@ -7,7 +7,6 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from fastapi import APIRouter, FastAPI
-from fastapi.responses import RedirectResponse
 from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import Request
 from starlette.responses import Response
@@ -23,7 +22,21 @@ from server.placement import Placement
 from server.placement.local import LocalPlacement
 from server.problems import Problem
 from server.readiness import Readiness
-from server.routes import frames, health, ingest, metrics, parts, points, render, scenes, stream, tickets, tracks
+from server.routes import (
+    frames,
+    health,
+    ingest,
+    inspect,
+    metrics,
+    parts,
+    points,
+    render,
+    scenes,
+    stream,
+    tickets,
+    tracks,
+    viewer,
+)
 from server.scenes import Scenes
 from server.settings import ServerSettings
 from server.tickets import Tickets
@@ -68,13 +81,13 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         )
     app.add_middleware(Door, settings=settings, tickets=app.state.tickets)
     app.add_middleware(AccessLog)
-    for resource in (scenes, points, frames, ingest, render, tracks, parts, stream, tickets, health, metrics):
+    resources = (
+        *(scenes, inspect, points, frames, ingest, render, tracks, parts, stream),
+        *(tickets, health, metrics, viewer),
+    )
+    for resource in resources:
         app.include_router(resource.router)
         _answer_plain_requests(app, resource.router)
-
-    @app.get("/", include_in_schema=False)
-    async def root() -> RedirectResponse:
-        return RedirectResponse("/docs")
 
     return app
 

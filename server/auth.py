@@ -18,7 +18,9 @@ from server.problems import Problem
 from server.settings import ServerSettings, is_loopback
 from server.tickets import SUBPROTOCOL, Tickets
 
-OPEN = frozenset({"/", "/favicon.ico", "/health/live", "/docs", "/docs/oauth2-redirect", "/redoc", "/openapi.json"})
+OPEN = frozenset(
+    {"/", "/viewer", "/favicon.ico", "/health/live", "/docs", "/docs/oauth2-redirect", "/redoc", "/openapi.json"}
+)
 """What bears no data and can be read without a token: the page that asks for one, and the description of the API."""
 OPEN_FOLDERS = ("/viewer/",)
 """Files of the viewer's page."""

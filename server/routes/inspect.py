@@ -30,5 +30,6 @@ async def frames(
 ) -> FrameList:
     """What became of many frames, from `first` on; `next` says where to go on."""
     indices = sorted(index for index in scene.frames if index >= first)
-    reports = [scene.frames[index].report.model_copy(update={"loss": []}) for index in indices[:limit]]
-    return FrameList(frames=reports, next=indices[limit] if len(indices) > limit else None)
+    reports = [await scene.report(index) for index in indices[:limit]]
+    without_loss = [report.model_copy(update={"loss": []}) for report in reports if report is not None]
+    return FrameList(frames=without_loss, next=indices[limit] if len(indices) > limit else None)
