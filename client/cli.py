@@ -10,15 +10,15 @@ from typing import Annotated
 
 import typer
 
-from client import __version__, bench
+from client import __version__, bench, commands
 from client.errors import ServiceError, ServiceUnreachable
 from client.overrides import overrides
-from client.progress import Bars, console
-from client.sdk import DEFAULT_URL, Client
+from client.progress import console
 from scas4d_core.captures import CaptureError, ImageError, open_capture
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Online 4D reconstruction of multi-camera rigs.")
 app.add_typer(bench.app, name="bench")
+commands.register(app)
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture.")]
 Preset = Annotated[str, typer.Option(help="Named settings: scas4d or dynamic3dgs.")]
@@ -45,29 +45,6 @@ def serve(
     from server.settings import ServerSettings
 
     run(ServerSettings.from_environment(host=host, port=port, data=data))
-
-
-@app.command()
-def push(
-    capture: CaptureFolder,
-    url: Annotated[str, typer.Option(help="Of the service.")] = DEFAULT_URL,
-    fps: Annotated[float | None, typer.Option(min=0.001, help="Frames a second at most; as fast as taken.")] = None,
-    frames: Frames = None,
-    preset: Preset = "scas4d",
-    changes: Changes = None,
-) -> None:
-    """Sends a capture to a running service as its rig would, and waits for the last frame."""
-    from client import rig
-
-    opened = open_capture(capture)
-    with Client(url) as client, Bars() as bars:
-        status = rig.push(
-            opened, client, fps=fps, frames=frames, preset=preset, settings=overrides(changes or []), told=bars
-        )
-    console.print(f"scene {status.id}: {status.committed} of {status.next_frame} frames committed, {status.state}")
-    console.print(f"{url.rstrip('/')}/v1/scenes/{status.id}/render", soft_wrap=True)
-    if status.error:
-        raise SystemExit(f"scas4d: {status.error}")
 
 
 @app.command()

@@ -77,7 +77,8 @@ def run(capture: Capture, url: str, out: Path, *, frames: int | None, preset: st
     """
     with Client(url) as client:
         with Bars() as bars:
-            status = rig.push(capture, client, frames=frames, preset=preset, settings=settings, told=bars)
+            delivery = rig.push(capture, client, frames=frames, preset=preset, settings=settings, told=bars)
+        status = client.scene(delivery.scene)
         if status.last_committed is None:
             raise RuntimeError(f"no frame was committed: {status.error}")
         _report(client, status.id, status.next_frame)

@@ -3,13 +3,13 @@
 Sent again is what does the same when it is done twice: reading, and every frame, which the service knows by its
 content.
 
-=======================================  ==========================================================================
-429                                      after the seconds that the service asks for, `busy` seconds in all
-502, 503, 504; a connection that breaks  after 0.2, 0.4, 0.8 … 5 s, each cut at random to 50…100 % so that many
-or cannot be made                        senders do not return together; until `outage` seconds after the first
-                                         failure of the call
-every other 4xx, 500                     never: the same request would be refused again
-=======================================  ==========================================================================
+============================  =====================================================================================
+429                           after the seconds that the service asks for, `busy` seconds in all
+502, 503, 504, 507, and a     after 0.2, 0.4, 0.8 … 5 s, each cut at random to 50…100 % so that many senders do not
+connection that breaks        return together, or later where the answer says so; until `outage` seconds after the
+or cannot be made             first failure of the call
+every other 4xx, 500          never: the same request would be refused again
+============================  =====================================================================================
 
 What is *not* the same when done twice (making a scene) is sent again only where no connection could be made at all.
 """
@@ -32,7 +32,7 @@ from client.errors import ServiceUnreachable, error_of
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 5.0
 SHORTEST_BUSY_WAIT_S = 0.1
-OUTAGE_STATUSES = (502, 503, 504)
+OUTAGE_STATUSES = (502, 503, 504, 507)
 
 BUSY_S = 3600.0
 """How long a full queue is waited for: a first frame takes minutes."""

@@ -19,7 +19,7 @@ from client import calls
 from client.calls import Call
 from client.errors import ServiceError
 from client.retries import BUSY_S, OUTAGE_S, Retries, Told
-from client.wire import FrameReportModel, FrameState, SceneState, SceneStatus
+from client.wire import FINISHED, FrameReportModel, SceneState, SceneStatus
 
 __all__ = ["DEFAULT_URL", "AsyncClient", "Client", "ServiceError"]
 
@@ -30,7 +30,6 @@ R = TypeVar("R")
 DEFAULT_URL = "http://127.0.0.1:8000"
 TIMEOUT_S = 130.0
 """How long an answer may take: the service itself gives up on a render after 120 s."""
-UNFINISHED = (FrameState.QUEUED, FrameState.UPDATING)
 
 
 def _signed(method: Callable[..., R], build: Callable[..., Any]) -> Callable[..., R]:
@@ -134,13 +133,21 @@ class Client(_Settings):
     live = _sends(calls.live)
     ready = _sends(calls.ready)
     metrics = _sends(calls.metrics)
+    ticket = _sends(calls.ticket)
     create_scene = _sends(calls.create_scene)
     scenes = _sends(calls.scenes)
     scene = _sends(calls.scene)
+    rig = _sends(calls.rig)
+    pause = _sends(calls.pause)
+    resume = _sends(calls.resume)
     delete_scene = _sends(calls.delete_scene)
     put_points = _sends(calls.put_points)
     put_frame = _sends(calls.put_frame)
+    put_camera = _sends(calls.put_camera)
+    close_frame = _sends(calls.close_frame)
+    declare_missing = _sends(calls.declare_missing)
     frame = _sends(calls.frame)
+    frames = _sends(calls.frames)
     ply = _sends(calls.ply)
     render = _sends(calls.render)
     render_file = _sends(calls.render_file)
@@ -220,13 +227,21 @@ class AsyncClient(_Settings):
     live = _sends_async(calls.live)
     ready = _sends_async(calls.ready)
     metrics = _sends_async(calls.metrics)
+    ticket = _sends_async(calls.ticket)
     create_scene = _sends_async(calls.create_scene)
     scenes = _sends_async(calls.scenes)
     scene = _sends_async(calls.scene)
+    rig = _sends_async(calls.rig)
+    pause = _sends_async(calls.pause)
+    resume = _sends_async(calls.resume)
     delete_scene = _sends_async(calls.delete_scene)
     put_points = _sends_async(calls.put_points)
     put_frame = _sends_async(calls.put_frame)
+    put_camera = _sends_async(calls.put_camera)
+    close_frame = _sends_async(calls.close_frame)
+    declare_missing = _sends_async(calls.declare_missing)
     frame = _sends_async(calls.frame)
+    frames = _sends_async(calls.frames)
     ply = _sends_async(calls.ply)
     render = _sends_async(calls.render)
     render_file = _sends_async(calls.render_file)
@@ -257,7 +272,7 @@ class AsyncClient(_Settings):
 
 
 def _over(status: SceneStatus, frame: FrameReportModel) -> bool:
-    return frame.state not in UNFINISHED or status.state == SceneState.FAILED
+    return frame.state in FINISHED or status.state == SceneState.FAILED
 
 
 def _too_long(id: str, index: int, seconds: float) -> TimeoutError:

@@ -58,7 +58,7 @@ def nothing(response: httpx.Response) -> None:
 
 def body(model: BaseModel) -> dict[str, Any]:
     """A model of the wire as the request's JSON; what was not set is left out."""
-    return {"json": model.model_dump(mode="json", exclude_none=True)}
+    return {"json": model.model_dump(mode="json", exclude_unset=True)}
 
 
 def wire_camera(camera: Camera | str) -> CameraModel | str:

@@ -1,12 +1,13 @@
-"""Frames: sent whole, and what became of them."""
+"""Frames: sent whole or camera by camera, closed, declared missing, and what became of them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from client.calls.call import Call, path, reads
-from client.wire import FrameReceipt, FrameReportModel
+from client.calls.call import Call, body, path, reads
+from client.wire import FRAME_MEDIA_TYPE, FrameReceipt, FrameReportModel, MissingRequest, PartReceipt, frame_chunks
+from client.wire.listings import FrameList
 
 
 def put_frame(
@@ -29,17 +30,57 @@ def put_frame(
         FrameGap: `expected` is the index that comes next.
         Conflict: the index is known with other content.
     """
-    files = {camera: (camera, data) for camera, data in images.items()}
-    files |= {f"mask.{camera}": (f"mask.{camera}", data) for camera, data in (masks or {}).items()}
-    arguments: dict[str, Any] = {"files": files}
-    if time is not None:
-        arguments["data"] = {"time": repr(float(time))}
+    arguments = _framed(index, images, masks or {}, time)
     return Call("PUT", path(id, "frames", index), reads(FrameReceipt), arguments=arguments)
+
+
+def put_camera(
+    id: str, index: int, camera: str, image: bytes, mask: bytes | None = None, time: float | None = None
+) -> Call[PartReceipt]:
+    """Sends one camera's picture of frame `index`, where each camera has its own sender.
+
+    The frame is closed when all are in, by `close_frame`, or when the scene's `ingest.part_seconds` are over. A camera
+    may be some frames ahead of the others.
+
+    Args:
+        id: of the scene.
+        index: of the frame.
+        camera: of the rig.
+        image: JPEG, PNG or WebP.
+        mask: PNG.
+        time: seconds of the frame, the same for all its cameras.
+    """
+    arguments = _framed(index, {camera: image}, {} if mask is None else {camera: mask}, time, part=True)
+    return Call("PUT", path(id, "frames", index, "cameras", camera), reads(PartReceipt), arguments=arguments)
+
+
+def close_frame(id: str, index: int) -> Call[FrameReceipt]:
+    """Closes a frame whose cameras send one by one: it goes without those that are not in."""
+    return Call("POST", path(id, "frames", index, "close"), reads(FrameReceipt))
+
+
+def declare_missing(id: str, index: int, reason: str = "") -> Call[FrameReportModel]:
+    """Declares that frame `index`, which is next, will never come; for ever. The one after it is next then."""
+    arguments = body(MissingRequest(reason=reason))
+    return Call("POST", path(id, "frames", index, "missing"), reads(FrameReportModel), arguments=arguments)
+
+
+def _framed(
+    index: int, images: Mapping[str, bytes], masks: Mapping[str, bytes], time: float | None, *, part: bool = False
+) -> dict[str, Any]:
+    content = b"".join(frame_chunks(index, images, masks, time, part=part))
+    return {"content": content, "headers": {"Content-Type": FRAME_MEDIA_TYPE}}
 
 
 def frame(id: str, index: int) -> Call[FrameReportModel]:
     """What became of a frame."""
     return Call("GET", path(id, "frames", index), reads(FrameReportModel))
+
+
+def frames(id: str, first: int = 0, limit: int = 500) -> Call[FrameList]:
+    """What became of many frames, from `first` on; `next` of the answer says where to go on."""
+    arguments = {"params": {"first": first, "limit": limit}}
+    return Call("GET", path(id, "frames"), reads(FrameList), arguments=arguments)
 
 
 def ply(id: str, index: int) -> Call[bytes]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.calls.call import NPZ, Call, body, nothing, path, reads
-from client.wire import PointsReceipt, RigModel, SceneCreate, SceneList, SceneStatus
+from client.wire import IngestSettings, PointsReceipt, RigModel, SceneCreate, SceneList, SceneStatus
 from scas4d_core.cameras import Rig
 from scas4d_core.captures import InitialPoints
 
@@ -22,7 +22,7 @@ def create_scene(
     preset: str = "scas4d",
     settings: Mapping[str, Any] | None = None,
     frames_per_second: float = 30.0,
-    **more: Any,
+    ingest: IngestSettings | None = None,
 ) -> Call[SceneStatus]:
     """A new scene. Never sent twice: that would make two.
 
@@ -32,7 +32,7 @@ def create_scene(
         preset: named settings.
         settings: what differs from the preset, nested.
         frames_per_second: frame n without a time of its own is taken at n / frames_per_second.
-        more: further fields of `SceneCreate`.
+        ingest: how the scene takes frames, and what it keeps of them.
     """
     request = SceneCreate(
         rig=RigModel.of(rig),
@@ -40,7 +40,7 @@ def create_scene(
         preset=preset,
         settings=dict(settings or {}),
         frames_per_second=frames_per_second,
-        **more,
+        ingest=ingest or IngestSettings(),
     )
     return Call("POST", path(), reads(SceneStatus), repeatable=False, arguments=body(request))
 
@@ -53,6 +53,21 @@ def scenes() -> Call[list[SceneStatus]]:
 def scene(id: str) -> Call[SceneStatus]:
     """A scene's state, progress and queue."""
     return Call("GET", path(id), reads(SceneStatus))
+
+
+def rig(id: str) -> Call[Rig]:
+    """A scene's cameras."""
+    return Call("GET", path(id, "rig"), lambda response: RigModel.model_validate_json(response.content).rig())
+
+
+def pause(id: str) -> Call[SceneStatus]:
+    """Lets the scene rest after the frame at work: it takes frames, and reconstructs none."""
+    return Call("POST", path(id, "pause"), reads(SceneStatus))
+
+
+def resume(id: str) -> Call[SceneStatus]:
+    """Lets a paused scene go on."""
+    return Call("POST", path(id, "resume"), reads(SceneStatus))
 
 
 def delete_scene(id: str) -> Call[None]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from client.calls.call import Call, reads
-from client.wire import Health
+from client.wire import Health, Ticket
 
 
 def live() -> Call[Health]:
@@ -19,3 +19,8 @@ def ready() -> Call[Health]:
 def metrics() -> Call[str]:
     """Counters and gauges in the text format of Prometheus."""
     return Call("GET", "/metrics", lambda response: response.text)
+
+
+def ticket() -> Call[Ticket]:
+    """A ticket that opens one WebSocket from a browser, which cannot send the token. Each call makes another."""
+    return Call("POST", "/v1/tickets", reads(Ticket))

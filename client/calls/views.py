@@ -22,6 +22,7 @@ def render(
     kind: str = "colour",
     format: str = "png",
     background: Colour | None = None,
+    width: int | None = None,
     parts: int | None = None,
 ) -> Call[NDArray[Any]]:
     """One kind of view as a picture: [H, W, 3] uint8 for colour, else [H, W].
@@ -31,11 +32,12 @@ def render(
         camera: any camera in the rig's world, or the name of one of the rig.
         frame: a committed one; the last where None.
         kind: colour, depth, alpha or parts.
-        format: how it crosses the wire: png, jpeg, …
+        format: how it crosses the wire: png, jpeg or webp.
         background: RGB in 0…1; the scene's where None.
+        width: pixels that the camera is scaled to.
         parts: how many parts to tell apart; by a stated rule where None.
     """
-    arguments = _asks(camera, frame, [kind], format, background, parts)
+    arguments = _asks(camera, frame, [kind], format, background, width, parts)
     return Call("POST", path(id, "render"), read_picture, arguments=arguments)
 
 
@@ -47,10 +49,11 @@ def render_file(
     kind: str = "colour",
     format: str = "png",
     background: Colour | None = None,
+    width: int | None = None,
     parts: int | None = None,
 ) -> Call[bytes]:
-    """The same as the file that the service sends."""
-    arguments = _asks(camera, frame, [kind], format, background, parts)
+    """The same as the bytes that the service sends, in any of its formats."""
+    arguments = _asks(camera, frame, [kind], format, background, width, parts)
     return Call("POST", path(id, "render"), lambda response: response.content, arguments=arguments)
 
 
@@ -61,10 +64,11 @@ def render_arrays(
     *,
     kinds: Sequence[str] = ("colour",),
     background: Colour | None = None,
+    width: int | None = None,
     parts: int | None = None,
 ) -> Call[dict[str, NDArray[Any]]]:
     """Several kinds of view as arrays by kind: colour 0…1, depth along z in the rig's units, alpha, parts."""
-    arguments = _asks(camera, frame, kinds, "npz", background, parts)
+    arguments = _asks(camera, frame, kinds, "npz", background, width, parts)
     return Call("POST", path(id, "render"), read_npz, arguments=arguments)
 
 
@@ -74,6 +78,7 @@ def _asks(
     kinds: Sequence[str],
     format: str,
     background: Colour | None,
+    width: int | None,
     parts: int | None,
 ) -> dict[str, Any]:
     request = RenderRequest.model_validate(
@@ -83,6 +88,7 @@ def _asks(
             "kinds": list(kinds),
             "format": format,
             "background": background,
+            "width": width,
             "parts": parts,
         }
     )

@@ -48,7 +48,7 @@ def open_source(
     if fps is not None and not 0 < fps < 1e6:
         raise CaptureError(f"fps {fps!r} must be a positive number of frames per second")
     if calibration is None and (folder / TRAIN_META).exists():
-        return CaptureSource(open_capture(folder, fps=fps or 30.0, use_masks=use_masks))
+        return CaptureSource(open_capture(folder, fps=fps, use_masks=use_masks))
     found = read_calibration(folder, calibration)
     seen = _pictures(folder, found, pictures)
     masks = folder / "masks"

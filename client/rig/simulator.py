@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from typing import Any
 
+from client.importers.source import CaptureSource, Source
+from client.retries import Retry
+from client.rig.delivery import Delivery, Lateness
+from client.rig.pace import Pace
+from client.rig.sender import Requests, Said, Sender, Sockets
+from client.rig.sequence import Sequence
 from client.sdk import Client
-from client.wire import SceneStatus
+from client.wire import IngestSettings, SceneStatus
 from scas4d_core.captures import Capture
 
 Told = Callable[[str, int, int], None]
@@ -15,57 +23,130 @@ Told = Callable[[str, int, int], None]
 
 
 def push(
-    capture: Capture,
+    source: Source | Capture,
     client: Client,
     *,
-    fps: float | None = None,
+    scene: str | None = None,
+    pace: Pace | None = None,
     frames: int | None = None,
+    start: int = 0,
+    loop: bool = False,
+    per_camera: bool = False,
+    websocket: bool = False,
     preset: str = "scas4d",
     settings: Mapping[str, Any] | None = None,
+    ingest: IngestSettings | None = None,
     told: Told | None = None,
-) -> SceneStatus:
-    """Creates a scene, sends its cloud and every frame in order, and waits until the last is finished.
+    said: Said | None = None,
+) -> Delivery:
+    """Creates a scene, sends its cloud and every frame in order and in time, and waits until the last is finished.
+
+    The clock of a rig starts when frame 0 is finished. A restart of the service is waited out for as long as the
+    client waits for an outage, and what it says comes next is sent next.
 
     Args:
-        capture: opened with image_scale 1; the files go as they are. The service scales, if `settings` say so.
+        source: what is sent, at the size of the files. The service scales, if `settings` say so.
         client: of the service.
-        fps: frames a second to send at most; None sends as fast as the service takes them. The times of the frames are
-            those of the capture either way.
-        frames: how many to send; all where None.
+        scene: id of a scene to go on with, from its next frame; a new one where None.
+        pace: of the rig; as fast as the service takes them where None. The times of the frames are those of the capture
+            either way.
+        frames: how many the scene shall have; all where None, or without end with `loop`.
+        start: the frame of the capture that is frame 0 of the scene.
+        loop: go back and forth through the capture until `frames`, or until it is interrupted.
+        per_camera: every camera sends its own pictures, over a connection of its own.
+        websocket: send over a WebSocket (one for each camera with `per_camera`) instead of requests.
         preset: named settings.
         settings: what differs from the preset, nested.
+        ingest: how the scene takes frames.
         told: hears of progress: the stages of frame 0, then "frames" with the number finished.
-
-    Returns:
-        The scene's status after the last frame.
+        said: hears sentences: outages, frames that were lost, where it goes on.
 
     Raises:
-        ServiceError: the service refused.
-        RuntimeError: the scene failed.
+        ServiceError, ServiceUnreachable: as by the client.
+        RuntimeError: the scene failed, or has other cameras than the capture.
     """
+    source = CaptureSource(source) if isinstance(source, Capture) else source
     told = told or (lambda stage, done, total: None)
-    count = min(frames or capture.frame_count, capture.frame_count)
-    scene = client.create_scene(
-        capture.full_rig, name=capture.name, preset=preset, settings=settings, frames_per_second=capture.fps
-    )
-    if capture.points is not None:
-        client.put_points(scene.id, capture.points)
-    began = time.monotonic()
-    for index in range(count):
-        if fps:
-            time.sleep(max(0.0, began + index / fps - time.monotonic()))
-        images = {name: capture.encoded(index, name) for name in capture.full_rig.names}
-        found = {name: capture.encoded_mask(index, name) for name in capture.full_rig.names}
-        masks = {name: mask for name, mask in found.items() if mask is not None}
-        # The service takes masks of all cameras or of none.
-        masks = masks if len(masks) == len(images) else {}
-        client.put_frame(scene.id, index, images, masks, time=index / capture.fps)
-        if index == 0:
-            _follow(client, scene.id, 0, count, told)
+    said = said or (lambda sentence: None)
+    sequence = Sequence(source, start=start, loop=loop)
+    with ExitStack() as stack:
+        stack.callback(sequence.close)
+        count = min(frames or len(sequence), len(sequence))
+        if scene is None:
+            status = client.create_scene(
+                source.rig,
+                name=source.name,
+                preset=preset,
+                settings=settings,
+                frames_per_second=source.fps,
+                ingest=ingest,
+            )
+            if source.points is not None and start == 0:
+                client.put_points(status.id, source.points)
         else:
-            told("frames", _finished(client.scene(scene.id)), count)
-    _follow(client, scene.id, count - 1, count, told)
-    return client.scene(scene.id)
+            status = client.scene(scene)
+            _check_cameras(status, source)
+            said(f"scene {scene} goes on with frame {status.next_frame}")
+        delivery = Delivery(status.id)
+        way = Sockets(client, status.id) if websocket else Requests(client, status.id)
+        stack.callback(way.close)
+        sender = Sender(client, way, sequence, pace or Pace(), delivery, said, per_camera)
+        stack.callback(sender.close)
+        stack.enter_context(_listening(client, delivery.lateness, said))
+        try:
+            for index in sender.send_all(status.next_frame, count):
+                if index == 0:
+                    _follow(client, status.id, 0, count, told)
+                    sender.start_clock()
+                else:
+                    told("frames", _finished(client.scene(status.id)), count)
+            delivery.lateness.ended = time.monotonic()
+            _follow(client, status.id, count - 1, count, told)
+        except KeyboardInterrupt:  # how a loop without end is ended
+            said("interrupted")
+            delivery.lateness.ended = delivery.lateness.ended or time.monotonic()
+        delivery.status = client.scene(status.id)
+    return delivery
+
+
+class _listening:
+    """Counts what the client waits for, and says when an outage begins."""
+
+    def __init__(self, client: Client, lateness: Lateness, said: Said) -> None:
+        self._client = client
+        self._lateness = lateness
+        self._said = said
+        self._before = client.on_retry
+        self._out = False
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> None:
+        self._client.on_retry = self._hear
+
+    def __exit__(self, *_: object) -> None:
+        self._client.on_retry = self._before
+
+    def _hear(self, retry: Retry) -> None:
+        with self._lock:  # cameras of their own wait at the same time
+            if retry.reason == "busy":
+                self._lateness.busy += retry.seconds
+                self._lateness.busy_count += 1
+            else:
+                self._lateness.outage += retry.seconds
+                self._lateness.outage_count += 1
+                if not self._out:
+                    self._said(f"the service does not answer ({retry.detail}); trying on")
+            self._out = retry.reason == "outage"
+        if self._before is not None:
+            self._before(retry)
+
+
+def _check_cameras(status: SceneStatus, source: Source) -> None:
+    if set(status.cameras) != set(source.rig.names):
+        raise RuntimeError(
+            f"scene {status.id} has the cameras {', '.join(status.cameras)}, {source.name} has "
+            f"{', '.join(source.rig.names)}; go on with the capture that the scene began with"
+        )
 
 
 def _follow(client: Client, id: str, index: int, count: int, told: Told) -> None:
@@ -82,5 +163,5 @@ def _follow(client: Client, id: str, index: int, count: int, told: Told) -> None
 
 
 def _finished(status: SceneStatus) -> int:
-    """Frames committed or set aside."""
+    """Frames of which nothing more will happen."""
     return status.next_frame - status.queued

@@ -2,7 +2,8 @@
 
 ``train_meta.json`` and ``test_meta.json`` hold ``w``, ``h``, ``k[t][c]`` (3×3, pixels), ``w2c[t][c]`` (4×4, OpenCV
 axes), ``fn[t][c]`` (path under ``ims/``) and ``cam_id[t][c]``. Masks lie under ``seg/`` with the same path, ending in
-``.png``. ``init_pt_cld.npz`` holds ``data`` [P, 7]: x y z, r g b (0…1), foreground (0…1).
+``.png``. ``init_pt_cld.npz`` holds ``data`` [P, 7]: x y z, r g b (0…1), foreground (0…1). Beyond that layout,
+``train_meta.json`` may say ``fps``, and a cloud of which nobody knows the foreground has six columns.
 (JonathonLuiten/Dynamic3DGaussians, ``train.py``.)
 """
 
@@ -31,7 +32,7 @@ def read_dynamic3dgs(
     folder: Path | str,
     *,
     image_scale: float = 1.0,
-    fps: float = 30.0,
+    fps: float | None = None,
     use_masks: bool = True,
     use_points: bool = True,
 ) -> Capture:
@@ -42,7 +43,7 @@ def read_dynamic3dgs(
     Args:
         folder: holds ``train_meta.json``.
         image_scale: resizes pictures, masks, labels and cameras alike.
-        fps: frames per second; the layout does not say.
+        fps: frames per second; where None, those of ``train_meta.json`` (``scas4d import`` writes them), else 30.
         use_masks: False to leave ``seg/`` alone.
         use_points: False to leave ``init_pt_cld.npz`` alone.
 
@@ -50,9 +51,10 @@ def read_dynamic3dgs(
         CaptureError: a file is missing, broken, or does not fit the others; or a camera moves.
     """
     folder = Path(folder)
-    if not (np.isfinite(fps) and fps > 0):
-        raise CaptureError(f"fps {fps!r} must be a positive number of frames per second")
     train = _read_cameras(folder, TRAIN_META)
+    rate = train.fps if fps is None else fps
+    if isinstance(rate, bool) or not isinstance(rate, int | float) or not (np.isfinite(rate) and rate > 0):
+        raise CaptureError(f"{folder}: fps {rate!r} must be a positive number of frames per second")
     test = _read_cameras(folder, "test_meta.json") if (folder / "test_meta.json").exists() else None
     if test is not None:
         both = sorted(set(train.rig.names) & set(test.rig.names))
@@ -79,7 +81,7 @@ def read_dynamic3dgs(
         test_mask_files=_masks(folder, test, required=False)
         if test and with_masks
         else tuple({} for _ in train.images),
-        fps=fps,
+        fps=float(rate),
         points=_read_points(folder / "init_pt_cld.npz") if use_points else None,
         ground_truth=read_ground_truth(folder, len(train.images), sizes),
         extent=read_extent(folder),
@@ -91,6 +93,7 @@ class _Cameras:
     rig: Rig
     images: tuple[Files, ...]
     relative: tuple[dict[str, PurePosixPath], ...]
+    fps: Any = 30.0
 
 
 def _read_cameras(folder: Path, file: str) -> _Cameras:
@@ -123,7 +126,7 @@ def _read_cameras(folder: Path, file: str) -> _Cameras:
                 f"{picture}: is {size[0]}x{size[1]} pixels, but {file} says {width}x{height} (camera {name}); "
                 "give pictures at the size the cameras were calibrated for (image_scale resizes both)"
             )
-    return _Cameras(rig, images, relative)
+    return _Cameras(rig, images, relative, meta.get("fps", 30.0))
 
 
 def _whole(path: Path, key: str, value: Any) -> int:
@@ -196,9 +199,10 @@ def _read_points(path: Path) -> InitialPoints | None:
     if not path.exists():
         return None
     data = read_npz(path, ("data",))["data"]
-    if data.ndim != 2 or data.shape[1] != 7 or len(data) == 0 or data.dtype.kind not in "fiu":
+    if data.ndim != 2 or data.shape[1] not in (6, 7) or len(data) == 0 or data.dtype.kind not in "fiu":
         raise CaptureError(
-            f"{path}: data must be [P, 7] numbers, x y z r g b foreground; found {data.dtype} {list(data.shape)}"
+            f"{path}: data must be [P, 7] numbers, x y z r g b foreground ([P, 6] without the last); "
+            f"found {data.dtype} {list(data.shape)}"
         )
     if not np.isfinite(data).all():
         raise CaptureError(f"{path}: data holds NaN or infinity in row {int(np.argmin(np.isfinite(data).all(axis=1)))}")
@@ -209,4 +213,5 @@ def _read_points(path: Path) -> InitialPoints | None:
             "divide by 255 what is in 0…255"
         )
     shown = np.clip(shown, 0, 1).astype(np.float32)
-    return InitialPoints(data[:, :3].astype(np.float64), shown[:, :3], shown[:, 3])
+    foreground = shown[:, 3] if shown.shape[1] == 4 else None
+    return InitialPoints(data[:, :3].astype(np.float64), shown[:, :3], foreground)

@@ -230,7 +230,7 @@ def test_test_cameras_must_have_the_same_frames(folder):
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (np.zeros((4, 6)), r"data must be \[P, 7\]"),
+        (np.zeros((4, 5)), r"data must be \[P, 7\]"),
         (np.zeros((0, 7)), r"data must be \[P, 7\]"),
         (np.full((4, 7), 200.0), "divide by 255"),
         (np.array([[0.0] * 7, [np.nan] + [0.0] * 6]), "NaN or infinity in row 1"),

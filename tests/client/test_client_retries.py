@@ -135,7 +135,7 @@ def test_waits_grow_to_a_limit_and_are_not_all_alike(monkeypatch):
 
 def test_a_full_queue_says_that_the_service_is_back():
     """An outage is counted from its own first failure, not from that of one long over."""
-    retries = Retries(put_frame("s", 0, {}), "u", busy=10, outage=0.2)
+    retries = Retries(put_frame("s", 0, {"c": b"x"}), "u", busy=10, outage=0.2)
     retries.after_break(httpx.ReadError("cut"))
     time.sleep(0.25)
     assert retries.after_answer(busy()) is not None

@@ -8,7 +8,7 @@ import pytest
 from running import HEIGHT, WIDTH, make_rig, pictures
 
 from client.errors import FrameGap
-from client.rig import push
+from client.rig import Pace, push
 from client.sdk import AsyncClient, Client
 from scas4d_core.captures import open_capture
 
@@ -18,7 +18,7 @@ def test_the_rig_simulator_sends_a_capture(service, capture_folder):
     with Client(service.url) as client:
         status = push(
             open_capture(capture_folder), client, told=lambda *now: told.append(now), settings={"update": {"seed": 3}}
-        )
+        ).status
         assert (status.name, status.committed, status.state) == ("tiny", 4, "ready")
         assert status.cameras == ["0", "1"]
         assert status.gaussians == 5  # the cloud came first
@@ -31,7 +31,7 @@ def test_the_rig_simulator_sends_a_capture(service, capture_folder):
 def test_a_rig_sends_no_faster_than_asked(service, capture_folder):
     with Client(service.url) as client:
         began = asyncio.run(_clock())
-        status = push(open_capture(capture_folder), client, fps=4, frames=3)
+        status = push(open_capture(capture_folder), client, pace=Pace(fps=4), frames=3).status
         assert asyncio.run(_clock()) - began > 0.5
         assert status.committed == 3
         client.delete_scene(status.id)

@@ -1,0 +1,102 @@
+"""Writes what was imported in the layout of Dynamic3DGaussians, which every command reads without any extra."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Collection
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from client.importers.source import Source
+from scas4d_core.cameras import Camera
+from scas4d_core.captures import CaptureError
+
+Told = Callable[[str, int, int], None]
+
+
+def write_dynamic3dgs(
+    source: Source,
+    out: Path,
+    *,
+    frames: int | None = None,
+    test: Collection[str] = (),
+    told: Told | None = None,
+) -> None:
+    """Writes a capture: pictures under `ims/`, masks under `seg/`, cameras in `train_meta.json` and `test_meta.json`.
+
+    The cameras' files come last: a folder that was not finished is no capture.
+
+    Args:
+        source: what is written.
+        out: folder, new or empty.
+        frames: how many; all where None.
+        test: cameras to hold out, for measuring.
+        told: hears ("frames", done, total).
+
+    Raises:
+        CaptureError: the folder is not empty, cameras differ in size, or a test camera is unknown or the last.
+    """
+    cameras = source.rig.cameras
+    if out.exists() and any(out.iterdir()):
+        raise CaptureError(f"{out}: is not empty; name a new folder")
+    unknown = sorted(set(test) - set(source.rig.names))
+    if unknown:
+        raise CaptureError(f"test camera {unknown[0]!r} is not one of {', '.join(source.rig.names)}")
+    train = [camera for camera in cameras if camera.name not in test]
+    if not train:
+        raise CaptureError("every camera is a test camera; leave some to reconstruct from")
+    sizes = {camera.name: (camera.width, camera.height) for camera in cameras}
+    if len(set(sizes.values())) > 1:
+        listed = ", ".join(f"{name} {width}x{height}" for name, (width, height) in list(sizes.items())[:4])
+        raise CaptureError(f"the cameras differ in size ({listed}), and this layout has one for all; push them instead")
+    count = min(frames or source.frame_count, source.frame_count)
+    ends: dict[str, str] = {}
+
+    def write(index: int, name: str) -> None:
+        picture, mask = source.encoded(index, name), source.encoded_mask(index, name)
+        ends[name] = end = _end_of(picture)
+        _put(out / "ims" / name / f"{index:06d}{end}", picture)
+        if mask is not None:
+            _put(out / "seg" / name / f"{index:06d}.png", mask)
+
+    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
+        for index in range(count):
+            list(pool.map(write, [index] * len(cameras), source.rig.names))
+            if told is not None:
+                told("frames", index + 1, count)
+    points = source.points
+    if points is not None:
+        foreground = () if points.foreground is None else (points.foreground[:, None],)
+        np.savez(out / "init_pt_cld.npz", data=np.concatenate([points.positions, points.colours, *foreground], axis=1))
+    held_out = [camera for camera in cameras if camera.name in test]
+    if held_out:
+        _write_meta(out / "test_meta.json", held_out, count, ends, source.fps)
+    _write_meta(out / "train_meta.json", train, count, ends, source.fps)
+
+
+def _write_meta(path: Path, cameras: list[Camera], count: int, ends: dict[str, str], fps: float) -> None:
+    meta: dict[str, Any] = {
+        "w": cameras[0].width,
+        "h": cameras[0].height,
+        "fps": fps,
+        "k": [[camera.intrinsics.tolist() for camera in cameras]] * count,
+        "w2c": [[camera.world_to_camera.tolist() for camera in cameras]] * count,
+        "cam_id": [[camera.name for camera in cameras]] * count,
+        "fn": [[f"{camera.name}/{t:06d}{ends[camera.name]}" for camera in cameras] for t in range(count)],
+    }
+    path.write_text(json.dumps(meta))
+
+
+def _end_of(picture: bytes) -> str:
+    if picture.startswith(b"\xff\xd8"):
+        return ".jpg"
+    return ".png" if picture.startswith(b"\x89PNG") else ".webp"
+
+
+def _put(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)

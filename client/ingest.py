@@ -1,0 +1,117 @@
+"""`IngestSocket`: frames over one WebSocket, each a binary message of `client.wire.framing`, each acknowledged.
+
+The same retries as over HTTP: a connection that breaks is made anew and the frame sent again.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+from urllib.parse import quote
+
+import httpx
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from client.calls import Call
+from client.errors import ServiceError, error_of
+from client.retries import Retries
+from client.sdk import Client
+from client.wire import FrameReceipt, IngestAnswer, PartReceipt, frame_chunks
+
+ANSWER_S = 130.0
+"""How long an acknowledgement may take."""
+
+
+class IngestSocket:
+    """One sender's connection to a scene. Close it, or use it in a `with`. Not to be shared by threads.
+
+    Args:
+        client: whose service, token, patience and `on_retry` are used.
+        scene: id.
+    """
+
+    def __init__(self, client: Client, scene: str) -> None:
+        self._client = client
+        base = "ws" + client.url.removeprefix("http")
+        self._address = f"{base}/v1/scenes/{quote(scene, safe='')}/ingest"
+        self._connection: ClientConnection | None = None
+
+    def __enter__(self) -> IngestSocket:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Closes the connection."""
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+
+    def put_frame(
+        self,
+        index: int,
+        images: Mapping[str, bytes],
+        masks: Mapping[str, bytes] | None = None,
+        time: float | None = None,
+    ) -> FrameReceipt:
+        """As `Client.put_frame`."""
+        receipt = self._send(frame_chunks(index, images, masks, time))
+        assert isinstance(receipt, FrameReceipt)
+        return receipt
+
+    def put_camera(
+        self, index: int, camera: str, image: bytes, mask: bytes | None = None, time: float | None = None
+    ) -> PartReceipt:
+        """As `Client.put_camera`."""
+        masks = {} if mask is None else {camera: mask}
+        receipt = self._send(frame_chunks(index, {camera: image}, masks, time, part=True))
+        assert isinstance(receipt, PartReceipt)
+        return receipt
+
+    def _send(self, chunks: list[bytes]) -> FrameReceipt | PartReceipt:
+        call: Call[Any] = Call("PUT", self._address, lambda response: None)
+        client = self._client
+        retries = Retries(call, client.url, busy=client.patience, outage=client.outage, told=client.on_retry)
+        while True:
+            wait: float | None
+            try:
+                answer = self._exchange(chunks)
+            except InvalidStatus as error:
+                refusal = error.response
+                wait = retries.after_answer(
+                    httpx.Response(
+                        refusal.status_code, headers=dict(refusal.headers.raw_items()), content=bytes(refusal.body)
+                    )
+                )
+            except (OSError, TimeoutError, ConnectionClosed, InvalidHandshake) as error:
+                self.close()
+                wait = retries.after_break(httpx.ReadError(str(error)))
+            else:
+                if answer.receipt is not None:
+                    return answer.receipt
+                wait = retries.after_answer(_as_response(answer))
+            if wait is None:
+                raise ServiceError(error_of(_as_response(answer)).problem)
+            time.sleep(wait)
+
+    def _exchange(self, chunks: list[bytes]) -> IngestAnswer:
+        if self._connection is None:
+            token = self._client.token
+            self._connection = connect(
+                self._address,
+                additional_headers={} if token is None else {"Authorization": f"Bearer {token}"},
+                compression=None,  # pictures are compressed already
+                close_timeout=2,
+            )
+        self._connection.send(iter(chunks))
+        return IngestAnswer.model_validate_json(self._connection.recv(timeout=ANSWER_S))
+
+
+def _as_response(answer: IngestAnswer) -> httpx.Response:
+    """The answer as the HTTP door would have given it, so that the same rules hold."""
+    problem = {} if answer.problem is None else answer.problem.model_dump(mode="json", exclude_none=True)
+    headers = {"Retry-After": str(problem["retry_after"])} if "retry_after" in problem else {}
+    return httpx.Response(answer.status, headers=headers, json=problem)

@@ -1,0 +1,61 @@
+"""What became of a push."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+from client.wire import SceneStatus
+
+
+@dataclass
+class Lateness:
+    """How far the sending fell behind the pace, in seconds, and what it waited for.
+
+    Attributes:
+        late: by how much each frame was acknowledged after its moment, plus one period: 0 means before the next one.
+        busy: waited for a full queue, and how often.
+        outage: waited for a service that did not answer, and how often.
+    """
+
+    late: list[float] = field(default_factory=list)
+    busy: float = 0.0
+    busy_count: int = 0
+    outage: float = 0.0
+    outage_count: int = 0
+    began: float = field(default_factory=time.monotonic)
+    ended: float | None = None
+
+    def summary(self, fps: float | None) -> str:
+        """One line for a person."""
+        count = len(self.late)
+        seconds = (self.ended or time.monotonic()) - self.began
+        rate = f"{(count - 1) / seconds:.2f}" if count > 1 and seconds > 0 else "-"
+        asked = f" of {fps:g}" if fps else ""
+        parts = [f"sent {count} frames at {rate}{asked} a second"]
+        if fps and count:
+            behind = [value for value in self.late if value > 0]
+            worst = f", at most {max(behind):.2f} s" if behind else ""
+            parts.append(f"{len(behind)} acknowledged after the next was due{worst}")
+        if self.busy_count:
+            parts.append(f"waited {self.busy:.1f} s for a full queue ({self.busy_count} times)")
+        if self.outage_count:
+            parts.append(f"waited {self.outage:.1f} s for the service ({self.outage_count} tries)")
+        return "; ".join(parts)
+
+
+@dataclass
+class Delivery:
+    """What became of a push.
+
+    Attributes:
+        scene: id.
+        lateness: how far the sending fell behind.
+        lost: indices that the rig lost, declared missing.
+        status: of the scene after the last frame; None while it goes on.
+    """
+
+    scene: str
+    lateness: Lateness = field(default_factory=Lateness)
+    lost: list[int] = field(default_factory=list)
+    status: SceneStatus | None = None

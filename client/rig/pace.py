@@ -1,0 +1,39 @@
+"""When a rig takes its frames, and what of it is lost: the clock of the rig simulator."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How a rig behaves.
+
+    Attributes:
+        fps: frames a second; None sends as fast as the service takes them.
+        jitter: seconds that a frame is late at most, evenly distributed: cables, encoders, switches.
+        drop: share of frames that the rig loses, 0…1. Frame 0 is never lost.
+        seed: of what is random here.
+    """
+
+    fps: float | None = None
+    jitter: float = 0.0
+    drop: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.fps is not None and not self.fps > 0:
+            raise ValueError(f"fps {self.fps!r} must be above 0")
+        if not self.jitter >= 0:
+            raise ValueError(f"jitter {self.jitter!r} must be 0 seconds or more")
+        if not 0 <= self.drop < 1:
+            raise ValueError(f"drop {self.drop!r} must be a share from 0 to below 1")
+
+    def loses(self, index: int, camera: str = "") -> bool:
+        """Is this frame (or this camera's picture of it) lost? The same answer every time."""
+        return index > 0 and random.Random(f"{self.seed} {index} {camera} lost").random() < self.drop
+
+    def late(self, index: int, camera: str = "") -> float:
+        """Seconds that this frame leaves late."""
+        return random.Random(f"{self.seed} {index} {camera} late").uniform(0, self.jitter)

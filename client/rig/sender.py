@@ -1,0 +1,154 @@
+"""How the rig simulator's frames leave: as requests or over WebSockets, whole or each camera for itself, in time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+from client.errors import FrameGap
+from client.ingest import IngestSocket
+from client.rig.delivery import Delivery
+from client.rig.pace import Pace
+from client.rig.sequence import Files, Sequence
+from client.sdk import Client
+
+Said = Callable[[str], None]
+
+
+class Requests:
+    """Frames as requests."""
+
+    def __init__(self, client: Client, scene: str) -> None:
+        self._client = client
+        self._scene = scene
+
+    def frame(self, index: int, files: Files) -> None:
+        """A whole frame."""
+        self._client.put_frame(self._scene, index, files.images, files.masks, time=files.time)
+
+    def camera(self, index: int, name: str, files: Files) -> None:
+        """One camera's pictures."""
+        mask = files.masks.get(name)
+        self._client.put_camera(self._scene, index, name, files.images[name], mask, time=files.time)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+class Sockets:
+    """Frames over WebSockets, one a sender."""
+
+    def __init__(self, client: Client, scene: str) -> None:
+        self._client = client
+        self._scene = scene
+        self._sockets: dict[str, IngestSocket] = {}
+
+    def frame(self, index: int, files: Files) -> None:
+        """A whole frame."""
+        self._of("").put_frame(index, files.images, files.masks, time=files.time)
+
+    def camera(self, index: int, name: str, files: Files) -> None:
+        """One camera's pictures, over its own socket."""
+        self._of(name).put_camera(index, name, files.images[name], files.masks.get(name), time=files.time)
+
+    def close(self) -> None:
+        """Closes the sockets."""
+        for socket in self._sockets.values():
+            socket.close()
+
+    def _of(self, sender: str) -> IngestSocket:
+        # Of one camera there is one picture at a time on its way: no two threads come here with one name.
+        if sender not in self._sockets:
+            self._sockets[sender] = IngestSocket(self._client, self._scene)
+        return self._sockets[sender]
+
+
+class Sender:
+    """Sends the frames in their time."""
+
+    def __init__(
+        self,
+        client: Client,
+        way: Requests | Sockets,
+        sequence: Sequence,
+        pace: Pace,
+        delivery: Delivery,
+        said: Said,
+        per_camera: bool,
+    ) -> None:
+        self._client = client
+        self._way = way
+        self._sequence = sequence
+        self._pace = pace
+        self._delivery = delivery
+        self._said = said
+        names = sequence.source.rig.names
+        self._cameras = ThreadPoolExecutor(max_workers=len(names), thread_name_prefix="camera") if per_camera else None
+        self.start_clock()
+
+    def start_clock(self) -> None:
+        """The next frame is due now."""
+        self._began = time.monotonic()
+        self._sent = 0
+        if not self._delivery.lateness.late:
+            self._delivery.lateness.began = self._began
+
+    def send_all(self, first: int, count: int) -> Iterator[int]:
+        """Every index in order, once it is acknowledged or given up; goes where the service says it goes on."""
+        index = first
+        while index < count:
+            due = self._await(index)
+            try:
+                self._send(index)
+            except FrameGap as gap:
+                if gap.expected == index:
+                    raise
+                self._said(f"the service expects frame {gap.expected} next, not {index}: going on there")
+                index = gap.expected
+                continue
+            if due is not None:
+                period = 1 / self._pace.fps if self._pace.fps else 0.0
+                self._delivery.lateness.late.append(time.monotonic() - due - period)
+            yield index
+            index += 1
+
+    def _await(self, index: int) -> float | None:
+        due = self._began + (self._sent / self._pace.fps if self._pace.fps else 0.0)
+        self._sent += 1
+        time.sleep(max(0.0, due + self._pace.late(index) - time.monotonic()))
+        return due
+
+    def _send(self, index: int) -> None:
+        id = self._delivery.scene
+        if self._cameras is None:
+            if self._pace.loses(index):
+                self._lose(index)
+                return
+            files = self._sequence.files(index)
+            self._way.frame(index, files)
+            return
+        files = self._sequence.files(index)
+        sending = [name for name in files.images if not self._pace.loses(index, name)]
+        if not sending:
+            self._lose(index)
+            return
+        list(self._cameras.map(lambda name: self._send_camera(index, name, files), sending))
+        if len(sending) < len(files.images):
+            self._client.close_frame(id, index)
+            lost = ", ".join(name for name in files.images if name not in sending)
+            self._said(f"frame {index}: the rig lost the pictures of {lost}; closed without them")
+
+    def _send_camera(self, index: int, name: str, files: Files) -> None:
+        time.sleep(self._pace.late(index, name))
+        self._way.camera(index, name, files)
+
+    def _lose(self, index: int) -> None:
+        self._client.declare_missing(self._delivery.scene, index, reason="lost by the rig simulator")
+        self._delivery.lost.append(index)
+        self._said(f"frame {index}: lost by the rig, declared missing")
+
+    def close(self) -> None:
+        """Ends its threads."""
+        if self._cameras is not None:
+            self._cameras.shutdown(wait=True, cancel_futures=True)

@@ -1,0 +1,77 @@
+"""The frames of a capture as those of a scene, made ready ahead of their time."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+from client.importers.source import Source
+
+FOREVER = 10**9
+
+
+@dataclass(frozen=True)
+class Files:
+    """One frame as it is sent."""
+
+    time: float
+    images: dict[str, bytes]
+    masks: dict[str, bytes]
+
+
+class Sequence:
+    """The frames of a capture as frames of a scene: from a start, and where it loops back and forth for ever.
+
+    Back and forth, because a jump from the last frame to the first is a motion that no scene makes.
+    """
+
+    def __init__(self, source: Source, *, start: int = 0, loop: bool = False) -> None:
+        if not 0 <= start < source.frame_count:
+            raise ValueError(f"start {start} is not one of the frames 0…{source.frame_count - 1} of {source.name}")
+        self.source = source
+        self.start = start
+        self.loop = loop
+        self._last = source.frame_count - 1 - start
+        self._pool = ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1), thread_name_prefix="frames")
+        self._ahead: tuple[int, Future[Files]] | None = None
+        self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="ahead")
+
+    def __len__(self) -> int:
+        return FOREVER if self.loop else self._last + 1
+
+    def place(self, index: int) -> int:
+        """Which frame of the capture is frame `index` of the scene."""
+        if index <= self._last:
+            return self.start + index
+        if self._last == 0:
+            return self.start
+        turn = index % (2 * self._last)
+        return self.start + min(turn, 2 * self._last - turn)
+
+    def time(self, index: int) -> float:
+        """Seconds: those of the capture; beyond its end by its rate."""
+        if index <= self._last:
+            return self.source.time(self.start + index) - self.source.time(self.start)
+        return self.time(self._last) + (index - self._last) / self.source.fps
+
+    def files(self, index: int) -> Files:
+        """The files of a frame; those of the next are made meanwhile."""
+        future = self._ahead[1] if self._ahead and self._ahead[0] == index else self._reader.submit(self._files, index)
+        found = future.result()
+        if index + 1 < len(self):
+            self._ahead = index + 1, self._reader.submit(self._files, index + 1)
+        return found
+
+    def _files(self, index: int) -> Files:
+        place, names = self.place(index), self.source.rig.names
+        images = dict(zip(names, self._pool.map(lambda name: self.source.encoded(place, name), names), strict=True))
+        found = dict(zip(names, self._pool.map(lambda name: self.source.encoded_mask(place, name), names), strict=True))
+        masks = {name: mask for name, mask in found.items() if mask is not None}
+        # The service takes masks of all cameras or of none.
+        return Files(self.time(index), images, masks if len(masks) == len(images) else {})
+
+    def close(self) -> None:
+        """Ends its threads."""
+        self._reader.shutdown(wait=True, cancel_futures=True)
+        self._pool.shutdown(wait=True)
