@@ -10,7 +10,7 @@ from typing import Any
 
 from client.wire import FrameReportModel, FrameState, ProgressModel, SceneState, SceneStatus
 from scas4d_core.cameras import Camera
-from server import reports, worker
+from server import metrics, reports, worker
 from server.definition import JOURNAL_FILE, Definition
 from server.disk import no_room
 from server.facts import Died, Fact, FramesDeleted, SetAside, StatesDeleted
@@ -94,6 +94,8 @@ class Scene:
 
     def _tell(self, event: Event) -> None:
         """Tells who listens to the scene (`server.hub`); called at every change of its status or of a frame."""
+        if isinstance(event, FrameFinished):
+            metrics.finished(event.report)
         self._hub.publish(self.id, event)
 
     @property
@@ -225,7 +227,8 @@ class Scene:
 
     async def ask(self, query: Query) -> Answer:
         """The reader process's answer; see `Readers.ask`."""
-        return await self._questions.ask(query)
+        with metrics.answering(query):
+            return await self._questions.ask(query)
 
     # The way of a frame.
 
@@ -308,6 +311,7 @@ class Scene:
         if message.deleted:
             deleted = StatesDeleted(frames=message.deleted)
             self.ledger.apply(deleted)
+            self._tell(SceneChanged())
             await self._write(deleted)
         await self.retain()
         await self.ingest.close_what_can_be()
@@ -354,6 +358,7 @@ class Scene:
             self.sizes.pop(name, None)
         fact = FramesDeleted(frames=tuple(gone))
         self.ledger.apply(fact)
+        self._tell(SceneChanged())
         await asyncio.to_thread(remove, self.spec.frames, names)
         await self._write(fact)
 
@@ -380,6 +385,7 @@ class Scene:
         self._ready, self.progress = False, None
         if self._stopping or self.ledger.fatal is not None:
             return
+        metrics.RESTARTS.labels("worker").inc()
         own, delay = self.supervision.died(reason.exit_code)
         self._trouble = f"the worker is gone: {reason}; it is started again in {delay:g} s"
         log.error("scene %s: %s", self.id, self._trouble)
