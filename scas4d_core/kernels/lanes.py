@@ -218,11 +218,20 @@ def fill(typing_context: Any, value: Any) -> Any:
     return lanes_type(types.float32), generate
 
 
-def _place(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+def _data(context: Any, builder: Any, array_type: Any, array: Any) -> Any:
     if not (isinstance(array_type, types.Array) and array_type.dtype == types.float32 and array_type.layout == "C"):
         raise TypeError(f"Lanes are read from and written to C-contiguous float32 arrays; this is {array_type}")
-    data = cgutils.create_struct_proxy(array_type)(context, builder, value=array).data
+    return cgutils.create_struct_proxy(array_type)(context, builder, value=array).data
+
+
+def _place(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+    data = _data(context, builder, array_type, array)
     return builder.bitcast(builder.gep(data, [index]), _FLOATS.as_pointer())
+
+
+def _places(context: Any, builder: Any, array_type: Any, array: Any, index: Any, stride: Any) -> list[Any]:
+    data = _data(context, builder, array_type, array)
+    return [builder.gep(data, [builder.add(index, builder.mul(stride, _LONG(k)))]) for k in range(COUNT)]
 
 
 @emitted
@@ -252,6 +261,31 @@ def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
 def aligned(array):
     """The first flat index of a float32 array whose address is a multiple of 64 bytes: of a ``Lanes``."""
     return -(array.ctypes.data // 4) & (COUNT - 1)
+
+
+@emitted
+def gather(typing_context: Any, array: Any, index: Any, stride: Any) -> Any:
+    """The numbers at a flat index of a float32 array and at every ``stride`` after it: a column of sixteen rows."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        value = ir.Constant(_FLOATS, ir.Undefined)
+        for lane, place in enumerate(_places(context, builder, signature.args[0], *arguments)):
+            value = builder.insert_element(value, builder.load(place), _INT(lane))
+        return value
+
+    return lanes_type(array, types.int64, types.int64), generate
+
+
+@emitted
+def scatter(typing_context: Any, array: Any, index: Any, stride: Any, value: Any) -> Any:
+    """Write the lanes to a flat index and to every ``stride`` after it."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        for lane, place in enumerate(_places(context, builder, signature.args[0], *arguments[:3])):
+            builder.store(builder.extract_element(arguments[3], _INT(lane)), place)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, types.int64, lanes_type), generate
 
 
 @emitted
@@ -290,6 +324,34 @@ def exp2(x):
     y = y * part + np.float32(6.931469670612127e-1)
     y = y * part + np.float32(1.0)
     return _times_power_of_two(y, whole)
+
+
+@emitted
+def _exponent_and_mantissa(typing_context: Any, x: Any) -> Any:
+    """Of positive numbers: x = m 2^e with m in [1/√2, √2)."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        def all_of(value: int) -> Any:
+            return ir.Constant(_INTS, [value] * COUNT)
+
+        bits = builder.sub(builder.bitcast(arguments[0], _INTS), all_of(0x3F3504F3))  # of 1/√2
+        exponent = builder.sitofp(builder.ashr(bits, all_of(23)), _FLOATS)
+        mantissa = builder.bitcast(builder.add(builder.and_(bits, all_of(0x7FFFFF)), all_of(0x3F3504F3)), _FLOATS)
+        return context.make_tuple(builder, signature.return_type, (exponent, mantissa))
+
+    return types.UniTuple(lanes_type, 2)(lanes_type), generate
+
+
+@inline
+def log2(x):
+    """Logarithm of positive, normal numbers, absolute error 2e-7 near 1 and relative 2e-7 elsewhere."""
+    exponent, mantissa = _exponent_and_mantissa(x)
+    t = (mantissa - np.float32(1.0)) / (mantissa + np.float32(1.0))
+    square = t * t
+    y = square * np.float32(2.8853900817779268 / 7) + np.float32(2.8853900817779268 / 5)
+    y = y * square + np.float32(2.8853900817779268 / 3)
+    y = y * square + np.float32(2.8853900817779268)
+    return y * t + exponent
 
 
 @emitted
@@ -371,3 +433,26 @@ def sums_of(typing_context: Any, values: Any) -> Any:
         return given[0]
 
     return lanes_type(values), generate
+
+
+@emitted
+def transposed(typing_context: Any, values: Any) -> Any:
+    """Sixteen ``Lanes`` in a tuple, as rows and columns changed places."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        rows = [builder.extract_value(arguments[0], k) for k in range(COUNT)]
+        length = COUNT
+        while length > 1:
+            half = length // 2
+            # Off-diagonal quarters of each square of ``length`` rows and columns change places.
+            low = [k if k % length < half else COUNT + k - half for k in range(COUNT)]
+            high = [k + half if k % length < half else COUNT + k for k in range(COUNT)]
+            for k in range(COUNT):
+                if k % length < half:
+                    a, b = rows[k], rows[k + half]
+                    rows[k] = builder.shuffle_vector(a, b, ir.Constant(_INTS, low))
+                    rows[k + half] = builder.shuffle_vector(a, b, ir.Constant(_INTS, high))
+            length = half
+        return context.make_tuple(builder, signature.return_type, rows)
+
+    return values(values), generate

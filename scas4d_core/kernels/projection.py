@@ -6,11 +6,12 @@ A camera enters as ``pose`` [3, 4] float32 (world to camera, OpenCV axes) and ``
 
 from __future__ import annotations
 
-from math import log, log2, sqrt
+from math import log2
 
 import numpy as np
 from numba import prange
 
+from scas4d_core.kernels import lanes
 from scas4d_core.kernels.jit import HALF, ONE, TWO, ZERO, inline, kernel, parallel_kernel
 
 TILE = 32
@@ -18,6 +19,9 @@ TILE = 32
 
 CHUNK = 256
 """Gaussians a task: enough work for a thread, few enough for balance."""
+
+AHEAD = 16
+"""Gaussians that one's records are asked for before they are used: they lie anywhere in memory."""
 
 # Columns of ``splats`` [N, 16], what later kernels read of a Gaussian. REACH is the support's squared Mahalanobis
 # radius. At a column dx right of the centre, the support is at SLOPE dx ± sqrt(SPREAD (REACH - THIN dx²)) below it; it
@@ -28,151 +32,210 @@ SPLAT_COLUMNS = 16
 
 
 @inline
-def tangents(x, y, z, lens, margin):
-    """x/z and y/z, clamped for the Jacobian, and whether each is inside (1) or clamped (0)."""
+def tangents(u, v, lens, margin):
+    """x/z and y/z, clamped for the Jacobian, and where each is inside."""
     fx, fy, cx, cy, width, height = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
     margin_x = margin * HALF * width / fx
     margin_y = margin * HALF * height / fy
-    u = x / z
-    v = y / z
     low_u, high_u = -(cx / fx + margin_x), (width - cx) / fx + margin_x
     low_v, high_v = -(cy / fy + margin_y), (height - cy) / fy + margin_y
-    free_u = ONE if (u >= low_u and u <= high_u) else ZERO
-    free_v = ONE if (v >= low_v and v <= high_v) else ZERO
-    return min(max(u, low_u), high_u), min(max(v, low_v), high_v), free_u, free_v
+    free_u, free_v = (u >= low_u) & (u <= high_u), (v >= low_v) & (v <= high_v)
+    u = lanes.minimum(lanes.maximum(u, lanes.fill(low_u)), lanes.fill(high_u))
+    v = lanes.minimum(lanes.maximum(v, lanes.fill(low_v)), lanes.fill(high_v))
+    return u, v, free_u, free_v
 
 
-@parallel_kernel
-def project(means, factors, opacities, pose, lens, limits, splats, rects, counts):
-    """Project N Gaussians.
+@inline
+def turned(pose, row, x, y, z):
+    """One coordinate of vectors turned into the camera's axes."""
+    return x * pose[row, 0] + y * pose[row, 1] + z * pose[row, 2]
+
+
+@kernel
+def project_group(first, means, factors, opacities, pose, lens, limits, splats, place, boxes):
+    """Project sixteen Gaussians from row ``first`` on; see ``project``.
 
     Args:
-        means: [N, 3] float32 world. factors: [N, 3, 3] float32, Σ = F Fᵀ. opacities: [N] float32.
-        pose, lens: the camera. limits: [6] float32, the fields of ``Limits`` in order.
-        splats: out [N, 16] float32, columns above.
-        rects: out [N, 4] int32, tiles x0, y0, x1, y1 (exclusive) of the support's box; empty where culled.
-        counts: out [N] int32, tiles in the box.
+        splats: out, from row ``place`` on. boxes: out [5 · 16]: tiles x0, y0, x1, y1 of each, and how many.
     """
     alpha_floor, low_pass, near, margin = limits[0], limits[3], limits[4], limits[5]
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     width, height = lens[4], lens[5]
-    tiles_x = (int(width) + TILE - 1) // TILE
-    tiles_y = (int(height) + TILE - 1) // TILE
+    tiles_x = np.float32((int(width) + TILE - 1) // TILE)
+    tiles_y = np.float32((int(height) + TILE - 1) // TILE)
+    zero = lanes.fill(ZERO)
+    px, py = lanes.gather(means, 3 * first, 3), lanes.gather(means, 3 * first + 1, 3)
+    pz = lanes.gather(means, 3 * first + 2, 3)
+    x = turned(pose, 0, px, py, pz) + pose[0, 3]
+    y = turned(pose, 1, px, py, pz) + pose[1, 3]
+    z = turned(pose, 2, px, py, pz) + pose[2, 3]
+    inverse = lanes.fill(ONE) / z
+    opacity = lanes.load(opacities, first)
+    visible = (z >= near) & (opacity >= alpha_floor)
+    u, v, _, _ = tangents(x * inverse, y * inverse, lens, margin)
+    sxx = syy = lanes.fill(low_pass)
+    sxy = zero
+    m00 = m01 = m02 = m10 = m11 = m12 = zero
+    for k in range(3):
+        f0 = lanes.gather(factors, 9 * first + k, 9)
+        f1 = lanes.gather(factors, 9 * first + 3 + k, 9)
+        f2 = lanes.gather(factors, 9 * first + 6 + k, 9)
+        a2 = turned(pose, 2, f0, f1, f2)
+        m0 = fx * inverse * (turned(pose, 0, f0, f1, f2) - u * a2)
+        m1 = fy * inverse * (turned(pose, 1, f0, f1, f2) - v * a2)
+        sxx = sxx + m0 * m0
+        sxy = sxy + m0 * m1
+        syy = syy + m1 * m1
+        m00, m01, m02 = m01, m02, m0
+        m10, m11, m12 = m11, m12, m1
+    # |m0 x m1|^2 + low_pass (...) - low_pass^2 without the cancellation of sxx syy - sxy^2 for needles.
+    n0 = m01 * m12 - m02 * m11
+    n1 = m02 * m10 - m00 * m12
+    n2 = m00 * m11 - m01 * m10
+    determinant = n0 * n0 + n1 * n1 + n2 * n2 + low_pass * (sxx + syy - low_pass)
+    visible = visible & (determinant > ZERO) & (determinant < np.float32(1e30))
+    mx = fx * x * inverse + cx
+    my = fy * y * inverse + cy
+    log_opacity = lanes.log2(opacity)
+    reach = (log_opacity - np.float32(log2(alpha_floor))) * np.float32(1.3862943611198906)
+    reach = lanes.maximum(reach, zero)
+    half_x = lanes.square_root(reach * sxx)
+    half_y = lanes.square_root(reach * syy)
+    # Pixel centres lie at +0.5: the first covered column has centre >= mx - half_x.
+    left, right = mx - half_x - HALF, mx + half_x + HALF
+    top, bottom = my - half_y - HALF, my + half_y + HALF
+    visible = visible & (right > ZERO) & (left < width) & (bottom > ZERO) & (top < height)
+    tile = np.float32(1.0 / TILE)
+    x0 = lanes.choose(visible, lanes.floor(lanes.maximum(left, zero) * tile), zero)
+    y0 = lanes.choose(visible, lanes.floor(lanes.maximum(top, zero) * tile), zero)
+    x1 = lanes.minimum(lanes.floor(lanes.minimum(right, lanes.fill(width)) * tile) + ONE, lanes.fill(tiles_x))
+    y1 = lanes.minimum(lanes.floor(lanes.minimum(bottom, lanes.fill(height)) * tile) + ONE, lanes.fill(tiles_y))
+    x1, y1 = lanes.choose(visible, x1, zero), lanes.choose(visible, y1, zero)
+    lanes.store(boxes, 0, x0)
+    lanes.store(boxes, lanes.COUNT, y0)
+    lanes.store(boxes, 2 * lanes.COUNT, x1)
+    lanes.store(boxes, 3 * lanes.COUNT, y1)
+    lanes.store(boxes, 4 * lanes.COUNT, (x1 - x0) * (y1 - y0))
+    over = lanes.fill(ONE) / determinant
+    thin = lanes.fill(ONE) / sxx
+    rows = lanes.transposed(
+        (
+            mx, my, syy * over, (zero - sxy) * over, sxx * over, opacity, reach, z,
+            log_opacity, sxy * thin, determinant * thin, thin, sxy * half_y / syy, zero, zero, zero,
+        )
+    )  # fmt: skip
+    for k in range(lanes.COUNT):
+        lanes.store(splats, SPLAT_COLUMNS * (place + k), rows[k])
+
+
+@parallel_kernel
+def project(means, factors, opacities, pose, lens, limits, splats, rects, counts):
+    """Project N Gaussians, sixteen at a time.
+
+    Args:
+        means: [N, 3] float32 world. factors: [N, 3, 3] float32, Σ = F Fᵀ. opacities: [N] float32.
+        pose, lens: the camera. limits: [6] float32, the fields of ``Limits`` in order.
+        splats: out [N + 15 or more, 16] float32, columns above.
+        rects: out [N, 4] int32, tiles x0, y0, x1, y1 (exclusive) of the support's box; empty where culled.
+        counts: out [N] int32, tiles in the box.
+    """
     count = means.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):
-        m = np.empty((2, 3), np.float32)
-        for i in range(task * CHUNK, min(count, (task + 1) * CHUNK)):
-            counts[i] = 0
-            rects[i, 0] = rects[i, 1] = rects[i, 2] = rects[i, 3] = 0
-            px, py, pz = means[i, 0], means[i, 1], means[i, 2]
-            x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
-            y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
-            z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
-            splats[i, DEPTH] = z
-            opacity = opacities[i]
-            if not (z >= near) or not (opacity >= alpha_floor):
-                continue
-            u, v, _, _ = tangents(x, y, z, lens, margin)
-            for k in range(3):
-                a0 = pose[0, 0] * factors[i, 0, k] + pose[0, 1] * factors[i, 1, k] + pose[0, 2] * factors[i, 2, k]
-                a1 = pose[1, 0] * factors[i, 0, k] + pose[1, 1] * factors[i, 1, k] + pose[1, 2] * factors[i, 2, k]
-                a2 = pose[2, 0] * factors[i, 0, k] + pose[2, 1] * factors[i, 1, k] + pose[2, 2] * factors[i, 2, k]
-                m[0, k] = fx / z * (a0 - u * a2)
-                m[1, k] = fy / z * (a1 - v * a2)
-            sxx = m[0, 0] * m[0, 0] + m[0, 1] * m[0, 1] + m[0, 2] * m[0, 2] + low_pass
-            sxy = m[0, 0] * m[1, 0] + m[0, 1] * m[1, 1] + m[0, 2] * m[1, 2]
-            syy = m[1, 0] * m[1, 0] + m[1, 1] * m[1, 1] + m[1, 2] * m[1, 2] + low_pass
-            # |m0 x m1|^2 + low_pass (...) - low_pass^2 without the cancellation of sxx syy - sxy^2 for needles.
-            n0 = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
-            n1 = m[0, 2] * m[1, 0] - m[0, 0] * m[1, 2]
-            n2 = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
-            determinant = n0 * n0 + n1 * n1 + n2 * n2 + low_pass * (sxx + syy - low_pass)
-            if not (determinant > ZERO) or not (determinant < np.float32(1e30)):
-                continue
-            mx = fx * x / z + cx
-            my = fy * y / z + cy
-            reach = np.float32(TWO * log(opacity / alpha_floor))
-            half_x = np.float32(sqrt(reach * sxx))
-            half_y = np.float32(sqrt(reach * syy))
-            # Pixel centres lie at +0.5: the first covered column has centre >= mx - half_x.
-            left, right = mx - half_x - HALF, mx + half_x + HALF
-            top, bottom = my - half_y - HALF, my + half_y + HALF
-            if not (right > ZERO and left < width and bottom > ZERO and top < height):
-                continue
-            x0 = int(max(left, ZERO)) // TILE
-            y0 = int(max(top, ZERO)) // TILE
-            x1 = min(int(min(right, width)) // TILE + 1, tiles_x)
-            y1 = min(int(min(bottom, height)) // TILE + 1, tiles_y)
-            splats[i, MEAN_X], splats[i, MEAN_Y] = mx, my
-            splats[i, CONIC_A] = syy / determinant
-            splats[i, CONIC_B] = -sxy / determinant
-            splats[i, CONIC_C] = sxx / determinant
-            splats[i, OPACITY], splats[i, REACH] = opacity, reach
-            splats[i, LOG_OPACITY] = np.float32(log2(opacity))
-            splats[i, SLOPE], splats[i, SPREAD] = sxy / sxx, determinant / sxx
-            splats[i, THIN] = ONE / sxx
-            splats[i, LOWEST_X] = sxy * half_y / syy
-            rects[i, 0], rects[i, 1], rects[i, 2], rects[i, 3] = x0, y0, x1, y1
-            counts[i] = (x1 - x0) * (y1 - y0)
+        boxes = np.empty(5 * lanes.COUNT, np.float32)
+        for first in range(task * CHUNK, min(count, (task + 1) * CHUNK), lanes.COUNT):
+            some = min(lanes.COUNT, count - first)
+            if some == lanes.COUNT:
+                project_group(first, means, factors, opacities, pose, lens, limits, splats, first, boxes)
+            else:
+                last_means = padded(means[first:])
+                last_factors = padded(factors[first:])
+                last_opacities = padded(opacities[first:])
+                project_group(0, last_means, last_factors, last_opacities, pose, lens, limits, splats, first, boxes)
+            for k in range(some):
+                for side in range(4):
+                    rects[first + k, side] = np.int32(boxes[side * lanes.COUNT + k])
+                counts[first + k] = np.int32(boxes[4 * lanes.COUNT + k])
 
 
 @kernel
-def project_backward_one(i, means, factors, pose, lens, limits, splat, g_mean, g_conic, g_depth, g_means, g_factors):
-    """Carry one Gaussian's gradients from the picture to the world; see ``project_backward``."""
+def padded(rows):
+    """Up to sixteen rows of an array, as sixteen; those beyond are 0."""
+    result = np.zeros((lanes.COUNT,) + rows.shape[1:], np.float32)  # noqa: RUF005 (Numba knows no starred tuples)
+    result[: len(rows)] = rows
+    return result
+
+
+@kernel
+def project_backward_group(
+    first, place, means, factors, pose, lens, limits, splats, sums, columns, depth_channel, g_means, g_factors,
+    g_opacities, g_screen,
+):  # fmt: skip
+    """Carry sixteen Gaussians' gradients from the picture to the world; see ``project_backward``.
+
+    Args:
+        first: row of the Gaussians in ``means`` and ``factors``. place: their row in ``splats``.
+        sums: [16, columns], each Gaussian's record summed over its pairs, and 1 behind it if there was one, else 0.
+        g_means, g_factors, g_opacities, g_screen: out, from row ``first`` on.
+    """
     margin = limits[5]
     fx, fy = lens[0], lens[1]
-    px, py, pz = means[i, 0], means[i, 1], means[i, 2]
-    x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
-    y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
-    z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
-    u, v, free_u, free_v = tangents(x, y, z, lens, margin)
-    inverse = ONE / z
-    a, b, c = splat[CONIC_A], splat[CONIC_B], splat[CONIC_C]
-    ga, gb, gc = g_conic[0], g_conic[1], g_conic[2]
+    zero = lanes.fill(ZERO)
+    px, py = lanes.gather(means, 3 * first, 3), lanes.gather(means, 3 * first + 1, 3)
+    pz = lanes.gather(means, 3 * first + 2, 3)
+    x = turned(pose, 0, px, py, pz) + pose[0, 3]
+    y = turned(pose, 1, px, py, pz) + pose[1, 3]
+    z = turned(pose, 2, px, py, pz) + pose[2, 3]
+    inverse = lanes.fill(ONE) / z
+    u, v, free_u, free_v = tangents(x * inverse, y * inverse, lens, margin)
+    row = SPLAT_COLUMNS * place
+    a = lanes.gather(splats, row + CONIC_A, SPLAT_COLUMNS)
+    b = lanes.gather(splats, row + CONIC_B, SPLAT_COLUMNS)
+    c = lanes.gather(splats, row + CONIC_C, SPLAT_COLUMNS)
+    seen = lanes.gather(sums, columns - 1, columns) > ZERO
+    by_1, by_x, by_y = lanes.gather(sums, 0, columns), lanes.gather(sums, 1, columns), lanes.gather(sums, 2, columns)
+    by_xx, by_xy, by_yy = lanes.gather(sums, 3, columns), lanes.gather(sums, 4, columns), lanes.gather(sums, 5, columns)
+    g_depth = lanes.gather(sums, 6 + depth_channel, columns) if depth_channel >= 0 else zero
+    opacity = lanes.gather(splats, row + OPACITY, SPLAT_COLUMNS)
+    lanes.store(g_opacities, first, lanes.choose(seen, by_1 / opacity, zero))
+    g_x = lanes.choose(seen, a * by_x + b * by_y, zero)
+    g_y = lanes.choose(seen, b * by_x + c * by_y, zero)
+    lanes.scatter(g_screen, 2 * first, 2, g_x)
+    lanes.scatter(g_screen, 2 * first + 1, 2, g_y)
     # dL/dcov2d = -conic dL/dconic conic, with dL/dconic symmetric: [[ga, gb/2], [gb/2, gc]].
-    h = HALF * gb
+    ga, h, gc = by_xx * -HALF, by_xy * -HALF, by_yy * -HALF
     p00, p01 = a * ga + b * h, a * h + b * gc
     p10, p11 = b * ga + c * h, b * h + c * gc
-    s00 = -(p00 * a + p01 * b)
-    s01 = -(p00 * b + p01 * c)
-    s11 = -(p10 * b + p11 * c)
-    g_u = ZERO
-    g_v = ZERO
-    g_z = ZERO
+    s00 = zero - (p00 * a + p01 * b)
+    s01 = zero - (p00 * b + p01 * c)
+    s11 = zero - (p10 * b + p11 * c)
+    g_u = g_v = g_z = zero
     for k in range(3):
-        f0, f1, f2 = factors[i, 0, k], factors[i, 1, k], factors[i, 2, k]
-        a0 = pose[0, 0] * f0 + pose[0, 1] * f1 + pose[0, 2] * f2
-        a1 = pose[1, 0] * f0 + pose[1, 1] * f1 + pose[1, 2] * f2
-        a2 = pose[2, 0] * f0 + pose[2, 1] * f1 + pose[2, 2] * f2
-        m0 = fx * inverse * (a0 - u * a2)
-        m1 = fy * inverse * (a1 - v * a2)
+        f0 = lanes.gather(factors, 9 * first + k, 9)
+        f1 = lanes.gather(factors, 9 * first + 3 + k, 9)
+        f2 = lanes.gather(factors, 9 * first + 6 + k, 9)
+        a2 = turned(pose, 2, f0, f1, f2)
+        m0 = fx * inverse * (turned(pose, 0, f0, f1, f2) - u * a2)
+        m1 = fy * inverse * (turned(pose, 1, f0, f1, f2) - v * a2)
         gm0 = TWO * (s00 * m0 + s01 * m1)
         gm1 = TWO * (s01 * m0 + s11 * m1)
         ga0 = fx * inverse * gm0
         ga1 = fy * inverse * gm1
-        ga2 = -(u * ga0 + v * ga1)
-        g_u -= ga0 * a2
-        g_v -= ga1 * a2
-        g_z -= (gm0 * m0 + gm1 * m1) * inverse
-        g_factors[i, 0, k] = pose[0, 0] * ga0 + pose[1, 0] * ga1 + pose[2, 0] * ga2
-        g_factors[i, 1, k] = pose[0, 1] * ga0 + pose[1, 1] * ga1 + pose[2, 1] * ga2
-        g_factors[i, 2, k] = pose[0, 2] * ga0 + pose[1, 2] * ga1 + pose[2, 2] * ga2
+        ga2 = zero - (u * ga0 + v * ga1)
+        g_u = g_u - ga0 * a2
+        g_v = g_v - ga1 * a2
+        g_z = g_z - (gm0 * m0 + gm1 * m1) * inverse
+        for j in range(3):
+            g = ga0 * pose[0, j] + ga1 * pose[1, j] + ga2 * pose[2, j]
+            lanes.scatter(g_factors, 9 * first + 3 * j + k, 9, lanes.choose(seen, g, zero))
     # The clamped tangents are constants; the projected centre always moves.
-    gx = fx * inverse * g_mean[0] + free_u * g_u * inverse
-    gy = fy * inverse * g_mean[1] + free_v * g_v * inverse
-    gz = (
-        g_z
-        + g_depth
-        - inverse
-        * (
-            fx * x * inverse * g_mean[0]
-            + fy * y * inverse * g_mean[1]
-            + free_u * g_u * x * inverse
-            + free_v * g_v * y * inverse
-        )
-    )
+    g_u = lanes.choose(free_u, g_u, zero) * inverse
+    g_v = lanes.choose(free_v, g_v, zero) * inverse
+    gx = fx * inverse * g_x + g_u
+    gy = fy * inverse * g_y + g_v
+    gz = g_z + g_depth - inverse * (x * gx + y * gy)
     for k in range(3):
-        g_means[i, k] = pose[0, k] * gx + pose[1, k] * gy + pose[2, k] * gz
+        g = gx * pose[0, k] + gy * pose[1, k] + gz * pose[2, k]
+        lanes.scatter(g_means, 3 * first + k, 3, lanes.choose(seen, g, zero))
 
 
 @parallel_kernel
@@ -184,8 +247,7 @@ def project_backward(
     limits,
     splats,
     counts,
-    offsets,
-    pair_covers,
+    firsts,
     records,
     depth_channel,
     g_means,
@@ -194,50 +256,51 @@ def project_backward(
     g_features,
     g_screen,
 ):
-    """Sum each Gaussian's pairs (in a fixed order) and carry the gradients to the world.
+    """Sum each Gaussian's pairs (in a fixed order) and carry the gradients to the world, sixteen at a time.
 
     Args:
-        records: [pairs, >= 6 + C] from ``blend_backward``; offsets [N + 1]; pair_covers [pairs].
+        records: [pairs, whole ``Lanes``] from ``blend_backward``; counts, firsts: [N], how many each Gaussian
+            has, and the first.
         depth_channel: the feature channel that holds the depth of the centre, or -1.
-        g_means [N, 3], g_factors [N, 3, 3], g_opacities [N], g_features [N, C]: out, float32; 0 where culled.
-        g_screen: out [N, 2], dL/d(projected centre) per pixel, which density control reads.
+        g_means [N, 3], g_factors [N, 3, 3], g_opacities [N], g_features [N, C], g_screen [N, 2]: out, float32; 0 where
+            culled. ``g_screen`` is dL/d(projected centre) per pixel, which density control reads.
     """
     channels = g_features.shape[1]
+    columns = records.shape[1]
     count = means.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):
-        sums = np.empty(6 + channels, np.float32)
-        g_mean = np.empty(2, np.float32)
-        g_conic = np.empty(3, np.float32)
-        for i in range(task * CHUNK, min(count, (task + 1) * CHUNK)):
-            sums[:] = ZERO
-            any_pair = False
-            if counts[i] > 0:
-                for pair in range(offsets[i], offsets[i + 1]):
-                    if pair_covers[pair] != 0:
-                        any_pair = True
-                        for column in range(6 + channels):
-                            sums[column] += records[pair, column]
-            if not any_pair:
-                g_opacities[i] = ZERO
-                g_screen[i, 0] = g_screen[i, 1] = ZERO
-                for k in range(3):
-                    g_means[i, k] = ZERO
-                    for j in range(3):
-                        g_factors[i, k, j] = ZERO
+        sums = np.empty((lanes.COUNT, columns + 1), np.float32)
+        for first in range(task * CHUNK, min(count, (task + 1) * CHUNK), lanes.COUNT):
+            some = min(lanes.COUNT, count - first)
+            sums[:, columns] = ZERO
+            for k in range(some):
+                i = first + k
+                sums[k, columns] = ONE if counts[i] > 0 else ZERO
+                ahead = min(i + AHEAD, count - 1)
+                if counts[ahead] > 0:
+                    lanes.fetch(records, firsts[ahead])
+                for column in range(0, columns, lanes.COUNT):
+                    total = lanes.fill(ZERO)
+                    for pair in range(firsts[i], firsts[i] + counts[i]):
+                        total += lanes.load(records, pair * columns + column)
+                    lanes.store(sums, k * (columns + 1) + column, total)
                 for channel in range(channels):
-                    g_features[i, channel] = ZERO
-                continue
-            splat = splats[i]
-            g_opacities[i] = sums[0] / splat[OPACITY]
-            g_mean[0] = splat[CONIC_A] * sums[1] + splat[CONIC_B] * sums[2]
-            g_mean[1] = splat[CONIC_B] * sums[1] + splat[CONIC_C] * sums[2]
-            g_screen[i, 0], g_screen[i, 1] = g_mean[0], g_mean[1]
-            g_conic[0] = -HALF * sums[3]
-            g_conic[1] = -sums[4]
-            g_conic[2] = -HALF * sums[5]
-            for channel in range(channels):
-                g_features[i, channel] = sums[6 + channel]
-            g_depth = sums[6 + depth_channel] if depth_channel >= 0 else ZERO
-            project_backward_one(
-                i, means, factors, pose, lens, limits, splat, g_mean, g_conic, g_depth, g_means, g_factors
-            )
+                    g_features[i, channel] = sums[k, 6 + channel]
+            if some == lanes.COUNT:
+                project_backward_group(
+                    first, first, means, factors, pose, lens, limits, splats, sums, columns + 1, depth_channel,
+                    g_means, g_factors, g_opacities, g_screen,
+                )  # fmt: skip
+            else:
+                last = (
+                    padded(g_means[first:]), padded(g_factors[first:]),
+                    padded(g_opacities[first:]), padded(g_screen[first:]),
+                )  # fmt: skip
+                project_backward_group(
+                    0, first, padded(means[first:]), padded(factors[first:]), pose, lens, limits, splats, sums,
+                    columns + 1, depth_channel, last[0], last[1], last[2], last[3],
+                )  # fmt: skip
+                g_means[first:] = last[0][:some]
+                g_factors[first:] = last[1][:some]
+                g_opacities[first:] = last[2][:some]
+                g_screen[first:] = last[3][:some]

@@ -8,7 +8,6 @@ from numba import prange
 from scas4d_core.kernels import lanes
 from scas4d_core.kernels.jit import HALF, ZERO, inline, kernel, parallel_kernel
 from scas4d_core.kernels.projection import (
-    CHUNK,
     DEPTH,
     LOWEST_X,
     MEAN_X,
@@ -21,6 +20,9 @@ from scas4d_core.kernels.projection import (
 )
 
 RADIX_BITS = 11
+
+AHEAD = 8
+"""Gaussians that one's numbers are asked for before they are used: in depth order they lie anywhere in memory."""
 
 
 @inline
@@ -92,47 +94,55 @@ def depth_order(splats, counts, keys, order, keys_too, order_too, histogram):
 
 
 @kernel
-def pair_offsets(counts, offsets):
-    """Exclusive sums of ``counts`` into ``offsets`` [N + 1] int64: where each Gaussian's pairs begin."""
+def share_pairs(order, visible, counts, begins):
+    """Where each task's pairs begin, ``begins`` [tasks] int64: tasks have equal shares of the order.
+
+    Returns:
+        Pairs of Gaussians and tiles at most: tiles of all boxes.
+    """
+    tasks = begins.shape[0]
     total = 0
-    for i in range(counts.shape[0]):
-        offsets[i] = total
-        total += counts[i]
-    offsets[counts.shape[0]] = total
+    for task in range(tasks):
+        begins[task] = total
+        for k in range(visible * task // tasks, visible * (task + 1) // tasks):
+            total += counts[order[k]]
     return total
 
 
 @parallel_kernel
-def cover_tiles(splats, rects, counts, offsets, covers):
-    """Find the blocks of each tile of each Gaussian's box that its support meets.
+def cover_tiles(splats, rects, order, visible, tiles_x, begins, ends, counts, firsts, pairs, covers, tile_counts):
+    """List the tiles that each Gaussian's support reaches, in depth order.
 
     Args:
-        offsets: [N + 1] where each Gaussian's pairs begin (a pair per tile of its box, row by row).
-        covers: out [pairs] uint64, see ``cover``; 0 where the tile is not reached (such pairs have no gradient).
+        begins: [tasks] from ``share_pairs``. ends: out [tasks] int64, where each task's pairs end.
+        counts: in: tiles of each Gaussian's box; out: tiles reached. firsts: out [N] int64, each one's first pair; the
+            others follow it.
+        pairs: out [pairs, 2] int32, Gaussian and tile. covers: out [pairs] uint64, blocks of the tile, see ``cover``.
+        tile_counts: out [tasks, tiles] int32.
     """
-    count = counts.shape[0]
-    for task in prange((count + CHUNK - 1) // CHUNK):
-        for i in range(task * CHUNK, min(count, (task + 1) * CHUNK)):
-            pair = offsets[i]
-            for tile_y in range(rects[i, 1], rects[i, 3]):
-                for tile_x in range(rects[i, 0], rects[i, 2]):
-                    covers[pair] = cover(splats[i], tile_x, tile_y)
-                    pair += 1
-
-
-@parallel_kernel
-def count_tiles(rects, order, visible, offsets, covers, tiles_x, tile_counts):
-    """Gaussians that reach each tile, ``tile_counts`` [tasks, tiles] int32: each task's share of the order."""
-    tasks = tile_counts.shape[0]
+    tasks = begins.shape[0]
     for task in prange(tasks):
         tile_counts[task] = 0
+        pair = begins[task]
         for k in range(visible * task // tasks, visible * (task + 1) // tasks):
             i = order[k]
-            pair = offsets[i]
+            ahead = order[min(k + AHEAD, visible - 1)]
+            lanes.fetch(splats, ahead)
+            lanes.fetch(rects, ahead)
+            firsts[i] = pair
             for tile_y in range(rects[i, 1], rects[i, 3]):
-                for tile in range(tile_y * tiles_x + rects[i, 0], tile_y * tiles_x + rects[i, 2]):
-                    tile_counts[task, tile] += covers[pair] != 0
-                    pair += 1
+                for tile_x in range(rects[i, 0], rects[i, 2]):
+                    blocks = cover(splats[i], tile_x, tile_y)
+                    tile = tile_y * tiles_x + tile_x
+                    # Written in any case, kept if reached: there is nothing to guess for the processor.
+                    reached = np.int64(blocks != 0)
+                    pairs[pair, 0] = i
+                    pairs[pair, 1] = tile
+                    covers[pair] = blocks
+                    tile_counts[task, tile] += reached
+                    pair += reached
+            counts[i] = pair - firsts[i]
+        ends[task] = pair
 
 
 @kernel
@@ -153,24 +163,18 @@ def tile_offsets(tile_counts, starts, cursors):
 
 
 @parallel_kernel
-def fill_tiles(rects, order, visible, offsets, covers, tiles_x, cursors, items, slots, entry_covers):
+def fill_tiles(begins, ends, pairs, covers, cursors, items, slots, entry_covers):
     """Write the tile lists in depth order, each task its share, whose place ``tile_offsets`` has set aside.
 
     Args:
         cursors: [tasks, tiles] int64, moved on. items, slots: out [entries] int32, the Gaussian and its pair.
         entry_covers: out [entries] uint64.
     """
-    tasks = cursors.shape[0]
-    for task in prange(tasks):
-        for k in range(visible * task // tasks, visible * (task + 1) // tasks):
-            i = order[k]
-            pair = offsets[i]
-            for tile_y in range(rects[i, 1], rects[i, 3]):
-                for tile in range(tile_y * tiles_x + rects[i, 0], tile_y * tiles_x + rects[i, 2]):
-                    if covers[pair] != 0:
-                        place = cursors[task, tile]
-                        items[place] = i
-                        slots[place] = pair
-                        entry_covers[place] = covers[pair]
-                        cursors[task, tile] = place + 1
-                    pair += 1
+    for task in prange(begins.shape[0]):
+        for pair in range(begins[task], ends[task]):
+            tile = pairs[pair, 1]
+            place = cursors[task, tile]
+            cursors[task, tile] = place + 1
+            items[place] = pairs[pair, 0]
+            slots[place] = pair
+            entry_covers[place] = covers[pair]

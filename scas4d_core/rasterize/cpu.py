@@ -68,8 +68,7 @@ class ForwardPass(NamedTuple):
     depth_channel: int
     splats: Array
     counts: NDArray[np.int32]
-    offsets: NDArray[np.int64]
-    pair_covers: NDArray[np.uint64]
+    firsts: NDArray[np.int64]
     starts: NDArray[np.int64]
     items: NDArray[np.int32]
     slots: NDArray[np.int32]
@@ -120,7 +119,8 @@ class CpuRasterizer:
         count, channels = features.shape
         width, height = camera.width, camera.height
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-        splats = self._buffer("splats", (count, projection.SPLAT_COLUMNS))
+        # Projection writes whole groups of sixteen.
+        splats = self._buffer("splats", (count + 15, projection.SPLAT_COLUMNS))[:count]
         rects = self._buffer("rects", (count, 4), np.int32)
         counts = self._buffer("counts", (count,), np.int32)
         projection.project(means, factors, opacities, camera.pose, camera.lens, self.limits, splats, rects, counts)
@@ -136,20 +136,24 @@ class CpuRasterizer:
             order,
             self._histogram,
         )
-        offsets = self._buffer("offsets", (count + 1,), np.int64)
-        pairs = tiles.pair_offsets(counts, offsets)
-        pair_covers = self._buffer("pair_covers", (pairs,), np.uint64)
-        tiles.cover_tiles(splats, rects, counts, offsets, pair_covers)
         tasks = threads()
+        begins, ends = self._buffer("begins", (2, tasks), np.int64)
+        # One more: a pair that is not reached is written and then overwritten.
+        most = tiles.share_pairs(order, visible, counts, begins) + 1
+        firsts = self._buffer("firsts", (count,), np.int64)
+        pairs = self._buffer("pairs", (most, 2), np.int32)
+        pair_covers = self._buffer("pair_covers", (most,), np.uint64)
         tile_counts = self._buffer("tile_counts", (tasks, tiles_x * tiles_y), np.int32)
-        tiles.count_tiles(rects, order, visible, offsets, pair_covers, tiles_x, tile_counts)
+        tiles.cover_tiles(
+            splats, rects, order, visible, tiles_x, begins, ends, counts, firsts, pairs, pair_covers, tile_counts
+        )
         starts = self._buffer("starts", (tiles_x * tiles_y + 1,), np.int64)
         cursors = self._buffer("cursors", (tasks, tiles_x * tiles_y), np.int64)
         entries = tiles.tile_offsets(tile_counts, starts, cursors)
         items = self._buffer("items", (entries,), np.int32)
         slots = self._buffer("slots", (entries,), np.int32)
         covers = self._buffer("covers", (entries,), np.uint64)
-        tiles.fill_tiles(rects, order, visible, offsets, pair_covers, tiles_x, cursors, items, slots, covers)
+        tiles.fill_tiles(begins, ends, pairs, pair_covers, cursors, items, slots, covers)
         # Heavy tiles first, dealt out in turn: the tasks end together.
         tile_order = np.argsort(starts[:-1] - starts[1:], kind="stable")
         image = self._buffer("image", (channels, tiles_y * TILE, tiles_x * TILE))
@@ -177,8 +181,7 @@ class CpuRasterizer:
             depth_channel,
             splats,
             counts,
-            offsets,
-            pair_covers,
+            firsts,
             starts,
             items,
             slots,
@@ -186,7 +189,7 @@ class CpuRasterizer:
             tile_order,
             image,
             rest,
-            pairs,
+            most,
         )
         return Picture(image[:, :height, :width], rest[:height, :width])
 
@@ -257,8 +260,7 @@ class CpuRasterizer:
             self.limits,
             last.splats,
             last.counts,
-            last.offsets,
-            last.pair_covers,
+            last.firsts,
             records,
             last.depth_channel,
             *gradients,
@@ -277,5 +279,5 @@ class CpuRasterizer:
 
     @property
     def counts(self) -> NDArray[np.int32]:
-        """[N] tiles of each Gaussian in the last forward pass, 0 where culled."""
+        """[N] tiles that each Gaussian reached in the last forward pass, 0 where culled."""
         return self._last.counts
