@@ -8,6 +8,7 @@ from collections.abc import Coroutine
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from client.wire import FileKind, FrameHead, FrameReceipt, FrameReportModel, FrameState, PartReceipt
+from server import metrics
 from server.disk import full_disk, no_room
 from server.facts import Fact, Missing, PartTaken, Paused, Skipped, Taken
 from server.frame_store import FrameDamage, read_pictures, remove
@@ -96,6 +97,8 @@ class Ingest:
             await self._append(*self._skips(head.index), fact)
             scene.sizes[received.file] = received.size
             received.kept = True
+            metrics.INGEST_BYTES.inc(received.size)
+            metrics.FRAMES.labels("acknowledged").inc()
             receipt = scene.frames[head.index].receipt
             assert receipt is not None
         scene.work()
@@ -268,6 +271,7 @@ class Ingest:
                 await self._append(fact)
                 scene.sizes[received.file] = received.size
                 received.kept = True
+                metrics.INGEST_BYTES.inc(received.size)
                 self._set_deadline(index)
         await self.close_what_can_be()
         known = await self._parts_of(index) if index < scene.next_frame else scene.ledger.open[index]
@@ -386,6 +390,7 @@ class Ingest:
         fact = Taken(index=frame.index, time=seconds, identity=identity, files=tuple(sorted(frame.files)), closed_by=by)
         await self._append(*self._skips(frame.index), fact)
         self._forget_deadline(frame.index)
+        metrics.FRAMES.labels("acknowledged").inc()
         receipt = scene.frames[frame.index].receipt
         assert receipt is not None
         return receipt

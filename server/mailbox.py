@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 from client.wire.base import Model
+from server.metrics import STREAM_MISSED
 
 UNSENT_REPLIES = 64
 """A client that sends without reading is not listened to until it has read down to so many replies."""
@@ -57,6 +58,7 @@ class Mailbox:
         if self._last:
             return
         old = self._slots.pop(id, None)
+        STREAM_MISSED.inc(missed + (0 if old is None else old.weight))
         if old is not None:
             missed += old.missed + old.weight
         self._slots[id] = _Slot(make, missed, weight)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Protocol
 
 from prometheus_client import CollectorRegistry, Counter, Histogram
@@ -11,6 +13,7 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 
 from client.wire import FrameReportModel, SceneState, SceneStatus
 from server.hub import Hub
+from server.messages import Query
 from server.settings import ServerSettings
 
 SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 4, 8, 16, 32, 64, 128, 256)
@@ -55,6 +58,17 @@ def finished(report: FrameReportModel) -> None:
     FRAMES.labels(report.state.value).inc()
     for stage, seconds in report.seconds.items():
         UPDATE_SECONDS.labels(stage).observe(seconds)
+
+
+@contextmanager
+def answering(query: Query) -> Iterator[None]:
+    """Times a question to a scene's reader."""
+    kind, began, outcome = type(query).__name__.removesuffix("Query").lower(), time.perf_counter(), "failed"
+    try:
+        yield
+        outcome = "answered"
+    finally:
+        ANSWER_SECONDS.labels(kind, outcome).observe(time.perf_counter() - began)
 
 
 class HasStatus(Protocol):
