@@ -133,9 +133,12 @@ class Committed:
         tolerance = tracks_of_history.depth_tolerance(self.history, self.world, index)
         return tracks.with_visibility(camera, self._depth, tolerance)
 
-    def parts(self, count: int | None = None) -> NDArray[np.int64]:
-        """[N] part labels, the largest part 0; −1 for what does not move. ``count`` None: chosen by silhouette."""
-        return parts_of_history.parts(self.history, count)
+    def parts(self, count: int | None = None, previous: NDArray[Any] | None = None) -> NDArray[np.int64]:
+        """[N] part labels, the largest part 0; −1 for what does not move. ``count`` None: chosen by silhouette.
+
+        With ``previous``, labels found from fewer frames, parts that go on keep their labels.
+        """
+        return parts_of_history.parts(self.history, count, previous=previous)
 
     def write_ply(self, path: Path, index: int | None = None) -> None:
         """A committed frame as a standard 3DGS .ply."""

@@ -3,6 +3,9 @@
 The paper's section "Visualization of Part Segmentation": the feature of Gaussian i is
 ``[λp·p_i(t), λR·R_i(t), λp0·p_i(0)]`` over the frames t. Here p is in units of the extent of what moves, so that one
 set of λ serves every scene.
+
+Parts found again, after more frames, keep their labels: the clustering also starts from the parts before and leaves
+them only for clearly better ones, and the new labels are matched to the old ones by what they cover in common.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.optimize import linear_sum_assignment
 from sklearn.cluster import KMeans
 from sklearn.metrics import silhouette_score
 
@@ -47,11 +51,26 @@ class PartsSettings(Model):
         default=20_000, ge=100, description="At most this many Gaussians are clustered; all are labelled."
     )
     most_parts: int = Field(default=12, ge=2, description="Largest count that is tried when none is given.")
+    stay: float = Field(
+        default=0.05,
+        ge=0,
+        description="Share of the inertia that a fresh clustering has to gain for the parts before to be given up.",
+    )
+    stay_count: float = Field(
+        default=0.02,
+        ge=0,
+        description="Mean silhouette that another count has to gain for that of the parts before to be given up.",
+    )
     restarts: int = Field(default=10, ge=1, description="Starts of K-means (n_init); the best is kept.")
     seed: int = Field(default=0, ge=0, description="Seed of the starts and of the sample.")
 
 
-def parts(history: History, count: int | None = None, settings: PartsSettings | None = None) -> NDArray[np.int64]:
+def parts(
+    history: History,
+    count: int | None = None,
+    settings: PartsSettings | None = None,
+    previous: NDArray[Any] | None = None,
+) -> NDArray[np.int64]:
     """A part label for every Gaussian, [N]: 0…count−1, the largest part first; −1 for those that do not move.
 
     Which Gaussians move is read off the newest committed frame. A Gaussian weighs by its opacity times the area of its
@@ -62,9 +81,12 @@ def parts(history: History, count: int | None = None, settings: PartsSettings | 
         count: how many parts; None: the count from 2 to ``most_parts`` with the largest mean silhouette
             (Rousseeuw 1987) on up to 1,000 Gaussians.
         settings: λ and the clustering.
+        previous: [N] labels found before, with the same count (or None), from fewer frames. Parts that go on keep
+            their labels then, whatever their size; with a count found anew, a label may be left out.
 
     Raises:
-        ValueError: nothing committed, nothing moves, or count below 1 or above the number of moving Gaussians.
+        ValueError: nothing committed, nothing moves, count below 1 or above the number of moving Gaussians, or
+            ``previous`` of another number of Gaussians.
     """
     settings = settings or PartsSettings()
     if not len(history):
@@ -76,6 +98,9 @@ def parts(history: History, count: int | None = None, settings: PartsSettings | 
     if count is not None and not 1 <= count <= rows.size:
         raise ValueError(f"count {count} must be between 1 and the {rows.size} moving Gaussians")
 
+    if previous is not None and previous.shape != (len(newest),):
+        raise ValueError(f"previous labels {previous.shape} must be [{len(newest)}], one a Gaussian")
+
     rng = np.random.default_rng(settings.seed)
     chosen = rows if rows.size <= settings.sample else np.sort(rng.choice(rows, settings.sample, replace=False))
     extent = moving_extent(newest)
@@ -83,7 +108,7 @@ def parts(history: History, count: int | None = None, settings: PartsSettings | 
     weights = coverage(newest)
     inside = np.searchsorted(rows, chosen)
     features = part_features(positions[:, inside], rotations[:, inside], extent, settings)
-    model = _cluster(features, weights[chosen], count, settings, rng)
+    model = _cluster(features, weights[chosen], count, settings, rng, None if previous is None else previous[chosen])
 
     labels = np.empty(rows.size, dtype=np.int64)
     for start in range(0, rows.size, ROWS_AT_ONCE):
@@ -94,6 +119,36 @@ def parts(history: History, count: int | None = None, settings: PartsSettings | 
     rank[np.argsort(-size, kind="stable")] = np.arange(model.n_clusters)
     result = np.full(len(newest), STANDING, dtype=np.int64)
     result[rows] = rank[labels]
+    return result if previous is None else match_labels(result, previous, weights)
+
+
+def match_labels(labels: NDArray[Any], previous: NDArray[Any], weights: NDArray[Any]) -> NDArray[np.int64]:
+    """The same parts under the labels of those before that they overlap most, as a whole (Hungarian method).
+
+    A part that overlaps none of those before, or whose match went to another, takes the lowest label left.
+
+    Args:
+        labels: [N] new labels from 0; negative ones belong to no part and stay.
+        previous: [N] labels before.
+        weights: [N] what a Gaussian counts for.
+
+    Returns:
+        [N] labels.
+    """
+    result = labels.astype(np.int64)
+    inside = labels >= 0
+    both = inside & (previous >= 0)
+    count = int(labels.max(initial=-1)) + 1
+    overlap = np.zeros((count, int(previous.max(initial=-1)) + 1))
+    np.add.at(overlap, (labels[both], previous[both]), weights[both])
+    names = np.full(count, -1, dtype=np.int64)
+    for new, old in zip(*linear_sum_assignment(overlap, maximize=True), strict=True):
+        if overlap[new, old] > 0:
+            names[new] = old
+    free = (label for label in range(count + overlap.shape[1]) if label not in set(names.tolist()))
+    for new in np.flatnonzero(names < 0):
+        names[new] = next(free)
+    result[inside] = names[labels[inside]]
     return result
 
 
@@ -139,20 +194,32 @@ def coverage(gaussians: Gaussians) -> NDArray[np.float64]:
 
 
 def _cluster(
-    features: Features, weights: NDArray[Any], count: int | None, settings: PartsSettings, rng: np.random.Generator
+    features: Features,
+    weights: NDArray[Any],
+    count: int | None,
+    settings: PartsSettings,
+    rng: np.random.Generator,
+    previous: NDArray[Any] | None,
 ) -> KMeans:
+    known = np.empty(0, np.int64) if previous is None else np.unique(previous[previous >= 0])
     if count is None:
         # Drawn by weight, so that the silhouette sees what the pictures see.
         drawn = rng.choice(len(features), size=SILHOUETTE_SAMPLE, p=weights / weights.sum())
-        count = _best_count(features[np.unique(drawn)], settings)
-    return _kmeans(count, settings).fit(features, sample_weight=weights)
+        count = _best_count(features[np.unique(drawn)], settings, len(known))
+    fresh = _kmeans(count, settings).fit(features, sample_weight=weights)
+    if previous is None or len(known) != count:
+        return fresh
+    centres = np.stack([np.average(features[previous == k], axis=0, weights=weights[previous == k]) for k in known])
+    kept = KMeans(n_clusters=count, init=centres, n_init=1).fit(features, sample_weight=weights)
+    return kept if kept.inertia_ <= (1 + settings.stay) * fresh.inertia_ else fresh
 
 
-def _best_count(features: Features, settings: PartsSettings) -> int:
+def _best_count(features: Features, settings: PartsSettings, known: int) -> int:
+    """The count of the largest mean silhouette; ``known``, that of the parts before, has an advantage (0: none)."""
     best, best_score = 1, 0.0
     for count in range(2, min(settings.most_parts, len(features) - 1) + 1):
         labels = _kmeans(count, settings).fit_predict(features)
-        score = float(silhouette_score(features, labels))
+        score = float(silhouette_score(features, labels)) + settings.stay_count * (count == known)
         if score > best_score:
             best, best_score = count, score
     return best

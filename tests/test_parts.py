@@ -5,7 +5,7 @@ from sklearn.metrics import adjusted_rand_score
 
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.history import History
-from scas4d_core.parts import STANDING, PartsSettings, part_features, parts
+from scas4d_core.parts import STANDING, PartsSettings, match_labels, part_features, parts
 
 
 def bodies(frames: int = 12, n: int = 300, unit: float = 1.0, standing: int = 0) -> tuple[History, np.ndarray]:
@@ -92,6 +92,62 @@ def test_features_have_the_papers_distances():
     np.testing.assert_allclose(np.linalg.norm(features[0] - features[1]), expected, rtol=1e-6)
 
 
+def first_frames(history: History, frames: int) -> History:
+    short = History()
+    for index in history.indices[:frames]:
+        short.append(index, history.time(index), history.gaussians(index))
+    return short
+
+
+def test_labels_go_on_when_more_frames_come():
+    history, _ = bodies()
+    early = parts(first_frames(history, 6), 3)
+    order = np.array([2, 0, 1])  # as if they had been numbered otherwise, when other parts were the largest
+    later = parts(history, 3, previous=order[early])
+    assert np.array_equal(later, order[parts(history, 3)])
+    # From one frame to the next, nearly every Gaussian keeps its label.
+    labels = parts(first_frames(history, 4), 3)
+    for frames in range(5, 13):
+        again = parts(first_frames(history, frames), 3, previous=labels)
+        assert np.mean(again == labels) > 0.98
+        labels = again
+
+
+def test_without_the_parts_before_labels_would_not_be_stable():
+    # Two rods of nearly the same size: which is the larger one turns on a hair.
+    rng = np.random.default_rng(4)
+    labels = np.repeat([0, 1], [500, 498])
+    swapped = 1 - labels
+    swapped[rng.choice(998, 20, replace=False)] ^= 1
+    assert np.mean(match_labels(swapped, labels, np.ones(998)) == labels) > 0.97
+
+
+def test_another_count_is_taken_only_where_it_is_clearly_better():
+    history, which = bodies()
+    settings = PartsSettings(restarts=3, most_parts=6)
+    four = np.where((which == 0) & (np.arange(len(which)) % 2 == 0), 3, which)
+    assert np.array_equal(parts(history, None, settings, previous=four) == 1, which == 1)
+    assert len(np.unique(parts(history, None, settings, previous=four))) == 3
+    # Two parts are hardly worse than three here: they stay where they were found before.
+    two = np.where(which == 2, 1, which)
+    assert np.array_equal(parts(history, None, settings, previous=two), two)
+    fresh = parts(history, None, settings.model_copy(update={"stay_count": 0}), previous=two)
+    assert len(np.unique(fresh)) == 3
+
+
+def test_labels_are_matched_by_weight_as_a_whole():
+    previous = np.array([0, 0, 0, 1, 1, 1, -1])
+    labels = np.array([1, 1, 0, 0, 0, 0, 0])
+    assert match_labels(labels, previous, np.ones(7)).tolist() == [0, 0, 1, 1, 1, 1, 1]
+    # One heavy Gaussian decides against two light ones.
+    heavy = match_labels(np.array([0, 1, 1]), np.array([1, 1, 0]), np.array([1.0, 1.0, 9.0]))
+    assert heavy.tolist() == [1, 0, 0]
+    # A part too many takes the lowest label that is free; what belongs to no part stays so.
+    assert match_labels(np.array([0, 1, 2, -1]), np.array([4, 0, -1, 0]), np.ones(4)).tolist() == [4, 0, 1, -1]
+    assert match_labels(np.array([-1, -1]), np.array([0, 1]), np.ones(2)).tolist() == [-1, -1]
+    assert match_labels(np.array([0, 1]), np.array([-1, -1]), np.ones(2)).tolist() == [0, 1]
+
+
 def test_refusals():
     history, _ = bodies(frames=2, n=4)
     with pytest.raises(ValueError, match="count 99 must be between 1 and the 12 moving"):
@@ -103,3 +159,5 @@ def test_refusals():
     still.append(0, 0.0, theta.replace(foreground=np.zeros(len(theta), np.float32)))
     with pytest.raises(ValueError, match="no Gaussian moves"):
         parts(still, 2)
+    with pytest.raises(ValueError, match=r"previous labels \(3,\) must be \[12\]"):
+        parts(history, 2, previous=np.zeros(3))
