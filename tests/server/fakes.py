@@ -98,7 +98,7 @@ class FakeReader:
         colour = np.broadcast_to(np.array(background, np.float32), (camera.height, camera.width, 3)).copy()
         colour[0, 0] = min(1, index / 10)  # which frame this is
         depth = np.full(colour.shape[:2], 2.0)
-        depth[0, 0], depth[0, 1] = np.nan, 4.0
+        depth[0, 0], depth[0, 1:2] = np.nan, 4.0
         parts = None if labels is None else np.full(colour.shape[:2], labels.max() + 1, np.uint8)
         return SimpleNamespace(colour=colour, alpha=np.ones(colour.shape[:2]), depth=depth, parts=parts)
 
