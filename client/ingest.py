@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from contextlib import ExitStack
 from typing import Any
 from urllib.parse import quote
 
@@ -37,6 +38,7 @@ class IngestSocket:
         base = "ws" + client.url.removeprefix("http")
         self._address = f"{base}/v1/scenes/{quote(scene, safe='')}/ingest"
         self._connection: ClientConnection | None = None
+        self._stack = ExitStack()
 
     def __enter__(self) -> IngestSocket:
         return self
@@ -46,9 +48,8 @@ class IngestSocket:
 
     def close(self) -> None:
         """Closes the connection."""
-        if self._connection is not None:
-            self._connection.close()
-            self._connection = None
+        self._stack.close()
+        self._connection = None
 
     def put_frame(
         self,
@@ -100,11 +101,13 @@ class IngestSocket:
     def _exchange(self, chunks: list[bytes]) -> IngestAnswer:
         if self._connection is None:
             token = self._client.token
-            self._connection = connect(
-                self._address,
-                additional_headers={} if token is None else {"Authorization": f"Bearer {token}"},
-                compression=None,  # pictures are compressed already
-                close_timeout=2,
+            self._connection = self._stack.enter_context(
+                connect(
+                    self._address,
+                    additional_headers={} if token is None else {"Authorization": f"Bearer {token}"},
+                    compression=None,  # pictures are compressed already
+                    close_timeout=2,
+                )
             )
         self._connection.send(iter(chunks))
         return IngestAnswer.model_validate_json(self._connection.recv(timeout=ANSWER_S))

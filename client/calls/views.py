@@ -81,15 +81,13 @@ def _asks(
     width: int | None,
     parts: int | None,
 ) -> dict[str, Any]:
-    request = RenderRequest.model_validate(
-        {
-            "camera": wire_camera(camera),
-            "frame": frame,
-            "kinds": list(kinds),
-            "format": format,
-            "background": background,
-            "width": width,
-            "parts": parts,
-        }
-    )
-    return body(request)
+    asked = {
+        "camera": wire_camera(camera),
+        "frame": frame,
+        "kinds": list(kinds),
+        "format": format,
+        "background": background,
+        "width": width,
+        "parts": parts,
+    }
+    return body(RenderRequest.model_validate({name: value for name, value in asked.items() if value is not None}))

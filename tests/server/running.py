@@ -21,10 +21,10 @@ WIDTH, HEIGHT = 24, 16
 class Running:
     """A uvicorn server in a thread."""
 
-    def __init__(self, settings):
+    def __init__(self, settings, port=None):
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
-            self.port = free.getsockname()[1]
+            self.port = port or free.getsockname()[1]
         self.app = create_app(settings)
         config = uvicorn.Config(self.app, port=self.port, log_level="error")
         self.server = uvicorn.Server(config)
