@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +14,9 @@ from running import HEIGHT, WIDTH
 
 from client.overrides import overrides
 from client.pictures import coloured, comparison, psnr
+from client.rig import push
+from client.sdk import Client
+from scas4d_core.captures import open_capture
 
 FAKES = str(Path(__file__).parents[1] / "server")
 
@@ -41,6 +46,69 @@ def test_push_to_a_running_service(service, capture_folder):
     assert done.returncode == 0, done.stderr
     assert "2 of 2 frames committed, ready" in done.stdout
     assert service.url in done.stdout
+    with Client(service.url) as client:
+        for status in client.scenes():
+            client.delete_scene(status.id)
+
+
+def test_push_as_a_rig_scenes_and_going_on(service, capture_folder):
+    rig = ("--fps", "20", "--jitter", "0.01", "--loop", "--frames", "6", "--per-camera", "--websocket", "--drop", "0")
+    done = scas4d("push", str(capture_folder), "--url", service.url, *rig)
+    assert done.returncode == 0, done.stderr
+    assert "6 of 6 frames committed, ready" in done.stdout
+    assert "of 20 a second" in done.stdout
+    id = re.search(r"scene (\w+):", done.stdout)[1]
+    listed = scas4d("scenes", "--url", service.url)
+    assert re.search(rf"{id}\s+tiny\s+ready\s+2\s+6\s+0\s+6", listed.stdout), listed.stdout
+    more = scas4d("push", str(capture_folder), "--scene", id, "--loop", "--frames", "8", SCAS4D_URL=service.url)
+    assert "8 of 8 frames committed" in more.stdout, more.stderr
+    with Client(service.url) as client:
+        client.delete_scene(id)
+
+
+def test_watch_prints_frames_until_the_scene_is_gone(service, capture_folder):
+    with Client(service.url) as client:
+        scene = client.create_scene(open_capture(capture_folder).rig)
+        command = [sys.executable, "-m", "client.cli", "watch", scene.id, "--url", service.url]
+        watching = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "TERM": "dumb"})
+        assert watching.stdout.readline() == "scene is awaiting_first_frame\n"
+        push(open_capture(capture_folder), client, scene=scene.id, frames=1)
+        client.declare_missing(scene.id, 1, "gone for ever")
+        client.delete_scene(scene.id)
+        said, _ = watching.communicate(timeout=30)
+    assert watching.returncode == 0
+    assert re.search(r"frame 0: committed .* s$", said, re.MULTILINE) or "frame 1: missing" in said
+    missing = scas4d("watch", "nowhere", "--url", service.url)
+    assert missing.returncode == 1
+    assert "Traceback" not in missing.stderr
+
+
+def test_import_makes_a_capture_that_can_be_pushed(service, tmp_path):
+    pytest.importorskip("cv2")
+    studio = tmp_path / "studio"
+    k = {"w": WIDTH, "h": HEIGHT, "fl_x": 20, "fl_y": 20, "cx": 12, "cy": 8, "k1": -0.05, "camera_model": "OPENCV"}
+    frames = []
+    for i in range(3):
+        (studio / f"images/c{i}").mkdir(parents=True)
+        for t in range(2):
+            Image.new("RGB", (WIDTH, HEIGHT), (0, i, t)).save(studio / f"images/c{i}/{t}.png")
+        matrix = [[1, 0, 0, i], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
+        frames.append({"file_path": f"images/c{i}/0.png", "transform_matrix": matrix})
+    (studio / "transforms.json").write_text(json.dumps({**k, "frames": frames}))
+    out = tmp_path / "out"
+    done = scas4d("import", str(studio), str(out), "--test", "c1", "--encoding", "png")
+    assert done.returncode == 0, done.stderr
+    assert (out / "test_meta.json").exists()
+    for folder, cameras in ((out, 2), (studio, 3)):
+        pushed = scas4d("push", str(folder), "--url", service.url)
+        assert "2 of 2 frames committed" in pushed.stdout, pushed.stderr
+        with Client(service.url) as client:
+            (status,) = client.scenes()
+            assert len(status.cameras) == cameras
+            client.delete_scene(status.id)
+    broken = scas4d("push", str(studio), "--pictures", "videos")
+    assert broken.returncode == 1
+    assert "put each camera's video into videos/<camera>.mp4" in broken.stderr
 
 
 def test_the_demo_starts_a_service_and_leaves_pictures(capture_folder, tmp_path):
