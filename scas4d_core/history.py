@@ -42,6 +42,10 @@ class HistoryError(ValueError):
     """A history that cannot be extended or read: the message names the frame or file, the fault and the remedy."""
 
 
+class UnreadableFrameError(HistoryError):
+    """A frame that is not in the history, or whose file is damaged."""
+
+
 class History:
     """The committed states of one scene, in the order of their indices.
 
@@ -320,9 +324,9 @@ class History:
         if index in self._times:
             return
         if index in self.damaged:
-            raise HistoryError(f"frame {index} cannot be read: {self.damaged[index]}")
+            raise UnreadableFrameError(f"frame {index} cannot be read: {self.damaged[index]}")
         held = f"{self.indices[0]} to {self.indices[-1]}" if self._times else "none yet"
-        raise HistoryError(f"frame {index} is not in the history; committed frames: {held}")
+        raise UnreadableFrameError(f"frame {index} is not in the history; committed frames: {held}")
 
     def _file(self, index: int) -> Path:
         assert self.directory is not None
@@ -383,4 +387,4 @@ def _read(path: Path, names: Sequence[str]) -> Arrays:
     try:
         return read_npz(path, names)
     except ValueError as error:
-        raise HistoryError(f"{error}; restore it or start the scene anew") from error
+        raise UnreadableFrameError(f"{error}; restore it or start the scene anew") from error

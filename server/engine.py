@@ -41,7 +41,7 @@ class Reader(Protocol):
         index: int,
         *,
         background: tuple[float, float, float],
-        labels: NDArray[np.int64] | None = None,
+        labels: NDArray[np.signedinteger] | None = None,
     ) -> View:
         """A novel view of a committed frame."""
 
@@ -57,8 +57,8 @@ class Reader(Protocol):
     def with_visibility(self, tracks: Tracks, camera: Camera, index: int) -> Tracks:
         """The same tracks, asked for at frame `index`, with their visibility in one more camera."""
 
-    def parts(self, count: int | None) -> NDArray[np.int64]:
-        """[N] labels, 0 … count−1."""
+    def parts(self, count: int | None, previous: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+        """[N] labels, 0 … count−1; parts that go on keep those of `previous`, found from fewer frames."""
 
     def write_ply(self, path: Path, index: int) -> None:
         """A committed frame as a 3DGS .ply."""

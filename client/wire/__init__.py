@@ -22,7 +22,7 @@ from client.wire.framing import (
     parse_frame,
     parse_head,
 )
-from client.wire.parts import PartsModel
+from client.wire.parts import PartsModel, part_colour, parts_model
 from client.wire.rigs import CameraModel, RigModel
 from client.wire.scenes import (
     IngestSettings,
@@ -83,5 +83,7 @@ __all__ = [
     "head_length",
     "parse_frame",
     "parse_head",
+    "part_colour",
+    "parts_model",
     "tracks_model",
 ]

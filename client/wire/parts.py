@@ -2,14 +2,46 @@
 
 from __future__ import annotations
 
+import colorsys
+
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from client.wire.base import Model
 
+GOLDEN = 0.618033988749895
+"""Hues this far apart on the circle stay apart however many there are."""
+
 
 class PartsModel(Model):
-    """A part label for every Gaussian."""
+    """A part label for every Gaussian. Parts that go on when frames are committed keep their labels and colours."""
 
-    count: int
+    count: int = Field(description="How many parts there are.")
+    frame: int = Field(description="The newest frame that they were found from.")
     ids: list[int] = Field(description="[N]")
-    labels: list[int] = Field(description="[N] 0 … count−1; −1 for what stands still.")
+    labels: list[int] = Field(
+        description="[N] from 0; −1 for what stands still. Those of a count that was chosen may have gaps."
+    )
+    colours: list[tuple[int, int, int]] = Field(
+        description="RGB, 0…255, of each label from 0 to the largest; the same label always has the same."
+    )
+
+
+def part_colour(label: int) -> tuple[int, int, int]:
+    """RGB, 0…255, of a part."""
+    red, green, blue = colorsys.hsv_to_rgb(
+        (0.58 + label * GOLDEN) % 1, (0.65, 0.45, 0.85)[label % 3], (0.95, 0.8)[label % 2]
+    )
+    return round(255 * red), round(255 * green), round(255 * blue)
+
+
+def parts_model(labels: NDArray[np.int64], ids: NDArray[np.int64], frame: int) -> PartsModel:
+    """Labels [N] of Gaussians [N] as they go over the wire."""
+    return PartsModel(
+        count=len(np.unique(labels[labels >= 0])),
+        frame=frame,
+        ids=ids.tolist(),
+        labels=labels.tolist(),
+        colours=[part_colour(label) for label in range(int(labels.max(initial=-1)) + 1)],
+    )

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from client.wire.base import Model
+from client.wire.base import MAX_PIXELS_A_SIDE, Model
 from client.wire.rigs import CameraModel
 
 
@@ -25,7 +25,9 @@ class RenderFormat(StrEnum):
 
     PNG = "png"
     JPEG = "jpeg"
+    WEBP = "webp"
     NPZ = "npz"
+    FLOAT32 = "float32"
 
 
 Unit = Annotated[float, Field(ge=0, le=1)]
@@ -38,10 +40,22 @@ class RenderRequest(Model):
     frame: int | None = Field(default=None, ge=0, description="Index of a committed frame; the last where not given.")
     kinds: Annotated[list[RenderKind], Field(min_length=1, max_length=4)] = Field(
         default_factory=lambda: [RenderKind.COLOUR],
-        description="PNG and JPEG take one; npz takes several. Depth is along z in the rig's units, NaN where nothing "
-        "is; as PNG it is 16 bit, 0 where nothing is, else 1…65535 from X-Depth-Near to X-Depth-Far.",
+        description="A picture holds one, npz and float32 several. Depth is along z in the rig's units, NaN where "
+        "nothing is; as PNG it is 16 bit, 0 where nothing is, else 1…65535 from X-Depth-Near to X-Depth-Far. Parts are "
+        "0 where nothing moves, else 1 + the part's label; as PNG they have a palette, a colour for each label.",
     )
-    format: RenderFormat = RenderFormat.PNG
+    format: RenderFormat = Field(
+        default=RenderFormat.PNG,
+        description="JPEG and WebP take colour and alpha. float32: rows from the top, little-endian, X-Shape is "
+        "'height,width,channels' and X-Channels names the channels.",
+    )
+    width: int | None = Field(
+        default=None,
+        ge=1,
+        le=MAX_PIXELS_A_SIDE,
+        description="Of the picture; the camera is scaled to it, the height in proportion.",
+    )
+    quality: int | None = Field(default=None, ge=1, le=100, description="Of JPEG and WebP; 92 where not given.")
     background: tuple[Unit, Unit, Unit] | None = Field(default=None, description="RGB; the scene's where not given.")
     parts: int | None = Field(
         default=None, ge=1, le=254, description="Number of parts; chosen by the scene where not given."

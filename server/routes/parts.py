@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Query, Request, Response
 
 from client.wire import PartsModel
 from server.messages import PartsQuery
 from server.routes.access import TheScene
+from server.routes.asking import ask
 
 router = APIRouter(prefix="/v1/scenes", tags=["parts"])
 
@@ -18,9 +19,10 @@ ANSWERS: dict[int | str, dict[str, Any]] = {200: {"model": PartsModel}}
 @router.get("/{id}/parts", response_class=Response, responses=ANSWERS)
 async def parts(
     scene: TheScene,
+    request: Request,
     count: Annotated[int | None, Query(ge=1, le=254, description="How many; chosen by a rule if not given.")] = None,
 ) -> Response:
     """A label for every Gaussian, from its motion over all committed frames."""
     scene.committed_frame(None, "id")
-    answer = await scene.ask(PartsQuery(count))
+    answer = await ask(request, scene, PartsQuery(count))
     return Response(answer.body, media_type=answer.media_type)

@@ -2,79 +2,123 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Query, Request, Response
 
-from client.wire import RenderFormat, RenderKind, RenderRequest
+from client.wire import MAX_PIXELS_A_SIDE, RenderFormat, RenderKind, RenderRequest
 from server.messages import RenderQuery
 from server.problems import Problem
 from server.routes.access import TheScene, TheSettings
+from server.routes.asking import ask
 from server.scenes import Scene
 from server.settings import ServerSettings
 
 router = APIRouter(prefix="/v1/scenes", tags=["views"])
 
+FILES = ("image/png", "image/jpeg", "image/webp", "application/vnd.numpy.npz", "application/octet-stream")
 PICTURES: dict[int | str, dict[str, Any]] = {
     200: {
-        "content": {"image/png": {}, "image/jpeg": {}, "application/vnd.numpy.npz": {}},
+        "content": {media_type: {"schema": {"type": "string", "format": "binary"}} for media_type in FILES},
         "description": "The view; X-Frame says of which frame.",
     }
 }
+SEVERAL = (RenderFormat.NPZ, RenderFormat.FLOAT32)
+LOSSY = (RenderFormat.JPEG, RenderFormat.WEBP)
 
 
 @router.post("/{id}/render", response_class=Response, responses=PICTURES)
-async def render(scene: TheScene, server: TheSettings, request: RenderRequest) -> Response:
+async def render(scene: TheScene, server: TheSettings, request: Request, view: RenderRequest) -> Response:
     """Any camera at any committed frame, from the last committed state; an update at work is not waited for."""
-    return await answer(scene, server, request)
+    return await _answer(scene, server, request, view)
 
 
 @router.get("/{id}/render", response_class=Response, responses=PICTURES)
 async def render_by_name(
     scene: TheScene,
     server: TheSettings,
+    request: Request,
     camera: Annotated[str | None, Query(max_length=64, description="Of the rig; its first where not given.")] = None,
-    frame: Annotated[int | None, Query(ge=0)] = None,
+    frame: Annotated[int | None, Query(ge=0, description="A committed one; the last where not given.")] = None,
     kind: RenderKind = RenderKind.COLOUR,
     format: RenderFormat = RenderFormat.PNG,
-    parts: Annotated[int | None, Query(ge=1, le=254)] = None,
+    width: Annotated[int | None, Query(ge=1, le=MAX_PIXELS_A_SIDE, description="Of the picture, in pixels.")] = None,
+    quality: Annotated[int | None, Query(ge=1, le=100, description="Of JPEG and WebP.")] = None,
+    background: Annotated[str | None, Query(max_length=64, description="Red, green, blue in 0…1, as 1,1,1.")] = None,
+    parts: Annotated[int | None, Query(ge=1, le=254, description="How many; chosen by the scene if not given.")] = None,
 ) -> Response:
-    """The same for a camera of the rig, as an address to open."""
-    name = scene.rig.names[0] if camera is None else camera
-    request = RenderRequest(camera=name, frame=frame, kinds=[kind], format=format, parts=parts)
-    return await answer(scene, server, request)
+    """The same for a camera of the rig, as an address: for an `<img>`, or to open."""
+    view = RenderRequest(
+        camera=scene.rig.names[0] if camera is None else camera,
+        frame=frame,
+        kinds=[kind],
+        format=format,
+        width=width,
+        quality=quality,
+        background=None if background is None else _colour(background),
+        parts=parts,
+    )
+    return await _answer(scene, server, request, view)
 
 
-async def answer(scene: Scene, server: ServerSettings, request: RenderRequest) -> Response:
-    """Checks the request and asks the reader."""
-    found = await scene.ask(query_of(scene, server, request))
-    return Response(found.body, media_type=found.media_type, headers=found.headers)
+async def _answer(scene: Scene, server: ServerSettings, request: Request, view: RenderRequest) -> Response:
+    """Checks what is asked for and asks the reader."""
+    found = await ask(request, scene, query_of(scene, server, view))
+    # The last frame is another one in a moment; one that was named stays what it is.
+    caching = "no-store" if view.frame is None else "private, max-age=60"
+    return Response(found.body, media_type=found.media_type, headers={**found.headers, "Cache-Control": caching})
 
 
 def query_of(scene: Scene, server: ServerSettings, request: RenderRequest) -> RenderQuery:
     """The request, checked, as the reader takes it; `server.routes.stream` asks it too."""
     camera = scene.camera(request.camera) if isinstance(request.camera, str) else request.camera.camera()
+    if request.width is not None:
+        camera = camera.scaled(request.width / camera.width)
     pixels = camera.width * camera.height
     if pixels > server.max_render_pixels:
         raise Problem(
             422,
             f"a view of {pixels} pixels",
-            field="camera",
+            field="camera" if request.width is None else "width",
             value=f"{camera.width}x{camera.height}",
             remedy=f"ask for at most {server.max_render_pixels} pixels, or raise SCAS4D_MAX_RENDER_PIXELS",
         )
     kinds = tuple(dict.fromkeys(kind.value for kind in request.kinds))
-    if request.format != RenderFormat.NPZ and len(kinds) > 1:
+    if request.format not in SEVERAL and len(kinds) > 1:
         raise Problem(
             422,
             f"{request.format} holds one kind",
             field="kinds",
             value=", ".join(kinds),
-            remedy="ask for one kind, or for npz",
+            remedy="ask for one kind, or for npz or float32",
         )
-    if request.format == RenderFormat.JPEG and kinds[0] in ("depth", "parts"):
-        raise Problem(422, f"JPEG would change {kinds[0]}", field="format", value="jpeg", remedy="ask for png or npz")
-    background = request.background or scene.spec.settings.scene.background
+    if request.format in LOSSY and kinds[0] in ("depth", "parts"):
+        raise Problem(
+            422,
+            f"{request.format} would change {kinds[0]}",
+            field="format",
+            value=request.format.value,
+            remedy="ask for png, npz or float32",
+        )
     return RenderQuery(
-        camera, scene.committed_frame(request.frame), kinds, request.format.value, background, request.parts
+        camera,
+        scene.committed_frame(request.frame),
+        kinds,
+        request.format.value,
+        request.background or scene.spec.settings.scene.background,
+        parts=request.parts,
+        quality=request.quality,
     )
+
+
+def _colour(text: str) -> tuple[float, float, float]:
+    try:
+        red, green, blue = (float(part) for part in text.split(","))
+    except ValueError:
+        red = green = blue = math.nan
+    if not all(0 <= value <= 1 for value in (red, green, blue)):
+        raise Problem(
+            422, "background is three numbers in 0…1", field="background", value=text, remedy="give background=1,1,1"
+        )
+    return red, green, blue

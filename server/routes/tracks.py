@@ -1,18 +1,21 @@
-"""Point tracks."""
+"""Point tracks. docs/tracks.md says what the answers mean."""
 
 from __future__ import annotations
 
+import asyncio
 import math
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Query, Request, Response
 
 from client.wire import CameraModel, TracksModel, TracksRequest
 from scas4d_core.cameras import Camera
+from server import track_answers
 from server.messages import TracksQuery
 from server.problems import Problem
 from server.routes.access import TheScene, TheSettings
+from server.routes.asking import ask
 from server.scenes import Scene
 from server.settings import ServerSettings
 
@@ -27,15 +30,16 @@ ANSWERS: dict[int | str, dict[str, Any]] = {
 
 
 @router.post("/{id}/tracks/query", response_class=Response, responses=ANSWERS)
-async def query(scene: TheScene, server: TheSettings, request: TracksRequest) -> Response:
+async def query(scene: TheScene, server: TheSettings, http: Request, request: TracksRequest) -> Response:
     """Trajectories in the world of what is asked for by id, by pixel, or by 3D point; any number of them."""
-    return await answer(scene, server, request)
+    return await answer(http, scene, server, request)
 
 
 @router.get("/{id}/tracks", response_class=Response, responses=ANSWERS)
 async def tracks(
     scene: TheScene,
     server: TheSettings,
+    http: Request,
     ids: Annotated[str | None, Query(max_length=10_000, description="Of Gaussians, separated by commas.")] = None,
     pixel: Annotated[Many, Query(description="u,v in the picture of `camera`, repeated.")] = None,
     camera: Annotated[str | None, Query(max_length=64, description="Of the rig: where the pixels are.")] = None,
@@ -60,13 +64,23 @@ async def tracks(
         project=list(project or []),
         format=format,
     )
-    return await answer(scene, server, request)
+    return await answer(http, scene, server, request)
 
 
-async def answer(scene: Scene, server: ServerSettings, request: TracksRequest) -> Response:
-    """Checks the request and asks the reader."""
-    found = await scene.ask(query_of(scene, server, request))
-    return Response(found.body, media_type=found.media_type)
+async def answer(http: Request, scene: Scene, server: ServerSettings, request: TracksRequest) -> Response:
+    """Checks the request and asks the reader; a long one in pieces, so that other questions come in between."""
+    query = query_of(scene, server, request)
+    pieces = track_answers.pieces(query)
+    if len(pieces) * len(pieces[0]) == 1:
+        found = await ask(http, scene, query)
+        return Response(found.body, media_type=found.media_type)
+    answers = [[(await ask(http, scene, piece)).body for piece in row] for row in pieces]
+    body, media_type = await asyncio.to_thread(_together, answers, query, track_answers.metres_per_unit(scene.spec))
+    return Response(body, media_type=media_type)
+
+
+def _together(answers: list[list[bytes]], query: TracksQuery, unit: float) -> tuple[bytes, str]:
+    return track_answers.encoded(track_answers.joined(answers), query, unit)
 
 
 def query_of(scene: Scene, server: ServerSettings, request: TracksRequest) -> TracksQuery:
@@ -99,20 +113,55 @@ def query_of(scene: Scene, server: ServerSettings, request: TracksRequest) -> Tr
             value=len(queries) * len(frames),
             remedy=f"ask for at most {server.max_track_points} at once, or raise SCAS4D_MAX_TRACK_POINTS",
         )
+    if request.format == "json" and len(queries) * len(frames) > server.max_track_json_points:
+        raise Problem(
+            422,
+            f"{len(queries)} points over {len(frames)} frames are too many for JSON",
+            field="format",
+            value="json",
+            remedy=f"ask for npz, or for at most {server.max_track_json_points} (SCAS4D_MAX_TRACK_JSON_POINTS)",
+        )
     if request.ids is not None and not all(0 <= id <= LARGEST_ID for id in request.ids):
         raise Problem(422, "ids count from 0", field="ids", value=request.ids, remedy="give ids of Gaussians")
     if request.pixels is not None and request.camera is None:
         raise Problem(422, "pixels of which camera?", field="camera", remedy=f"one of {', '.join(scene.rig.names)}")
-    return TracksQuery(
+    query = TracksQuery(
         frames=frames,
         at=scene.committed_frame(scene.committed[0] if request.at is None else request.at, "at"),
         ids=None if request.ids is None else tuple(request.ids),
         camera=None if request.camera is None else _camera(scene, server, request.camera),
         pixels=None if request.pixels is None else np.array(request.pixels),
         points=None if request.points is None else np.array(request.points),
-        project=tuple(_camera(scene, server, camera) for camera in request.project),
+        project=_different([_camera(scene, server, camera) for camera in request.project]),
         format=request.format,
     )
+    cameras = track_answers.cameras_of(query)
+    if len(cameras) * len(frames) > server.max_track_views:
+        raise Problem(
+            422,
+            f"visibility in {len(cameras)} cameras over {len(frames)} frames",
+            field="project" if request.project else "camera",
+            value=len(cameras) * len(frames),
+            remedy=f"ask for at most {server.max_track_views} cameras times frames (SCAS4D_MAX_TRACK_VIEWS): "
+            "fewer frames or cameras at once",
+        )
+    return query
+
+
+def _different(cameras: list[Camera]) -> tuple[Camera, ...]:
+    """Answers go by the camera's name."""
+    by_name: dict[str, Camera] = {}
+    for camera in cameras:
+        known = by_name.setdefault(camera.name, camera)
+        if known is not camera and CameraModel.of(known) != CameraModel.of(camera):
+            raise Problem(
+                422,
+                f"two different cameras are named {camera.name!r}",
+                field="project",
+                value=camera.name,
+                remedy="name each differently: the answer goes by names",
+            )
+    return tuple(by_name.values())
 
 
 def _camera(scene: Scene, server: ServerSettings, camera: CameraModel | str) -> Camera:

@@ -15,6 +15,8 @@ from scas4d_core.gaussians import Gaussians
 SLOW, SLOW_RAISES, RAISES, DIES = 200, 201, 250, 251
 SLOW_S = 2.0
 STEP_M = 0.125
+HANGS, KILLS = 777_001, 777_002
+"""Ids that the reader never finds, or dies of."""
 
 
 @dataclass
@@ -38,6 +40,7 @@ class Report:
 
 
 def obey(frame):
+    time.sleep(float(os.environ.get("FAKE_UPDATE_S", "0")))
     red = int(next(iter(frame.images.values()))[0, 0, 0])
     if red in (SLOW, SLOW_RAISES):
         time.sleep(SLOW_S)
@@ -48,15 +51,17 @@ def obey(frame):
     return red
 
 
-def state(points, index):
+def state(points, index, before=None, red=0):
+    """What depends on all frames so far is in the colours: a frame lost, or done twice, shows."""
     count = len(points)
+    colour = np.float32(0.5 if before is None else before * np.float32(0.5) + np.float32(red / 512) + 0.125)
     offset = np.array([STEP_M * index, 0, 0])
     return Gaussians(
         means=(points + offset).astype(np.float32),
         factors=np.tile(0.05 * np.eye(3, dtype=np.float32), (count, 1, 1)),
         rotations=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
         opacities=np.full(count, 0.9, np.float32),
-        colours=np.full((count, 3), 0.5, np.float32),
+        colours=np.full((count, 3), colour, np.float32),
         foreground=np.ones(count, np.float32),
         ids=np.arange(count),
     )
@@ -79,8 +84,11 @@ class FakeReconstruction:
     def commit(self, frame, dropped, notes):
         count = len(self.points)
         report = Report(frame.index, frame.time, 100, {"update": 0.01}, [0.5, 0.25], 31.5, count, count)
+        known = self.history.indices
+        before = self.history.gaussians(known[-1]).colours[0, 0] if known else None
+        red = int(next(iter(frame.images.values()))[0, 0, 0])
         record = {**asdict(report), "used": list(frame.images), "dropped": dropped or {}, **(notes or {})}
-        self.history.append(frame.index, frame.time, state(self.points, frame.index), record)
+        self.history.append(frame.index, frame.time, state(self.points, frame.index, before, red), record)
         return report
 
     def step(self, frame, *, dropped=None, notes=None):
@@ -112,12 +120,16 @@ class FakeReader:
         return tracks.tracks_of_pixels(self.history, self.world, camera, uv, index, indices, self._depth)
 
     def tracks_of_ids(self, ids, indices):
+        if HANGS in ids:
+            time.sleep(600)
+        if KILLS in ids:
+            os._exit(9)
         return tracks.tracks_of_ids(self.history, self.world, ids, indices)
 
     def with_visibility(self, found, camera, index):
         return found.with_visibility(camera, self._depth, 0.01)
 
-    def parts(self, count):
+    def parts(self, count, previous=None):
         return np.arange(len(self.history.gaussians(0))) % (count or 2)
 
     def write_ply(self, path, index):
