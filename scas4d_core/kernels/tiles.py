@@ -19,7 +19,8 @@ from scas4d_core.kernels.projection import (
     TILE,
 )
 
-RADIX_BITS = 11
+RADIX_BITS = 12
+DIGITS = 1 << RADIX_BITS
 
 AHEAD = 8
 """Gaussians that one's numbers are asked for before they are used: in depth order they lie anywhere in memory."""
@@ -50,15 +51,16 @@ def cover(splat, tile_x, tile_y):
 def depth_order(splats, counts, keys, order, keys_too, order_too, histogram):
     """Sort the visible Gaussians by depth, nearest first; equal depths keep row order.
 
-    Depths are positive, so their float32 bits sort as integers; three stable passes of 11 bits.
+    Depths are positive, so their float32 bits sort as integers: stable passes of 12 bits over what differs from the
+    nearest, two where the farthest is within four times the nearest.
 
     Args:
         splats: [N, 16]; counts: [N] tiles of each, 0 where culled.
-        keys, keys_too: scratch [N] uint32. order, order_too: [N] int32; the result is in ``order_too``.
-        histogram: scratch [2048] int64.
+        keys, keys_too: scratch [N] uint32. order, order_too: [N] int32.
+        histogram: scratch [DIGITS] int64.
 
     Returns:
-        How many are visible.
+        How many are visible, and which of the two arrays holds their order.
     """
     visible = 0
     for i in range(counts.shape[0]):
@@ -69,28 +71,32 @@ def depth_order(splats, counts, keys, order, keys_too, order_too, histogram):
     for k in range(visible):
         depths[k] = splats[order[k], DEPTH]
     bits = depths.view(np.uint32)
+    nearest, farthest = np.uint32(0xFFFFFFFF), np.uint32(0)
     for k in range(visible):
-        keys[k] = bits[k]
-    source_keys, source_order, target_keys, target_order = keys, order, keys_too, order_too
-    for step in range(3):
-        shift = np.uint32(step * RADIX_BITS)
+        nearest, farthest = min(nearest, bits[k]), max(farthest, bits[k])
+    for k in range(visible):
+        keys[k] = bits[k] - nearest
+    shift = np.uint32(0)
+    last = np.uint32(DIGITS - 1)
+    while visible > 0 and (farthest - nearest) >> shift != 0:
         histogram[:] = 0
         for k in range(visible):
-            histogram[(source_keys[k] >> shift) & np.uint32(2047)] += 1
+            histogram[(keys[k] >> shift) & last] += 1
         total = 0
-        for k in range(2048):
+        for k in range(DIGITS):
             here = histogram[k]
             histogram[k] = total
             total += here
         for k in range(visible):
-            digit = (source_keys[k] >> shift) & np.uint32(2047)
+            digit = (keys[k] >> shift) & last
             place = histogram[digit]
             histogram[digit] = place + 1
-            target_keys[place] = source_keys[k]
-            target_order[place] = source_order[k]
-        source_keys, target_keys = target_keys, source_keys
-        source_order, target_order = target_order, source_order
-    return visible
+            keys_too[place] = keys[k]
+            order_too[place] = order[k]
+        keys, keys_too = keys_too, keys
+        order, order_too = order_too, order
+        shift += np.uint32(RADIX_BITS)
+    return visible, order
 
 
 @kernel

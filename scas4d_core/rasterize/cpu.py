@@ -6,6 +6,7 @@ on the number of threads. Twin: ``rasterize.twin``.
 
 from __future__ import annotations
 
+from math import prod
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -86,17 +87,22 @@ class CpuRasterizer:
         self.limits = np.array(limits, dtype=np.float32)
         self._last: ForwardPass
         self._buffers: dict[str, NDArray[Any]] = {}
+        self._views: dict[str, NDArray[Any]] = {}
         self._gradient_shape: tuple[int, ...] = ()
-        self._histogram = np.empty(1 << tiles.RADIX_BITS, np.int64)
+        self._histogram = np.empty(tiles.DIGITS, np.int64)
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
         """A contiguous scratch array; grows by a quarter so that a drifting count does not allocate each time."""
-        size = int(np.prod(shape))
+        view = self._views.get(name)
+        if view is not None and view.shape == shape:
+            return view
+        size = prod(shape)
         flat = self._buffers.get(name)
         if flat is None or flat.size < size:
             flat = np.empty(size + size // 4, dtype)
             self._buffers[name] = flat
-        return flat[:size].reshape(shape)
+        self._views[name] = flat[:size].reshape(shape)
+        return self._views[name]
 
     def forward(
         self,
@@ -126,14 +132,13 @@ class CpuRasterizer:
         projection.project(means, factors, opacities, camera.pose, camera.lens, self.limits, splats, rects, counts)
         if depth_channel >= 0:
             features[:, depth_channel] = splats[:, projection.DEPTH]
-        order = self._buffer("order", (count,), np.int32)
-        visible = tiles.depth_order(
+        visible, order = tiles.depth_order(
             splats,
             counts,
             self._buffer("keys", (count,), np.uint32),
-            self._buffer("order_scratch", (count,), np.int32),
+            self._buffer("order", (count,), np.int32),
             self._buffer("keys_too", (count,), np.uint32),
-            order,
+            self._buffer("order_too", (count,), np.int32),
             self._histogram,
         )
         tasks = threads()
