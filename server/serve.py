@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 from functools import partial
 
 import uvicorn
@@ -37,5 +38,9 @@ def serve(settings: ServerSettings) -> None:
         timeout_graceful_shutdown=max(1, round(settings.stop_seconds)),
         ws_max_size=int(settings.max_body_mb * 1e6),
     )
+    # uvicorn ends gracefully and then raises the signal again, for whoever called it: here that is nobody, and the
+    # process ends with status 0.
+    for ending in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(ending, lambda *_: None)
     uvicorn.Server(config).run()
     log.info("ended")

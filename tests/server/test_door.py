@@ -191,7 +191,7 @@ def test_everything_but_what_bears_no_data_is_behind_the_token(guarded):
     assert get(guarded, "/health/live").status_code == 200
     for path in get(guarded, "/openapi.json").json()["paths"]:
         if path != "/health/live":
-            problem(get(guarded, path.format(id="x", n=0, camera="c")), 401)
+            problem(get(guarded, re.sub(r"{\w+}", "0", path)), 401)
     for path in ("/metrics", "/health/ready", "/v1", "/nowhere", "/viewerx", "//v1/scenes"):
         problem(get(guarded, path), 401)
         assert get(guarded, path, **BEARER).status_code in (200, 404)

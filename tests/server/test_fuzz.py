@@ -25,7 +25,7 @@ with warnings.catch_warnings():
 
 load_all_checks()
 
-EXAMPLES = 6
+EXAMPLES = 15
 TOKEN = "a-token-for-the-fuzzer-alone"
 HEADERS = {"Authorization": f"Bearer {TOKEN}"}
 
