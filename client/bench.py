@@ -160,3 +160,71 @@ def device(
         out.write_text(text + "\n")
     if not agree:
         raise typer.Exit(1)
+
+
+@app.command()
+def faults(
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; short ones are repeated.")],
+    frames: Annotated[int, typer.Option(min=4, help="Sent in every scenario.")] = 20,
+    kills: Annotated[int, typer.Option(min=0, help="kill -9 of the worker or the service, at random moments.")] = 30,
+    cuts: Annotated[int, typer.Option(min=0, help="Files of the log that are cut.")] = 20,
+    flips: Annotated[int, typer.Option(min=0, help="Files of the log in which a bit is flipped.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Of the random moments and places.")] = 0,
+    work: Annotated[Path, typer.Option(help="Folder for data folders and logs; what is there goes.")] = Path(
+        "out/faults"
+    ),
+    out: Annotated[Path | None, typer.Option(help="Write the table here, as Markdown.")] = None,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="A setting of the scene, as update.iterations=20."),
+    ] = None,
+    engine: Annotated[str | None, typer.Option(help="module:function instead of the method itself.")] = None,
+) -> None:
+    """Kills the service and its workers, cuts and damages its files, fills its disk; compares with an undisturbed run.
+
+    Example: scas4d bench faults samples/robot --set static.iterations=300 --set update.iterations=20
+    """
+    from client.overrides import overrides
+    from scas4d_core.captures import open_capture
+    from server.bench import faults as of_faults
+
+    opened = open_capture(capture)
+    study = of_faults.Study(
+        work.resolve(),
+        opened,
+        of_faults.encoded_frames(opened, frames),
+        overrides(changes or []),
+        {} if engine is None else {"SCAS4D_ENGINE": engine},
+    )
+    outcomes = of_faults.run(study, moments=kills, cuts=cuts, flips=flips, seed=seed, told=typer.echo)
+    text = of_faults.table(outcomes)
+    typer.echo(text)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(text + "\n")
+    if not all(outcome.reached for outcome in outcomes):
+        raise typer.Exit(1)
+
+
+@app.command()
+def ingest(
+    frames: Annotated[int, typer.Option(min=1, help="A round.")] = 20,
+    cameras: Annotated[int, typer.Option(min=1, help="Of the rig.")] = 27,
+    megabytes: Annotated[float, typer.Option(min=0.01, help="Of one JPEG.")] = 1.0,
+    rounds: Annotated[int, typer.Option(min=1, help="Each measures both ways.")] = 5,
+    senders: Annotated[int, typer.Option(min=1, help="Connections of the one sending process.")] = 2,
+    work: Annotated[Path, typer.Option(help="Folder on the disk that is measured.")] = Path("out/ingest"),
+    out: Annotated[Path | None, typer.Option(help="Write the table here, as Markdown.")] = None,
+) -> None:
+    """Measures ingest over the loopback against plain fsynced writes of the same records, in turns."""
+    from server.bench import ingest as of_ingest
+
+    size = int(megabytes * 1e6)
+    measured = of_ingest.measure(
+        work.resolve(), frames=frames, cameras=cameras, size_bytes=size, rounds=rounds, senders=senders
+    )
+    text = of_ingest.page(measured, frames=frames, cameras=cameras, size_bytes=size, senders=senders)
+    typer.echo(text)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(text + "\n")

@@ -48,6 +48,11 @@ class FolderLock:
             os.close(self._file)
             raise
 
+    def write(self, text: str) -> None:
+        """Puts something in the file for people, such as who holds it."""
+        os.ftruncate(self._file, 0)
+        os.pwrite(self._file, text.encode(), 0)
+
     def release(self) -> None:
         """Lets it go."""
         os.close(self._file)

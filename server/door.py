@@ -139,7 +139,7 @@ def _receiving(scene: Scene, head: FrameHead, seconds: float | None, keep: bool)
 async def _feed(receiving: Receiving, files: Sequence[tuple[FrameFile, bytes]]) -> None:
     try:
         for file, data in files:
-            await receiving.file(file, memoryview(data))
+            await receiving.files([file], memoryview(data))
     except BaseException as error:
         await receiving.abort()
         if no_room(error) and isinstance(error, OSError):

@@ -62,11 +62,10 @@ class Upload:
         self._digest = blake3(start)
         self._write(start)
 
-    def file(self, data: memoryview) -> str:
-        """Writes the next file whole, and tells its BLAKE3."""
+    def write(self, data: memoryview) -> None:
+        """Writes what comes next of the files."""
         self._digest.update(data)
         self._write(data)
-        return blake3(data).hexdigest()
 
     def finish(self) -> None:
         """The record is on disk when this returns.

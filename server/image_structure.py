@@ -51,7 +51,7 @@ def _truncated(kind: str, size: int) -> StructureError:
 
 
 def _jpeg(data: memoryview) -> ImageHeader:
-    at, header = 2, None
+    at, header, components = 2, None, 0
     while True:
         while bytes(data[at : at + 2]) == b"\xff\xff":  # fill bytes
             at += 1
@@ -74,8 +74,13 @@ def _jpeg(data: memoryview) -> ImageHeader:
             if bits != 8 or channels not in (1, 3):
                 raise StructureError(f"a JPEG of {channels} channels of {bits} bits; send RGB or grey of 8 bits")
             header = ImageHeader("jpeg", width, height)
+            components = channels if marker in (0xC0, 0xC1) else 0
         at += 2 + length
         if marker == 0xDA:
+            # The one scan of a sequential picture is followed by the end only, and holds no end marker itself: where
+            # the file ends with one, it is whole. Others are walked from scan to scan.
+            if at <= len(data) - 2 and data[at - length + 2] == components and bytes(data[-2:]) == b"\xff\xd9":
+                break
             at = _end_of_scan(data, at)
     if header is None:
         raise StructureError("a JPEG without a frame header; the file is damaged: send it again")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Iterable
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,9 @@ from server.disk import full_disk, no_room
 from server.facts import Hashes
 from server.frame_store import Upload
 from server.problems import Problem
+
+BATCH = 4_000_000
+"""Bytes of files that are checked, hashed and written at once, where a file is not larger itself."""
 
 Check = Callable[[FrameFile, memoryview], None]
 """Raises Problem for a file that is not what the scene takes."""
@@ -46,25 +49,26 @@ class Receiving:
         self._size = 0
         self._at_work: asyncio.Future[None] | None = None
 
-    async def file(self, file: FrameFile, data: memoryview) -> None:
-        """Takes the next file of the head; returns as soon as the one before it is done.
+    async def files(self, files: Sequence[FrameFile], data: memoryview) -> None:
+        """Takes the next files of the head, one behind the other in `data`; returns when those before them are done.
 
         Raises:
-            Problem, OSError: of the file before this one.
+            Problem, OSError: of the files before these.
         """
         await self._done()
-        self._at_work = asyncio.ensure_future(asyncio.to_thread(self._take, file, data))
+        self._at_work = asyncio.ensure_future(asyncio.to_thread(self._take, files, data))
 
-    def _take(self, file: FrameFile, data: memoryview) -> None:
-        self._check(file, data)
+    def _take(self, files: Sequence[FrameFile], data: memoryview) -> None:
+        at = 0
+        for file in files:
+            piece = data[at : at + file.size]
+            at += file.size
+            self._check(file, piece)
+            self._hashes.setdefault(file.camera, {})[file.kind] = blake3(piece).hexdigest()
         if self._keep:
             if self._upload is None:
                 self._upload = Upload(self._folder, self._head, self._seconds)
-            value = self._upload.file(data)
-        else:
-            value = blake3(data).hexdigest()
-        self._size += len(data)
-        self._hashes.setdefault(file.camera, {})[file.kind] = value
+            self._upload.write(data)
 
     async def _done(self) -> None:
         if self._at_work is not None:
@@ -98,7 +102,7 @@ class Receiving:
 async def receive_framed(
     chunks: AsyncIterator[bytes], head_of: Callable[[FrameHead], Receiving], total: int | None
 ) -> tuple[FrameHead, Receiving]:
-    """Reads a frame as `client.wire.framing` writes it, file by file; nothing is held but the files at work.
+    """Reads a frame as `client.wire.framing` writes it, batch by batch; nothing is held but two batches of them.
 
     Args:
         chunks: the bytes as they come. head_of: told the head once it is here; refuses or begins. total: bytes
@@ -107,46 +111,49 @@ async def receive_framed(
     Raises:
         Problem: 422, no frame, or not what its head says; or what `head_of` and the checks raise.
     """
-    buffer = bytearray()
+    start = bytearray()
     head: FrameHead | None = None
     receiving: Receiving | None = None
-    files: Iterable[FrameFile] = iter(())
-    file: FrameFile | None = None
-    data = bytearray()
-    filled = 0
+    batches: Iterator[list[FrameFile]] = iter(())
+    batch: list[FrameFile] | None = None
+    buffers = (bytearray(), bytearray())
+    size = filled = 0
     try:
         async for chunk in chunks:
-            if head is None:
-                buffer += chunk
-                if len(buffer) < PREFIX.size or len(buffer) < PREFIX.size + head_length(buffer):
+            view = memoryview(chunk)
+            if head is None or receiving is None:
+                start += chunk
+                if len(start) < PREFIX.size or len(start) < PREFIX.size + head_length(start):
                     continue
-                start = PREFIX.size + head_length(buffer)
-                head = parse_head(memoryview(buffer)[PREFIX.size : start])
-                _check_length(head, start, total)
+                end = PREFIX.size + head_length(start)
+                head = parse_head(start[PREFIX.size : end])
+                _check_length(head, end, total)
                 receiving = head_of(head)
-                files = iter(head.files)
-                file, data, filled = _next(files)
-                view = memoryview(bytes(buffer))[start:]
-            else:
-                view = memoryview(chunk)
-            assert receiving is not None
-            while True:
-                if file is None:
-                    if len(view):
-                        raise FramingError(f"goes on for {len(view)} bytes and more behind its files; send none there")
-                    break
-                piece = view[: file.size - filled]
-                data[filled : filled + len(piece)] = piece
+                view = memoryview(bytes(start))[end:]
+                planned = in_batches(head.files)
+                # Two, in turns: while one is checked and written, the other is filled.
+                buffers = tuple(bytearray(max(map(_bytes, planned))) for _ in range(2))  # type: ignore[assignment]
+                batches = iter(planned)
+                batch = next(batches, None)
+                size = _bytes(batch or [])
+            while batch is not None:
+                piece = view[: size - filled]
+                buffers[0][filled : filled + len(piece)] = piece
                 filled += len(piece)
                 view = view[len(piece) :]
-                if filled < file.size:
+                if filled < size:
                     break
-                await receiving.file(file, memoryview(data))
-                file, data, filled = _next(files)
+                await receiving.files(batch, memoryview(buffers[0])[:size])
+                buffers = buffers[::-1]
+                batch, filled = next(batches, None), 0
+                size = _bytes(batch or [])
+            if batch is None and len(view):
+                raise FramingError(f"goes on for {len(view)} bytes and more behind its files; send none there")
         if head is None or receiving is None:
-            raise FramingError(f"ends after {len(buffer)} bytes, within its head; send the whole frame")
-        if file is not None:
-            raise FramingError(f"ends within the {file.kind} of camera {file.camera!r}; send the whole frame")
+            raise FramingError(f"ends after {len(start)} bytes, within its head; send the whole frame")
+        if batch is not None:
+            missing = size - filled + sum(map(_bytes, batches))
+            raise FramingError(f"ends {missing} bytes before its last file does; send the whole frame")
         return head, receiving
     except BaseException as error:
         if receiving is not None:
@@ -170,6 +177,15 @@ def _check_length(head: FrameHead, start: int, total: int | None) -> None:
         raise FramingError(f"has {total} bytes where its head says {expected}; send what the head says")
 
 
-def _next(files: Iterable[FrameFile]) -> tuple[FrameFile | None, bytearray, int]:
-    file = next(iter(files), None)
-    return file, bytearray(0 if file is None else file.size), 0
+def in_batches(files: Sequence[FrameFile]) -> list[list[FrameFile]]:
+    """Consecutive files that are given to a thread together: each time costs more than a small file is worth."""
+    batches: list[list[FrameFile]] = []
+    for file in files:
+        if not batches or _bytes(batches[-1]) + file.size > BATCH:
+            batches.append([])
+        batches[-1].append(file)
+    return batches
+
+
+def _bytes(files: Sequence[FrameFile]) -> int:
+    return sum(file.size for file in files)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import signal
@@ -34,6 +35,8 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
     # A service that was killed leaves a worker in the middle of an update: two must not commit to one history.
     lock = FolderLock(spec.folder / "worker.lock", wait=True)
+    with contextlib.suppress(OSError):  # a full disk is no reason not to work
+        lock.write(f"{os.getpid()}\n")
     worker = Worker(spec, connection)
     try:
         if worker.open():

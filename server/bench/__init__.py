@@ -1,0 +1,1 @@
+"""Studies of the service that need one running: faults, the speed of ingest."""

@@ -1,0 +1,392 @@
+"""What kills, cuts, flipped bits and a full disk cost: nothing acknowledged, and not a bit of the states.
+
+Each scenario runs the whole service as a process of its own. The undisturbed run comes first; the others are compared
+with it, state by state and bit by bit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import random
+import resource
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from client.wire import FrameState
+from scas4d_core.captures import Capture
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.history import History
+from server.bench.service import PATIENCE_S, Service, StudyError
+from server.facts import Taken
+from server.journal import read_journal
+
+AGAIN_S = 0.05
+KILLS_OF_A_WORKER_AT_A_FRAME = 4
+"""The sixth sets a frame aside, as it should: the study stays below."""
+
+Files = tuple[dict[str, bytes], dict[str, bytes]]
+Told = Callable[[str], None]
+
+
+@dataclass
+class Outcome:
+    """One row of the table."""
+
+    name: str
+    bar: str
+    found: str
+    faults: list[str] = field(default_factory=list)
+
+    @property
+    def reached(self) -> bool:
+        """Whether nothing went wrong."""
+        return not self.faults
+
+
+@dataclass(frozen=True)
+class Study:
+    """What is sent, and where to.
+
+    Attributes:
+        folder: for data folders and logs. frames: encoded pictures and masks of each. settings: of the scene.
+        environment: of the service.
+    """
+
+    folder: Path
+    capture: Capture
+    frames: Sequence[Files]
+    settings: Mapping[str, Any]
+    environment: Mapping[str, str]
+
+    def service(self, name: str) -> Service:
+        """Over a new folder."""
+        data = self.folder / name
+        shutil.rmtree(data, ignore_errors=True)
+        data.mkdir(parents=True)
+        return Service(data, self.environment)
+
+    def create(self, service: Service, **more: Any) -> str:
+        """A scene that keeps all its pictures."""
+        rules = {"keep_frames": {}, "queue_frames": 100, **more}
+        return service.create(self.capture.full_rig, self.settings, ingest=rules)
+
+
+def encoded_frames(capture: Capture, count: int) -> list[Files]:
+    """So many frames of a capture; where it has fewer, it goes back and forth, so that the motion stays one."""
+    there, frames = capture.frame_count, []
+    for number in range(count):
+        turn = number % max(1, 2 * there - 2)
+        index = min(turn, 2 * there - 2 - turn) if there > 1 else 0
+        images = {name: capture.encoded(index, name) for name in capture.full_rig.names}
+        found = {name: capture.encoded_mask(index, name) for name in capture.full_rig.names}
+        masks = {name: mask for name, mask in found.items() if mask is not None}
+        frames.append((images, masks if len(masks) == len(images) else {}))
+    return frames
+
+
+def digests(states: Path) -> dict[int, str]:
+    """SHA-256 over every array of each committed state, and over what its report says of decisions."""
+    history = History.load(states)
+    found = {}
+    for index in history.indices:
+        digest = hashlib.sha256()
+        for name, array in sorted(Gaussians.arrays(history.gaussians(index)).items()):
+            digest.update(f"{name} {array.dtype} {array.shape}".encode())
+            digest.update(array.tobytes())
+        report = history.report(index)
+        decided = {name: report.get(name) for name in ("index", "time", "iterations", "loss", "used", "dropped")}
+        digest.update(repr(decided).encode())
+        found[index] = digest.hexdigest()
+    return found
+
+
+def compare(found: Mapping[int, str], expected: Mapping[int, str], but: Sequence[int] = ()) -> list[str]:
+    """Faults of a run's states against the undisturbed one's; those in `but` may be gone."""
+    wrong = [index for index in expected if index not in but and found.get(index) != expected[index]]
+    missing = [index for index in wrong if index not in found]
+    faults = [f"frames {missing} are not committed"] if missing else []
+    others = [index for index in wrong if index in found]
+    return faults + ([f"states {others} are not bit-identical"] if others else [])
+
+
+class Sender:
+    """Sends frames as a rig would that never gives up, and keeps what was acknowledged."""
+
+    def __init__(self, study: Study, service: Service, scene: str) -> None:
+        self.study, self.service, self.scene = study, service, scene
+        self.receipts: dict[int, dict[str, Any]] = {}
+        self.faults: list[str] = []
+
+    def send(self, index: int) -> None:
+        """Until it is acknowledged."""
+        until = time.monotonic() + PATIENCE_S
+        while time.monotonic() < until:
+            try:
+                answer = self.service.put(self.scene, index, *self.study.frames[index])
+            except httpx.TransportError:
+                time.sleep(AGAIN_S)
+                continue
+            if answer.status_code == 202:
+                self.receipts[index] = answer.json()
+                return
+            if answer.status_code not in (429, 507):
+                self.faults.append(f"frame {index} was answered {answer.status_code}: {answer.text}")
+                return
+            time.sleep(AGAIN_S)
+        self.faults.append(f"frame {index} was never acknowledged")
+
+    def check(self) -> list[str]:
+        """Every acknowledged frame is committed and has the identity that was acknowledged; faults."""
+        faults = list(self.faults)
+        for index, receipt in self.receipts.items():
+            report = self.service.frame(self.scene, index)
+            if report.state != FrameState.COMMITTED:
+                faults.append(f"frame {index} was acknowledged and is {report.state}: {report.error}")
+            if report.identity != receipt["identity"]:
+                faults.append(f"frame {index} has another identity than was acknowledged")
+            again = self.service.put(self.scene, index, *self.study.frames[index])
+            if again.status_code != 202 or again.json() != receipt:
+                faults.append(f"frame {index}, sent again, is answered {again.status_code}: {again.text}")
+        return faults
+
+
+def undisturbed(study: Study) -> tuple[dict[int, str], float]:
+    """States of a run that nothing disturbs, and the seconds that an update took."""
+    service = study.service("undisturbed")
+    service.start()
+    try:
+        scene = study.create(service)
+        sender = Sender(study, service, scene)
+        sender.send(0)
+        service.finish(scene, 1)
+        began = time.monotonic()
+        for index in range(1, len(study.frames)):
+            sender.send(index)
+        service.finish(scene, len(study.frames))
+        seconds = (time.monotonic() - began) / max(1, len(study.frames) - 1)
+        if faults := sender.check():
+            raise StudyError(f"the undisturbed run: {'; '.join(faults)}")
+        return digests(service.data / "scenes" / scene / "states"), seconds
+    finally:
+        service.stop()
+
+
+def kills(study: Study, expected: Mapping[int, str], update_s: float, count: int, seed: int, told: Told) -> Outcome:
+    """`kill -9` of the worker or the whole service, `count` times, at random moments of the capture."""
+    random_ = random.Random(seed)
+    moments: dict[int, list[str]] = {}
+    while sum(map(len, moments.values())) < count:
+        index, victim = random_.randrange(len(study.frames)), random_.choice(("worker", "service"))
+        before = moments.setdefault(index, [])
+        if victim == "service" or before.count("worker") < KILLS_OF_A_WORKER_AT_A_FRAME:
+            before.append(victim)
+    service = study.service("kills")
+    service.start()
+    scene = study.create(service)
+    sender = Sender(study, service, scene)
+    done = {"worker": 0, "service": 0}
+    try:
+        for index in range(len(study.frames)):
+            thread = threading.Thread(target=sender.send, args=(index,))
+            thread.start()
+            for victim in moments.get(index, ()):
+                time.sleep(random_.uniform(0, 1.5 * update_s))
+                if victim == "service":
+                    service.kill()
+                    service.start()
+                else:
+                    _kill_worker(service, scene)
+                done[victim] += 1
+                told(f"killed the {victim} at frame {index}: {sum(done.values())} of {count}")
+            thread.join()
+        service.finish(scene, len(study.frames))
+        service.kill()
+        service.start()  # and once more: all is found again
+        service.finish(scene, len(study.frames))
+        faults = sender.check() + compare(digests(service.data / "scenes" / scene / "states"), expected)
+        lost = len(study.frames) - len(sender.receipts)
+        found = (
+            f"{done['worker']} of the worker, {done['service']} of the service; {lost} acknowledged frames lost, "
+            f"{len(expected)} states compared"
+        )
+        bar = "0 acknowledged frames lost, final state bit-identical"
+        return Outcome(f"kill -9 at {count} random moments over {len(study.frames)} frames", bar, found, faults)
+    finally:
+        service.stop()
+
+
+def _kill_worker(service: Service, scene: str) -> None:
+    """As soon as there is one: after a death it is away for a moment."""
+    until = time.monotonic() + PATIENCE_S
+    while time.monotonic() < until:
+        pid = service.worker_pid(scene)
+        if pid is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+            return
+        time.sleep(AGAIN_S)
+
+
+def damaged_log(study: Study, expected: Mapping[int, str], cuts: int, flips: int, seed: int, told: Told) -> Outcome:
+    """Files of the log cut, or a bit flipped, under a service that is down; then it starts, says so, and goes on.
+
+    Half of the frames are committed, the other half wait, as after a kill.
+    """
+    random_ = random.Random(seed)
+    service = study.service("log")
+    service.start()
+    half = len(study.frames) // 2
+    scene = study.create(service)
+    sender = Sender(study, service, scene)
+    for index in range(half):
+        sender.send(index)
+    service.finish(scene, half)
+    service.http.post(f"/v1/scenes/{scene}/pause")
+    for index in range(half, len(study.frames)):
+        sender.send(index)
+    service.kill()
+    faults = list(sender.faults)
+    dropped = 0
+    for number in range(cuts + flips):
+        kind = "cut" if number < cuts else "flip"
+        victim = study.service("damaged")
+        shutil.rmtree(victim.data)
+        shutil.copytree(service.data, victim.data)
+        folder = victim.data / "scenes" / scene
+        said, hit = _damage(folder, kind, random_, half)
+        victim.start()
+        try:
+            victim.http.post(f"/v1/scenes/{scene}/resume")
+            status = victim.finish(scene, len(study.frames) if hit is None else 0)
+            told(f"{said}: {'; '.join(status.damage) or 'nothing to say'}")
+            wrong = _check_damaged(victim, scene, sender, hit)
+            wrong += compare(digests(folder / "states"), expected, range(hit, len(study.frames)) if hit else ())
+            if hit is not None:
+                report = victim.frame(scene, hit)
+                dropped += 1
+                if report.state != FrameState.SET_ASIDE or not report.error:
+                    wrong.append(f"frame {hit} is {report.state}, its record is damaged")
+            elif not status.damage:
+                wrong.append("the damage was not said")
+            faults += [f"{said}: {fault}" for fault in wrong]
+        except StudyError as error:
+            faults.append(f"{said}: {error}")
+        finally:
+            victim.stop()
+    found = f"started {cuts + flips} times; {dropped} frames set aside with their reason, all others committed"
+    bar = "starts, loses nothing acknowledged before the damage, says what it dropped"
+    return Outcome(f"{cuts} cuts and {flips} flipped bytes of journal and frame log", bar, found, faults)
+
+
+def _damage(folder: Path, kind: str, random_: random.Random, half: int) -> tuple[str, int | None]:
+    """Damages the journal or the record of a frame that waits; says how, and which frame is hit."""
+    journal = folder / "journal.log"
+    taken = {fact.index: fact for fact in read_journal(journal).facts if isinstance(fact, Taken)}
+    waiting = [index for index in taken if index >= half]
+    hit = random_.choice([None, random_.choice(waiting)])
+    file = journal if hit is None else folder / "frames" / taken[hit].files[0]
+    at = random_.randrange(1, file.stat().st_size)
+    with file.open("r+b") as opened:
+        if kind == "cut":
+            opened.truncate(at)
+        else:
+            opened.seek(at)
+            byte = opened.read(1)[0]
+            opened.seek(at)
+            opened.write(bytes([byte ^ (1 << random_.randrange(8))]))
+    return f"{kind} of {file.name} at byte {at}", hit
+
+
+def _check_damaged(service: Service, scene: str, sender: Sender, hit: int | None) -> list[str]:
+    faults = []
+    for index, receipt in sender.receipts.items():
+        report = service.frame(scene, index)
+        if index != hit and report.state != FrameState.COMMITTED:
+            faults.append(f"frame {index} is {report.state}: {report.error}")
+        if report.identity != receipt["identity"]:
+            faults.append(f"frame {index} has another identity")
+    return faults
+
+
+def full_disk(study: Study, expected: Mapping[int, str], told: Told) -> Outcome:
+    """No file may grow: first for the service, then for the worker; then there is room again.
+
+    The limit on the size of files is set on the running processes (RLIMIT_FSIZE), so that every write fails where a
+    full disk would make it fail.
+    """
+    service = study.service("full")
+    service.start()
+    faults: list[str] = []
+    try:
+        scene = study.create(service)
+        sender = Sender(study, service, scene)
+        half = len(study.frames) // 2
+        for index in range(half):
+            sender.send(index)
+        service.finish(scene, half)
+        with _no_room(service.pid):
+            answers = [service.put(scene, half, *study.frames[half]) for _ in range(3)]
+            told(f"while the disk is full: {[answer.status_code for answer in answers]}")
+            faults += [f"answered {answer.status_code}, not 507" for answer in answers if answer.status_code != 507]
+            if service.status(scene).next_frame != half:
+                faults.append("a frame was taken that was not acknowledged")
+        worker = service.worker_pid(scene)
+        assert worker is not None
+        with _no_room(worker):
+            sender.send(half)
+            until = time.monotonic() + PATIENCE_S
+            while "room" not in (service.status(scene).error or "") and time.monotonic() < until:
+                time.sleep(AGAIN_S)
+            told(f"while the worker has no room: {service.status(scene).error}")
+            if service.frame(scene, half).state != FrameState.UPDATING:
+                faults.append("the worker did not wait for room")
+        for index in range(half + 1, len(study.frames)):
+            sender.send(index)
+        service.finish(scene, len(study.frames))
+        faults += sender.check() + compare(digests(service.data / "scenes" / scene / "states"), expected)
+    finally:
+        service.stop()
+    bar = "starts, loses nothing acknowledged before the damage, says what it dropped"
+    return Outcome("disk full while ingesting", bar, "507 meanwhile; all committed once there was room", faults)
+
+
+@contextlib.contextmanager
+def _no_room(pid: int) -> Any:
+    soft, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, hard))
+    try:
+        yield
+    finally:
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def run(
+    study: Study, *, moments: int = 30, cuts: int = 20, flips: int = 1, seed: int = 0, told: Told = print
+) -> list[Outcome]:
+    """All scenarios."""
+    expected, update_s = undisturbed(study)
+    told(f"undisturbed: {len(expected)} states, {update_s:.2f} s an update")
+    return [
+        kills(study, expected, update_s, moments, seed, told),
+        damaged_log(study, expected, cuts, flips, seed, told),
+        full_disk(study, expected, told),
+    ]
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """As Markdown."""
+    rows = ["| fault | bar | found | |", "|---|---|---|---|"]
+    for outcome in outcomes:
+        found = "; ".join(outcome.faults) or outcome.found
+        rows.append(f"| {outcome.name} | {outcome.bar} | {found} | {'reached' if outcome.reached else '**missed**'} |")
+    return "\n".join(rows)
