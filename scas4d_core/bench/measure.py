@@ -81,6 +81,7 @@ def measure_tracks(reconstruction: Reconstruction, capture: Capture, indices: Se
         return {}
     tracks = reconstruction.tracks_of_points(points[0], indices[0], list(indices))
     error = metrics.track_error_3d(tracks.positions, points, moving, extent)
+    sorted_errors = metrics.error_by_confidence(tracks.positions, points, tracks.confidence, moving, extent)
     at_last = metrics.track_error_3d(tracks.positions[[0, -1]], points[[0, -1]], moving, extent)
 
     def depth(camera: Camera, index: int) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -108,6 +109,7 @@ def measure_tracks(reconstruction: Reconstruction, capture: Capture, indices: Se
         "track_3d_p90": _finite(error.percentile_90),
         "track_3d_last": _finite(at_last.median),
         "track_points": float(moving.sum()),
+        **{f"track_3d_confidence_{k}": _finite(error) for k, error in enumerate(sorted_errors, 1)},
         **mean_scores(by_camera),
     }
 

@@ -4,6 +4,7 @@ from scas4d_core.metrics.image import Score, flip, lpips, psnr, ssim
 from scas4d_core.metrics.parts import adjusted_rand_index
 from scas4d_core.metrics.tracks import (
     TrackError,
+    error_by_confidence,
     median_trajectory_error,
     oracle_tracks,
     track_error_3d,
@@ -14,6 +15,7 @@ __all__ = [
     "Score",
     "TrackError",
     "adjusted_rand_index",
+    "error_by_confidence",
     "flip",
     "lpips",
     "median_trajectory_error",

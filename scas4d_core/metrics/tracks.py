@@ -141,6 +141,42 @@ def track_error_3d(
     return TrackError(float(np.median(pooled)), float(ninety), int(pooled.size))
 
 
+def error_by_confidence(
+    tracks: NDArray[Any],
+    truth: NDArray[Any],
+    confidence: NDArray[Any],
+    moving: NDArray[np.bool_],
+    extent: float,
+    *,
+    query: int = 0,
+    groups: int = 4,
+) -> list[float]:
+    """Median 3D error in % of the extent of equally large groups of positions, the most confident first.
+
+    A confidence that says something gives rising numbers. Positions count as in ``track_error_3d``.
+
+    Args:
+        tracks: [T, P, 3] predicted. truth: [T, P, 3]. Both in the user's units.
+        confidence: [T, P].
+        moving: [P] the points that count.
+        extent: user's units.
+        query: the frame in which the points were given; it does not count.
+        groups: how many; those beyond a multiple of it, the least confident, are left out.
+
+    Raises:
+        ValueError: as ``track_error_3d``, or confidence of another shape.
+    """
+    if confidence.shape != tracks.shape[:2]:
+        raise ValueError(f"confidence has shape {confidence.shape}; give [T, P] = {tracks.shape[:2]}")
+    track_error_3d(tracks, truth, moving, extent, query=query)  # the same checks
+    chosen = np.ix_(np.arange(len(truth)) != query, moving)
+    distances = np.linalg.norm(tracks.astype(np.float64) - truth.astype(np.float64), axis=-1)[chosen].ravel()
+    distances = np.where(np.isfinite(distances), distances, np.inf) * (100.0 / extent)
+    order = np.argsort(-confidence[chosen].ravel(), kind="stable")
+    size = len(order) // groups
+    return [float(np.median(distances[order[k * size : (k + 1) * size]])) if size else math.nan for k in range(groups)]
+
+
 def visibility_accuracy(predicted: NDArray[np.bool_], truth: NDArray[np.bool_], *, query: int = 0) -> float:
     """Share of points and frames, 0…1, whose visibility was told rightly: the occlusion accuracy of TAP-Vid.
 

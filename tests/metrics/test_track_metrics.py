@@ -3,7 +3,13 @@ import math
 import numpy as np
 import pytest
 
-from scas4d_core.metrics import median_trajectory_error, oracle_tracks, track_error_3d, visibility_accuracy
+from scas4d_core.metrics import (
+    error_by_confidence,
+    median_trajectory_error,
+    oracle_tracks,
+    track_error_3d,
+    visibility_accuracy,
+)
 
 
 def test_mte_is_the_mean_over_tracks_of_medians_over_frames():
@@ -69,6 +75,24 @@ def test_3d_error_of_lost_points_is_infinite_where_they_weigh():
     tracks[9:] = np.nan
     error = track_error_3d(tracks, truth, np.array([True]), extent=1.0)
     assert (error.median, error.percentile_90) == (0.0, math.inf)
+
+
+def test_errors_sorted_by_confidence():
+    truth = np.zeros((3, 5, 3))
+    tracks = truth.copy()
+    tracks[1:, :4, 0] = [[1, 2, 3, 4], [5, 6, 7, 8]]
+    tracks[0] = 99  # the query's frame
+    tracks[:, 4] = 50  # stands
+    confidence = np.zeros((3, 5))
+    confidence[1:, :4] = 1 / tracks[1:, :4, 0]
+    confidence[:, 4] = confidence[0] = 2
+    moving = np.array([True, True, True, True, False])
+    assert error_by_confidence(tracks, truth, confidence, moving, 100.0) == [1.5, 3.5, 5.5, 7.5]
+    assert error_by_confidence(tracks, truth, -confidence, moving, 100.0, groups=2) == [6.5, 2.5]
+    tracks[1, 0] = np.nan
+    assert error_by_confidence(tracks, truth, confidence, moving, 100.0, groups=2) == [3.5, 6.5]
+    with pytest.raises(ValueError, match=r"confidence has shape \(5,\)"):
+        error_by_confidence(tracks, truth, confidence[0], moving, 100.0)
 
 
 def test_visibility_accuracy_leaves_the_query_frame_out():
