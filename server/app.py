@@ -23,6 +23,7 @@ from server.placement.local import LocalPlacement
 from server.problems import Problem
 from server.readiness import Readiness
 from server.routes import (
+    estimate,
     frames,
     health,
     ingest,
@@ -83,7 +84,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     app.add_middleware(AccessLog)
     resources = (
         *(scenes, inspect, points, frames, ingest, render, tracks, parts, stream),
-        *(tickets, health, metrics, viewer),
+        *(estimate, tickets, health, metrics, viewer),
     )
     for resource in resources:
         app.include_router(resource.router)

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from client.wire import SceneCreate, SceneList, SceneStatus
 from scas4d_core.presets import preset
 from scas4d_core.settings import Settings
+from server import estimate
 from server.problems import Problem
 from server.routes.access import AllScenes, TheScene, TheSettings
 
@@ -55,6 +56,7 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
                 value=f"{camera.width}x{camera.height}",
                 remedy="send smaller pictures with the intrinsics to match, or raise SCAS4D_MAX_IMAGE_PIXELS",
             )
+    estimate.check(request.rig, settings, server)
     scene = await scenes.create(request, settings)
     response.headers["Location"] = f"/v1/scenes/{scene.id}"
     return scene.status()

@@ -1,0 +1,83 @@
+"""Measures the peak memory of a reconstruction against the estimate of the service (server/estimate.py).
+
+    python scripts/measure_memory.py --cameras 24 --size 512 --gaussians 40000 --masks
+
+Frame 0 and two updates of a ball in the middle of a ring of cameras, in few iterations: memory does not depend on them.
+Prints the peak, the estimate and their ratio as JSON.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import sys
+
+import numpy as np
+
+from client.wire import RigModel
+from scas4d_core.cameras import Camera, Rig
+from scas4d_core.captures import Frame, InitialPoints
+from scas4d_core.presets import preset
+from scas4d_core.settings import Settings
+from server.estimate import estimate
+from server.settings import ServerSettings
+
+
+def ring(count: int, size: int) -> Rig:
+    """Cameras around the origin, 2 m away."""
+    lens = np.array([[1.2 * size, 0, size / 2], [0, 1.2 * size, size / 2], [0, 0, 1]])
+    cameras = []
+    for k in range(count):
+        c, s = np.cos(2 * np.pi * k / count), np.sin(2 * np.pi * k / count)
+        pose = np.eye(4)
+        pose[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
+        pose[2, 3] = 2.0
+        cameras.append(Camera(f"c{k}", lens, pose, size, size))
+    return Rig(tuple(cameras))
+
+
+def frame(rig: Rig, size: int, index: int, masked: bool) -> Frame:
+    """A ball that moves by a pixel a frame."""
+    rows, columns = np.mgrid[:size, :size]
+    ball = np.hypot(rows - size / 2, columns - size / 2 - index) < 0.24 * size
+    picture = np.zeros((size, size, 3), np.uint8)
+    picture[ball] = (np.stack([rows, columns, rows + columns], -1)[ball] % 256).astype(np.uint8)
+    images = {name: picture.copy() for name in rig.names}
+    return Frame(index, index / 30, images, {name: ball.astype(np.uint8) for name in rig.names} if masked else {})
+
+
+def main() -> None:
+    """Reconstructs, and compares."""
+    from scas4d_core.reconstruction import Reconstruction
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cameras", type=int, default=24)
+    parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("--gaussians", type=int, default=10_000)
+    parser.add_argument("--scale", type=float, default=1.0)
+    parser.add_argument("--masks", action="store_true")
+    given = parser.parse_args()
+    base = preset("scas4d").model_dump()
+    base["static"] |= {"iterations": 8, "max_gaussians": given.gaussians, "initial_share": 1.0, "densify_from": 1000}
+    base["static"] |= {"min_views": 0, "prune_opacity": 0.0}
+    base["update"] |= {"iterations": 4}
+    base["scene"] |= {"image_scale": given.scale}
+    settings = Settings.model_validate(base)
+    rig = ring(given.cameras, given.size)
+    normals = np.random.default_rng(0).normal(size=(given.gaussians, 3))
+    points = 0.4 * normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    cloud = InitialPoints(points, np.full((given.gaussians, 3), 0.5, np.float32), None)
+    first = frame(rig, given.size, 0, given.masks)
+    reconstruction = Reconstruction.start(rig, first, settings, points=cloud)
+    for index in (1, 2):
+        reconstruction.step(frame(rig, given.size, index, given.masks))
+    unit = 1 if sys.platform == "darwin" else 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+    expected = estimate(RigModel.of(rig), settings, ServerSettings()).worker_mb
+    kept = len(reconstruction.history.gaussians(0))
+    print(json.dumps({"peak_mb": round(peak), "estimate_mb": round(expected), "ratio": peak / expected, "kept": kept}))
+
+
+if __name__ == "__main__":
+    main()

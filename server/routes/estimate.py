@@ -1,0 +1,19 @@
+"""What a scene would take."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+
+from client.wire import SceneCreate
+from client.wire.estimate import SceneEstimate
+from server.estimate import estimate
+from server.routes.access import TheSettings
+from server.routes.scenes import scene_settings
+
+router = APIRouter(prefix="/v1/estimate", tags=["service"])
+
+
+@router.post("")
+async def of_scene(request: SceneCreate, server: TheSettings) -> SceneEstimate:
+    """Memory and disk that the scene would take; nothing is created. A scene above the limit is refused."""
+    return estimate(request.rig, scene_settings(request), server)
