@@ -3,8 +3,10 @@ FROM python:3.12-slim
 WORKDIR /scas4d
 COPY . .
 RUN scripts/setup server
-ENV SCAS4D_DATA=/data NUMBA_CACHE_DIR=/cache/numba
+ENV SCAS4D_DATA=/data NUMBA_CACHE_DIR=/cache/numba SCAS4D_HOST=0.0.0.0
 VOLUME ["/data", "/cache"]
 EXPOSE 8000
-# Inside the container all addresses; the compose file publishes on the host's loopback only.
-CMD [".venv/bin/scas4d", "serve", "--host", "0.0.0.0", "--allow-remote"]
+# It does not start without SCAS4D_TOKEN or SCAS4D_TOKEN_FILE: inside a container it listens at all addresses.
+HEALTHCHECK --start-period=120s CMD .venv/bin/python -c "import urllib.request as u; u.urlopen('http://127.0.0.1:8000/health/live', timeout=5)"
+STOPSIGNAL SIGTERM
+CMD [".venv/bin/scas4d", "serve"]

@@ -1,12 +1,19 @@
 # docker build -f docker/cuda.Dockerfile -t scas4d-cuda .
-# The devel image: gsplat compiles its kernels at first use. TORCH_CUDA_ARCH_LIST names the GPU (9.0: H100, 8.9: L4).
+# The devel image: gsplat compiles its kernels at first use, with the nvcc of the CUDA that torch was built for. Image and
+# torch are pinned together: torch from PyPI is built for CUDA 13, and would not compile with this nvcc.
+# TORCH_CUDA_ARCH_LIST names the GPU (9.0: H100, 8.9: L4).
 FROM nvidia/cuda:12.8.1-devel-ubuntu24.04
 RUN apt-get update && apt-get install -y --no-install-recommends python3 python3-dev python3-venv ninja-build \
     && rm -rf /var/lib/apt/lists/*
 WORKDIR /scas4d
 COPY . .
-RUN scripts/setup cuda
-ENV SCAS4D_DATA=/data NUMBA_CACHE_DIR=/cache/numba TORCH_EXTENSIONS_DIR=/cache/torch TORCH_CUDA_ARCH_LIST=9.0
+RUN python3 -m venv .venv \
+    && .venv/bin/python -m pip install --no-cache-dir torch==2.11.0 --index-url https://download.pytorch.org/whl/cu128 \
+    && scripts/setup cuda
+ENV SCAS4D_DATA=/data NUMBA_CACHE_DIR=/cache/numba SCAS4D_HOST=0.0.0.0 \
+    TORCH_EXTENSIONS_DIR=/cache/torch TORCH_CUDA_ARCH_LIST=9.0
 VOLUME ["/data", "/cache"]
 EXPOSE 8000
-CMD [".venv/bin/scas4d", "serve", "--host", "0.0.0.0", "--allow-remote"]
+HEALTHCHECK --start-period=120s CMD .venv/bin/python -c "import urllib.request as u; u.urlopen('http://127.0.0.1:8000/health/live', timeout=5)"
+STOPSIGNAL SIGTERM
+CMD [".venv/bin/scas4d", "serve"]
