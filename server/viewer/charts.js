@@ -82,7 +82,15 @@ export class Chart {
     const height = clientHeight - TOP - BOTTOM;
     const values = known.map((point) => point.value);
     let [low, high] = [Math.min(...values), Math.max(...values)];
-    if (this.kind === "bars") low = 0;
+    let clipped = () => false;
+    if (this.kind === "bars") {
+      low = 0;
+      // One frame that had to wait for a compiler would make all others invisible: it leaves the chart at the top.
+      const middle = [...values].sort((a, b) => a - b)[values.length >> 1];
+      const usual = Math.max(...values.filter((value) => value <= 5 * middle));
+      clipped = (value) => value > 5 * middle;
+      high = usual;
+    }
     const pad = this.kind === "bars" ? 0 : Math.max(0.12 * (high - low), 0.5);
     [low, high] = [low - pad, high + Math.max(pad, 0.08 * (high - low), 1e-6)];
     const tick = step(high - low, 3);
@@ -103,8 +111,13 @@ export class Chart {
     if (this.kind === "bars") {
       const wide = Math.max(1, Math.min(14, 0.7 * this.width / this.count));
       for (const point of known) {
-        element("rect", { x: this.x(point) - wide / 2, width: wide, y: y(point.value), rx: Math.min(1.5, wide / 3),
-          height: TOP + height - y(point.value), class: "bar" }, this.svg);
+        const top = clipped(point.value) ? TOP - 4 : y(point.value);
+        element("rect", { x: this.x(point) - wide / 2, width: wide, y: top, rx: Math.min(1.5, wide / 3),
+          height: TOP + height - top, class: clipped(point.value) ? "bar beyond" : "bar" }, this.svg);
+        if (clipped(point.value)) {
+          element("text", { x: this.x(point) + wide / 2 + 4, y: TOP + 6, class: "label start" }, this.svg).textContent =
+            this.text(point.value);
+        }
       }
     } else {
       const path = known.map((point, i) => `${i ? "L" : "M"}${this.x(point)} ${y(point.value)}`).join("");

@@ -10,6 +10,7 @@ import { LiveView } from "./view.js";
 const LIST_EVERY_MS = 4000;
 const PLAY_FPS = 8;
 const MOST_TRACKS = 12;
+const NOTE_MS = 6000;
 const $ = (id) => document.getElementById(id);
 
 const page = {
@@ -26,6 +27,11 @@ const page = {
 const view = new LiveView($("picture"), $("overlay"), {
   pick,
   shown: showInfo,
+  slow: (mode) => {
+    const ready = page.status?.committed > 0;
+    $("busy").hidden = !ready || page.lost;
+    $("busy").textContent = mode === "parts" ? "Finding the parts …" : "Waiting for the picture …";
+  },
   turned: () => $("hint").classList.add("known"),
 });
 const psnr = new Chart($("psnr"), "line", "dB", choose);
@@ -156,6 +162,7 @@ function showStatus(status) {
     } else if (status.state === "initialising") curtain("Reconstructing the first frame", "The pictures are being read");
     else curtain("Waiting for the first frame", "The scene is there and takes frames.", `PUT ${scenePath(status.id)}/frames/0`);
   }
+  if (status.committed && !view.shown) curtain("Opening the scene", "The first picture is on its way.");
   showTimeline();
 }
 
@@ -280,6 +287,7 @@ function bulk(head, bytes) {
 
 function showInfo(info) {
   $("curtain").hidden = true;
+  if (info.tag === view.tag) $("busy").hidden = true;
   if (page.failed === "view") note("");
   const legend = $("legend");
   legend.hidden = info.mode !== "depth";
@@ -317,6 +325,8 @@ function curtain(title, words, detail = "", share) {
 
 function note(words, id = null) {
   page.failed = words ? id : null;
+  clearTimeout(page.fading);
+  if (words && !id) page.fading = setTimeout(() => note(""), NOTE_MS);
   $("note").textContent = words ? words[0].toUpperCase() + words.slice(1) + (words.endsWith(".") ? "" : ".") : "";
 }
 
@@ -328,7 +338,7 @@ function pick(u, v, camera, frame) {
   const id = `track-${++page.picks}`;
   const used = new Set(page.tracks.map((track) => track.colour));
   const colour = TRACKS.find((one) => !used.has(one)) ?? TRACKS[page.picks % TRACKS.length];
-  page.tracks.push({ id, colour, name: page.picks, positions: new Map(), confidence: null, from: frame });
+  page.tracks.push({ id, colour, name: page.picks, positions: new Map(), confidence: new Map() });
   page.stream.subscribe(id, "tracks", { pixels: [[u, v]], camera, at: frame }, page.picks);
   showTracks();
 }
@@ -343,8 +353,10 @@ function grow(head, model) {
   }
   if (page.failed === null) note("");
   track.gaussian = model.ids[0];
-  track.confidence = model.confidence[0];
-  model.frames.forEach((frame, k) => track.positions.set(frame, model.positions[0][k]));
+  model.frames.forEach((frame, k) => {
+    track.positions.set(frame, model.positions[0][k]);
+    track.confidence.set(frame, model.confidence[0][k]);
+  });
   view.draw();
   showTracks();
 }
@@ -362,7 +374,9 @@ function showTracks() {
   $("tracks").replaceChildren(...page.tracks.map((track) => {
     const key = node("span", { class: "key" });
     key.style.background = track.colour;
-    const words = track.gaussian === undefined ? "looking for the point" : `Gaussian ${track.gaussian}, ${track.positions.size} frames, confidence ${track.confidence.toFixed(2)}`;
+    const lowest = Math.min(...track.confidence.values());
+    const words = track.gaussian === undefined ? "looking for the point"
+      : `Gaussian ${track.gaussian} · ${track.positions.size} frames · confidence from ${lowest.toFixed(2)}`;
     return node("li", { "data-id": track.id }, key, node("span", {}, words),
       node("button", { type: "button", "aria-label": `Forget track ${track.name}`, onclick: () => forget(track) }, "×"));
   }));
@@ -417,14 +431,14 @@ $("live").addEventListener("click", () => {
 });
 $("clear").addEventListener("click", () => [...page.tracks].forEach(forget));
 document.addEventListener("keydown", (event) => {
-  if (event.target.matches("input, select, dialog *") || event.ctrlKey || event.altKey || event.metaKey || !page.stream) return;
+  if (event.target.matches("input:not([type=checkbox]), select, dialog *") || event.ctrlKey || event.altKey || event.metaKey || !page.stream) return;
   const modes = { 1: "colour", 2: "depth", 3: "parts", 4: "alpha" };
   if (modes[event.key]) setMode(modes[event.key]);
   else if (event.key === ",") stopPlaying(), stepBy(-1);
   else if (event.key === ".") stopPlaying(), stepBy(1);
   else if (event.key.toLowerCase() === "l") stopPlaying(), choose(null);
   else if (event.key.toLowerCase() === "c") lookFrom((Number($("from").value) + 1) % page.rig.cameras.length);
-  else if (event.key === " " && !event.target.matches("button")) play();
+  else if (event.key === " " && !event.target.matches("button, input")) play();
   else return;
   event.preventDefault();
 });

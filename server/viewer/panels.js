@@ -42,7 +42,7 @@ export function showQueue(box, words, status) {
   box.replaceChildren(...Array.from({ length: places }, (_, i) => node("span", { class: i < taken ? "taken" : "free" })));
   const full = status.queued >= status.queue_limit;
   words.textContent = status.queued
-    ? `${status.queued} of ${status.queue_limit} waiting${full ? ": full, senders are asked to wait" : ""}`
+    ? `${status.queued} of ${status.queue_limit} waiting or at work${full ? ": full, senders are asked to wait" : ""}`
     : `Empty; frame ${status.next_frame} is next`;
   box.classList.toggle("full", full);
 }
@@ -89,7 +89,8 @@ export function showCameras(body, summary, names, report, reports, lookFrom) {
     const found = report ? complaints(name, report, reports) : [];
     troubled += found.length > 0;
     const meter = node("span", { class: "meter" }, node("span", {}));
-    if (fit && fit.psnr !== null) meter.firstChild.style.width = `${Math.max(3, 100 * (fit.psnr - low) / (high - low))}%`;
+    const share = fit && fit.psnr !== null ? Math.max(0.03, (fit.psnr - low) / (high - low)) : 0;
+    meter.firstChild.style.width = `${100 * share}%`;
     const shift = fit?.colour_shift;
     const swatch = node("span", { class: "swatch", title: shift ? `red, green, blue: ${shift.map((v) => `${(100 * v).toFixed(1)} %`).join(", ")}` : "not measured" });
     // Around middle grey and ten times stronger: a shift of one hundredth can be seen.

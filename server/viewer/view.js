@@ -5,6 +5,7 @@ import { paintDepth } from "./colours.js";
 import { drawFrusta, drawTracks } from "./overlay.js";
 
 const SETTLE_MS = 220;
+const SLOW_MS = 1000;
 const TARGET_MS = 90;
 const CLICK_PX = 4;
 const EMPTY = [16, 19, 24];
@@ -16,7 +17,7 @@ const MODES = {
 };
 
 export class LiveView {
-  /** @param on { pick(u, v, camera, frame), shown(info), turned() } */
+  /** @param on { pick(u, v, camera, frame), shown(info), turned(), slow(mode) } */
   constructor(canvas, overlay, on) {
     this.canvas = canvas;
     this.overlay = overlay;
@@ -48,6 +49,7 @@ export class LiveView {
   close() {
     this.stream = null;
     clearTimeout(this.settle);
+    clearTimeout(this.slow);
     this.clear();
   }
 
@@ -103,6 +105,8 @@ export class LiveView {
     const camera = this.orbit.camera(width, height);
     const request = { camera, frame: this.frame, parts: this.mode === "parts" ? this.parts : null, ...MODES[this.mode] };
     this.asked.set(++this.tag, { camera, mode: this.mode, at: performance.now(), share });
+    clearTimeout(this.slow);
+    this.slow = setTimeout(() => this.stream && this.on.slow(this.mode), SLOW_MS);
     if (this.asked.size > 64) this.asked.delete(this.asked.keys().next().value);
     if (verb === "subscribe") this.stream.subscribe("view", "render", request, this.tag);
     else this.stream.update("view", request, this.tag);
@@ -128,6 +132,7 @@ export class LiveView {
     else context.drawImage(painted.bitmap, 0, 0);
     const milliseconds = first ? performance.now() - asked.at : null;
     if (first && head.missed === 0) this.adapt(milliseconds, asked.share);
+    if (head.tag === this.tag) clearTimeout(this.slow);
     this.shown = { camera: asked.camera, frame: head.frame, mode: asked.mode, tag: head.tag };
     this.draw();
     this.on.shown({ ...this.shown, milliseconds, width, height, near: painted.near, far: painted.far });

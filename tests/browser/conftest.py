@@ -1,0 +1,68 @@
+"""A headless browser of this machine: tests of the page are skipped, with the reason, where there is none."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.append(str(Path(__file__).parents[1] / "server"))
+sys.path.append(str(Path(__file__).parent))
+
+from running import Running, fake_settings
+from stage import FRAMES, push, start_scene
+
+from client.sdk import Client
+
+SIZE = {"width": 1280, "height": 800}
+
+
+def browser_path():
+    return os.environ.get("SCAS4D_TEST_BROWSER") or shutil.which("chromium") or shutil.which("google-chrome")
+
+
+@pytest.fixture(scope="session")
+def chromium():
+    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright for the tests of the page")
+    path = browser_path()
+    if path is None:
+        pytest.skip("no chromium here: apt-get install chromium, or name one in SCAS4D_TEST_BROWSER")
+    with playwright.sync_playwright() as started:
+        # As root, which containers often are, Chromium runs only without its own sandbox; it opens this service alone.
+        browser = started.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def page(chromium):
+    """A page on which nothing may go wrong unseen."""
+    opened = chromium.new_page(viewport=SIZE)
+    opened.set_default_timeout(20_000)
+    opened.faults = []
+    opened.on("pageerror", lambda error: opened.faults.append(str(error)))
+    opened.on("console", lambda message: opened.faults.append(message.text) if message.type == "error" else None)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(scope="session")
+def service(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("viewer")
+    running = Running(fake_settings(folder, engine="drawn:engine", max_render_pixels=2_000_000))
+    yield running
+    running.stop()
+
+
+@pytest.fixture(scope="session")
+def finished(service):
+    """A scene whose frames are all committed."""
+    with Client(service.url, patience=30) as sdk:
+        id = start_scene(sdk)
+        for index in range(FRAMES):
+            push(sdk, id, index)
+        sdk.wait(id, FRAMES - 1)
+        yield id

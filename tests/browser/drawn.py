@@ -1,0 +1,98 @@
+"""The fake engine with pictures: points drawn as discs; they depend on camera, frame and mode."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import fakes
+import numpy as np
+
+from scas4d_core.cameras import Camera, Rig
+
+COUNT = 24
+BUMPED_FROM = 5
+"""Frame from which the reports say that camera c2 was bumped."""
+
+
+def make_rig():
+    """Six cameras on a ring around the origin, z up, pictures 32 by 24."""
+    cameras = []
+    for number in range(6):
+        angle = 2 * np.pi * number / 6
+        eye = np.array([3 * np.cos(angle), 3 * np.sin(angle), 1.0])
+        z = -eye / np.linalg.norm(eye)
+        x = np.cross(z, [0, 0, 1])
+        x /= np.linalg.norm(x)
+        rotation = np.array([x, np.cross(z, x), z])
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
+        cameras.append(Camera(f"c{number}", np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]), pose, 32, 24))
+    return Rig(tuple(cameras))
+
+
+def positions():
+    """[COUNT, 3] on a spiral, so that no two views of it are the same."""
+    turn = np.linspace(0, 4 * np.pi, COUNT)
+    return np.stack([0.8 * np.cos(turn), 0.8 * np.sin(turn), np.linspace(-0.5, 0.7, COUNT)], axis=1)
+
+
+def colours():
+    return np.stack([np.linspace(0.2, 1, COUNT), np.linspace(1, 0.2, COUNT), np.full(COUNT, 0.5)], axis=1)
+
+
+class DrawnReconstruction(fakes.FakeReconstruction):
+    def commit(self, frame, dropped, notes):
+        fits = {
+            name: {"psnr": 32.0 + number, "colour_shift": [0.001, 0, 0]} for number, name in enumerate(frame.images)
+        }
+        if frame.index >= BUMPED_FROM:
+            fits["c2"] = {"psnr": 21.0, "colour_shift": [0.06, 0.01, -0.02]}
+        seconds = {"total": 0.8 + 0.1 * (frame.index % 3)}
+        more = {"cameras": fits, "psnr": 31.0 + np.sin(frame.index), "seconds": seconds}
+        return super().commit(frame, dropped, {**(notes or {}), **more})
+
+
+class DrawnReader(fakes.FakeReader):
+    def render(self, camera, index, *, background, labels=None):
+        inside = self.world.camera_to_inside(camera)
+        means = self.history.gaussians(index).means
+        uv, z = inside.project(means)
+        shape = (camera.height, camera.width)
+        depth = np.full(shape, np.nan, np.float32)
+        nearest = np.full(shape, -1)
+        rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
+        for number in np.argsort(-z):
+            if z[number] > 0:
+                disc = np.hypot(columns - uv[number, 0], rows - uv[number, 1]) < 0.09 * inside.fx / z[number]
+                depth[disc], nearest[disc] = z[number], number
+        met = nearest >= 0
+        colour = np.broadcast_to(np.array(background, np.float32), (*shape, 3)).copy()
+        colour[met] = colours()[nearest[met]]
+        parts = None
+        if labels is not None:
+            parts = np.where(met, np.asarray(labels)[np.maximum(nearest, 0)] + 1, 0).astype(np.uint8)
+        return SimpleNamespace(colour=colour, alpha=met.astype(np.float32), depth=depth, parts=parts)
+
+    def _depth(self, camera, index):
+        view = self.render(camera, index, background=(0, 0, 0))
+        return view.depth, view.alpha
+
+    def parts(self, count, previous=None):
+        return np.arange(COUNT) * (count or 3) // COUNT
+
+
+class DrawnEngine(fakes.FakeEngine):
+    def start(self, rig, frame, settings, *, points, **options):
+        made = super().start(rig, frame, settings, points=points, **options)
+        return DrawnReconstruction(made.points, made.history)
+
+    def resume(self, rig, settings, history, **options):
+        made = super().resume(rig, settings, history, **options)
+        return DrawnReconstruction(made.points, made.history, made.resumed)
+
+    def reader(self, rig, settings, history):
+        return DrawnReader(rig, history)
+
+
+def engine():
+    return DrawnEngine()

@@ -1,0 +1,287 @@
+"""The page in a real browser: what a person does, and what they then see."""
+
+from __future__ import annotations
+
+import base64
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+from running import Running, fake_settings
+from stage import FRAMES, push, start_scene
+
+from client.sdk import Client
+
+
+def opened(page, service, scene, frame=None):
+    page.goto(f"{service.url}/#scene={scene}" + ("" if frame is None else f"&frame={frame}"))
+    return page
+
+
+def shown(page, **wanted):
+    """Waits until the picture that is shown has these properties; the picture."""
+    tests = " && ".join(f"d.{name} === {value!r}" for name, value in wanted.items()) or "true"
+    page.wait_for_function(f"() => {{ const d = document.getElementById('view').dataset; return d.tag && ({tests}); }}")
+    return canvas(page)
+
+
+def until(page, condition):
+    """Waits until an expression is true; as a function, because the page's policy forbids to evaluate text."""
+    page.wait_for_function(f"() => {condition}")
+
+
+def canvas(page, id="picture"):
+    data = page.evaluate(f"document.getElementById({id!r}).toDataURL('image/png').split(',')[1]")
+    return np.array(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGBA")).astype(int)
+
+
+def rests(page, **wanted):
+    """The same, when a picture of full size is shown and nothing more comes."""
+    shown(page, **wanted)
+    before = None
+    for _ in range(50):
+        page.wait_for_timeout(300)
+        tag = page.evaluate("document.getElementById('view').dataset.tag")
+        if tag == before:
+            return canvas(page)
+        before = tag
+    raise AssertionError("pictures go on coming")
+
+
+def middle(page):
+    box = page.locator("#overlay").bounding_box()
+    return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+
+def drag(page, dx, dy):
+    x, y = middle(page)
+    page.mouse.move(x, y)
+    page.mouse.down()
+    for step in range(1, 6):
+        page.mouse.move(x + dx * step / 5, y + dy * step / 5)
+    page.mouse.up()
+
+
+def differs(one, other):
+    return one.shape != other.shape or np.abs(one - other).mean() > 0.5
+
+
+def test_a_scene_is_picked_and_shown_with_its_figures(page, service, finished):
+    page.goto(service.url)
+    page.select_option("#scenes", finished)
+    picture = shown(page, frame=str(FRAMES - 1), mode="colour")
+    assert picture[..., :3].max() > 100  # discs on black
+    assert page.locator("#state").inner_text() == "Ready"
+    assert f"{FRAMES} committed" in page.locator("#facts").inner_text()
+    assert page.locator("#psnr .dot").count() == FRAMES
+    assert page.locator("#seconds .bar").count() == FRAMES - 1
+    assert "frame 7 is next" in page.locator("#queue-words").inner_text()
+    assert page.locator("#curtain").is_hidden()
+    assert page.faults == []
+
+
+def test_dragging_turns_the_wheel_zooms_and_home_goes_back(page, service, finished):
+    opened(page, service, finished)
+    first = rests(page)
+    drag(page, 150, 0)
+    turned = rests(page)
+    assert differs(first, turned)
+    page.mouse.wheel(0, 400)
+    zoomed = rests(page)
+    assert (zoomed[..., :3].sum(-1) > 0).mean() < 0.8 * (turned[..., :3].sum(-1) > 0).mean()  # farther away: smaller
+    page.focus("#overlay")
+    page.keyboard.press("Shift+ArrowLeft")
+    assert differs(zoomed, rests(page))
+    page.keyboard.press("Home")
+    assert not differs(first, rests(page))
+    page.select_option("#from", "3")  # the other side of the ring
+    assert differs(first, rests(page))
+    assert page.faults == []
+
+
+def test_time_is_scrubbed_by_slider_keys_and_chart_and_followed_live(page, service, finished):
+    opened(page, service, finished)
+    newest = rests(page, frame=str(FRAMES - 1))
+    page.locator("#time").fill("0")
+    first = rests(page, frame="0")
+    assert differs(newest, first)
+    assert page.locator("#moment").inner_text().startswith("frame 0")
+    assert page.locator("#live").get_attribute("aria-pressed") == "false"
+    page.focus("#overlay")
+    page.keyboard.press(".")
+    shown(page, frame="1")
+    box = page.locator("#psnr").bounding_box()
+    page.mouse.click(box["x"] + 40 + 3.5 / 8 * (box["width"] - 46), box["y"] + 40)
+    shown(page, frame="3")
+    assert page.url.endswith("frame=3")
+    page.keyboard.press("l")
+    assert not differs(newest, rests(page, frame=str(FRAMES - 1)))
+    assert page.faults == []
+
+
+def test_depth_parts_and_coverage(page, service, finished):
+    opened(page, service, finished)
+    colour = rests(page, mode="colour")
+    page.click("#modes [data-mode=depth]")
+    depth = rests(page, mode="depth")
+    assert differs(colour, depth)
+    near, far = (float(page.locator(f"#{id}").inner_text()) for id in ("near", "far"))
+    assert 1.2 < near < far < 5  # the ring is three units wide
+    page.keyboard.press("3")
+    parts = rests(page, mode="parts")
+    assert len(np.unique(parts[..., :3].reshape(-1, 3), axis=0)) == 1 + 3  # the fake's rule
+    page.select_option("#part-count select", "5")
+    page.wait_for_timeout(300)
+    five = rests(page, mode="parts")
+    assert len(np.unique(five[..., :3].reshape(-1, 3), axis=0)) == 1 + 5
+    page.focus("#overlay")
+    page.keyboard.press("4")
+    alpha = rests(page, mode="alpha")
+    assert set(np.unique(alpha[..., :3])) == {0, 255}
+    assert page.faults == []
+
+
+def test_a_click_follows_a_point_and_nothing_is_said_where_there_is_none(page, service, finished):
+    opened(page, service, finished)
+    picture = rests(page)
+    rows, columns = np.nonzero(picture[..., :3].sum(-1) > 150)
+    pick = np.argsort(np.hypot(rows - rows.mean(), columns - columns.mean()))[0]
+    box = page.locator("#overlay").bounding_box()
+    at = [(columns[pick] + 0.5) / picture.shape[1], (rows[pick] + 0.5) / picture.shape[0]]
+    assert canvas(page, "overlay")[..., 3].max() == 0
+    page.mouse.click(box["x"] + at[0] * box["width"], box["y"] + at[1] * box["height"])
+    until(page, "document.getElementById('tracks').innerText.includes('7 frames')")
+    drawn = canvas(page, "overlay")[..., 3] > 0
+    assert drawn.sum() > 50
+    ys, xs = np.nonzero(drawn)
+    assert abs(xs - at[0] * drawn.shape[1]).min() < 6  # it begins where the click was
+    assert abs(ys - at[1] * drawn.shape[0]).min() < 6
+    page.mouse.click(box["x"] + 5, box["y"] + box["height"] - 5)  # the background
+    until(page, "document.getElementById('note').innerText.includes('no surface')")
+    assert page.locator("#tracks li").count() == 1
+    page.click("#tracks button")
+    assert page.locator("#tracks li").count() == 0
+    assert canvas(page, "overlay")[..., 3].max() == 0
+    page.check("#frusta")
+    page.focus("#overlay")
+    for _ in range(8):
+        page.keyboard.press("-")
+    rests(page)
+    assert (canvas(page, "overlay")[..., 3] > 0).sum() > 200  # the rig
+    assert page.faults == []
+
+
+def test_a_bumped_camera_shows(page, service, finished):
+    opened(page, service, finished)
+    shown(page, frame=str(FRAMES - 1))
+    until(page, "document.getElementById('camera-summary').innerText.includes('c2')")
+    row = page.locator("#cameras tr.bad")
+    assert row.count() == 1
+    assert row.locator("th").inner_text() == "c2"
+    assert "dB worse than before" in page.locator("#camera-summary").inner_text()
+    page.locator("#time").fill("3")  # before it was bumped
+    until(page, "document.querySelectorAll('#cameras tr.bad').length === 0")
+    assert page.faults == []
+
+
+def test_a_scene_from_its_first_frame_to_its_deletion(page, service, finished):
+    with Client(service.url, patience=30) as sdk:
+        id = start_scene(sdk, "young")
+        opened(page, service, id)
+        until(page, "document.querySelector('#curtain h2').innerText === 'Waiting for the first frame'")
+        assert page.locator("#time").is_disabled()
+        push(sdk, id, 0)
+        shown(page, frame="0")
+        push(sdk, id, 1)
+        shown(page, frame="1")  # followed live
+        push(sdk, id, 2, red=250)  # the fake raises: the frame is set aside
+        until(page, "document.getElementById('trouble').innerText.includes('Frame 2 was set aside')")
+        assert page.locator("#state").inner_text() == "Degraded"
+        assert page.locator("#psnr .fault").count() == 1
+        sdk.delete_scene(id)
+        until(page, "document.querySelector('#curtain h2').innerText === 'The scene is gone'")
+        assert page.locator("#curtain").is_visible()
+        page.select_option("#scenes", finished)
+        shown(page, frame=str(FRAMES - 1))
+    assert [fault for fault in page.faults if "404" not in fault] == []
+
+
+def test_it_connects_again_when_the_service_restarts(page, tmp_path):
+    settings = fake_settings(tmp_path, engine="drawn:engine")
+    service = Running(settings)
+    try:
+        with Client(service.url, patience=30) as sdk:
+            id = start_scene(sdk)
+            push(sdk, id, 0)
+            sdk.wait(id, 0)
+        opened(page, service, id)
+        shown(page, frame="0")
+        service.stop()
+        page.wait_for_selector("#banner:not([hidden])")
+        assert "connection to the service is lost" in page.locator("#banner").inner_text()
+        assert page.locator("#curtain").is_hidden()  # the last picture stays
+        service = Running(settings, service.port)
+        page.wait_for_selector("#banner[hidden]", state="attached")
+        with Client(service.url, patience=30) as sdk:
+            push(sdk, id, 1)
+        shown(page, frame="1")
+    finally:
+        service.stop()
+
+
+def test_without_a_scene_it_says_what_to_do(page, tmp_path):
+    service = Running(fake_settings(tmp_path, engine="drawn:engine"))
+    try:
+        page.goto(service.url)
+        until(page, "document.querySelector('#curtain').innerText.includes('scas4d push')")
+        assert page.faults == []
+    finally:
+        service.stop()
+
+
+def test_a_token_is_asked_for_and_the_stream_opens_with_a_ticket(page, tmp_path):
+    token = "a-token-that-is-long-enough"
+    service = Running(fake_settings(tmp_path, engine="drawn:engine", token=token))
+    try:
+        with Client(service.url, token=token, patience=30) as sdk:
+            id = start_scene(sdk)
+            push(sdk, id, 0)
+            sdk.wait(id, 0)
+        opened(page, service, id)
+        page.wait_for_selector("#door[open]")
+        page.fill("#token", "a-token-that-is-another-one")
+        page.click("#door button")
+        until(page, "document.getElementById('door-words').innerText.includes('does not know')")
+        page.fill("#token", token)
+        page.click("#door button")
+        shown(page, frame="0")
+        assert token not in page.url
+    finally:
+        service.stop()
+
+
+@pytest.mark.parametrize(("width", "height"), [(1600, 950), (700, 900), (420, 800)])
+def test_it_fits_the_window(page, service, finished, width, height):
+    page.set_viewport_size({"width": width, "height": height})
+    opened(page, service, finished)
+    shown(page)
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    box = page.locator("#view").bounding_box()
+    assert box["width"] > 0.5 * width
+    assert box["height"] > 0.4 * height
+    picture = rests(page)
+    assert picture.shape[1] / picture.shape[0] == pytest.approx(box["width"] / box["height"], rel=0.05)
+    assert page.faults == []
+
+
+def test_nothing_comes_from_elsewhere(page, service, finished):
+    asked = []
+    page.on("request", lambda request: asked.append(request.url))
+    response = page.goto(f"{service.url}/#scene={finished}")
+    policy = response.headers["content-security-policy"]
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    shown(page)
+    assert all(url.startswith((service.url, service.url.replace("http", "ws"), "blob:")) for url in asked)
+    assert page.faults == []
