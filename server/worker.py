@@ -157,20 +157,20 @@ class Worker:
                 raise FrameDamage(f"{name}: it holds other pictures than were acknowledged")
             encoded.update(pictures.images)
             encoded_masks.update(pictures.masks)
-        for name, data in encoded.items():
-            camera = self.spec.rig[name]
-            size = (camera.width, camera.height)
+        # In the order of the rig, whatever the order in which they came: the same pictures give the same bits.
+        for camera in self.spec.rig.cameras:
+            name, size = camera.name, (camera.width, camera.height)
+            if name not in encoded:
+                dropped[name] = "; ".join(faults) or f"camera {name!r} had sent nothing when the frame was closed"
+                continue
             try:
-                image = decode_image(bytes(data), size=size, name=f"image of camera {name!r}")
+                image = decode_image(bytes(encoded[name]), size=size, name=f"image of camera {name!r}")
                 if name in encoded_masks:
                     mask = bytes(encoded_masks[name])
                     masks[name] = decode_mask(mask, size=size, name=f"mask of camera {name!r}")
                 images[name] = image
             except ImageError as error:
                 dropped[name] = str(error)
-        for name in self.spec.rig.names:
-            if name not in encoded:
-                dropped[name] = "; ".join(faults) or f"camera {name!r} had sent nothing when the frame was closed"
         return Frame(message.index, message.time, images, masks), dropped
 
     def reconstruct(self, frame: Frame, dropped: dict[str, str]) -> Committed:

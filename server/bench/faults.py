@@ -255,6 +255,7 @@ def damaged_log(study: Study, expected: Mapping[int, str], cuts: int, flips: int
     for index in range(half, len(study.frames)):
         sender.send(index)
     service.kill()
+    service.stop()
     faults = list(sender.faults)
     dropped = 0
     for number in range(cuts + flips):

@@ -73,7 +73,8 @@ class Service:
             self._process = None
 
     def stop(self) -> None:
-        """Asks it to end, as Ctrl-C would."""
+        """Asks it to end, as Ctrl-C would; for good."""
+        self.http.close()
         if self._process is not None:
             self._process.send_signal(signal.SIGTERM)
             self._process.wait(60)

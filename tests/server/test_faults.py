@@ -1,0 +1,63 @@
+"""The fault table, reduced: the whole of it is `scas4d bench faults`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from scas4d_core.captures import open_capture
+from server.bench import faults
+
+HERE = Path(__file__).parent
+CAPTURE = HERE.parents[1] / "samples" / "robot"
+SHORT = {
+    "scene": {"image_scale": 0.125},
+    "static": {"iterations": 60, "max_gaussians": 600},
+    "update": {"iterations": 6},
+}
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    capture = open_capture(CAPTURE)
+    fake = {"SCAS4D_ENGINE": "fakes:engine", "PYTHONPATH": f"{HERE}:{HERE.parents[1]}", "FAKE_UPDATE_S": "0.1"}
+    frames = faults.encoded_frames(capture, 8)
+    return faults.Study(tmp_path_factory.mktemp("faults"), capture, frames, {}, fake)
+
+
+@pytest.fixture(scope="module")
+def expected(study):
+    return faults.undisturbed(study)
+
+
+def test_states_of_the_fake_depend_on_every_frame(expected):
+    assert len(set(expected[0].values())) == 8
+
+
+def test_kills(study, expected):
+    outcome = faults.kills(study, *expected, count=4, seed=1, told=lambda said: None)
+    assert outcome.faults == []
+
+
+def test_cuts_and_flipped_bytes(study, expected):
+    outcome = faults.damaged_log(study, expected[0], cuts=2, flips=2, seed=0, told=lambda said: None)
+    assert outcome.faults == []
+
+
+def test_a_full_disk(study, expected):
+    assert faults.full_disk(study, expected[0], told=lambda said: None).faults == []
+
+
+def test_kills_with_the_method_itself(tmp_path):
+    capture = open_capture(CAPTURE)
+    study = faults.Study(tmp_path, capture, faults.encoded_frames(capture, 4), SHORT, {})
+    expected, seconds = faults.undisturbed(study)
+    assert faults.kills(study, expected, seconds, count=2, seed=3, told=lambda said: None).faults == []
+
+
+def test_a_lost_frame_and_another_state_are_noticed():
+    assert faults.compare({0: "a", 1: "b"}, {0: "a", 1: "c", 2: "d"}) == [
+        "frames [2] are not committed",
+        "states [1] are not bit-identical",
+    ]

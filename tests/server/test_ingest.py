@@ -1,0 +1,308 @@
+"""Doors for frames beside the form: framed bytes, camera by camera, WebSocket; missing, skipped, kept."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+
+import fakes
+import pytest
+from running import make_rig, picture, pictures, problem
+from websockets.sync.client import connect
+
+from client.wire import FRAME_MEDIA_TYPE, RigModel, frame_chunks
+
+FRAMED = {"Content-Type": FRAME_MEDIA_TYPE}
+
+
+@pytest.fixture
+def make(http):
+    """Makes scenes with rules of ingest; deletes them."""
+    made = []
+
+    def scene(cameras=2, **ingest):
+        body = {"rig": RigModel.of(make_rig(cameras)).model_dump(mode="json"), "ingest": ingest}
+        answer = http.post("/v1/scenes", json={**body, "frames_per_second": 10})
+        assert answer.status_code == 201, answer.text
+        made.append(answer.json()["id"])
+        return made[-1]
+
+    yield scene
+    for id in made:
+        http.delete(f"/v1/scenes/{id}")
+
+
+def framed(index, images=None, masks=None, time=None, **more):
+    return b"".join(frame_chunks(index, pictures() if images is None else images, masks, time, **more))
+
+
+def put(http, id, index, images=None, **more):
+    return http.put(f"/v1/scenes/{id}/frames/{index}", content=framed(index, images, **more), headers=FRAMED)
+
+
+def put_camera(http, id, index, camera, data, **params):
+    return http.put(f"/v1/scenes/{id}/frames/{index}/cameras/{camera}", content=data, params=params)
+
+
+def status(http, id):
+    return http.get(f"/v1/scenes/{id}").json()
+
+
+def finished(http, id, index):
+    until = time.monotonic() + 30
+    while True:
+        report = http.get(f"/v1/scenes/{id}/frames/{index}").json()
+        if report.get("state") in ("committed", "set_aside", "missing", "skipped"):
+            return report
+        assert time.monotonic() < until, report
+        time.sleep(0.05)
+
+
+def test_a_form_and_framed_bytes_of_the_same_pictures_are_the_same_frame(http, make):
+    id = make()
+    first = put(http, id, 0)
+    assert first.status_code == 202
+    files = {name: (name, data) for name, data in pictures().items()}
+    again = http.put(f"/v1/scenes/{id}/frames/0", files=files)
+    assert (again.status_code, again.json()) == (202, first.json())
+    assert finished(http, id, 0)["used_cameras"] == ["c0", "c1"]
+
+
+def test_framed_bytes_that_are_none_are_refused_by_name(http, make):
+    id = make()
+    url = f"/v1/scenes/{id}/frames/0"
+    whole = framed(0)
+    for body in (b"", b"S4DF", b"PK\3\4 and more", whole[:-1], whole + b"\0", whole[:30]):
+        document = problem(http.put(url, content=body, headers=FRAMED), 422)
+        assert document["field"] == "body"
+        assert document["remedy"]
+    assert problem(http.put(url, content=framed(1), headers=FRAMED), 422)["field"] == "head.index"
+    assert problem(put(http, id, 0, {"c0": picture()}), 422)["field"] == "c1"
+    assert status(http, id)["next_frame"] == 0
+    assert status(http, id)["frames_held"] == 0
+
+
+def test_a_refused_upload_leaves_no_file(http, make, service):
+    id = make()
+    problem(put(http, id, 0, {"c0": picture(), "c1": picture()[:-9]}), 422)
+    problem(put(http, id, 4), 409)
+    folder = service.app.state.scenes[id].spec.frames
+    assert list(folder.iterdir()) == []
+
+
+def test_frames_that_come_side_by_side_are_taken_in_order(http, make, service):
+    id = make(queue_frames=50)
+    http.post(f"/v1/scenes/{id}/pause")
+    answers = {}
+
+    def send(index):
+        import httpx
+
+        with httpx.Client(base_url=service.url, timeout=30) as own:
+            answer = put(own, id, index)
+            while answer.status_code == 409:  # its sender is ahead of the one before
+                answer = put(own, id, index)
+            answers[index] = answer.status_code
+
+    threads = [threading.Thread(target=send, args=(index,)) for index in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert answers == dict.fromkeys(range(6), 202)
+    assert status(http, id)["next_frame"] == 6
+
+
+def test_a_frame_of_parts_closes_when_all_cameras_are_in(http, make):
+    id = make()
+    first = put_camera(http, id, 0, "c0", picture(1))
+    assert first.status_code == 202, first.text
+    assert (first.json()["received"], first.json()["absent"], first.json()["frame"]) == (["c0"], ["c1"], None)
+    assert http.get(f"/v1/scenes/{id}/frames/0").json()["state"] == "open"
+    assert status(http, id)["open_frames"] == [0]
+    assert put_camera(http, id, 0, "c0", picture(1)).json() == first.json()
+    assert problem(put_camera(http, id, 0, "c0", picture(2)), 409)["field"] == "c0"
+    assert problem(put_camera(http, id, 0, "c7", picture(2)), 422)["field"] == "c"
+    assert problem(put_camera(http, id, 0, "c1", picture()[:-9]), 422)["field"] == "c1"
+    assert problem(put(http, id, 0), 409)["received"] == ["c0"]
+    last = put_camera(http, id, 0, "c1", picture(3)).json()
+    assert last["absent"] == []
+    # The same pictures as a whole frame have the same identity.
+    whole = put(http, id, 0, {"c0": picture(1), "c1": picture(3)})
+    assert (whole.status_code, whole.json()) == (202, last["frame"])
+    assert finished(http, id, 0)["state"] == "committed"
+    assert put_camera(http, id, 0, "c1", picture(3)).json()["frame"] == last["frame"]
+    assert problem(put_camera(http, id, 0, "c1", picture(4)), 409)["field"] == "c1"
+
+
+def test_a_camera_may_be_ahead_and_frames_close_in_order(http, make):
+    id = make()
+    for index in range(3):
+        assert put_camera(http, id, index, "c0", picture(index), time=index / 4).status_code == 202
+    assert put_camera(http, id, 1, "c1", picture()).json()["frame"] is None
+    assert status(http, id)["next_frame"] == 0
+    assert put_camera(http, id, 0, "c1", picture()).json()["frame"]["time"] == 0
+    assert finished(http, id, 1)["time"] == 0.25
+    assert status(http, id)["open_frames"] == [2]
+    assert problem(put_camera(http, id, 99, "c0", picture()), 409)["expected"] == 2
+    assert problem(put_camera(http, id, 2, "c1", picture(), time=0.75), 422)["field"] == "time"
+
+
+def test_masks_of_parts(http, make):
+    id = make(1)
+    assert put_camera(http, id, 0, "c0", picture(1), kind="mask").json()["received"] == []
+    assert put_camera(http, id, 0, "c0", picture()).json()["frame"] is not None
+    body = framed(1, {"c0": picture()}, {"c0": picture(1)}, part=True)
+    answer = http.put(f"/v1/scenes/{id}/frames/1/cameras/c0", content=body, headers=FRAMED)
+    assert answer.json()["frame"]["index"] == 1
+
+
+def test_a_frame_is_closed_on_request_down_to_the_minimum(http, make):
+    id = make(4)  # the minimum is 2
+    problem(http.post(f"/v1/scenes/{id}/frames/0/close"), 404)
+    put_camera(http, id, 0, "c0", picture())
+    assert problem(http.post(f"/v1/scenes/{id}/frames/0/close"), 409)["received"] == ["c0"]
+    put_camera(http, id, 0, "c2", picture())
+    closed = http.post(f"/v1/scenes/{id}/frames/0/close")
+    assert closed.status_code == 202
+    assert http.post(f"/v1/scenes/{id}/frames/0/close").json() == closed.json()
+    report = finished(http, id, 0)
+    assert (report["state"], report["used_cameras"]) == ("committed", ["c0", "c2"])
+    assert sorted(report["dropped_cameras"]) == ["c1", "c3"]
+    assert problem(put_camera(http, id, 0, "c1", picture()), 409)["field"] == "c1"
+
+
+def test_a_frame_is_closed_at_its_deadline(http, make):
+    id = make(2, part_seconds=0.3)
+    put_camera(http, id, 0, "c1", picture())
+    report = finished(http, id, 0)
+    assert (report["state"], report["used_cameras"]) == ("committed", ["c1"])
+
+
+def test_fewer_cameras_than_the_minimum_set_the_frame_aside(http, make):
+    id = make(2, part_seconds=0.2, minimum_cameras=2)
+    put_camera(http, id, 0, "c1", picture())
+    report = finished(http, id, 0)
+    assert (report["state"], report["error"]) == (
+        "set_aside",
+        "1 cameras' pictures are left, the scene's minimum is 2",
+    )
+    assert put(http, id, 1).status_code == 202  # and the next one starts the scene
+    assert finished(http, id, 1)["state"] == "committed"
+
+
+def test_a_frame_is_declared_missing_for_ever(http, make):
+    id = make()
+    url = f"/v1/scenes/{id}/frames"
+    put(http, id, 0)
+    assert problem(http.post(f"{url}/2/missing"), 409)["expected"] == 1
+    declared = http.post(f"{url}/1/missing", json={"reason": "cable"})
+    assert (declared.json()["state"], declared.json()["error"]) == ("missing", "cable")
+    assert http.post(f"{url}/1/missing", json={"reason": "other"}).json() == declared.json()
+    assert "missing" in problem(put(http, id, 1), 409)["detail"]
+    assert problem(http.post(f"{url}/0/missing"), 409)["expected"] == 2
+    put(http, id, 2)
+    report = finished(http, id, 2)
+    assert (report["state"], report["time"]) == ("committed", 0.2)  # by time, not by count
+    assert status(http, id)["missing"] == 1
+
+
+def test_a_scene_may_skip_to_the_newest(http, make):
+    id = make(queue_frames=2, when_full="skip")
+    put(http, id, 0)
+    finished(http, id, 0)
+    http.post(f"/v1/scenes/{id}/pause")
+    for index in range(1, 6):
+        assert put(http, id, index).status_code == 202
+    http.post(f"/v1/scenes/{id}/resume")
+    assert finished(http, id, 5)["state"] == "committed"
+    states = [http.get(f"/v1/scenes/{id}/frames/{index}").json()["state"] for index in range(6)]
+    assert states == ["committed", "skipped", "skipped", "skipped", "skipped", "committed"] or states == [
+        "committed", "skipped", "skipped", "skipped", "committed", "committed",
+    ]  # fmt: skip
+    assert status(http, id)["skipped"] == states.count("skipped")
+    assert put(http, id, 2).status_code == 202  # the same again: the same answer
+
+
+def test_a_paused_scene_takes_frames_and_reconstructs_none(http, make):
+    id = make(queue_frames=3)
+    assert http.post(f"/v1/scenes/{id}/pause").json()["state"] == "paused"
+    put(http, id, 0)
+    time.sleep(0.3)
+    assert (status(http, id)["state"], status(http, id)["queued"]) == ("paused", 1)
+    assert http.post(f"/v1/scenes/{id}/resume").json()["paused"] is False
+    assert finished(http, id, 0)["state"] == "committed"
+
+
+def wait_for(condition):
+    until = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def test_retention_deletes_pictures_and_states_and_says_so(http, make, service):
+    id = make(queue_frames=8, keep_frames={"last": 3}, keep_states={"last": 2})
+    receipts = []
+    for index in range(7):
+        receipts.append(put(http, id, index).json())
+        finished(http, id, index)
+    wait_for(lambda: status(http, id)["frames_held"] == 3 and status(http, id)["states_deleted"] == 4)
+    reports = [http.get(f"/v1/scenes/{id}/frames/{index}").json() for index in range(7)]
+    assert [report["held"] for report in reports] == [False] * 4 + [True] * 3
+    assert [report["deleted"] for report in reports] == [False, True, True, True, True, False, False]
+    assert len(list(service.app.state.scenes[id].spec.frames.iterdir())) == 3
+    # What a frame was is known for ever.
+    assert put(http, id, 1).json() == receipts[1]
+    assert problem(put(http, id, 1, pictures(9)), 409)["identity"] == receipts[1]["identity"]
+    assert "retention" in problem(http.get(f"/v1/scenes/{id}/render?frame=2"), 404)["detail"]
+    assert http.get(f"/v1/scenes/{id}/render?frame=0").status_code == 200
+
+
+def test_nothing_uncommitted_is_deleted(http, make):
+    id = make(queue_frames=8, keep_frames={"last": 0})
+    http.post(f"/v1/scenes/{id}/pause")
+    for index in range(4):
+        put(http, id, index)
+    time.sleep(0.2)
+    assert status(http, id)["frames_held"] == 4
+    http.post(f"/v1/scenes/{id}/resume")
+    finished(http, id, 3)
+    wait_for(lambda: status(http, id)["frames_held"] == 1)  # the newest may have to be done again
+    assert status(http, id)["frame_bytes"] > 0
+
+
+def test_frames_over_a_websocket(http, make, service):
+    id = make(queue_frames=8)
+    with connect(f"{service.url.replace('http', 'ws')}/v1/scenes/{id}/ingest") as socket:
+
+        def say(data):
+            socket.send(data)
+            return json.loads(socket.recv())
+
+        first = say(framed(0))
+        assert (first["index"], first["status"], first["receipt"]["index"]) == (0, 202, 0)
+        assert say(framed(0)) == first
+        assert (say(framed(5))["status"], say(b"rubbish")["status"]) == (409, 422)
+        bad = say(framed(1, {"c0": picture()[:-9], "c1": picture()}))
+        assert (bad["status"], bad["problem"]["field"]) == (422, "c0")
+        part = say(framed(1, {"c0": picture()}, part=True))
+        assert part["receipt"]["absent"] == ["c1"]
+        assert say(framed(1, {"c1": picture()}, part=True))["receipt"]["frame"]["index"] == 1
+        socket.send("text")
+        with pytest.raises(Exception, match="1003"):
+            socket.recv()
+    assert finished(http, id, 1)["state"] == "committed"
+    with connect(f"{service.url.replace('http', 'ws')}/v1/scenes/none/ingest") as socket:
+        socket.send(framed(0))
+        assert json.loads(socket.recv())["status"] == 404
+
+
+def test_a_frame_that_raises_keeps_its_reason(http, make):
+    id = make()
+    put(http, id, 0)
+    finished(http, id, 0)
+    put(http, id, 1, pictures(fakes.RAISES))
+    assert "told to raise" in finished(http, id, 1)["error"]
+    assert status(http, id)["set_aside"] == 1
