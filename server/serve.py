@@ -37,6 +37,7 @@ def serve(settings: ServerSettings) -> None:
         proxy_headers=False,  # what a client says about itself is not believed
         timeout_graceful_shutdown=max(1, round(settings.stop_seconds)),
         ws_max_size=int(settings.max_body_mb * 1e6),
+        ws_per_message_deflate=False,  # pictures are compressed already: a hundred subscribers would cost a core
     )
     # uvicorn ends gracefully and then raises the signal again, for whoever called it: here that is nobody, and the
     # process ends with status 0.

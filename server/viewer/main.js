@@ -201,7 +201,8 @@ function redraw() {
   // The first frame takes minutes and would flatten all others; it is told in words.
   const first = reports.find((one) => one.state === "committed");
   const updates = reports.filter((one) => one !== first);
-  seconds.set(updates.map((one) => ({ index: one.index, value: one.seconds?.total ?? null, fault: one.state !== "committed" })));
+  seconds.set(reports.map((one) => ({ index: one.index, fault: one.state !== "committed",
+    value: one === first ? null : one.seconds?.total ?? null })));
   const times = updates.map((one) => one.seconds?.total).filter((value) => value !== undefined).sort((a, b) => a - b);
   $("figures").textContent = first
     ? `First frame ${(first.seconds?.total ?? 0).toFixed(1)} s` + (times.length ? `; updates ${times[times.length >> 1].toFixed(2)} s in the middle, ${times.at(-1).toFixed(2)} s at most` : "")
