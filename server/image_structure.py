@@ -14,7 +14,14 @@ _SCAN_END = re.compile(rb"\xff(?![\x00\xd0-\xd7\xff])(?=[\x00-\xff])", re.DOTALL
 
 
 class StructureError(ValueError):
-    """Not a whole picture of a kind that is taken: the message names the fault and the remedy."""
+    """Not a whole picture of a kind that is taken: the message names the fault and, behind a semicolon, the remedy.
+
+    `value` is what was found; None where it is the file as a whole.
+    """
+
+    def __init__(self, message: str, value: str | None = None) -> None:
+        super().__init__(message)
+        self.value = value
 
 
 @dataclass(frozen=True)
@@ -72,7 +79,9 @@ def _jpeg(data: memoryview) -> ImageHeader:
                 raise StructureError("a JPEG with a short frame header; the file is damaged: send it again")
             bits, height, width, channels = struct.unpack(">BHHB", data[at + 4 : at + 10])
             if bits != 8 or channels not in (1, 3):
-                raise StructureError(f"a JPEG of {channels} channels of {bits} bits; send RGB or grey of 8 bits")
+                kind = "CMYK, " if channels == 4 else ""
+                value = f"{kind}{channels} channels of {bits} bits"
+                raise StructureError(f"a JPEG of {value}; send RGB or grey of 8 bits", value)
             header = ImageHeader("jpeg", width, height)
             components = channels if marker in (0xC0, 0xC1) else 0
         at += 2 + length
@@ -110,8 +119,12 @@ def _png(data: memoryview) -> ImageHeader:
             if kind != b"IHDR" or length != 13:
                 raise StructureError("a PNG that does not begin with its header; the file is damaged: send it again")
             header = ImageHeader("png", *struct.unpack(">II", data[at + 8 : at + 16]))
+            if data[at + 16] == 16:
+                raise StructureError(
+                    "a PNG of 16 bits a channel; send 8 bits: you choose how they are scaled", "16 bits"
+                )
         if kind == b"acTL":
-            raise StructureError("an animated PNG; send one picture a file")
+            raise StructureError("an animated PNG; send one picture a file", "animated")
         pixels |= kind == b"IDAT"
         if kind == b"IEND":
             break
@@ -132,7 +145,7 @@ def _webp(data: memoryview) -> ImageHeader:
         if len(body) < length or at + 8 + length > size:
             raise _truncated("WebP", len(data))
         if kind in (b"ANIM", b"ANMF"):
-            raise StructureError("an animated WebP; send one picture a file")
+            raise StructureError("an animated WebP; send one picture a file", "animated")
         if kind == b"VP8X" and length >= 10:
             width, height = int.from_bytes(body[4:7], "little") + 1, int.from_bytes(body[7:10], "little") + 1
             header = ImageHeader("webp", width, height)

@@ -68,9 +68,8 @@ def check_picture(rig: Rig, file: FrameFile, data: memoryview) -> None:
         header = walk(data)
     except StructureError as error:
         fault = str(error)
-        raise Problem(
-            422, f"{field}: {fault}", field=field, value=f"{len(data)} bytes", remedy=fault.rpartition("; ")[2]
-        ) from None
+        value = error.value or f"{len(data)} bytes"
+        raise Problem(422, f"{field}: {fault}", field=field, value=value, remedy=fault.rpartition("; ")[2]) from None
     if (header.width, header.height) != (camera.width, camera.height):
         raise Problem(
             422,

@@ -42,9 +42,10 @@ def recover(folder: Path, scene: str) -> Recovered:
     sizes = stored(frames)
     facts: list[Fact] = []
     if told.damage:
-        for fact in _found(frames, sorted(_unnamed(ledger, sizes)), ledger):
-            facts.append(fact)
-            damage.append(f"frame {fact.index}: the journal does not name its record any more; taken as it was found")
+        facts.extend(_found(frames, sorted(_unnamed(ledger, sizes)), ledger))
+    if facts:
+        found = ", ".join(dict.fromkeys(str(fact.index) for fact in facts if isinstance(fact, Taken | PartTaken)))
+        damage.append(f"the journal does not name the records of frames {found} any more; taken as they were found")
     debris = _unnamed(ledger, sizes)
     remove(frames, debris)
     sizes = {name: size for name, size in sizes.items() if name not in debris}
@@ -52,16 +53,13 @@ def recover(folder: Path, scene: str) -> Recovered:
     facts += ledger.reconcile(indices, damaged)
     for index, entry in ledger.frames.items():
         lost = [name for name in entry.files if name not in sizes]
-        if not lost:
-            continue
-        if entry.report.state == FrameState.QUEUED:
-            reason = f"its record is gone from the frame log: {', '.join(lost)}"
-            gone = SetAside(index=index, reason=reason)
-            damage.append(f"frame {index}: {reason}")
-            ledger.apply(gone)
-            facts.append(gone)
         entry.files = tuple(name for name in entry.files if name in sizes)
         entry.report.held = bool(entry.files)
+        if entry.report.state == FrameState.QUEUED and (reason := _unusable(frames, entry.files, lost)):
+            damage.append(f"frame {index}: {reason}")
+            gone = SetAside(index=index, reason=reason)
+            ledger.apply(gone)
+            facts.append(gone)
     return Recovered(ledger, told.good, facts, sizes, damage)
 
 
@@ -92,6 +90,18 @@ def _found(folder: Path, names: list[str], ledger: Ledger) -> Iterator[Taken | P
         if fact is not None and alone:
             ledger.apply(fact)
             yield fact
+
+
+def _unusable(folder: Path, files: tuple[str, ...], lost: list[str]) -> str | None:
+    """Why a frame that waits cannot be reconstructed. Of several records, one a camera, the worker leaves those out."""
+    if lost:
+        return f"its record is gone from the frame log: {', '.join(lost)}"
+    if len(files) == 1:
+        try:
+            read_pictures(folder, files[0])
+        except FrameDamage as error:
+            return f"its record in the frame log is damaged: {error}"
+    return None
 
 
 def _whole(index: int, name: str, pictures: Pictures, ledger: Ledger) -> Taken | None:
