@@ -228,3 +228,46 @@ def ingest(
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text + "\n")
+
+
+@app.command()
+def views(
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; short ones are repeated.")],
+    rate: Annotated[
+        list[float] | None, typer.Option(min=0.1, help="Views a second, default 1, 5 and 20. May be repeated.")
+    ] = None,
+    updates: Annotated[int, typer.Option(min=1, help="A turn, without views and with.")] = 8,
+    turns: Annotated[int, typer.Option(min=1, help="Of each rate.")] = 3,
+    width: Annotated[int, typer.Option(min=1, help="Of a view, in pixels.")] = 256,
+    work: Annotated[Path, typer.Option(help="Folder for the service's data; what is there goes.")] = Path("out/views"),
+    out: Annotated[Path | None, typer.Option(help="Write the table here, as Markdown.")] = None,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="A setting of the scene, as static.iterations=500."),
+    ] = None,
+    engine: Annotated[str | None, typer.Option(help="module:function instead of the method itself.")] = None,
+) -> None:
+    """Measures live views beside updates: latency under an open-loop load, and what it costs the updates.
+
+    Example: scas4d bench views captures/robot
+    """
+    from client.overrides import overrides
+    from scas4d_core.captures import open_capture
+    from server.bench import views as of_views
+
+    rows = of_views.measure(
+        open_capture(capture),
+        work.resolve(),
+        rates=rate or (1, 5, 20),
+        updates=updates,
+        turns=turns,
+        width=width,
+        settings=overrides(changes or []),
+        environment={} if engine is None else {"SCAS4D_ENGINE": engine},
+        told=typer.echo,
+    )
+    text = of_views.page(rows, capture.name, width, updates, turns)
+    typer.echo(text)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(text)
