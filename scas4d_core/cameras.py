@@ -51,6 +51,10 @@ class Camera:
                 raise CameraError(f"camera {self.name!r}: {field} holds NaN or infinity; give finite numbers")
             value.setflags(write=False)
             object.__setattr__(self, field, value)
+        with np.errstate(over="ignore", invalid="ignore"):  # numbers near the largest are no rotation either
+            self._check()
+
+    def _check(self) -> None:
         k, r = self.intrinsics, self.rotation
         if k[0, 0] <= 0 or k[1, 1] <= 0:
             raise CameraError(f"camera {self.name!r}: focal lengths {k[0, 0]:g}, {k[1, 1]:g} must be positive pixels")
@@ -58,7 +62,7 @@ class Camera:
             raise CameraError(
                 f"camera {self.name!r}: intrinsics must be [[fx,0,cx],[0,fy,cy],[0,0,1]]; undo skew first"
             )
-        if np.abs(r @ r.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(r) < 0:
+        if not np.abs(r @ r.T - np.eye(3)).max() <= ROTATION_TOLERANCE or np.linalg.det(r) < 0:
             raise CameraError(
                 f"camera {self.name!r}: world_to_camera[:3,:3] is no rotation "
                 f"(determinant {np.linalg.det(r):.4g}); give world-to-camera with OpenCV axes"

@@ -165,6 +165,16 @@ def _of_framework(request: Request, status: int, detail: str, headers: Mapping[s
     )
 
 
+def plain_tuples(schema: Any) -> None:
+    """Tuples of one kind as arrays of a fixed length: what reads documents knows `items` better than `prefixItems`."""
+    for part in schema.values() if isinstance(schema, dict) else schema if isinstance(schema, list) else ():
+        plain_tuples(part)
+    if isinstance(schema, dict) and schema.get("prefixItems") and "items" not in schema:
+        kinds = schema["prefixItems"]
+        if isinstance(kinds, list) and all(kind == kinds[0] for kind in kinds):
+            schema["items"] = schema.pop("prefixItems")[0]
+
+
 def document(app: FastAPI) -> dict[str, Any]:
     """The OpenAPI document, with what FastAPI does not know: the media type of errors, and the token."""
     if app.openapi_schema is None:
@@ -176,6 +186,8 @@ def document(app: FastAPI) -> dict[str, Any]:
                         operation["responses"][str(status)]["content"] = {MEDIA_TYPE: {"schema": PROBLEM}}
                 if path == "/health/live":
                     operation["security"] = []
+        for schema in written.get("components", {}).get("schemas", {}).values():
+            plain_tuples(schema)
         schemes = written.setdefault("components", {}).setdefault("securitySchemes", {})
         schemes["bearer"] = {"type": "http", "scheme": "bearer", "description": "Where the service has a token."}
         written["security"] = [{"bearer": []}]

@@ -1,0 +1,89 @@
+"""Writes the tables of settings into docs/operations.md and docs/settings.md, from the fields themselves.
+
+python scripts/settings_pages.py            # writes
+python scripts/settings_pages.py --check    # says whether they are up to date
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from scas4d_core.settings import Settings
+from server.settings import PREFIX, ServerSettings
+
+DOCS = Path(__file__).parent.parent / "docs"
+BEGIN, END = "<!-- settings: written by scripts/settings_pages.py -->", "<!-- end of settings -->"
+
+
+def cell(value: object) -> str:
+    """Text that stays one cell of a table."""
+    return str(value).replace("|", "\\|").replace("\n", " ")
+
+
+def default(field: FieldInfo) -> str:
+    """As it would be written."""
+    value: Any = field.get_default(call_default_factory=True)
+    if value is PydanticUndefined:
+        return "required"
+    if value is None or value == ():
+        return "–"
+    if isinstance(value, tuple):
+        return f"{len(value)} of them" if isinstance(value[0], BaseModel) else ", ".join(map(str, value))
+    return f"`{str(value).lower() if isinstance(value, bool) else value}`"
+
+
+def server_table() -> str:
+    """Of the service."""
+    rows = ["| `SCAS4D_…`, in TOML in lower case | default | |", "|---|---|---|"]
+    for name, field in ServerSettings.model_fields.items():
+        rows.append(f"| `{name.upper()}` | {default(field)} | {cell(field.description)} |")
+    assert PREFIX == "SCAS4D_"
+    return "\n".join(rows)
+
+
+def method_rows(model: type[BaseModel], path: str = "") -> Iterator[str]:
+    """Of the method, nested names with dots."""
+    for name, field in model.model_fields.items():
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            yield from method_rows(inner, f"{path}{name}.")
+        else:
+            yield f"| `{path}{name}` | {default(field)} | {cell(field.description or '')} |"
+
+
+def method_table() -> str:
+    """Of the method."""
+    return "\n".join(["| setting | default | |", "|---|---|---|", *method_rows(Settings)])
+
+
+def written(page: Path, table: str) -> str:
+    """The page with its table anew."""
+    before, _, rest = page.read_text().partition(BEGIN)
+    _, _, after = rest.partition(END)
+    return f"{before}{BEGIN}\n\n{table}\n\n{END}{after}"
+
+
+def main() -> None:
+    """Writes, or checks."""
+    stale = []
+    for name, table in (("operations.md", server_table()), ("settings.md", method_table())):
+        page = DOCS / name
+        text = written(page, table)
+        if text != page.read_text():
+            stale.append(name)
+            if "--check" not in sys.argv:
+                page.write_text(text)
+    if "--check" in sys.argv and stale:
+        raise SystemExit(f"docs/{', docs/'.join(stale)}: not up to date; run python scripts/settings_pages.py")
+    print("written: " + ", ".join(stale) if stale else "up to date")
+
+
+if __name__ == "__main__":
+    main()
