@@ -10,7 +10,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from server.messages import Answer, Query
+from server.messages import Answer, Query, RenderQuery
 
 KEPT_ANSWERS = 64
 KEPT_BYTES = 32_000_000
@@ -47,8 +47,13 @@ def fingerprint(value: Any) -> Hashable:
     return hashable
 
 
+def lane(query: Query) -> str:
+    """Views are short and somebody is looking; trajectories and parts take longer and must not stand before them."""
+    return "views" if isinstance(query, RenderQuery) and "parts" not in query.kinds else "bulk"
+
+
 class Desk:
-    """Asks the reader, `turns` questions at a time, and keeps the last answers for those who come a moment later.
+    """Asks the reader, `turns` questions of a lane at a time; keeps the last answers for those who come a moment later.
 
     Whoever waits for a turn makes up the question when the turn has come: a camera that was moved meanwhile is asked
     for where it is now. Turns are given in the order of waiting, so nobody is starved by one who asks faster.
@@ -56,7 +61,7 @@ class Desk:
 
     def __init__(self, ask: Ask, turns: int) -> None:
         self._ask = ask
-        self._turns = asyncio.Semaphore(turns)
+        self._turns = {"views": asyncio.Semaphore(turns), "bulk": asyncio.Semaphore(turns)}
         self._working: dict[Hashable, asyncio.Future[Answer]] = {}
         self._kept: OrderedDict[Hashable, Answer] = OrderedDict()
         self._bytes = 0
@@ -70,17 +75,20 @@ class Desk:
             Problem: what `question` or the scene raises.
         """
         asked = question()
-        if not self._known(asked.key):
-            await self._turns.acquire()
+        while not self._known(asked.key):
+            turns = self._turns[lane(asked.query)]
+            await turns.acquire()
             begun = False
             try:
-                asked = question()
-                if not self._known(asked.key):
-                    self._begin(asked.key, asked.query)
+                now = question()
+                # Another kind of question by now: it has its own turns to wait for.
+                if not self._known(now.key) and self._turns[lane(now.query)] is turns:
+                    self._begin(now.key, now.query, turns)
                     begun = True
+                asked = now
             finally:
                 if not begun:
-                    self._turns.release()
+                    turns.release()
         if asked.key in self._kept:
             self._kept.move_to_end(asked.key)
             return asked, self._kept[asked.key]
@@ -90,9 +98,9 @@ class Desk:
     def _known(self, key: Hashable) -> bool:
         return key in self._kept or key in self._working
 
-    def _begin(self, key: Hashable, query: Query) -> None:
+    def _begin(self, key: Hashable, query: Query, turns: asyncio.Semaphore) -> None:
         def done(task: asyncio.Future[Answer]) -> None:
-            self._turns.release()
+            turns.release()
             del self._working[key]
             if not task.cancelled() and task.exception() is None:
                 self._keep(key, task.result())

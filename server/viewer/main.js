@@ -10,6 +10,7 @@ import { LiveView } from "./view.js";
 const LIST_EVERY_MS = 4000;
 const PLAY_FPS = 8;
 const MOST_TRACKS = 12;
+const PICK_PX = 320;
 const NOTE_MS = 6000;
 const $ = (id) => document.getElementById(id);
 
@@ -89,7 +90,7 @@ async function openScene(id) {
     scene: (message) => showStatus(message.status),
     frame: (message) => finished(message.report, message.missed),
     bulk,
-    error: (message) => note(message.problem.detail, message.id),
+    error: failed,
     gone,
   });
   page.stream.subscribe("scene", "scene");
@@ -333,6 +334,22 @@ function note(words, id = null) {
 
 // Tracks.
 
+function failed(message) {
+  const track = page.tracks.find((one) => one.id === message.id);
+  if (track && !track.positions.size) forget(track);
+  note(message.problem.detail, track ? null : message.id);
+}
+
+/** The same view in a smaller picture: where a point can be seen is found from depth pictures of this size. */
+function smaller(camera) {
+  const ratio = Math.min(1, PICK_PX / Math.max(camera.width, camera.height));
+  const [width, height] = [Math.round(camera.width * ratio), Math.round(camera.height * ratio)];
+  const [sx, sy] = [width / camera.width, height / camera.height];
+  const k = camera.intrinsics;
+  const intrinsics = [[k[0][0] * sx, 0, k[0][2] * sx], [0, k[1][1] * sy, k[1][2] * sy], k[2]];
+  return { camera: { ...camera, width, height, intrinsics }, sx, sy };
+}
+
 function pick(u, v, camera, frame) {
   if (!page.stream) return;
   if (page.tracks.length >= MOST_TRACKS) forget(page.tracks[0]);
@@ -340,7 +357,8 @@ function pick(u, v, camera, frame) {
   const used = new Set(page.tracks.map((track) => track.colour));
   const colour = TRACKS.find((one) => !used.has(one)) ?? TRACKS[page.picks % TRACKS.length];
   page.tracks.push({ id, colour, name: page.picks, positions: new Map(), confidence: new Map() });
-  page.stream.subscribe(id, "tracks", { pixels: [[u, v]], camera, at: frame }, page.picks);
+  const small = smaller(camera);
+  page.stream.subscribe(id, "tracks", { pixels: [[u * small.sx, v * small.sy]], camera: small.camera, at: frame }, page.picks);
   showTracks();
 }
 

@@ -15,7 +15,7 @@ from client.wire.stream import STREAM_PROTOCOL, Subscribed, unpack
 from server.desk import Desk, fingerprint
 from server.feeds import RenderFeed
 from server.mailbox import UNSENT_REPLIES, Mailbox
-from server.messages import Answer, RenderQuery
+from server.messages import Answer, PartsQuery, RenderQuery
 from server.problems import Problem
 from server.settings import ServerSettings
 
@@ -82,6 +82,24 @@ def test_no_more_than_so_many_questions_are_with_the_reader_and_nobody_is_passed
             assert reader.asked == asked
             await reader.answer()
         await asyncio.gather(*tasks)
+
+    run(test())
+
+
+def test_trajectories_and_parts_do_not_stand_before_views():
+    async def test():
+        reader = Reader()
+        desk = Desk(reader, 1)
+        camera = make_rig().cameras[0]
+        view = RenderQuery(camera, 0, ("colour",), "png", (0.0, 0.0, 0.0))
+        queries = [PartsQuery(2), PartsQuery(3), view]
+        tasks = [asyncio.create_task(desk.answer(question(query))) for query in queries]
+        await settle()
+        assert reader.asked == [queries[0], view]  # one of each lane
+        for _ in queries:
+            await reader.answer()
+        await asyncio.gather(*tasks)
+        assert reader.asked == [queries[0], view, queries[1]]
 
     run(test())
 
