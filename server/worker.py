@@ -24,6 +24,8 @@ from server.messages import Broken, Committed, FrameReady, Progressed, Ready, Sc
 
 PROGRESS_EVERY_S = 0.2
 PARENT_EVERY_S = 0.5
+NICE = 5
+"""Added to the worker's niceness: requests and views go ahead of updates (docs/live-views.md: what that is worth)."""
 STALL_S, LONGEST_STALL_S = 1.0, 30.0
 
 log = logging.getLogger("scas4d.worker")
@@ -32,6 +34,7 @@ log = logging.getLogger("scas4d.worker")
 def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     """Runs until told to stop, or until the service is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the service says when to stop
+    os.nice(NICE)
     threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
     # A service that was killed leaves a worker in the middle of an update: two must not commit to one history.
     lock = FolderLock(spec.folder / "worker.lock", wait=True)
