@@ -15,6 +15,7 @@ import shutil
 import signal
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,7 +33,7 @@ from server.journal import read_journal
 
 AGAIN_S = 0.05
 KILLS_OF_A_WORKER_AT_A_FRAME = 4
-"""The sixth sets a frame aside, as it should: the study stays below."""
+"""The sixth sets a frame aside, as it should: the study stays below, and kills again when the next is at work."""
 
 Files = tuple[dict[str, bytes], dict[str, bytes]]
 Told = Callable[[str], None]
@@ -187,9 +188,8 @@ def kills(study: Study, expected: Mapping[int, str], update_s: float, count: int
     moments: dict[int, list[str]] = {}
     while sum(map(len, moments.values())) < count:
         index, victim = random_.randrange(len(study.frames)), random_.choice(("worker", "service"))
-        before = moments.setdefault(index, [])
-        if victim == "service" or before.count("worker") < KILLS_OF_A_WORKER_AT_A_FRAME:
-            before.append(victim)
+        moments.setdefault(index, []).append(victim)
+    killed: Counter[int] = Counter()
     service = study.service("kills")
     service.start()
     scene = study.create(service)
@@ -205,7 +205,7 @@ def kills(study: Study, expected: Mapping[int, str], update_s: float, count: int
                     service.kill()
                     service.start()
                 else:
-                    _kill_worker(service, scene)
+                    _kill_worker(service, scene, killed)
                 done[victim] += 1
                 told(f"killed the {victim} at frame {index}: {sum(done.values())} of {count}")
             thread.join()
@@ -225,16 +225,20 @@ def kills(study: Study, expected: Mapping[int, str], update_s: float, count: int
         service.stop()
 
 
-def _kill_worker(service: Service, scene: str) -> None:
-    """As soon as there is one: after a death it is away for a moment."""
+def _kill_worker(service: Service, scene: str, killed: Counter[int]) -> None:
+    """As soon as there is one (after a death it is away for a moment) and its frame has not had its share of kills."""
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
+        status = service.status(scene)
+        at_work = status.next_frame - status.queued
         pid = service.worker_pid(scene)
-        if pid is not None:
+        if pid is not None and killed[at_work] < KILLS_OF_A_WORKER_AT_A_FRAME:
+            killed[at_work] += 1
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
             return
         time.sleep(AGAIN_S)
+    raise StudyError("there was no worker to kill")
 
 
 def damaged_log(study: Study, expected: Mapping[int, str], cuts: int, flips: int, seed: int, told: Told) -> Outcome:

@@ -1,0 +1,141 @@
+"""What a scene's door takes next, and how it refuses what it does not take."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from client.wire import FrameReceipt, FrameState
+from server.facts import Fact, Skipped
+from server.ledger import LOST
+from server.problems import Problem
+
+if TYPE_CHECKING:
+    from server.scene import Scene
+
+
+class Admission:
+    """The rules of one scene's door. Nothing here changes anything."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+
+    def time_of(self, index: int, time: float | None) -> float:
+        """Seconds of a frame: as given, or by the scene's frame rate."""
+        return index / self._scene.request.frames_per_second if time is None else time
+
+    def again(self, index: int, identity: str) -> FrameReceipt:
+        """The receipt of a frame that is known, if it has the same content; else 409."""
+        entry = self._scene.frames[index]
+        if entry.receipt is None or entry.receipt.identity != identity:
+            state = entry.report.state
+            known = "known with other content or another time"
+            if entry.receipt is None:
+                known = "declared missing" if state == FrameState.MISSING else f"{state}: {entry.report.error or LOST}"
+            raise Problem(
+                409,
+                f"frame {index} is {known}",
+                field="n",
+                value=index,
+                remedy=f"send the next frame, {self._scene.next_frame}; what was acknowledged does not change",
+                expected=self._scene.next_frame,
+                identity=entry.report.identity,
+            )
+        return entry.receipt
+
+    def admit(self, index: int, seconds: float | None) -> None:
+        """Refuses a frame that cannot be the next; `seconds` None leaves its time unjudged."""
+        scene = self._scene
+        self.refuse_if_failed()
+        if index != scene.next_frame:
+            raise self.gap(index)
+        if index in scene.ledger.open:
+            raise Problem(
+                409,
+                f"frame {index} is being sent camera by camera",
+                field="n",
+                value=index,
+                remedy=f"send the other cameras, or close it: POST /v1/scenes/{scene.id}/frames/{index}/close",
+                received=scene.ledger.open[index].cameras,
+            )
+        if seconds is not None:
+            self.check_time(index, seconds)
+        if not self.room():
+            raise self.full(index)
+
+    def refuse_if_failed(self) -> None:
+        """409 for a scene that cannot go on."""
+        scene = self._scene
+        if scene.ledger.fatal is not None:
+            raise Problem(
+                409,
+                f"the scene has failed: {scene.ledger.fatal}",
+                field="id",
+                value=scene.id,
+                remedy="delete the scene and create it anew",
+                state=scene.state,
+            )
+
+    def gap(self, index: int) -> Problem:
+        """409 with the index expected."""
+        expected = self._scene.next_frame
+        return Problem(
+            409,
+            f"frame {index} would leave a gap: frame t is found from frame t−1",
+            field="n",
+            value=index,
+            remedy=f"send frame {expected} first, or declare it missing: POST …/frames/{expected}/missing",
+            expected=expected,
+        )
+
+    def check_time(self, index: int, seconds: float) -> None:
+        """422 for a time that is not after the last one."""
+        before = self._scene.ledger.last_time()
+        if not (math.isfinite(seconds) and (before is None or seconds > before)):
+            raise Problem(
+                422,
+                f"the time of frame {index} is not after that of the frame before it",
+                field="time",
+                value=seconds,
+                remedy="give finite seconds" if before is None else f"give seconds above {before:g}",
+            )
+
+    def room(self) -> bool:
+        """Whether the queue takes one more, if need be by skipping."""
+        scene = self._scene
+        if scene.queued < scene.queue_limit:
+            return True
+        return scene.rules.when_full == "skip" and bool(scene.ledger.waiting())
+
+    def full(self, index: int) -> Problem:
+        """429 with Retry-After, about as long as an update takes."""
+        scene = self._scene
+        wait = min(60, max(1, math.ceil(scene.last_seconds)))
+        return Problem(
+            429,
+            f"{scene.queued} frames wait already",
+            field="n",
+            value=index,
+            remedy=f"send the same frame again in {wait} s",
+            headers={"Retry-After": str(wait)},
+            queued=scene.queued,
+        )
+
+    def skips(self, index: int) -> list[Fact]:
+        """What has to be skipped to make room for a frame."""
+        scene = self._scene
+        if scene.queued < scene.queue_limit:
+            return []
+        return [Skipped(frames=tuple(scene.ledger.waiting()), by=index)]
+
+    def never_taken(self, index: int) -> Problem:
+        """409 for a frame that is finished and never had pictures."""
+        report = self._scene.frames[index].report
+        return Problem(
+            409,
+            f"frame {index} is {report.state}: {report.error}",
+            field="n",
+            value=index,
+            remedy=f"send frame {self._scene.next_frame}",
+            expected=self._scene.next_frame,
+        )
