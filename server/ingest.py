@@ -89,7 +89,7 @@ class Ingest:
                 raise AssertionError(f"frame {head.index} was not written")
             fact = Taken(index=head.index, time=seconds, identity=identity, files=(received.file,))
             await self._append(*self.rules.skips(head.index), fact)
-            scene.sizes[received.file] = received.size
+            scene.held.add(received.file, received.size)
             received.kept = True
             metrics.INGEST_BYTES.inc(received.size)
             metrics.FRAMES.labels("acknowledged").inc()
@@ -166,8 +166,7 @@ class Ingest:
             await self._append(Missing(index=index, reason=reason or "declared missing"))
             self._open.forget(index)
             if parts is not None:
-                for name in parts.files:
-                    scene.sizes.pop(name, None)
+                scene.held.discard(parts.files)
                 await asyncio.to_thread(remove, scene.spec.frames, parts.files)
             report = scene.frames[index].report
         scene.finished(report)

@@ -92,7 +92,7 @@ class OpenFrames:
                 assert received.file is not None
                 fact = PartTaken(index=index, time=head.time, camera=camera, file=received.file, hashes=kinds)
                 await self._append(fact)
-                scene.sizes[received.file] = received.size
+                scene.held.add(received.file, received.size)
                 received.kept = True
                 metrics.INGEST_BYTES.inc(received.size)
                 self._set_deadline(index)

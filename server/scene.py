@@ -25,7 +25,8 @@ from server.placement import Ended, Placement, Process
 from server.problems import Problem
 from server.readers import Readers
 from server.recovery import Recovered
-from server.retention import deletable
+from server.retention import Held, deletable
+from server.scene_status import state_of, status_of
 from server.settings import ServerSettings
 from server.supervision import Supervision, given_up
 
@@ -66,7 +67,7 @@ class Scene:
             server.engine, folder, self.rig, definition.settings, self.minimum_cameras, self.rules.keep_states
         )
         self.ledger = found.ledger
-        self.sizes = found.sizes
+        self.held = Held(found.sizes)
         self.damage = found.damage
         self.journal = Journal(folder / JOURNAL_FILE, found.good)
         self.supervision = Supervision()
@@ -75,7 +76,7 @@ class Scene:
         self.gaussians: int | None = None
         self.last_seconds = 1.0
         self.door = asyncio.Lock()
-        self._trouble: str | None = None
+        self.trouble: str | None = None
         """Why the scene is degraded: the last frame's, or that of the worker or the disk."""
         self._at_work: int | None = None
         self._ready = False
@@ -121,56 +122,21 @@ class Scene:
     @property
     def error(self) -> str | None:
         """Why the scene is failed or degraded."""
-        return self.ledger.fatal or self._trouble
+        return self.ledger.fatal or self.trouble
+
+    @property
+    def at_work(self) -> bool:
+        """Whether the worker has a frame."""
+        return self._at_work is not None and self._ready
 
     @property
     def state(self) -> SceneState:
         """Where the scene is; see `SceneStatus`."""
-        if self.ledger.fatal is not None:
-            return SceneState.FAILED
-        if self._at_work is not None and self._ready:
-            started = self.committed or self.ledger.states_deleted
-            return SceneState.UPDATING if started else SceneState.INITIALISING
-        if self.ledger.paused:
-            return SceneState.PAUSED
-        if self._trouble is not None:
-            return SceneState.DEGRADED
-        if not self.ledger.frames and not self.ledger.open:
-            return SceneState.AWAITING
-        return SceneState.READY
+        return state_of(self)
 
     def status(self) -> SceneStatus:
         """The scene as it is now."""
-        ledger = self.ledger
-        return SceneStatus(
-            id=self.id,
-            name=self.request.name,
-            state=self.state,
-            error=self.error,
-            progress=self.progress,
-            cameras=list(self.rig.names),
-            has_points=self.points_sha256 is not None,
-            next_frame=ledger.next_frame,
-            queued=ledger.unfinished,
-            queue_limit=self.queue_limit,
-            committed=len(ledger.committed),
-            first_committed=ledger.committed[0] if ledger.committed else None,
-            last_committed=ledger.committed[-1] if ledger.committed else None,
-            gaussians=self.gaussians,
-            paused=ledger.paused,
-            open_frames=sorted(ledger.open),
-            set_aside=ledger.counts[FrameState.SET_ASIDE],
-            missing=ledger.counts[FrameState.MISSING],
-            skipped=ledger.counts[FrameState.SKIPPED],
-            worker_deaths=self.supervision.deaths,
-            frames_held=len(self.sizes),
-            frame_bytes=sum(self.sizes.values()),
-            states_deleted=ledger.states_deleted,
-            damage=self.damage,
-            created=self.created.isoformat(),
-            ingest=self.rules,
-            settings=self.spec.settings.model_dump(mode="json"),
-        )
+        return status_of(self)
 
     def camera(self, name: str) -> Camera:
         """A camera of the rig by name."""
@@ -270,7 +236,7 @@ class Scene:
                 )
                 self.background(self._set_aside(fact))
             case Stalled():
-                self._trouble = f"frame {message.index} waits for room on the disk: {message.reason}"
+                self.trouble = f"frame {message.index} waits for room on the disk: {message.reason}"
                 self._tell(SceneChanged())
             case Broken():
                 self.ledger.fatal = f"what is committed cannot be gone on from: {message.reason}"
@@ -301,7 +267,7 @@ class Scene:
         self._fill(message.index, message.report)
         report = self.frames[message.index].report
         dropped = report.dropped_cameras
-        self._trouble = (
+        self.trouble = (
             f"frame {message.index} was committed without " + "; ".join(dropped.values()) if dropped else None
         )
         self._questions.refresh()
@@ -320,10 +286,10 @@ class Scene:
         await self._write(fact)
         self.ledger.apply(fact)
         self._at_work, self.progress = None, None
-        self._trouble = f"frame {fact.index} was set aside: {fact.reason}"
+        self.trouble = f"frame {fact.index} was set aside: {fact.reason}"
         if fact.fatal:
             await self._fail_those_that_wait(fact)
-        log.warning("scene %s: %s", self.id, self._trouble)
+        log.warning("scene %s: %s", self.id, self.trouble)
         self._tell(FrameFinished(self.frames[fact.index].report))
         self.work()
         await self.ingest.close_what_can_be()
@@ -350,12 +316,11 @@ class Scene:
 
     async def retain(self) -> None:
         """Deletes pictures from the frame log by the scene's rule."""
-        gone = deletable(self.ledger, self.sizes, self.rules.keep_frames)
+        gone = deletable(self.ledger, self.held, self.rules.keep_frames)
         if not gone:
             return
         names = [name for index in gone for name in self.frames[index].files]
-        for name in names:
-            self.sizes.pop(name, None)
+        self.held.discard(names)
         fact = FramesDeleted(frames=tuple(gone))
         self.ledger.apply(fact)
         self._tell(SceneChanged())
@@ -371,7 +336,7 @@ class Scene:
             except OSError as error:
                 if not no_room(error):
                     raise
-                self._trouble = f"the journal waits for room on the disk: {error}"
+                self.trouble = f"the journal waits for room on the disk: {error}"
                 self._tell(SceneChanged())
                 await asyncio.sleep(AGAIN_S)
 
@@ -387,8 +352,8 @@ class Scene:
             return
         metrics.RESTARTS.labels("worker").inc()
         own, delay = self.supervision.died(reason.exit_code)
-        self._trouble = f"the worker is gone: {reason}; it is started again in {delay:g} s"
-        log.error("scene %s: %s", self.id, self._trouble)
+        self.trouble = f"the worker is gone: {reason}; it is started again in {delay:g} s"
+        log.error("scene %s: %s", self.id, self.trouble)
         self.background(self._after_death(str(reason), own, delay))
 
     async def _after_death(self, reason: str, own: bool, delay: float) -> None:
