@@ -395,7 +395,7 @@ function showTracks() {
     key.style.background = track.colour;
     const lowest = Math.min(...track.confidence.values());
     const words = track.gaussian === undefined ? "looking for the point"
-      : `Gaussian ${track.gaussian} · ${track.positions.size} frames · confidence from ${lowest.toFixed(2)}`;
+      : `#${track.gaussian} · ${track.positions.size} frames · confidence ≥ ${lowest.toFixed(2)}`;
     return node("li", { "data-id": track.id }, key, node("span", {}, words),
       node("button", { type: "button", "aria-label": `Forget track ${track.name}`, onclick: () => forget(track) }, "×"));
   }));

@@ -230,10 +230,15 @@ export class LiveView {
       else this.orbit.turn(0.08 * x, -0.08 * y);
     } else if (event.key === "+" || event.key === "=") this.orbit.zoom(0.9);
     else if (event.key === "-") this.orbit.zoom(1 / 0.9);
+    else if (event.key.toLowerCase() === "t") this.pickMiddle();
     else if (event.key === "Home" || event.key === "0") this.orbit.from(this.rig[0]);
     else return;
     event.preventDefault();
     this.moved();
+  }
+
+  pickMiddle() {
+    if (this.shown) this.on.pick(this.shown.camera.width / 2, this.shown.camera.height / 2, this.shown.camera, this.shown.frame);
   }
 
   click(event) {
