@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import logging
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 
 from scas4d_core.cameras import Camera, Rig
@@ -9,6 +14,34 @@ from scas4d_core.captures import Frame, InitialPoints
 from scas4d_core.settings import Settings
 
 SIZE, BALL_M = 32, 0.4
+
+log = logging.getLogger("scas4d.kernels")
+
+
+def marker() -> Path | None:
+    """The file that says that this version's kernels are in the cache for this processor; None where there is none."""
+    import numba
+    from llvmlite import binding
+
+    from scas4d_core.kernels import jit  # noqa: F401  (names the cache's folder)
+
+    folder = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+    return Path(folder) / f"warm-{binding.get_host_cpu_name()}" if folder else None
+
+
+def warm_up_elsewhere() -> None:
+    """`warm_up` in a process of its own, unless the cache has the kernels already.
+
+    A kernel that a process has compiled and the same one loaded from the cache differ in the last bits (seen in
+    ``project``: products and sums are fused at other places). Results have to be the same in every process that takes
+    a scene up, so none computes with what it compiled itself.
+    """
+    mark = marker()
+    if mark is None or mark.exists():
+        return
+    program = [sys.executable, "-c", "from scas4d_core.warm_up import warm_up; warm_up()"]
+    if subprocess.run(program, stdin=subprocess.DEVNULL).returncode != 0:
+        log.warning("kernels could not be compiled beforehand; states may differ in last bits after a restart")
 
 
 def warm_up() -> None:
@@ -30,6 +63,9 @@ def warm_up() -> None:
         reconstruction.render(camera)
         reconstruction.tracks_of_pixels(camera, np.array([[SIZE / 2, SIZE / 2]]), 0, [0, 1])
         reconstruction.parts(2)
+    mark = marker()
+    if mark is not None:
+        mark.touch()
 
 
 def _rig() -> Rig:

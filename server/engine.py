@@ -106,8 +106,11 @@ class CoreEngine:
         dropped: Mapping[str, str] | None = None,
         notes: Mapping[str, Any] | None = None,
     ) -> Reconstruction:
-        """`Reconstruction.start`."""
+        """`Reconstruction.start`, with kernels from the cache: the same bits in every process."""
         from scas4d_core.reconstruction import Reconstruction
+        from scas4d_core.warm_up import warm_up_elsewhere
+
+        warm_up_elsewhere()
 
         return Reconstruction.start(
             rig, frame, settings, points=points, progress=progress, history=history, dropped=dropped, notes=notes
@@ -116,8 +119,11 @@ class CoreEngine:
     def resume(
         self, rig: Rig, settings: Any, history: History, *, held: Callable[[int], bool] = lambda index: True
     ) -> Reconstruction:
-        """`Reconstruction.resume`."""
+        """`Reconstruction.resume`, with kernels from the cache."""
         from scas4d_core.reconstruction import Reconstruction
+        from scas4d_core.warm_up import warm_up_elsewhere
+
+        warm_up_elsewhere()
 
         return Reconstruction.resume(rig, settings, history, held=held)
 
