@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 _SCAN_END = re.compile(rb"\xff(?![\x00\xd0-\xd7\xff])(?=[\x00-\xff])", re.DOTALL)
 
@@ -26,11 +26,13 @@ class StructureError(ValueError):
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What the header declares: format "jpeg", "png" or "webp", and the size in pixels."""
+    """What the file declares: format "jpeg", "png" or "webp", and the size in pixels."""
 
     format: str
     width: int
     height: int
+    exif: bool = False
+    """A JPEG has a segment of EXIF metadata, which may say that the picture is to be turned."""
 
 
 def walk(data: bytes | memoryview) -> ImageHeader:
@@ -58,7 +60,7 @@ def _truncated(kind: str, size: int) -> StructureError:
 
 
 def _jpeg(data: memoryview) -> ImageHeader:
-    at, header, components = 2, None, 0
+    at, header, components, exif = 2, None, 0, False
     while True:
         while bytes(data[at : at + 2]) == b"\xff\xff":  # fill bytes
             at += 1
@@ -84,6 +86,7 @@ def _jpeg(data: memoryview) -> ImageHeader:
                 raise StructureError(f"a JPEG of {value}; send RGB or grey of 8 bits", value)
             header = ImageHeader("jpeg", width, height)
             components = channels if marker in (0xC0, 0xC1) else 0
+        exif |= marker == 0xE1 and bytes(data[at + 4 : at + 10]) == b"Exif\0\0"
         at += 2 + length
         if marker == 0xDA:
             # The one scan of a sequential picture is followed by the end only, and holds no end marker itself: where
@@ -93,7 +96,7 @@ def _jpeg(data: memoryview) -> ImageHeader:
             at = _end_of_scan(data, at)
     if header is None:
         raise StructureError("a JPEG without a frame header; the file is damaged: send it again")
-    return header
+    return replace(header, exif=exif)
 
 
 def _end_of_scan(data: memoryview, at: int) -> int:
