@@ -96,11 +96,25 @@ def _kmeans(points: NDArray[np.float64], count: int, seed: int) -> Int:
 
 
 def _merge(points: NDArray[np.float64], labels: Int, count: int) -> Int:
-    """[M] labels after agglomerative merging of the clusters' mean positions to ``count`` clusters."""
+    """[M] labels after merging the clusters' mean positions to ``count`` clusters.
+
+    Agglomerative (the paper), then evened out: K-means among the merged clusters, started from what was merged, gives
+    a cluster at the border of two parents to the nearer one. Still nested, and rounder: what was merged first stays
+    merged otherwise, however badly the rest then fits.
+    """
     present = int(labels.max()) + 1
     if count >= present:
         return labels
-    sums = np.stack([np.bincount(labels, weights=points[:, k], minlength=present) for k in range(3)], axis=1)
-    centroids = sums / np.bincount(labels, minlength=present)[:, None]
-    parents: Int = AgglomerativeClustering(count).fit_predict(centroids).astype(np.int64)
-    return parents[labels]
+    counts = np.bincount(labels, minlength=present).astype(np.float64)
+    centroids = _means(points, labels, present)
+    merged: Int = AgglomerativeClustering(count).fit_predict(centroids).astype(np.int64)
+    model = KMeans(count, init=_means(points, merged[labels], count), n_init=1, max_iter=KMEANS_ROUNDS)
+    parents: Int = model.fit(centroids, sample_weight=counts).labels_.astype(np.int64)
+    return np.unique(parents, return_inverse=True)[1][labels]
+
+
+def _means(points: NDArray[np.float64], labels: Int, count: int) -> NDArray[np.float64]:
+    """[count, 3] mean position of each cluster; none is empty."""
+    sums = np.stack([np.bincount(labels, weights=points[:, k], minlength=count) for k in range(3)], axis=1)
+    means: NDArray[np.float64] = sums / np.bincount(labels, minlength=count)[:, None]
+    return means

@@ -1,4 +1,4 @@
-"""Which Gaussians move, read from the pictures where no mask says it.
+"""Which Gaussians move: read from the pictures where no mask says it, and settled where the masks leave a few standing.
 
 A pixel has changed where it differs from the frame before. A Gaussian moves when most of the cameras that see it see it
 in changed pixels: the background behind the new place of an object has changed for some cameras, but not for most.
@@ -28,6 +28,21 @@ IN_CHANGE = 0.5
 """Share of a Gaussian's weight in changed pixels from which a camera says that it moves."""
 MAJORITY = 0.5
 """Share of the cameras with a say that have to say so; and at least two."""
+
+STANDING_SHARE = 0.1
+"""Share of standing Gaussians from which a scene has something that stands; below, their labels are noise."""
+
+
+def settled(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians of frame 0 with labels that can be relied on.
+
+    The few Gaussians of an object that no mask taught would stay behind when it moves, and hide it. In a cluster that
+    does not move they stand just as well.
+    """
+    standing = int((~gaussians.moving).sum())
+    if not 0 < standing < STANDING_SHARE * len(gaussians):
+        return gaussians
+    return gaussians.replace(foreground=np.where(gaussians.moving, gaussians.foreground, np.float32(1)))
 
 
 def changed_pixels(before: Array, now: Array) -> Array:

@@ -10,6 +10,7 @@ PRESETS: dict[str, Settings] = {
     "dynamic3dgs": Settings(
         update=UpdateSettings(
             clusters=(),
+            own_start=0.0,
             rate_rotation=0.001,
             rate_scale=0.0,
             rate_end=1.0,
@@ -18,7 +19,7 @@ PRESETS: dict[str, Settings] = {
             rate_colour_standing=0.0025,
             momentum=1.0,
             cold_start=1.0,
-            weights=Weights(mask=3.0, mask_alone=3.0, scale=0.0),
+            weights=Weights(mask=3.0, mask_alone=3.0, isometry=2.0, scale=0.0),
         )
     ),
 }

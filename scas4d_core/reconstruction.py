@@ -27,7 +27,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import build_hierarchy
 from scas4d_core.history import History, HistoryError
 from scas4d_core.initial_points import initial_points
-from scas4d_core.motion_labels import moving_between
+from scas4d_core.motion_labels import moving_between, settled
 from scas4d_core.neighbours import build_neighbours
 from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.rasterize.limits import scene_limits
@@ -186,6 +186,7 @@ class Reconstruction(Committed):
         self = cls._of(rig, settings, History() if history is None else history)
         began = perf_counter()
         result = static or self._fit_static(rig, self._scaled(frame), points, progress or (lambda _: None))
+        result = replace(result, gaussians=settled(result.gaussians))
         fitted = perf_counter()
         self.static = result
         self._exposures = result.exposures

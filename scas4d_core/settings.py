@@ -113,7 +113,9 @@ class Weights(Model):
         "edges pull it off.",
     )
     rigidity: NotNegative = Field(4.0, description="Dynamic3DGaussians; with image 1, the paper's 0.19 to 0.05.")
-    isometry: NotNegative = Field(2.0, description="Likewise.")
+    isometry: NotNegative = Field(
+        6.0, description="Three times the authors': it ties distances and lets bend, and only helps."
+    )
     rotation: NotNegative = Field(4.0, description="Likewise.")
     scale: NotNegative = Field(10.0, description="Likewise, the paper's 0.48 to 0.05.")
     floor: NotNegative = Field(2.0, description="Dynamic3DGaussians; only where the scene names a floor.")
@@ -134,11 +136,21 @@ class UpdateSettings(Model):
     layer_rates: tuple[LayerRates, ...] = Field(
         (
             LayerRates(rotation=0.04, translation=0.008, scaling=0.002),
-            LayerRates(rotation=0.005, translation=0.001, scaling=0.002),
-            LayerRates(rotation=0.001, translation=0.0002, scaling=0.002),
+            LayerRates(rotation=0.01, translation=0.002, scaling=0.002),
+            LayerRates(rotation=0.002, translation=0.0004, scaling=0.002),
         ),
         min_length=1,
         description="One per layer, coarse to fine; with more layers the last is repeated.",
+    )
+    layer_starts: tuple[Annotated[float, Field(ge=0, lt=1)], ...] = Field(
+        (0.0, 0.2, 0.4),
+        min_length=1,
+        description="Share of the iterations after which a layer begins to learn, one per layer, coarse to fine; with "
+        "more layers the last is repeated. The coarse motion is found first: all at once, the finer layers take a part "
+        "of it, each cluster another.",
+    )
+    own_start: float = Field(
+        0.4, ge=0, lt=1, description="The same for what each Gaussian adds to its clusters: Δp, ΔR, Δs."
     )
     cold_start: float = Field(
         2.0, ge=1, description="Factor on the layers' rates where there is no motion to start from: further to go."

@@ -40,21 +40,31 @@ class Stopwatch:
 
 
 class Adam:
-    """Adam over one table of parameters, with a rate per column, times one per row where given."""
+    """Adam over one table of parameters, with a rate per column, times one per row where given.
 
-    def __init__(self, parameters: Array, columns: list[float], rates: Rates, by_row: Array = EVERY_ROW) -> None:
+    It begins after a share ``start`` of the iterations and leaves the table alone before.
+    """
+
+    def __init__(
+        self, parameters: Array, columns: list[float], rates: Rates, start: float = 0.0, by_row: Array = EVERY_ROW
+    ) -> None:
         self._parameters = parameters
         self._by_row = by_row
         self._first, self._second = np.zeros_like(parameters), np.zeros_like(parameters)
+        self._plan, self._start = rates, start
         self._rates = np.array(columns, np.float32)
         self._beta1, self._beta2 = np.float32(rates.beta1), np.float32(rates.beta2)
+        self._steps = 0
 
-    def step(self, gradients: Array, number: int, factor: float) -> None:
-        """Step ``number`` (from 1), all rates times ``factor``."""
-        rates = self._rates * np.float32(factor)
+    def step(self, gradients: Array, iteration: int, iterations: int) -> None:
+        """Take the step of an iteration, counted from 0."""
+        factor = self._plan.factor(iteration, iterations, self._start)
+        if factor == 0:
+            return
+        self._steps += 1
         adam(
-            self._parameters, gradients, self._first, self._second, rates, self._by_row, self._beta1, self._beta2,
-            number,
+            self._parameters, gradients, self._first, self._second, self._rates * np.float32(factor), self._by_row,
+            self._beta1, self._beta2, self._steps,
         )  # fmt: skip
 
 
@@ -168,9 +178,8 @@ class FrameUpdate:
             loss += soft
             g_colours = gradients.features[:, :3] + g_soft
             tables = [*deformation.cluster_gradients, deformation.delta_gradients, g_colours]
-            factor = self._rates.factor(iteration, settings.iterations)
             for optimizer, table in zip(optimizers, tables, strict=True):
-                optimizer.step(table, iteration + 1, factor)
+                optimizer.step(table, iteration, settings.iterations)
             losses.append(loss)
             watch.lap("adam")
         deformation.forward()
@@ -184,11 +193,14 @@ class FrameUpdate:
         rates, deformation = self._rates.hurried(self.settings.cold_start if cold else 1.0), self._deformation
         columns = [[r] * 3 + [t] * 3 + [scaling] * 4 for r, t, scaling in rates.layers]
         columns.append([rates.position] * 3 + [rates.rotation] * 3 + [rates.scale] * 3)
+        starts = [rates.start_of(layer) for layer in range(len(rates.layers))] + [rates.start]
         tables = [*deformation.clusters, deformation.deltas]
-        optimizers = [Adam(table, given, rates) for table, given in zip(tables, columns, strict=True)]
+        optimizers = [
+            Adam(table, given, rates, start) for table, given, start in zip(tables, columns, starts, strict=True)
+        ]
         by_row = np.full(len(colours), rates.colour_standing, np.float32)
         by_row[self.hierarchy.rows] = rates.colour
-        return [*optimizers, Adam(colours, [1.0] * 3, rates, by_row)]
+        return [*optimizers, Adam(colours, [1.0] * 3, rates, by_row=by_row)]
 
     def _neighbour_terms(self, sample: NDArray[np.int64], g_means: Array) -> float:
         weights = self.settings.weights

@@ -17,6 +17,11 @@ STANDARD_RADIUS_M = 4.0
 """The scene radius for which the translation rates of the layers are given."""
 
 
+def first_iteration(start: float, iterations: int) -> int:
+    """Number of the iteration, from 0, in which what begins after a share ``start`` of all takes its first step."""
+    return round(start * iterations)
+
+
 @dataclass(frozen=True)
 class Rates:
     """Adam's rates per iteration; a rate of 0 leaves the parameter where it starts.
@@ -26,6 +31,8 @@ class Rates:
         position, rotation, scale, colour: of Δp in metres, ΔR, Δs, RGB of what moves. colour_standing: RGB of the rest.
         end: all rates fall to this fraction in the last iteration, along half a cosine; 1 keeps them.
         beta1, beta2: Adam's decays.
+        starts: share of the iterations after which a layer begins, one a layer; what is missing begins at once.
+        start: the same of the Gaussians' own Δp, ΔR, Δs.
     """
 
     layers: tuple[tuple[float, float, float], ...]
@@ -37,11 +44,20 @@ class Rates:
     end: float = 1.0
     beta1: float = 0.9
     beta2: float = 0.999
+    starts: tuple[float, ...] = ()
+    start: float = 0.0
 
-    def factor(self, iteration: int, iterations: int) -> float:
-        """Share of the rates in an iteration counted from 0."""
-        done = iteration / max(1, iterations - 1)
+    def factor(self, iteration: int, iterations: int, start: float = 0.0) -> float:
+        """Share of the rates in an iteration counted from 0, of what begins after a share of all; 0 before."""
+        first = first_iteration(start, iterations)
+        if iteration < first:
+            return 0.0
+        done = (iteration - first) / max(1, iterations - 1 - first)
         return self.end + (1 - self.end) * 0.5 * (1 + cos(pi * done))
+
+    def start_of(self, layer: int) -> float:
+        """Share of the iterations after which a layer begins."""
+        return self.starts[layer] if layer < len(self.starts) else 0.0
 
     def hurried(self, factor: float) -> Rates:
         """Layers that turn and shift faster: where there is no motion to start from there is further to go."""
@@ -61,6 +77,8 @@ class Rates:
             end=settings.rate_end,
             beta1=settings.beta1,
             beta2=settings.beta2,
+            starts=tuple(settings.layer_starts[min(k, len(settings.layer_starts) - 1)] for k in range(layers)),
+            start=settings.own_start,
         )
 
 
@@ -87,14 +105,9 @@ def plan_samples(count: int, size: int, rng: np.random.Generator) -> list[NDArra
     return [np.sort(part) for part in np.split(order, cuts)]
 
 
-STANDING_SHARE = 0.1
-"""Share of standing Gaussians from which a scene has a background that stands; below, labels are noise."""
-
-
 def mask_weight(settings: UpdateSettings, moving: int, count: int) -> float:
     """Weight of the mask loss for a scene of ``count`` Gaussians of which so many move."""
-    stands = count - moving >= STANDING_SHARE * count
-    return settings.weights.mask if stands else settings.weights.mask_alone
+    return settings.weights.mask if moving < count else settings.weights.mask_alone
 
 
 def first_lengths(hierarchy: Hierarchy, first: Gaussians) -> NDArray[np.float32]:

@@ -188,15 +188,19 @@ class TorchUpdate:
         optimizer = torch.optim.Adam(
             scene.parameter_groups(self.rates), betas=(self.rates.beta1, self.rates.beta2), eps=ADAM_EPSILON
         )
-        base = [group["lr"] for group in optimizer.param_groups]
+        base = [(group["lr"], group["begins"]) for group in optimizer.param_groups]
         history: list[tuple[Tensor, Tensor]] = []
         for iteration, view in enumerate(order):
-            for group, rate in zip(optimizer.param_groups, base, strict=True):
-                group["lr"] = rate * self.rates.factor(iteration, len(order))
+            for group, (rate, begins) in zip(optimizer.param_groups, base, strict=True):
+                group["lr"] = rate * self.rates.factor(iteration, len(order), begins)
             sampled = None if rows is None else scene.indices(rows[iteration])
             optimizer.zero_grad(set_to_none=True)
             loss = scene.loss(view, sampled)
             loss.backward()  # type: ignore[no-untyped-call]
+            for group in optimizer.param_groups:
+                if group["lr"] == 0:  # not begun: its moments stay those of no step
+                    for tensor in group["params"]:
+                        tensor.grad = None
             optimizer.step()
             history.append((loss.detach(), scene.psnr))
             if on_iteration is not None:
@@ -301,21 +305,28 @@ class _Scene:
 
     def parameter_groups(self, rates: Rates) -> list[dict[str, Any]]:
         """What Adam moves; parameters of rate 0 are left out and need no gradient."""
-        groups: list[tuple[float, list[Tensor]]] = []
-        for (_, params), (rotation, translation, scaling) in zip(self.layers, rates.layers, strict=True):
-            groups += [(rotation, [params.r]), (translation, [params.t]), (scaling, [params.c, params.s])]
+        groups: list[tuple[float, float, list[Tensor]]] = []
+        for k, ((_, params), (rotation, translation, scaling)) in enumerate(
+            zip(self.layers, rates.layers, strict=True)
+        ):
+            start = rates.start_of(k)
+            groups += [
+                (rotation, start, [params.r]),
+                (translation, start, [params.t]),
+                (scaling, start, [params.c, params.s]),
+            ]
         groups += [
-            (rates.position, [self.deltas.dp]),
-            (rates.rotation, [self.deltas.dr]),
-            (rates.scale, [self.deltas.ds]),
-            (rates.colour, [self.free_colours[0]]),
-            (rates.colour_standing, [self.free_colours[1]]),
+            (rates.position, rates.start, [self.deltas.dp]),
+            (rates.rotation, rates.start, [self.deltas.dr]),
+            (rates.scale, rates.start, [self.deltas.ds]),
+            (rates.colour, 0.0, [self.free_colours[0]]),
+            (rates.colour_standing, 0.0, [self.free_colours[1]]),
         ]
-        learnt = [(rate, tensors) for rate, tensors in groups if rate > 0]
-        for _, tensors in learnt:
+        learnt = [(rate, start, tensors) for rate, start, tensors in groups if rate > 0]
+        for _, _, tensors in learnt:
             for tensor in tensors:
                 tensor.requires_grad_(True)
-        return [{"params": tensors, "lr": rate} for rate, tensors in learnt]
+        return [{"params": tensors, "lr": rate, "begins": start} for rate, start, tensors in learnt]
 
     def deformed(self) -> Deformed:
         """The moving Gaussians under the present parameters."""

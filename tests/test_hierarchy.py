@@ -102,6 +102,21 @@ def test_clusters_are_near_in_space() -> None:
             assert len(set(hierarchy.rows[begin:end] % 2)) == 1
 
 
+def test_parents_are_evened_out() -> None:
+    """The spread within the coarse clusters is near that of clusters that need not be nested."""
+    points = cloud(4000)
+    moving = np.ones(len(points), np.bool_)
+
+    def spread(clusters: tuple[int, ...]) -> float:
+        hierarchy = build_hierarchy(points, moving, clusters, 8)
+        labels, sorted_points = hierarchy.labels[0], points[hierarchy.rows]
+        counts = np.bincount(labels)
+        means = np.stack([np.bincount(labels, sorted_points[:, k]) for k in range(3)], axis=1) / counts[:, None]
+        return float(np.square(sorted_points - means[labels]).sum())
+
+    assert spread((16, 320)) < 1.15 * spread((16,))
+
+
 def test_a_sample_is_clustered_where_there_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scas4d_core.hierarchy.KMEANS_SAMPLE_PER_CLUSTER", 10)
     hierarchy = build_hierarchy(cloud(2000), np.ones(2000, bool), (2, 5, 20), 8)

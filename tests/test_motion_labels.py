@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from box_scene import MOVING, make_box, make_rig, moved, take_frame
 
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.motion_labels import changed_pixels
+from scas4d_core.motion_labels import changed_pixels, settled
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.static_scene import StaticResult
@@ -66,3 +67,16 @@ def test_a_changed_pixel_marks_its_surroundings() -> None:
     marked = changed_pixels(before, now)
     assert marked.sum() == 25
     assert marked[8:13, 2:7].all()
+
+
+@pytest.mark.parametrize(("standing", "all_move"), [(0, True), (5, True), (10, False), (50, False)])
+def test_the_few_that_stand_in_an_object_move_with_it(standing: int, all_move: bool) -> None:
+    rows = np.linspace(0, len(BOX) - 1, 100).astype(int)
+    labels = np.full(100, 0.9, np.float32)
+    labels[:standing] = 0.2
+    hundred = Gaussians(**{name: array[rows] for name, array in BOX.arrays().items()}).replace(foreground=labels)
+    after = settled(hundred)
+    assert after.moving.all() == all_move
+    np.testing.assert_array_equal(after.foreground[standing:], labels[standing:])
+    if not all_move:
+        assert after is hundred

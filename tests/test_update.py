@@ -315,3 +315,21 @@ def test_deformation_starts_from_what_it_is_given() -> None:
     np.testing.assert_allclose(deformation.means, BEFORE.means, atol=1e-7)
     np.testing.assert_allclose(deformation.factors, BEFORE.factors, atol=1e-8)
     np.testing.assert_array_equal(deformation.turns, np.tile(np.float32([1, 0, 0, 0]), (MOVING, 1)))
+
+
+def test_a_layer_that_begins_late_stays_where_it_was_before() -> None:
+    settings = SETTINGS.model_copy(update={"layer_starts": (0.0, 0.5, 0.5), "own_start": 0.5, "iterations": 3})
+    updater, views = prepare(settings)
+    seen: list[list[np.ndarray]] = []
+    inside = updater._deformation
+    forward = inside.forward
+
+    def record() -> None:
+        seen.append([table.copy() for table in [*inside.clusters, inside.deltas]])
+        forward()
+
+    inside.forward = record  # type: ignore[method-assign]
+    updater.run(BEFORE, views, None, 1.0, seed=1)
+    moved_by = [[bool(np.abs(table).max() > 0) for table in tables] for tables in seen]
+    # Half of three iterations, rounded, is two: in the third (from 0) all learn, and the commit sees it.
+    assert moved_by == [[False] * 4, [True, False, False, False], [True, False, False, False], [True] * 4]

@@ -212,3 +212,18 @@ def test_each_term_counts_with_its_weight(term: str, solved: tuple[Gaussians, np
     }[term]().item()
     assert expected > 1e-5
     assert second_loss(**{term: 2.5}) - second_loss() == pytest.approx(2.5 * expected, rel=2e-3)
+
+
+def test_what_begins_late_does_not_move_before() -> None:
+    rates = Rates(layers=(), position=0, rotation=0, scale=0, colour=0, end=0.2, starts=(0.0, 0.5), start=0.75)
+    assert [rates.start_of(layer) for layer in range(3)] == [0.0, 0.5, 0.0]
+    assert [rates.factor(i, 9, 0.5) for i in (0, 3, 4, 6, 8)] == pytest.approx([0, 0, 1, 0.6, 0.2])
+    before = ball_and_backdrop()
+    views = pictures(before, moved_truth(before), masks=False)
+    late = dataclasses.replace(RATES, start=0.75)
+    halfway = toy_update(before, rates=late).run(before, views, [0])
+    assert np.abs(halfway.layers[0].r).max() > 1e-4
+    for values in halfway.deltas:
+        np.testing.assert_array_equal(values, 0)
+    after = toy_update(before, rates=late).run(before, views, [0, 1, 2])
+    assert np.abs(after.deltas.dp).max() > 1e-5
