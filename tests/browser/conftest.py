@@ -24,7 +24,7 @@ def browser_path():
     return os.environ.get("SCAS4D_TEST_BROWSER") or shutil.which("chromium") or shutil.which("google-chrome")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # its event loop must not outlive these tests: others run their own
 def chromium():
     playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright for the tests of the page")
     path = browser_path()

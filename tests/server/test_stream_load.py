@@ -201,12 +201,13 @@ def test_a_mailbox_keeps_the_newest_of_each_and_says_what_it_took_the_place_of()
         for number in range(10):
             mailbox.put("a", lambda missed, number=number: f"a{number} {missed}")
         mailbox.put("b", lambda missed: f"b {missed}", missed=4)
+        mailbox.put("a", lambda missed: f"a10 {missed}")  # keeps its place before b
         mailbox.put("c", lambda missed: "c")
         mailbox.drop("c")
         await mailbox.reply(Subscribed(id="x"))
         task = asyncio.create_task(mailbox.empty_into(send))
         await settle()
-        assert sent == ['{"type":"subscribed","id":"x"}', "a9 9", "b 4"]
+        assert sent == ['{"type":"subscribed","id":"x"}', "a10 10", "b 4"]
         mailbox.put("a", lambda missed: f"again {missed}")
         await settle()
         assert sent[-1] == "again 0"
