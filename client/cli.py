@@ -68,7 +68,7 @@ def demo(
         id = main_job.run(opened, url, out, frames=frames, preset=preset, settings=overrides(changes or []))
         console.print(f"pictures (truth | render | difference x4): {out}")
         if sys.stdout.isatty() if stay is None else stay:
-            console.print(f"open {url}/v1/scenes/{id}/render or {url}/docs; Ctrl-C ends the service", soft_wrap=True)
+            console.print(f"open {url}/#scene={id} (the API: {url}/docs); Ctrl-C ends the service", soft_wrap=True)
             try:
                 while True:
                     time.sleep(3600)

@@ -115,7 +115,7 @@ def push(
         status = client.scene(delivery.scene)
     console.print(delivery.lateness.summary(fps), highlight=False, soft_wrap=True)
     console.print(f"scene {status.id}: {status.committed} of {status.next_frame} frames committed, {status.state}")
-    console.print(f"{url.rstrip('/')}/v1/scenes/{status.id}/render", soft_wrap=True)
+    console.print(f"{url.rstrip('/')}/#scene={status.id}", soft_wrap=True)
     if status.error:
         raise SystemExit(f"scas4d: {status.error}")
 
