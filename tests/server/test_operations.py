@@ -129,7 +129,9 @@ LEADING_OUT = [
 
 
 def tree(folder):
-    return sorted(path for path in folder.parent.rglob("*") if "__pycache__" not in path.parts)
+    """What is in the data folder, but for locks that processes take and leave, and files beside it."""
+    inside = [path for path in folder.rglob("*") if path.suffix != ".lock"]
+    return sorted([*inside, *(path for path in folder.parent.iterdir() if path.is_file())])
 
 
 def raw(service, method, path, body=b"{}"):
