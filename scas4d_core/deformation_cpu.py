@@ -5,14 +5,17 @@ Twin: ``deformation``. Buffers are allocated once per hierarchy.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import Hierarchy
-from scas4d_core.kernels import cascade, deltas, neighbour_terms
+from scas4d_core.kernels import neighbour_terms
+from scas4d_core.kernels.cascade import PARAMETERS, RECORD, TABLE
+from scas4d_core.kernels.deform import block_sums, deform, deform_backward
+from scas4d_core.kernels.lanes import COUNT
 from scas4d_core.neighbours import Neighbours
 
 Array = NDArray[np.float32]
@@ -26,7 +29,6 @@ class CpuDeformation:
         cluster_gradients, delta_gradients: the same shapes, filled by ``backward``.
         means [N, 3], factors [N, 3, 3]: of all Gaussians, filled by ``forward``.
         turns: [M, 4], rotation since the frame before, filled by ``forward``.
-        excess: [M] metres, how much the axes of each exceed their bounds, filled by ``backward``.
     """
 
     def __init__(
@@ -41,46 +43,47 @@ class CpuDeformation:
         self._bounds = bounds
         self._about_origin = np.float32(cluster_map == "published")
         count = len(hierarchy.rows)
-        self.clusters = [np.zeros((size, cascade.PARAMETERS), np.float32) for size in hierarchy.sizes]
-        self.cluster_gradients = [np.zeros_like(values) for values in self.clusters]
-        self._tables = [np.zeros((size, cascade.TABLE), np.float32) for size in hierarchy.sizes]
+        layers = len(hierarchy.sizes)
+        blocks = Blocks.of(hierarchy)
+        self._offsets, self._ranges, self._clusters_of = blocks.offsets, blocks.ranges, blocks.clusters
+        self._entries, self._rows, self._present = blocks.entries, hierarchy.rows[blocks.entries], blocks.present
+        self._parameters = np.zeros((blocks.offsets[-1], PARAMETERS), np.float32)
+        self._gradients = np.zeros_like(self._parameters)
+        self._tables = np.zeros((len(self._parameters), TABLE), np.float32)
+        ends = blocks.offsets[1:-1]
+        self.clusters, self.cluster_gradients = (
+            np.split(table, ends)[:layers] for table in (self._parameters, self._gradients)
+        )
         self.deltas = np.zeros((count, 9), np.float32)
         self.delta_gradients = np.zeros_like(self.deltas)
-        layers = len(hierarchy.sizes)
-        self._points = np.zeros((layers + 1, count, 3), np.float32)
-        self._jacobians = np.zeros((layers + 1, count, 9), np.float32)
-        self._jacobians[0] = np.eye(3, dtype=np.float32).ravel()
-        self._rotations = np.zeros((layers + 1, count, 4), np.float32)
-        self._rotations[0] = (1, 0, 0, 0)
-        self._g_points, self._g_jacobians, self._g_rotations = (
-            np.zeros((count, columns), np.float32) for columns in (3, 9, 4)
-        )
-        self._records = np.zeros((count, cascade.RECORD), np.float32)
+        held = len(blocks.entries)
+        self._points = np.zeros((max(layers, 1), held, 3, COUNT), np.float32)
+        self._sums = np.zeros((max(layers, 1), held, 3), np.float32)
+        self._before = np.zeros((held, 9, COUNT), np.float32)
+        self._records = np.zeros((held, layers, RECORD), np.float32)
+        self._excess = np.zeros(held, np.float32)
+        self._previous_means = np.zeros((count, 3), np.float32)
         self._accumulators = np.zeros((neighbour_terms.TASKS, count, neighbour_terms.COLUMNS), np.float32)
-        self._sums = np.zeros((neighbour_terms.TASKS, 3), np.float32)
+        self._neighbour_sums = np.zeros((neighbour_terms.TASKS, 3), np.float32)
         self._g_turns = np.zeros((count, 4), np.float32)
         self.turns = np.zeros((count, 4), np.float32)
-        self.excess = np.zeros(count, np.float32)
         self.means = np.zeros((0, 3), np.float32)
         self.factors = np.zeros((0, 3, 3), np.float32)
 
     def start(self, previous: Gaussians) -> None:
         """Take Θ_{t−1} to deform; standing Gaussians stay as they are in it."""
-        self._previous_factors = previous.factors
-        self._points[0] = previous.means[self.hierarchy.rows]
+        self._previous_means = previous.means[self.hierarchy.rows]
+        self._points[0] = np.swapaxes(previous.means[self._rows], 1, 2)
+        self._before[:] = np.swapaxes(previous.factors[self._rows].reshape(*self._rows.shape, 9), 1, 2)
+        block_sums(self._points, self._present, self._sums)
         self.means = previous.means.copy()
         self.factors = previous.factors.copy()
 
     def forward(self) -> None:
         """Equations (5) to (7): fill ``means``, ``factors`` and ``turns``."""
-        hierarchy = self.hierarchy
-        for k, values in enumerate(self.clusters):
-            cascade.cluster_tables(self._points[k], hierarchy.starts[k], values, self._tables[k])
-            cascade.layer(
-                *self._carried(k), hierarchy.labels[k], self._tables[k], self._about_origin, *self._carried(k + 1)
-            )
-        deltas.apply_deltas(
-            *self._carried(len(self.clusters)), self.deltas, hierarchy.rows, self._previous_factors,
+        deform(
+            self._parameters, self._offsets, self._ranges, self._clusters_of, self._entries, self._rows, self._present,
+            self._before, self.deltas, self._about_origin, self._points, self._sums, self._tables,
             self.means, self.factors, self.turns,
         )  # fmt: skip
 
@@ -96,12 +99,12 @@ class CpuDeformation:
             return np.zeros(3, np.float32)
         pairs = max(1, len(sample) * self.neighbours.index.shape[1])
         neighbour_terms.neighbour_terms(
-            self._gathered_means(), self.turns, self._points[0], sample, self.neighbours.index,
+            self._gathered_means(), self.turns, self._previous_means, sample, self.neighbours.index,
             self.neighbours.weights, self.neighbours.distances, np.array(weights, np.float32) / np.float32(pairs),
-            self._accumulators, self._sums,
+            self._accumulators, self._neighbour_sums,
         )  # fmt: skip
         neighbour_terms.gather_terms(self._accumulators, self.hierarchy.rows, g_means, self._g_turns)
-        means: Array = self._sums.sum(axis=0) / pairs
+        means: Array = self._neighbour_sums.sum(axis=0) / pairs
         return means
 
     def _gathered_means(self) -> Array:
@@ -114,23 +117,50 @@ class CpuDeformation:
         Args:
             g_means [N, 3], g_factors [N, 3, 3]: gradients of what ``forward`` filled.
         """
-        hierarchy = self.hierarchy
-        axes = max(1, 3 * len(hierarchy.rows))
-        deltas.apply_deltas_backward(
-            *self._carried(len(self.clusters)), self.deltas, hierarchy.rows, self._previous_factors,
-            np.float32(scale_weight / axes), self._bounds, g_means, g_factors, self._g_turns,
-            self._g_points, self._g_jacobians, self._g_rotations, self.delta_gradients, self.excess,
+        axes = max(1, 3 * len(self.hierarchy.rows))
+        deform_backward(
+            self._offsets, self._ranges, self._clusters_of, self._entries, self._rows, self._present, self._before,
+            self.deltas, self._about_origin, self._points, self._tables, np.float32(scale_weight / axes), self._bounds,
+            g_means, g_factors, self._g_turns, self._records, self._gradients, self.delta_gradients, self._excess,
         )  # fmt: skip
-        for k in reversed(range(len(self.clusters))):
-            cascade.layer_backward(
-                *self._carried(k), hierarchy.labels[k], self._tables[k], self._about_origin,
-                self._g_points, self._g_jacobians, self._g_rotations, self._records,
-            )  # fmt: skip
-            cascade.cluster_gradients(
-                self._records, hierarchy.starts[k], self.clusters[k], self._tables[k], self.cluster_gradients[k]
-            )
-        return float(self.excess.sum(dtype=np.float64)) / axes
+        return float(self._excess.sum(dtype=np.float64)) / axes
 
-    def _carried(self, layer: int) -> tuple[Array, Array, Array]:
-        """Points, Jacobians and rotations as they enter a layer."""
-        return self._points[layer], self._jacobians[layer], self._rotations[layer]
+
+class Blocks(NamedTuple):
+    """The Gaussians of a hierarchy sixteen at a time, each block of one cluster in every layer: B blocks.
+
+    Attributes:
+        entries: [B, 16] int64 entries of the hierarchy's order; a block that is not full repeats its last.
+        present: [B, 16] float32, 0 where an entry is repeated, else 1.
+        clusters: [B, L] int64, the clusters of each block, numbered through all layers.
+        offsets: [L + 1] int64, the number of each layer's first cluster.
+        ranges: [clusters of all layers, 3] int64, each one's first block, its last and one more, and its entries.
+    """
+
+    entries: NDArray[np.int64]
+    present: Array
+    clusters: NDArray[np.int64]
+    offsets: NDArray[np.int64]
+    ranges: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, hierarchy: Hierarchy) -> Blocks:
+        """The blocks of a hierarchy."""
+        count, layers = len(hierarchy.rows), len(hierarchy.sizes)
+        finest = hierarchy.starts[-1] if layers else np.array([0, count])
+        per_cluster = -(-np.diff(finest) // COUNT)
+        ends = np.repeat(finest[1:], per_cluster)
+        nth = np.arange(len(ends)) - np.repeat(np.cumsum(per_cluster) - per_cluster, per_cluster)
+        begins = np.repeat(finest[:-1], per_cluster) + COUNT * nth
+        wanted = begins[:, None] + np.arange(COUNT)
+        entries = np.minimum(wanted, ends[:, None] - 1)
+        offsets = np.concatenate([[0], np.cumsum(hierarchy.sizes)]).astype(np.int64)
+        clusters = np.zeros((len(begins), layers), np.int64)
+        ranges = np.zeros((offsets[-1], 3), np.int64)
+        for layer, (labels, starts) in enumerate(zip(hierarchy.labels, hierarchy.starts, strict=True)):
+            clusters[:, layer] = offsets[layer] + labels[begins]
+            of_layer = ranges[offsets[layer] : offsets[layer + 1]]
+            of_layer[:, 0] = np.searchsorted(begins, starts[:-1])
+            of_layer[:, 1] = np.searchsorted(begins, starts[1:])
+            of_layer[:, 2] = np.diff(starts)
+        return cls(np.ascontiguousarray(entries), (wanted == entries).astype(np.float32), clusters, offsets, ranges)

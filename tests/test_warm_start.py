@@ -34,8 +34,7 @@ def set_turn(
 ) -> None:
     """Clusters ``which`` of a layer turn about an axis through a point (space as the layers above leave it)."""
     model.forward()
-    starts = model.hierarchy.starts[layer]
-    pivots = np.add.reduceat(model._points[layer].astype(np.float64), starts[:-1]) / np.diff(starts)[:, None]
+    pivots = model._tables[model._offsets[layer] :][: model.hierarchy.sizes[layer], 13:16].astype(np.float64)
     values = model.clusters[layer]
     values[which, :3] = np.tan(angle / 2) * axis
     values[which, 3:6] = (turned(pivots, angle, axis, centre) - pivots)[which]

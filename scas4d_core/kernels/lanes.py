@@ -115,6 +115,21 @@ for _name, _sign in (("lt", "<"), ("le", "<="), ("gt", ">"), ("ge", ">=")):
     _operator(getattr(operator, _name), mask_type, "fcmp_ordered", _sign)
 
 
+class _Negative(AbstractTemplate):
+    key = operator.neg
+
+    def generic(self, arguments: Any, keywords: Any) -> Any:
+        return signature(lanes_type, lanes_type) if tuple(arguments) == (lanes_type,) else None
+
+
+infer_global(operator.neg)(_Negative)
+
+
+@lower_builtin(operator.neg, lanes_type)
+def _lower_negative(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return builder.fneg(arguments[0])
+
+
 class _And(AbstractTemplate):
     key = operator.and_
 
@@ -288,6 +303,42 @@ def scatter(typing_context: Any, array: Any, index: Any, stride: Any, value: Any
     return types.void(array, types.int64, types.int64, lanes_type), generate
 
 
+def _places_of_rows(context: Any, builder: Any, types_of: Any, values: Any) -> list[Any]:
+    """Pointers to ``array[rows[place + lane], column]``, for each lane."""
+    (array_type, rows_type), (array, rows, place, columns, column) = types_of, values
+    if not (isinstance(rows_type, types.Array) and rows_type.dtype == types.int64 and rows_type.layout == "C"):
+        raise TypeError(f"rows are a C-contiguous int64 array; this is {rows_type}")
+    data = _data(context, builder, array_type, array)
+    first = builder.gep(cgutils.create_struct_proxy(rows_type)(context, builder, value=rows).data, [place])
+    rows_of = [builder.load(builder.gep(first, [_LONG(k)])) for k in range(COUNT)]
+    return [builder.gep(data, [builder.add(builder.mul(row, columns), column)]) for row in rows_of]
+
+
+@emitted
+def pick(typing_context: Any, array: Any, rows: Any, place: Any, columns: Any, column: Any) -> Any:
+    """A column of sixteen rows of a float32 array [n, columns]: those that ``rows`` (int64) names from ``place`` on."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        value = ir.Constant(_FLOATS, ir.Undefined)
+        for lane, place in enumerate(_places_of_rows(context, builder, signature.args[:2], arguments)):
+            value = builder.insert_element(value, builder.load(place), _INT(lane))
+        return value
+
+    return lanes_type(array, rows, types.int64, types.int64, types.int64), generate
+
+
+@emitted
+def put(typing_context: Any, array: Any, rows: Any, place: Any, columns: Any, column: Any, value: Any) -> Any:
+    """Write the lanes to a column of the rows that ``pick`` would read; of rows named twice, the last lane stays."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        for lane, place in enumerate(_places_of_rows(context, builder, signature.args[:2], arguments[:5])):
+            builder.store(builder.extract_element(arguments[5], _INT(lane)), place)
+        return context.get_dummy_value()
+
+    return types.void(array, rows, types.int64, types.int64, types.int64, lanes_type), generate
+
+
 @emitted
 def fetch(typing_context: Any, array: Any, row: Any) -> Any:
     """Have a row of a two-dimensional float32 array brought into the first-level cache; any row, inside or not."""
@@ -323,6 +374,22 @@ def exp2(x):
     y = y * part + np.float32(2.4022119724211827e-1)
     y = y * part + np.float32(6.931469670612127e-1)
     y = y * part + np.float32(1.0)
+    return _times_power_of_two(y, whole)
+
+
+@inline
+def exp(x):
+    """The exponential in float32, relative error 2e-7, clamped to ±87; NaN stays NaN."""
+    bound = np.float32(125.5)
+    v = minimum(fill(bound), maximum(fill(-bound), x * np.float32(1.4426950408889634)))
+    whole = nearest(v)
+    r = v - whole
+    y = r * np.float32(1.535336188319500e-4) + np.float32(1.339887440266574e-3)
+    y = y * r + np.float32(9.618437357674640e-3)
+    y = y * r + np.float32(5.550332471162809e-2)
+    y = y * r + np.float32(2.402264791363012e-1)
+    y = y * r + np.float32(6.931472028550421e-1)
+    y = y * r + np.float32(1.0)
     return _times_power_of_two(y, whole)
 
 

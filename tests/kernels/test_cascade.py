@@ -7,11 +7,15 @@ import pytest
 import torch
 
 from scas4d_core import deformation, losses
-from scas4d_core.kernels import cascade, deltas
+from scas4d_core.deformation_cpu import Blocks, CpuDeformation
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.hierarchy import Hierarchy
 
 
 def hierarchy(points: int, sizes: tuple[int, ...], rng: np.random.Generator) -> list[np.ndarray]:
     """Nested contiguous labels, coarse to fine."""
+    if not sizes:
+        return []
     cuts = np.sort(rng.choice(np.arange(1, points), sizes[-1] - 1, replace=False))
     fine = np.searchsorted(cuts, np.arange(points), side="right")
     labels = [fine]
@@ -27,7 +31,7 @@ def starts_of(labels: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["centred", "published"])
-@pytest.mark.parametrize(("points", "sizes"), [(5, (2,)), (333, (3, 7, 20)), (1000, (1, 40))])
+@pytest.mark.parametrize(("points", "sizes"), [(5, ()), (5, (2,)), (333, (3, 7, 20)), (1000, (1, 40))])
 def test_cascade_and_deltas_agree_with_the_twin(kind: str, points: int, sizes: tuple[int, ...]) -> None:
     rng = np.random.default_rng(points)
     labels = hierarchy(points, sizes, rng)
@@ -63,38 +67,54 @@ def test_cascade_and_deltas_agree_with_the_twin(kind: str, points: int, sizes: t
     total.backward()
 
     # The kernels.
-    about_origin = np.float32(kind == "published")
-    nothing = np.tile(np.eye(3, dtype=np.float32).ravel(), (points, 1)), np.tile(np.float32([1, 0, 0, 0]), (points, 1))
-    carried = [(x, *nothing)]
-    tables = []
-    for labels_k, values in zip(labels, parameters, strict=True):
-        table = np.empty((len(values), cascade.TABLE), np.float32)
-        cascade.cluster_tables(carried[-1][0], starts_of(labels_k), values, table)
-        out = tuple(np.empty_like(array) for array in carried[-1])
-        cascade.layer(*carried[-1], labels_k.astype(np.int32), table, about_origin, *out)
-        carried.append(out)
-        tables.append(table)
-    rows = np.arange(points)
-    means_out, factors_out, turns = np.empty_like(x), np.empty_like(factors), np.empty((points, 4), np.float32)
-    deltas.apply_deltas(*carried[-1], own, rows, factors, means_out, factors_out, turns)
-    np.testing.assert_allclose(means_out, twin.means.detach().numpy(), atol=3e-6)
-    np.testing.assert_allclose(factors_out, twin.factors.detach().numpy(), atol=1e-6)
-    np.testing.assert_allclose(turns, twin.turns.detach().numpy(), atol=2e-6)
-
-    g_x, g_j, g_q = (np.empty_like(array) for array in carried[-1])
-    g_own, excess = np.empty_like(own), np.empty(points, np.float32)
-    deltas.apply_deltas_backward(
-        *carried[-1], own, rows, factors, np.float32(10.0 / (3 * points)), bound, g_means, g_factors, g_turns,
-        g_x, g_j, g_q, g_own, excess,
+    rows = rng.permutation(points)
+    model = CpuDeformation(
+        Hierarchy(rows, tuple(k.astype(np.int32) for k in labels), tuple(starts_of(k) for k in labels)),
+        None, bound, kind,
     )  # fmt: skip
-    np.testing.assert_allclose(excess.sum() / (3 * points), scale.item(), rtol=1e-5)
-    assert_close(g_own, own_leaf.grad)
-    for k in reversed(range(len(sizes))):
-        records = np.empty((points, cascade.RECORD), np.float32)
-        cascade.layer_backward(*carried[k], labels[k].astype(np.int32), tables[k], about_origin, g_x, g_j, g_q, records)
-        gradients = np.empty_like(parameters[k])
-        cascade.cluster_gradients(records, starts_of(labels[k]), parameters[k], tables[k], gradients)
-        assert_close(gradients, leaves[k].grad)
+    model.start(gaussians(scattered(x, rows), scattered(factors, rows)))
+    for table, values in zip([*model.clusters, model.deltas], [*parameters, own], strict=True):
+        table[:] = values
+    model.forward()
+    np.testing.assert_allclose(model.means[rows], twin.means.detach().numpy(), atol=3e-6)
+    np.testing.assert_allclose(model.factors[rows], twin.factors.detach().numpy(), atol=1e-6)
+    np.testing.assert_allclose(model.turns, twin.turns.detach().numpy(), atol=2e-6)
+
+    model._g_turns[:] = g_turns
+    excess = model.backward(scattered(g_means, rows), scattered(g_factors, rows), 10.0)
+    np.testing.assert_allclose(excess, scale.item(), rtol=1e-5)
+    assert_close(model.delta_gradients, own_leaf.grad)
+    for gradients, leaf in zip(model.cluster_gradients, leaves, strict=True):
+        assert_close(gradients, leaf.grad)
+
+
+def scattered(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Entries in the hierarchy's order, put where they are among all Gaussians."""
+    result = np.empty_like(values)
+    result[rows] = values
+    return result
+
+
+def gaussians(means: np.ndarray, factors: np.ndarray) -> Gaussians:
+    ones = np.ones(len(means), np.float32)
+    turns = np.tile(np.float32([1, 0, 0, 0]), (len(means), 1))
+    return Gaussians(means, factors, turns, ones, np.zeros_like(means), ones, np.arange(len(means)))
+
+
+def test_blocks_hold_every_gaussian_once_and_one_cluster_of_each_layer() -> None:
+    labels = hierarchy(333, (3, 7, 20), np.random.default_rng(3))
+    starts = tuple(starts_of(layer) for layer in labels)
+    blocks = Blocks.of(Hierarchy(np.arange(333), tuple(layer.astype(np.int32) for layer in labels), starts))
+    np.testing.assert_array_equal(np.sort(blocks.entries[blocks.present > 0]), np.arange(333))
+    for layer, of_points in enumerate(labels):
+        of_blocks = blocks.clusters[:, layer, None] - blocks.offsets[layer]
+        np.testing.assert_array_equal(of_points[blocks.entries], np.broadcast_to(of_blocks, blocks.entries.shape))
+        for cluster, (first, last, count) in enumerate(
+            blocks.ranges[blocks.offsets[layer] :][: len(starts[layer]) - 1]
+        ):
+            held = blocks.entries[first:last][blocks.present[first:last] > 0]
+            np.testing.assert_array_equal(np.sort(held), np.flatnonzero(of_points == cluster))
+            assert count == len(held)
 
 
 def assert_close(value: np.ndarray, expected: torch.Tensor | None) -> None:

@@ -38,6 +38,42 @@ def test_powers_and_logarithms_of_two():
 
 
 @kernel
+def exponentials(x, out):
+    for k in range(0, x.size, lanes.COUNT):
+        lanes.store(out, k, lanes.exp(-lanes.load(x, k)))
+
+
+def test_exponentials_are_clamped_and_keep_what_is_no_number():
+    x = np.linspace(-86, 86, 16 * 1024).astype(np.float32)
+    out = np.zeros_like(x)
+    exponentials(x, out)
+    # The exponent's own rounding, of up to 124, is 4e-6 of the result.
+    np.testing.assert_allclose(out, np.exp(-x.astype(np.float64)), rtol=8e-6)
+    near = np.abs(x) < 1
+    np.testing.assert_allclose(out[near], np.exp(-x[near].astype(np.float64)), rtol=3e-7)
+    exponentials(np.repeat(np.float32([np.nan, 1e9, -np.inf, 0]), 4), out[:16])
+    out = out[:16]
+    assert np.isnan(out[:4]).all()
+    assert (out[4:8] > 0).all()
+    assert np.isfinite(out[4:]).all()
+
+
+@kernel
+def picks(array, rows, out):
+    lanes.put(out, rows, 16, 2, 1, lanes.pick(array, rows, 16, 3, 2))
+
+
+def test_columns_of_named_rows():
+    rng = np.random.default_rng(1)
+    array, rows = rng.normal(size=(50, 3)).astype(np.float32), rng.permutation(50)[:32].reshape(2, 16)
+    out = np.zeros((50, 2), np.float32)
+    picks(array, rows, out)
+    expected = np.zeros_like(out)
+    expected[rows[1], 1] = array[rows[1], 2]
+    np.testing.assert_array_equal(out, expected)
+
+
+@kernel
 def arithmetic(x, y, factor, out):
     a, b = lanes.load(x, 0), lanes.load(y, 0)
     lanes.store(out, 0, (a + b) * factor - a / b)

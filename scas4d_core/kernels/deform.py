@@ -1,0 +1,152 @@
+"""D_t over all Gaussians that move, and its backward: ``cascade`` and ``deltas`` put together. Twin: ``deformation``.
+
+Gaussians are taken in blocks of sixteen of one finest cluster, hence of one cluster in every layer; where a cluster's
+number is no multiple of sixteen, its last block repeats its last Gaussian. Nothing but points is kept between layers
+(pivots are their means): the backward carries factors and turns through the layers again, which costs less than
+reading them from memory.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from scas4d_core.kernels import lanes
+from scas4d_core.kernels.cascade import carry, carry_backward, cluster_gradient, cluster_table, moved
+from scas4d_core.kernels.deltas import apply_own, apply_own_backward
+from scas4d_core.kernels.jit import ONE, ZERO, kernel, parallel_kernel
+
+BLOCKS = 16
+"""Blocks a task."""
+
+CARRIED = 13 * lanes.COUNT
+"""Numbers of a block's factors and turns."""
+
+
+@kernel
+def start_block(block, before, v):
+    """Factors of frame t−1 and no turn into v [13, 16]."""
+    for k in range(9):
+        lanes.store(v, lanes.COUNT * k, lanes.load(before, (9 * block + k) * lanes.COUNT))
+    lanes.store(v, lanes.COUNT * 9, lanes.fill(ONE))
+    for k in range(10, 13):
+        lanes.store(v, lanes.COUNT * k, lanes.fill(ZERO))
+
+
+@kernel
+def move_points(block, table, about_origin, points, layer, out, place):
+    """Points of a block through a layer, from ``points[layer]`` to flat index ``place`` of ``out`` on."""
+    first = (layer * points.shape[1] + block) * 3 * lanes.COUNT
+    x, y, z = moved(
+        table, about_origin, lanes.load(points, first), lanes.load(points, first + lanes.COUNT),
+        lanes.load(points, first + 2 * lanes.COUNT),
+    )  # fmt: skip
+    lanes.store(out, place, x)
+    lanes.store(out, place + lanes.COUNT, y)
+    lanes.store(out, place + 2 * lanes.COUNT, z)
+
+
+@kernel
+def sum_block(block, points, layer, present, sums):
+    """Sums of a block's points as they enter a layer, into ``sums[layer, block]``."""
+    first = (layer * points.shape[1] + block) * 3 * lanes.COUNT
+    weight = lanes.load(present, block * lanes.COUNT)
+    for k in range(3):
+        sums[layer, block, k] = lanes.sum_of(weight * lanes.load(points, first + lanes.COUNT * k))
+
+
+@parallel_kernel
+def block_sums(points, present, sums):
+    """Sums of the points as they enter the first layer: ``sums[0]`` of ``deform``."""
+    for block in prange(points.shape[1]):
+        sum_block(block, points, 0, present, sums)
+
+
+@parallel_kernel
+def deform(
+    parameters, offsets, ranges, clusters, entries, rows, present, before, deltas, about_origin,
+    points, sums, tables, means, factors, turns,
+):  # fmt: skip
+    """The moved Gaussians: M that move, of N, in B blocks, under L layers of K clusters together.
+
+    Args:
+        parameters: [K, 10], layer after layer, coarse to fine. offsets: [L + 1] int64, the first cluster of each layer.
+        ranges: [K, 3] int64, each cluster's first block, its last and one more, and its number of Gaussians.
+        clusters: [B, L] int64, the clusters of each block.
+        entries, rows: [B, 16] int64, each Gaussian's row among the M and among the N.
+        present: [B, 16] float32, 0 where a Gaussian is repeated, else 1.
+        before: [B, 9, 16] factors of frame t−1. deltas: [M, 9] Δp, Δr, Δs.
+        about_origin: 0 for the centred map, 1 for the published one.
+        points: [max(L, 1), B, 3, 16] as they enter each layer; the first is given, the others are filled.
+        sums: [max(L, 1), B, 3] of them; likewise. tables: out [K, 23].
+        means [N, 3], factors [N, 3, 3]: out at ``rows``. turns: out [M, 4], rotation since frame t−1.
+    """
+    blocks, layers = clusters.shape
+    tasks = (blocks + BLOCKS - 1) // BLOCKS
+    for layer in range(layers):
+        for j in prange(offsets[layer], offsets[layer + 1]):
+            cluster_table(parameters[j], sums[layer], ranges[j, 0], ranges[j, 1], ranges[j, 2], tables[j])
+        if layer + 1 < layers:
+            for task in prange(tasks):
+                for block in range(task * BLOCKS, min(blocks, (task + 1) * BLOCKS)):
+                    place = ((layer + 1) * blocks + block) * 3 * lanes.COUNT
+                    move_points(block, tables[clusters[block, layer]], about_origin, points, layer, points, place)
+                    sum_block(block, points, layer + 1, present, sums)
+    for task in prange(tasks):
+        v = np.empty(CARRIED, np.float32)
+        moved_points = np.empty(3 * lanes.COUNT, np.float32)
+        for block in range(task * BLOCKS, min(blocks, (task + 1) * BLOCKS)):
+            start_block(block, before, v)
+            for layer in range(layers):
+                place = (layer * blocks + block) * 3 * lanes.COUNT
+                carry(tables[clusters[block, layer]], about_origin, points, place, v)
+            if layers > 0:
+                move_points(
+                    block, tables[clusters[block, layers - 1]], about_origin, points, layers - 1, moved_points, 0
+                )
+            else:
+                for k in range(3):
+                    lanes.store(moved_points, lanes.COUNT * k, lanes.load(points, (3 * block + k) * lanes.COUNT))
+            apply_own(deltas, entries, rows, block * lanes.COUNT, v, moved_points, means, factors, turns)
+
+
+@parallel_kernel
+def deform_backward(
+    offsets, ranges, clusters, entries, rows, present, before, deltas, about_origin, points, tables,
+    scale_weight, bounds, g_means, g_factors, g_turns, records, gradients, g_deltas, losses,
+):  # fmt: skip
+    """Backward of ``deform``, with the gradient of the scale loss added.
+
+    Args:
+        offsets … tables: as ``deform`` left them.
+        scale_weight: weight of the scale loss over its mean's count 3M; 0 leaves it out.
+        bounds: [M, 3] metres, the length each axis may have.
+        g_means [N, 3], g_factors [N, 3, 3], g_turns [M, 4]: in.
+        records: scratch [B, L, 32]. gradients: out [K, 10]. g_deltas: out [M, 9].
+        losses: out [B], metres of excess length of the axes, summed over each block.
+    """
+    blocks, layers = clusters.shape
+    for task in prange((blocks + BLOCKS - 1) // BLOCKS):
+        v = np.empty((layers + 1) * CARRIED, np.float32)
+        g = np.empty(16 * lanes.COUNT, np.float32)
+        for block in range(task * BLOCKS, min(blocks, (task + 1) * BLOCKS)):
+            start_block(block, before, v)
+            for layer in range(layers):
+                leaving = v[(layer + 1) * CARRIED : (layer + 2) * CARRIED]
+                leaving[:] = v[layer * CARRIED : (layer + 1) * CARRIED]
+                place = (layer * blocks + block) * 3 * lanes.COUNT
+                carry(tables[clusters[block, layer]], about_origin, points, place, leaving)
+            losses[block] = apply_own_backward(
+                deltas, entries, rows, block * lanes.COUNT, present, v, layers * CARRIED, scale_weight, bounds,
+                g_means, g_factors, g_turns, g, g_deltas,
+            )  # fmt: skip
+            for back in range(layers):
+                layer = layers - 1 - back
+                place = (layer * blocks + block) * 3 * lanes.COUNT
+                record = (block * layers + layer) * records.shape[2]
+                carry_backward(
+                    tables[clusters[block, layer]], about_origin, points, place, v, layer * CARRIED, g, records, record
+                )
+    for layer in range(layers):
+        for j in prange(offsets[layer], offsets[layer + 1]):
+            cluster_gradient(records, layer, ranges[j, 0], ranges[j, 1], tables[j], gradients[j])
