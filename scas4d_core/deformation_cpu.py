@@ -15,6 +15,7 @@ from scas4d_core.hierarchy import Hierarchy
 from scas4d_core.kernels import neighbour_terms
 from scas4d_core.kernels.cascade import PARAMETERS, RECORD, TABLE
 from scas4d_core.kernels.deform import block_sums, deform, deform_backward
+from scas4d_core.kernels.deltas import PREVIOUS, STATE, TIED, TURN
 from scas4d_core.kernels.lanes import COUNT
 from scas4d_core.neighbours import Neighbours
 
@@ -62,17 +63,17 @@ class CpuDeformation:
         self._before = np.zeros((held, 9, COUNT), np.float32)
         self._records = np.zeros((held, layers, RECORD), np.float32)
         self._excess = np.zeros(held, np.float32)
-        self._previous_means = np.zeros((count, 3), np.float32)
-        self._accumulators = np.zeros((neighbour_terms.TASKS, count, neighbour_terms.COLUMNS), np.float32)
+        self._state = cache_lines(count)
+        self.turns = self._state[:, TURN : TURN + 4]
+        self._accumulators = np.zeros((neighbour_terms.TASKS, count, TIED), np.float32)
+        self._tied = self._accumulators[0]
         self._neighbour_sums = np.zeros((neighbour_terms.TASKS, 3), np.float32)
-        self._g_turns = np.zeros((count, 4), np.float32)
-        self.turns = np.zeros((count, 4), np.float32)
         self.means = np.zeros((0, 3), np.float32)
         self.factors = np.zeros((0, 3, 3), np.float32)
 
     def start(self, previous: Gaussians) -> None:
         """Take Θ_{t−1} to deform; standing Gaussians stay as they are in it."""
-        self._previous_means = previous.means[self.hierarchy.rows]
+        self._state[:, PREVIOUS : PREVIOUS + 3] = previous.means[self.hierarchy.rows]
         self._points[0] = np.swapaxes(previous.means[self._rows], 1, 2)
         self._before[:] = np.swapaxes(previous.factors[self._rows].reshape(*self._rows.shape, 9), 1, 2)
         block_sums(self._points, self._present, self._sums)
@@ -84,32 +85,25 @@ class CpuDeformation:
         deform(
             self._parameters, self._offsets, self._ranges, self._clusters_of, self._entries, self._rows, self._present,
             self._before, self.deltas, self._about_origin, self._points, self._sums, self._tables,
-            self.means, self.factors, self.turns,
+            self.means, self.factors, self._state,
         )  # fmt: skip
 
-    def neighbour_losses(self, sample: NDArray[np.int64], weights: tuple[float, float, float], g_means: Array) -> Array:
-        """Means over the sampled pairs of rigidity, isometry and rotation; their gradients are kept and added.
+    def neighbour_losses(self, sample: NDArray[np.int64], weights: tuple[float, float, float]) -> Array:
+        """Means over the sampled pairs of rigidity, isometry and rotation; ``backward`` adds their gradients.
 
         Args:
             sample: [S] entries of the hierarchy's order. weights: of the three terms.
-            g_means: [N, 3], added to. The turns' gradient is kept for ``backward``.
         """
         if self.neighbours is None or len(sample) == 0:
-            self._g_turns[:] = 0
+            self._tied[:] = 0
             return np.zeros(3, np.float32)
         pairs = max(1, len(sample) * self.neighbours.index.shape[1])
         neighbour_terms.neighbour_terms(
-            self._gathered_means(), self.turns, self._previous_means, sample, self.neighbours.index,
-            self.neighbours.weights, self.neighbours.distances, np.array(weights, np.float32) / np.float32(pairs),
-            self._accumulators, self._neighbour_sums,
+            self._state, sample, self.neighbours.index, self.neighbours.weights, self.neighbours.distances,
+            np.array(weights, np.float32) / np.float32(pairs), self._accumulators, self._neighbour_sums,
         )  # fmt: skip
-        neighbour_terms.gather_terms(self._accumulators, self.hierarchy.rows, g_means, self._g_turns)
         means: Array = self._neighbour_sums.sum(axis=0) / pairs
         return means
-
-    def _gathered_means(self) -> Array:
-        """[M, 3] the moved means in the hierarchy's order."""
-        return np.take(self.means, self.hierarchy.rows, axis=0)
 
     def backward(self, g_means: Array, g_factors: Array, scale_weight: float) -> float:
         """Fill ``cluster_gradients`` and ``delta_gradients``; returns the scale loss (metres, mean over axes).
@@ -121,9 +115,16 @@ class CpuDeformation:
         deform_backward(
             self._offsets, self._ranges, self._clusters_of, self._entries, self._rows, self._present, self._before,
             self.deltas, self._about_origin, self._points, self._tables, np.float32(scale_weight / axes), self._bounds,
-            g_means, g_factors, self._g_turns, self._records, self._gradients, self.delta_gradients, self._excess,
+            g_means, g_factors, self._tied, self._records, self._gradients, self.delta_gradients, self._excess,
         )  # fmt: skip
         return float(self._excess.sum(dtype=np.float64)) / axes
+
+
+def cache_lines(count: int) -> Array:
+    """[count, 16] zeros, each row a cache line of 64 bytes."""
+    flat = np.zeros((count + 1) * STATE, np.float32)
+    first = -(flat.ctypes.data // 4) % STATE
+    return flat[first : first + count * STATE].reshape(count, STATE)
 
 
 class Blocks(NamedTuple):

@@ -165,7 +165,7 @@ class FrameUpdate:
             psnr.append(self._picture.psnr)
             if last[view.name] == iteration:
                 cameras[view.name] = CameraFit(self._picture.psnr, self._picture.colour_shift(view))
-            loss += self._neighbour_terms(samples[iteration % len(samples)], gradients.means)
+            loss += self._neighbour_terms(samples[iteration % len(samples)])
             if self._floor is not None:
                 loss += floor_term(
                     self._floor, deformation.means, self.hierarchy.rows, settings.weights.floor, gradients.means
@@ -202,10 +202,10 @@ class FrameUpdate:
         by_row[self.hierarchy.rows] = rates.colour
         return [*optimizers, Adam(colours, [1.0] * 3, rates, by_row=by_row)]
 
-    def _neighbour_terms(self, sample: NDArray[np.int64], g_means: Array) -> float:
+    def _neighbour_terms(self, sample: NDArray[np.int64]) -> float:
         weights = self.settings.weights
         strengths = (weights.rigidity, weights.isometry, weights.rotation)
-        parts = self._deformation.neighbour_losses(sample, strengths, g_means)
+        parts = self._deformation.neighbour_losses(sample, strengths)
         return float(np.dot(strengths, parts))
 
     def _soft_colour(self, colours: Array, previous: Array) -> tuple[float, Array]:

@@ -164,7 +164,7 @@ class Bench:
     def _cpu_cascade_backward(self) -> Arrays:
         self._cpu_cascade()
         deformation = self._deformation
-        deformation.neighbour_losses(np.zeros(0, np.int64), (0.0, 0.0, 0.0), self.mean_pull)
+        deformation.neighbour_losses(np.zeros(0, np.int64), (0.0, 0.0, 0.0))
         deformation.backward(self.mean_pull, self.factor_pull, 0.0)
         found = {f"layer {k}": table for k, table in enumerate(deformation.cluster_gradients)}
         return {**found, "deltas": deformation.delta_gradients}
@@ -175,7 +175,7 @@ class Bench:
         picture = self._picture
         g = picture.evaluate(deformation.means, deformation.factors, self.before.opacities, self.features, self.view)
         sample = np.arange(len(self.hierarchy.rows))
-        tied = deformation.neighbour_losses(sample, (1.0, 1.0, 1.0), g.means)
+        tied = deformation.neighbour_losses(sample, (1.0, 1.0, 1.0))
         scale = deformation.backward(g.means, g.factors, 1.0)
         return {"image": picture.image_part, "mask": picture.mask_part, "neighbours": tied, "scale": scale}
 

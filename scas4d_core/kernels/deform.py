@@ -65,7 +65,7 @@ def block_sums(points, present, sums):
 @parallel_kernel
 def deform(
     parameters, offsets, ranges, clusters, entries, rows, present, before, deltas, about_origin,
-    points, sums, tables, means, factors, turns,
+    points, sums, tables, means, factors, state,
 ):  # fmt: skip
     """The moved Gaussians: M that move, of N, in B blocks, under L layers of K clusters together.
 
@@ -79,7 +79,7 @@ def deform(
         about_origin: 0 for the centred map, 1 for the published one.
         points: [max(L, 1), B, 3, 16] as they enter each layer; the first is given, the others are filled.
         sums: [max(L, 1), B, 3] of them; likewise. tables: out [K, 23].
-        means [N, 3], factors [N, 3, 3]: out at ``rows``. turns: out [M, 4], rotation since frame t−1.
+        means [N, 3], factors [N, 3, 3]: out at ``rows``. state: [M, 16], out its means and turns, see ``deltas``.
     """
     blocks, layers = clusters.shape
     tasks = (blocks + BLOCKS - 1) // BLOCKS
@@ -107,13 +107,13 @@ def deform(
             else:
                 for k in range(3):
                     lanes.store(moved_points, lanes.COUNT * k, lanes.load(points, (3 * block + k) * lanes.COUNT))
-            apply_own(deltas, entries, rows, block * lanes.COUNT, v, moved_points, means, factors, turns)
+            apply_own(deltas, entries, rows, block * lanes.COUNT, v, moved_points, means, factors, state)
 
 
 @parallel_kernel
 def deform_backward(
     offsets, ranges, clusters, entries, rows, present, before, deltas, about_origin, points, tables,
-    scale_weight, bounds, g_means, g_factors, g_turns, records, gradients, g_deltas, losses,
+    scale_weight, bounds, g_means, g_factors, g_tied, records, gradients, g_deltas, losses,
 ):  # fmt: skip
     """Backward of ``deform``, with the gradient of the scale loss added.
 
@@ -121,7 +121,7 @@ def deform_backward(
         offsets … tables: as ``deform`` left them.
         scale_weight: weight of the scale loss over its mean's count 3M; 0 leaves it out.
         bounds: [M, 3] metres, the length each axis may have.
-        g_means [N, 3], g_factors [N, 3, 3], g_turns [M, 4]: in.
+        g_means [N, 3], g_factors [N, 3, 3]: in. g_tied: [M, 8] in, of means and turns, see ``deltas``.
         records: scratch [B, L, 32]. gradients: out [K, 10]. g_deltas: out [M, 9].
         losses: out [B], metres of excess length of the axes, summed over each block.
     """
@@ -138,7 +138,7 @@ def deform_backward(
                 carry(tables[clusters[block, layer]], about_origin, points, place, leaving)
             losses[block] = apply_own_backward(
                 deltas, entries, rows, block * lanes.COUNT, present, v, layers * CARRIED, scale_weight, bounds,
-                g_means, g_factors, g_turns, g, g_deltas,
+                g_means, g_factors, g_tied, g, g_deltas,
             )  # fmt: skip
             for back in range(layers):
                 layer = layers - 1 - back

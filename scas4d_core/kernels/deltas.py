@@ -15,6 +15,13 @@ from scas4d_core.kernels.jit import ONE, ZERO, inline, kernel
 COLUMNS = 9
 """Columns of ``deltas``: Δp 0–2, Δr 3–5, Δs 6–8."""
 
+# Columns of a Gaussian's state, what the terms between neighbours read: mean now 0–2, turn since frame t−1 3–6, mean at
+# frame t−1 7–9. A row is a cache line.
+STATE = 16
+MEAN, TURN, PREVIOUS = 0, 3, 7
+TIED = 8
+"""Columns of what they answer: gradient of the mean 0–2, of the turn 3–6, none."""
+
 
 @inline
 def own_quaternion(deltas, entries, place):
@@ -27,18 +34,20 @@ def own_quaternion(deltas, entries, place):
 
 
 @kernel
-def apply_own(deltas, entries, rows, place, v, points, means, factors, turns):
+def apply_own(deltas, entries, rows, place, v, points, means, factors, state):
     """Write sixteen moved Gaussians.
 
     Args:
         deltas: [M, 9]. entries, rows: flat int64; from ``place`` on, the Gaussians' rows among the M that move and
             among all N.
         v: [13, 16] factors 0–8 and turns 9–12 from the cascade. points: [3, 16] likewise.
-        means [N, 3], factors [N, 3, 3], turns [M, 4]: out at those rows.
+        means [N, 3], factors [N, 3, 3]: out at those rows. state: [M, 16], out mean and turn.
     """
     n = lanes.COUNT
     for k in range(3):
-        lanes.put(means, rows, place, 3, k, lanes.load(points, n * k) + lanes.pick(deltas, entries, place, COLUMNS, k))
+        mean = lanes.load(points, n * k) + lanes.pick(deltas, entries, place, COLUMNS, k)
+        lanes.put(means, rows, place, 3, k, mean)
+        lanes.put(state, entries, place, STATE, MEAN + k, mean)
     w, x, y, z = own_quaternion(deltas, entries, place)
     r0, r1, r2, r3, r4, r5, r6, r7, r8 = rotation_entries(w, x, y, z)
     for column in range(3):
@@ -53,15 +62,15 @@ def apply_own(deltas, entries, rows, place, v, points, means, factors, turns):
         w, x, y, z, lanes.load(v, 9 * n), lanes.load(v, 10 * n), lanes.load(v, 11 * n), lanes.load(v, 12 * n)
     )
     sign = lanes.choose(qw >= ZERO, lanes.fill(ONE), lanes.fill(-ONE))
-    lanes.put(turns, entries, place, 4, 0, sign * qw)
-    lanes.put(turns, entries, place, 4, 1, sign * qx)
-    lanes.put(turns, entries, place, 4, 2, sign * qy)
-    lanes.put(turns, entries, place, 4, 3, sign * qz)
+    lanes.put(state, entries, place, STATE, TURN + 0, sign * qw)
+    lanes.put(state, entries, place, STATE, TURN + 1, sign * qx)
+    lanes.put(state, entries, place, STATE, TURN + 2, sign * qy)
+    lanes.put(state, entries, place, STATE, TURN + 3, sign * qz)
 
 
 @kernel
 def apply_own_backward(
-    deltas, entries, rows, place, present, v, leaving, scale_weight, bounds, g_means, g_factors, g_turns, g, g_deltas
+    deltas, entries, rows, place, present, v, leaving, scale_weight, bounds, g_means, g_factors, g_tied, g, g_deltas
 ):
     """Backward of ``apply_own``, with the gradient of the scale loss added.
 
@@ -70,7 +79,7 @@ def apply_own_backward(
         v: factors and turns from the cascade, from flat index ``leaving`` on.
         scale_weight: weight of the scale loss over its mean's count 3M; 0 leaves it out.
         bounds: [M, 3] metres, the length each axis may have.
-        g_means [N, 3], g_factors [N, 3, 3], g_turns [M, 4]: in.
+        g_means [N, 3], g_factors [N, 3, 3]: in. g_tied: [M, 8] in, more gradient of the means, and that of the turns.
         g: out [16, 16], gradients of point 0–2, factor 3–11, turn 12–15. g_deltas: out [M, 9].
 
     Returns:
@@ -80,7 +89,7 @@ def apply_own_backward(
     nothing = lanes.fill(ZERO)
     counts = lanes.load(present, place) > ZERO
     for k in range(3):
-        pull = lanes.pick(g_means, rows, place, 3, k)
+        pull = lanes.pick(g_means, rows, place, 3, k) + lanes.pick(g_tied, entries, place, TIED, k)
         lanes.put(g_deltas, entries, place, COLUMNS, k, pull)
         lanes.store(g, n * k, lanes.choose(counts, pull, nothing))
     w, x, y, z = own_quaternion(deltas, entries, place)
@@ -123,8 +132,10 @@ def apply_own_backward(
     )  # fmt: skip
     qw, _, _, _ = product(w, x, y, z, bw, bx, by, bz)
     sign = lanes.choose(qw >= ZERO, lanes.fill(ONE), lanes.fill(-ONE))
-    tw, tx = sign * lanes.pick(g_turns, entries, place, 4, 0), sign * lanes.pick(g_turns, entries, place, 4, 1)
-    ty, tz = sign * lanes.pick(g_turns, entries, place, 4, 2), sign * lanes.pick(g_turns, entries, place, 4, 3)
+    tw = sign * lanes.pick(g_tied, entries, place, TIED, 3)
+    tx = sign * lanes.pick(g_tied, entries, place, TIED, 4)
+    ty = sign * lanes.pick(g_tied, entries, place, TIED, 5)
+    tz = sign * lanes.pick(g_tied, entries, place, TIED, 6)
     ow, ox, oy, oz = product(w, -x, -y, -z, tw, tx, ty, tz)
     lanes.store(g, 12 * n, lanes.choose(counts, ow, nothing))
     lanes.store(g, 13 * n, lanes.choose(counts, ox, nothing))

@@ -340,6 +340,57 @@ def put(typing_context: Any, array: Any, rows: Any, place: Any, columns: Any, co
 
 
 @emitted
+def rows_at(typing_context: Any, array: Any, rows: Any, place: Any) -> Any:
+    """Sixteen rows of a float32 array [n, 16], those that ``rows`` (int64) names from ``place`` on."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        given = [arguments[0], arguments[1], arguments[2], _LONG(COUNT), _LONG(0)]
+        places = _places_of_rows(context, builder, signature.args[:2], given)
+        loaded = [builder.load(builder.bitcast(place, _FLOATS.as_pointer()), align=4) for place in places]
+        return context.make_tuple(builder, signature.return_type, loaded)
+
+    return types.UniTuple(lanes_type, COUNT)(array, rows, types.int64), generate
+
+
+@emitted
+def add_halves(typing_context: Any, array: Any, rows: Any, place: Any, columns: Any) -> Any:
+    """Add eight ``Lanes``, the columns of sixteen rows, to a float32 array [n, 8] at the rows named, one by one."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        given = [arguments[0], arguments[1], arguments[2], _LONG(COUNT // 2), _LONG(0)]
+        places = _places_of_rows(context, builder, signature.args[:2], given)
+        values = [builder.extract_value(arguments[3], k) for k in range(COUNT // 2)]
+        eight = ir.VectorType(_FLOAT, COUNT // 2)
+
+        def shuffled(a: Any, b: Any, picked: list[int]) -> Any:
+            return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT, len(picked)), picked))
+
+        # Pairs of columns side by side, then fours, then eights: lane by lane, the columns come together.
+        width = 1
+        groups = [[value] for value in values]  # each: the vectors that hold rows 0–15 of ``width`` columns in turn
+        while len(groups) > 1:
+            merged = []
+            for left, right in zip(groups[::2], groups[1::2], strict=True):
+                vectors = []
+                for a, b in zip(left, right, strict=True):
+                    for half in range(2):
+                        picked = []
+                        for row in range(half * COUNT // (2 * width), (half + 1) * COUNT // (2 * width)):
+                            picked += [row * width + k for k in range(width)]
+                            picked += [COUNT + row * width + k for k in range(width)]
+                        vectors.append(shuffled(a, b, picked))
+                merged.append(vectors)
+            groups, width = merged, 2 * width
+        for lane, place in enumerate(places):
+            of_row = shuffled(groups[0][lane // 2], groups[0][lane // 2], [8 * (lane % 2) + k for k in range(8)])
+            target = builder.bitcast(place, eight.as_pointer())
+            builder.store(builder.fadd(builder.load(target, align=4), of_row), target, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, rows, types.int64, columns), generate
+
+
+@emitted
 def fetch(typing_context: Any, array: Any, row: Any) -> Any:
     """Have a row of a two-dimensional float32 array brought into the first-level cache; any row, inside or not."""
 

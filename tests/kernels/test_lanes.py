@@ -74,6 +74,28 @@ def test_columns_of_named_rows():
 
 
 @kernel
+def whole_rows(array, rows, sums, out):
+    taken = lanes.rows_at(array, rows, 0)
+    for k in range(16):
+        lanes.store(out, 16 * k, taken[k])
+    columns = lanes.transposed(taken)
+    lanes.add_halves(
+        sums, rows, 0, (columns[0], columns[1], columns[2], columns[3], columns[4], columns[5], columns[6], columns[7])
+    )
+
+
+def test_whole_rows_and_sums_of_rows_named_twice():
+    rng = np.random.default_rng(2)
+    array, rows = rng.normal(size=(20, 16)).astype(np.float32), rng.integers(0, 12, 16)
+    sums, out = np.ones((20, 8), np.float32), np.zeros((16, 16), np.float32)
+    whole_rows(array, rows, sums, out)
+    np.testing.assert_array_equal(out, array[rows])
+    expected = np.ones((20, 8))
+    np.add.at(expected, rows, array[rows, :8].astype(np.float64))
+    np.testing.assert_allclose(sums, expected, rtol=1e-5, atol=1e-6)
+
+
+@kernel
 def arithmetic(x, y, factor, out):
     a, b = lanes.load(x, 0), lanes.load(y, 0)
     lanes.store(out, 0, (a + b) * factor - a / b)

@@ -17,6 +17,7 @@ def test_losses_and_gradients_agree_with_the_twin() -> None:
     turns = (turns / np.linalg.norm(turns, axis=1, keepdims=True)).astype(np.float32)
     neighbours = np.array([rng.choice(np.delete(np.arange(count), i), k, replace=False) for i in range(count)])
     weights = rng.uniform(0.1, 1, size=(count, k)).astype(np.float32)
+    weights[rng.random(size=weights.shape) < 0.1] = 0  # no neighbour
     distances = rng.uniform(0.5, 2, size=(count, k)).astype(np.float32)
     sample = rng.choice(count, 61, replace=False)
     strengths = np.array([4.0, 2.0, 3.0], np.float32) / (len(sample) * k)
@@ -31,13 +32,14 @@ def test_losses_and_gradients_agree_with_the_twin() -> None:
     ]
     (4 * expected[0] + 2 * expected[1] + 3 * expected[2]).backward()
 
-    accumulators = np.full((neighbour_terms.TASKS, count, 7), np.nan, np.float32)
+    state = np.zeros((count, 16), np.float32)
+    state[:, :3], state[:, 3:7], state[:, 7:10] = means, turns, previous
+    accumulators = np.full((neighbour_terms.TASKS, count, 8), np.nan, np.float32)
     sums = np.empty((neighbour_terms.TASKS, 3), np.float32)
     neighbour_terms.neighbour_terms(
-        means, turns, previous, sample, neighbours.astype(np.int32), weights, distances, strengths, accumulators, sums
+        state, sample, neighbours.astype(np.int32), weights, distances, strengths, accumulators, sums
     )
-    g_means, g_turns = np.zeros((count, 3), np.float32), np.empty((count, 4), np.float32)
-    neighbour_terms.gather_terms(accumulators, np.arange(count), g_means, g_turns)
+    g_means, g_turns = accumulators[0, :, :3], accumulators[0, :, 3:7]
     np.testing.assert_allclose(sums.sum(0) / (len(sample) * k), [loss.item() for loss in expected], rtol=1e-5)
     for value, leaf in zip((g_means, g_turns), leaves, strict=True):
         assert leaf.grad is not None
