@@ -49,6 +49,14 @@ class StaticSettings(Model):
     """Frame 0: 3D Gaussian Splatting with adaptive density control."""
 
     iterations: int = Field(3000, ge=1, description="Iterations of frame 0, one training view each.")
+    stop_gain: float = Field(
+        0.0,
+        ge=0,
+        lt=1,
+        description="Stop rule: frame 0 ends before its iterations are through, once none are added any more and five "
+        "rounds over all views lower the mean training loss by less than this share. 0: never; 0.01 saves a simple "
+        "scene a part of its wait.",
+    )
     max_gaussians: int | None = Field(
         None,
         ge=1,

@@ -88,6 +88,9 @@ PER_PIXEL, PER_COVERED_PIXEL, LARGEST_BUDGET = 0.34, 0.27, 100_000
 """The rule for the budget of Gaussians, see ``StaticSettings.max_gaussians``. Detail lies on objects: a picture that is
 mostly background asks for nearly as many Gaussians as a full one. Beyond the largest an update takes seconds."""
 
+STOP_ROUNDS = 5
+"""Rounds over all views that the stop rule compares with as many before: in fewer the order of views is noise."""
+
 PLAIN = 2 / 255
 """A pixel this near the background's colour is background."""
 
@@ -125,6 +128,7 @@ class StaticTrainer:
         self._reset_moments()
         self.exposing = settings.exposure is not False
         self.psnr: list[float] = []
+        self._last = settings.iterations
         self.cameras: dict[str, CameraFit] = {}
         self._exposure_moments = {view.name: np.zeros((2, *view.exposure.shape), np.float32) for view in views}
 
@@ -144,9 +148,9 @@ class StaticTrainer:
         self._gradients = np.empty_like(self.parameters)
 
     def train(self, progress: Callable[[int, float], None] | None = None) -> list[float]:
-        """Run all iterations; ``progress`` gets the iteration and the loss."""
+        """Run all iterations, or as many as the stop rule lets; ``progress`` gets the iteration and the loss."""
         settings = self.settings
-        losses = []
+        losses: list[float] = []
         order = view_order(len(self.views), settings.iterations, self._rng)
         self._allocate()
         start = len(self.parameters)
@@ -159,18 +163,31 @@ class StaticTrainer:
                 self.control_density(round(start + (self.budget - start) * min(1.0, share + 0.1)))
             if done == until or done == (until + settings.iterations) // 2:
                 self.remove_unseen()
+            if done > until and self._last == settings.iterations and self._settled(losses):
+                self._last = min(settings.iterations, done + len(self.views))
+                self.remove_unseen()
             if settings.exposure == "auto" and done == round(EXPOSURE_TRIAL * settings.iterations):
                 self._judge_exposure()
             if progress is not None:
                 progress(done, losses[-1])
+            if done == self._last:
+                break
         return losses
+
+    def _settled(self, losses: list[float]) -> bool:
+        """The stop rule: rounds over all views no longer lower the loss. One more round of them follows the verdict."""
+        window = STOP_ROUNDS * len(self.views)
+        if self.settings.stop_gain == 0 or len(losses) % window or len(losses) < 2 * window:
+            return False
+        before, now = np.mean(losses[-2 * window : -window]), np.mean(losses[-window:])
+        return bool(before - now < self.settings.stop_gain * before)
 
     def step(self, view: TrainingView, iteration: int) -> float:
         """One iteration: render the view, compare, carry back, Adam. Returns the loss."""
         activation.activate(self.parameters, self._means, self._factors, self._opacities, self._features)
         gradients = self._loss.evaluate(self._means, self._factors, self._opacities, self._features, view)
         self.psnr.append(self._loss.psnr)
-        if iteration >= self.settings.iterations - len(self.views):
+        if iteration >= self._last - len(self.views):
             self.cameras[view.name] = CameraFit(self._loss.psnr, self._loss.colour_shift(view))
         activation.activate_backward(
             self.parameters, self._factors, self._opacities, self._features, gradients.means, gradients.factors,

@@ -11,6 +11,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.settings import SceneSettings, StaticSettings
 from scas4d_core.static_scene import (
     EXPOSURE_SPREAD,
+    STOP_ROUNDS,
     StaticResult,
     StaticTrainer,
     fit_static_scene,
@@ -183,3 +184,18 @@ def test_progress_counts_every_iteration() -> None:
         factory, views, *cloud(), None, SceneSettings(), short, lambda done, loss: seen.append((done, loss))
     )
     assert seen == list(enumerate(result.losses, start=1))
+
+
+def test_frame_0_ends_early_once_nothing_is_gained() -> None:
+    """The verdict comes after densification, at the end of some rounds, and one more round follows it."""
+    settings = SETTINGS.model_copy(update={"iterations": 120, "densify_until": 0.3, "exposure": False})
+    whole = fit(settings)
+    assert len(whole.losses) == 120
+    never = fit(settings.model_copy(update={"stop_gain": 0.0}))
+    np.testing.assert_array_equal(never.losses, whole.losses)
+    cameras = len(RIG.cameras)
+    early = fit(settings.model_copy(update={"stop_gain": 0.99}))
+    assert 0.3 * 120 < len(early.losses) - cameras < 120  # 60, in fact: the first end of rounds with as many before
+    assert (len(early.losses) - cameras) % (STOP_ROUNDS * cameras) == 0
+    np.testing.assert_array_equal(early.losses[:-cameras], whole.losses[: len(early.losses) - cameras])
+    assert set(early.cameras) == set(RIG.names)

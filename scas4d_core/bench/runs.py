@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from scas4d_core.bench.quality import Job, Report, run_jobs, settings_of
 from scas4d_core.bench.store import Row, Store
@@ -17,6 +18,9 @@ CAPTURES = (*OBJECT_CAPTURES, "stage", "basketball")
 
 CAPTURE_CHANGES: Mapping[str, tuple[str, ...]] = {}
 """What a scene itself asks for in every run of it (its budget of Gaussians, its floor), never what tunes a method."""
+
+LATER: Mapping[str, Mapping[str, Any]] = {"static": {"stop_gain": 0.0}}
+"""Settings that rows measured before do not name, by group, with the value that they had in effect."""
 
 OTHER_MAP = "published" if preset("scas4d").update.cluster_map == "centred" else "centred"
 """The cluster map that is not the default."""
@@ -119,6 +123,14 @@ def measure_runs(
     return run_jobs(jobs, out, again=again, report=report)
 
 
+def completed(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """A row's settings with what came later, at the value that leaves all as it was."""
+    return {
+        group: {**LATER.get(group, {}), **given} if isinstance(given, dict) else given
+        for group, given in settings.items()
+    }
+
+
 def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
     """The rows on disk by run and capture; of several, the one with most frames. Rows with other settings are left out.
 
@@ -134,7 +146,8 @@ def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
             for row in rows:
                 given = row["given"]
                 withheld = (given["masks"], given["points"])
-                same = all(row["settings"].get(group) == settings[group] for group in groups)
+                told = completed(row["settings"])
+                same = all(told.get(group) == settings[group] for group in groups)
                 if row["capture"] != capture or not same or withheld != (run.masks, run.points):
                     continue
                 best = found.get((name, capture))
