@@ -65,10 +65,7 @@ async def take_form(scene: Scene, index: int, request: Request) -> FrameReceipt:
             scene.ingest.coming(index)
         try:
             receiving = _receiving(scene, head, scene.ingest.time_of(index, time), keep)
-            await _feed(
-                receiving,
-                [(file, await upload.read()) for file, upload in zip(head.files, given.values(), strict=True)],
-            )
+            await _feed(receiving, [await upload.read() for upload in given.values()])
             return await _taken(scene, head, receiving)
         finally:
             if keep:
@@ -103,7 +100,7 @@ async def take_file(
     head = _head(index, time, [FrameFile(camera=camera, kind=kind, size=len(data))], part=True)
     scene.ingest.expects_part(head, camera)
     receiving = _receiving(scene, head, time, index >= scene.next_frame)
-    await _feed(receiving, [(head.files[0], data)])
+    await _feed(receiving, [data])
     return await _part_taken(scene, head, camera, receiving)
 
 
@@ -136,10 +133,10 @@ def _receiving(scene: Scene, head: FrameHead, seconds: float | None, keep: bool)
     )
 
 
-async def _feed(receiving: Receiving, files: Sequence[tuple[FrameFile, bytes]]) -> None:
+async def _feed(receiving: Receiving, files: Sequence[bytes]) -> None:
     try:
-        for file, data in files:
-            await receiving.files([file], memoryview(data))
+        for data in files:
+            await receiving.take(memoryview(data))
     except BaseException as error:
         await receiving.abort()
         if no_room(error) and isinstance(error, OSError):

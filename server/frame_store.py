@@ -6,6 +6,9 @@ a cut can damage one record only, and retention deletes files.
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import fcntl
 import os
 import re
 import secrets
@@ -13,14 +16,15 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from blake3 import blake3
-
 from client.wire import FileKind, FrameHead
 from scas4d_core.npz import sync_folder
 from server.facts import Hashes
-from server.record_log import CHECKSUM, Kind, Record, opening, read_at
+from server.record_log import BY_FILE, CHECKSUM, Kind, Record, checksum, opening, read_at
 
 FILE = re.compile(r"(\d{10})-[0-9a-f]{12}\.frame")
+DIRECT = getattr(os, "O_DIRECT", 0)
+BLOCK = 4096
+"""Bytes: a multiple of what disks write at once."""
 
 
 class FrameDamage(ValueError):
@@ -43,7 +47,10 @@ class Pictures:
 
 
 class Upload:
-    """One record on its way to disk. Its bytes are written and hashed as they come; blocking, for a thread.
+    """One record on its way to disk, its bytes written as they come. `write` and the others block: for a thread.
+
+    Past the page cache where the file system can (O_DIRECT): through it a frame costs ten times the processor time.
+    Such writes are of whole blocks, from memory that begins at a page; what is over waits for the next.
 
     Args:
         folder: of the frame log.
@@ -53,28 +60,45 @@ class Upload:
 
     def __init__(self, folder: Path, head: FrameHead, seconds: float | None) -> None:
         self.name = f"{head.index:010d}-{secrets.token_hex(6)}.frame"
-        self.size = 0
         self._folder = folder
-        self._file: int | None = os.open(folder / self.name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._file: int | None = None
         files = [file.model_dump(mode="json") for file in head.files]
         said = {"time": seconds, "part": head.part, "files": files}
-        start = opening(Kind.PICTURES, head.index, said, sum(file.size for file in head.files))
-        self._digest = blake3(start)
-        self._write(start)
+        length = sum(file.size for file in head.files)
+        self._opening = opening(Kind.PICTURES, head.index, said, length, BY_FILE)
+        self._over = self._opening
+        self.begin = len(self._opening)
+        """Where in the file the pictures begin."""
+        self.size = self.begin + length + CHECKSUM
+        """Bytes of the whole record."""
 
-    def write(self, data: memoryview) -> None:
-        """Writes what comes next of the files."""
-        self._digest.update(data)
-        self._write(data)
+    def write(self, block: memoryview, lead: int) -> None:
+        """Writes what comes next of the files.
 
-    def finish(self) -> None:
-        """The record is on disk when this returns.
+        Args:
+            block: memory that begins at a page; the bytes are those from `lead` on, and before them is room for what
+                is left of those before.
+            lead: their place in the file, modulo `BLOCK`.
+        """
+        if self._file is None:
+            self._open()
+        assert lead == len(self._over)
+        block[:lead] = self._over
+        whole = len(block) // BLOCK * BLOCK
+        self._put(block[:whole])
+        self._over = bytes(block[whole:])
+
+    def finish(self, digests: Iterable[bytes]) -> None:
+        """The record, whose files have these BLAKE3s, is on disk when this returns.
 
         Raises:
             OSError: it is not; `abort` removes what is there.
         """
-        self._write(self._digest.digest(CHECKSUM))
+        if self._file is None:
+            self._open()
         assert self._file is not None
+        self._direct(False)
+        self._put(memoryview(self._over + checksum(self._opening, *digests)))
         os.fsync(self._file)
         os.close(self._file)
         self._file = None
@@ -87,12 +111,30 @@ class Upload:
             self._file = None
         (self._folder / self.name).unlink(missing_ok=True)
 
-    def _write(self, data: bytes | memoryview) -> None:
+    def _open(self) -> None:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+        self._file = os.open(self._folder / self.name, flags, 0o644)
+        whole = len(self._over) // BLOCK * BLOCK
+        self._put(memoryview(self._over[:whole]))  # of many cameras
+        self._over = self._over[whole:]
+        self._direct(True)
+
+    def _direct(self, on: bool) -> None:
         assert self._file is not None
-        view = memoryview(data)
-        self.size += len(view)
-        while view:
-            view = view[os.write(self._file, view) :]
+        flags = fcntl.fcntl(self._file, fcntl.F_GETFL)
+        with contextlib.suppress(OSError):  # not on this file system: through the cache, then
+            fcntl.fcntl(self._file, fcntl.F_SETFL, flags | DIRECT if on else flags & ~DIRECT)
+
+    def _put(self, data: memoryview) -> None:
+        assert self._file is not None
+        while data:
+            try:
+                data = data[os.write(self._file, data) :]
+            except OSError as error:
+                # Blocks are larger here, or the write before ended within one, as at the end of the disk.
+                if error.errno != errno.EINVAL or not fcntl.fcntl(self._file, fcntl.F_GETFL) & DIRECT:
+                    raise
+                self._direct(False)
 
 
 def read_pictures(folder: Path, name: str) -> Pictures:
@@ -113,14 +155,11 @@ def read_pictures(folder: Path, name: str) -> Pictures:
     images: dict[str, memoryview] = {}
     masks: dict[str, memoryview] = {}
     hashes: Hashes = {}
-    at = 0
     try:
-        for file in found.head["files"]:
+        for file, piece, digest in zip(found.head["files"], found.files, found.digests, strict=True):
             kind, camera = FileKind(file["kind"]), file["camera"]
-            piece = found.body[at : at + file["size"]]
-            at += file["size"]
             (images if kind == FileKind.IMAGE else masks)[camera] = piece
-            hashes.setdefault(camera, {})[kind] = blake3(piece).hexdigest()
+            hashes.setdefault(camera, {})[kind] = digest.hex()
         return Pictures(found.index, found.head["time"], bool(found.head["part"]), images, masks, hashes)
     except (KeyError, TypeError, ValueError) as error:
         raise FrameDamage(f"{name}: its head is not one of pictures ({error!r})") from None

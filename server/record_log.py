@@ -4,7 +4,7 @@ A record is a header, a head (JSON) and a body (raw bytes), and a checksum behin
 
     bytes  what
     4      magic S4DR
-    1      version of the format, 1
+    1      version of the format, 1 or 2: which checksum is behind the body
     1      kind, `Kind`
     2      nought
     4      length of the head
@@ -13,11 +13,13 @@ A record is a header, a head (JSON) and a body (raw bytes), and a checksum behin
     4      CRC-32 of the 28 bytes before and of the head
     …      head, UTF-8 JSON
     …      body
-    16     BLAKE3 of all before, cut to 128 bits
+    16     BLAKE3, cut to 128 bits; version 1: of all before, version 2: of header and head and then of the BLAKE3
+           (32 bytes) of each file
 
 All numbers are unsigned little-endian. The CRC makes a header that is found in the middle of damage worth believing, so
 that a reader can look for the next record; the BLAKE3 says that the record is what was written. The body may be written
-before its checksum is known: a frame goes to disk while it is received.
+before its checksum is known: a frame goes to disk while it is received. Of version 2 the head has `files`, whose `size`
+says where in the body each is: the BLAKE3 of a file is the frame's identity too, and so no byte is hashed twice.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ from typing import Any
 from blake3 import blake3
 
 MAGIC = b"S4DR"
-VERSION = 1
+WHOLE, BY_FILE = 1, 2
+"""Versions of the format."""
 HEADER = struct.Struct("<4sBBHIQQ")
 CRC = struct.Struct("<I")
 PREFIX = HEADER.size + CRC.size
@@ -52,12 +55,14 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """One record as read. `body` is a view into what was read."""
+    """One record as read; views into what was read. `files` and `digests`, the BLAKE3 of each, only of version 2."""
 
     kind: int
     index: int
     head: Any
     body: memoryview
+    files: tuple[memoryview, ...] = ()
+    digests: tuple[bytes, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -76,15 +81,15 @@ class Damage:
     """It reaches the end of the log: an append that was cut short looks like this."""
 
 
-def opening(kind: int, index: int, head: Any, body_length: int) -> bytes:
-    """Header and head of a record; the body and then `RecordDigest.checksum` follow."""
+def opening(kind: int, index: int, head: Any, body_length: int, version: int = WHOLE) -> bytes:
+    """Header and head of a record; the body and its checksum follow."""
     text = json.dumps(head, separators=(",", ":"), allow_nan=False).encode()
-    header = HEADER.pack(MAGIC, VERSION, kind, 0, len(text), index, body_length)
+    header = HEADER.pack(MAGIC, version, kind, 0, len(text), index, body_length)
     return header + CRC.pack(zlib.crc32(text, zlib.crc32(header))) + text
 
 
 def checksum(*pieces: bytes | bytearray | memoryview) -> bytes:
-    """Of a record, given as consecutive pieces."""
+    """Of consecutive pieces: all of a record, or its opening and the BLAKE3 of each of its files."""
     digest = blake3()
     for piece in pieces:
         digest.update(piece)
@@ -92,7 +97,7 @@ def checksum(*pieces: bytes | bytearray | memoryview) -> bytes:
 
 
 def encoded(kind: int, index: int, head: Any, body: bytes = b"") -> bytes:
-    """A whole record."""
+    """A whole record of version 1."""
     start = opening(kind, index, head, len(body))
     return start + body + checksum(start, body)
 
@@ -108,7 +113,7 @@ def read_at(data: memoryview, at: int) -> tuple[Record | Damage, int]:
         return _skip(data, at, "no record begins here")
     _, version, kind, nought, head_length, index, body_length = HEADER.unpack(header)
     head_end = at + PREFIX + head_length
-    if version != VERSION or nought or head_length > MAX_HEAD or head_end > len(data):
+    if version not in (WHOLE, BY_FILE) or nought or head_length > MAX_HEAD or head_end > len(data):
         return _skip(data, at, "the header is of another version, damaged, or cut")
     head_bytes = data[at + PREFIX : head_end]
     if CRC.unpack_from(data, at + HEADER.size)[0] != zlib.crc32(head_bytes, zlib.crc32(header)):
@@ -117,13 +122,33 @@ def read_at(data: memoryview, at: int) -> tuple[Record | Damage, int]:
     if end > len(data):
         damage, after = _skip(data, at, f"ends after {len(data) - at} of {end - at} bytes")
         return Damage(at, after, damage.reason, index, kind, damage.torn), after
-    if checksum(data[at : end - CHECKSUM]) != data[end - CHECKSUM : end]:
+    start, body, found = data[at:head_end], data[head_end : end - CHECKSUM], data[end - CHECKSUM : end]
+    if version == WHOLE and checksum(start, body) != found:
         return Damage(at, end, "the record fails its checksum", index, kind), end
     try:
         head = json.loads(bytes(head_bytes))
-    except ValueError as error:  # whole, but written by something else
-        return Damage(at, end, f"the head is no JSON ({error})", index, kind), end
-    return Record(kind, index, head, data[head_end : end - CHECKSUM]), end
+        files = () if version == WHOLE else _files(head, body)
+    except (KeyError, TypeError, ValueError) as error:  # whole, but written by something else
+        return Damage(at, end, f"the head is not one of a record ({error!r})", index, kind), end
+    digests = tuple(blake3(file).digest() for file in files)
+    if version == BY_FILE and checksum(start, *digests) != found:
+        return Damage(at, end, "the record fails its checksum", index, kind), end
+    return Record(kind, index, head, body, files, digests), end
+
+
+def _files(head: Any, body: memoryview) -> tuple[memoryview, ...]:
+    """The pieces of a body.
+
+    Raises:
+        KeyError, TypeError, ValueError: the head does not say where they are.
+    """
+    files, at = [], 0
+    for file in head["files"]:
+        files.append(body[at : at + file["size"]])
+        at += file["size"]
+    if at != len(body):
+        raise ValueError(f"its files have {at} bytes, the body {len(body)}")
+    return tuple(files)
 
 
 def records(data: bytes | memoryview) -> Iterator[Record | Damage]:
@@ -145,7 +170,7 @@ def _skip(data: memoryview, at: int, reason: str) -> tuple[Damage, int]:
             break
         _, version, _, nought, head_length, _, _ = HEADER.unpack(header)
         head_end = following + PREFIX + head_length
-        if version != VERSION or nought or head_length > MAX_HEAD or head_end > len(data):
+        if version not in (WHOLE, BY_FILE) or nought or head_length > MAX_HEAD or head_end > len(data):
             continue
         head = data[following + PREFIX : head_end]
         if CRC.unpack_from(data, following + HEADER.size)[0] == zlib.crc32(head, zlib.crc32(header)):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+import mmap
+from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,14 +14,18 @@ from client.wire import FrameFile, FrameHead, FramingError, head_length, parse_h
 from client.wire.framing import PREFIX
 from server.disk import full_disk, no_room
 from server.facts import Hashes
-from server.frame_store import Upload
+from server.frame_store import BLOCK, Upload
 from server.problems import Problem
 
 BATCH = 4_000_000
 """Bytes of files that are checked, hashed and written at once, where a file is not larger itself."""
+SPARE_BUFFERS = 8
+"""Buffers of that size that are kept for the next uploads: fresh memory costs as much time as filling it."""
 
 Check = Callable[[FrameFile, memoryview], None]
 """Raises Problem for a file that is not what the scene takes."""
+
+_spare: list[mmap.mmap] = []
 
 
 @dataclass(eq=False)
@@ -35,45 +40,61 @@ class Received:
 
 
 class Receiving:
-    """One record that is being received.
+    """One record that is being received, batch by batch: each is filled while a thread has the one before.
 
     Args:
         folder: of the frame log. head: what comes. seconds: time of the frame, where it is known.
         check: of each file. keep: whether to write; otherwise the files are only hashed.
+
+    Attributes:
+        missing: bytes of its files that have not come yet.
     """
 
     def __init__(self, folder: Path, head: FrameHead, seconds: float | None, check: Check, *, keep: bool) -> None:
-        self._folder, self._head, self._seconds, self._check, self._keep = folder, head, seconds, check, keep
+        self._check = check
         self._hashes: Hashes = {}
-        self._upload: Upload | None = None
-        self._size = 0
+        self._digests: list[bytes] = []
+        self._upload = Upload(folder, head, seconds) if keep else None
         self._at_work: asyncio.Future[None] | None = None
+        self._batches = in_batches(head.files)
+        # Memory and file are alike modulo the size of a block: so it can be written without the page cache.
+        self._at = self._begin = 0 if self._upload is None else self._upload.begin % BLOCK
+        self.missing = sum(map(_bytes, self._batches))
+        size = BLOCK + max(map(_bytes, self._batches))
+        self._buffers = [_buffer(size) for _ in self._batches[:2]]
 
-    async def files(self, files: Sequence[FrameFile], data: memoryview) -> None:
-        """Takes the next files of the head, one behind the other in `data`; returns when those before them are done.
+    async def take(self, data: memoryview) -> None:
+        """Takes what comes next, not more than is missing; returns when there is room for more.
 
         Raises:
-            Problem, OSError: of the files before these.
+            Problem, OSError: of files that came before.
         """
-        await self._done()
-        self._at_work = asyncio.ensure_future(asyncio.to_thread(self._take, files, data))
+        while self._batches:
+            end = self._begin + _bytes(self._batches[0])
+            piece = data[: end - self._at]
+            self._buffers[0][self._at : self._at + len(piece)] = piece
+            self._at += len(piece)
+            self.missing -= len(piece)
+            data = data[len(piece) :]
+            if self._at < end:
+                return
+            await self._settle()
+            block = memoryview(self._buffers[0])[:end]
+            self._start(self._write, self._batches.pop(0), block, self._begin)
+            self._buffers.reverse()
+            self._at = self._begin = 0 if self._upload is None else end % BLOCK
 
-    def _take(self, files: Sequence[FrameFile], data: memoryview) -> None:
-        at = 0
+    def _write(self, files: Sequence[FrameFile], block: memoryview, begin: int) -> None:
+        at = begin
         for file in files:
-            piece = data[at : at + file.size]
+            piece = block[at : at + file.size]
             at += file.size
             self._check(file, piece)
-            self._hashes.setdefault(file.camera, {})[file.kind] = blake3(piece).hexdigest()
-        if self._keep:
-            if self._upload is None:
-                self._upload = Upload(self._folder, self._head, self._seconds)
-            self._upload.write(data)
-
-    async def _done(self) -> None:
-        if self._at_work is not None:
-            task, self._at_work = self._at_work, None
-            await task
+            digest = blake3(piece)
+            self._digests.append(digest.digest())
+            self._hashes.setdefault(file.camera, {})[file.kind] = digest.hexdigest()
+        if self._upload is not None:
+            self._upload.write(block, begin)
 
     async def finish(self) -> Received:
         """All files are on disk.
@@ -81,22 +102,38 @@ class Receiving:
         Raises:
             Problem, OSError: they are not.
         """
-        await self._done()
+        await self._settle()
         upload = self._upload
-        if upload is None:
-            return Received(self._hashes, None, 0)
-        await asyncio.to_thread(upload.finish)
-        return Received(self._hashes, upload.name, upload.size)
+        if upload is not None:
+            self._start(upload.finish, self._digests)
+            await self._settle()
+        self._give_back()
+        return Received(self._hashes, None, 0) if upload is None else Received(self._hashes, upload.name, upload.size)
 
     async def abort(self) -> None:
-        """Removes what was written."""
-        try:
-            await self._done()
-        except (Problem, OSError):
-            pass
-        finally:
-            if self._upload is not None:
-                await asyncio.to_thread(self._upload.abort)
+        """Removes what was written, whoever is cancelled meanwhile."""
+        await asyncio.shield(asyncio.ensure_future(self._abort()))
+
+    async def _abort(self) -> None:
+        if self._at_work is not None:
+            await asyncio.wait([self._at_work])  # nothing may be closed or used again under a thread that writes
+        self._give_back()
+        if self._upload is not None:
+            await asyncio.to_thread(self._upload.abort)
+
+    def _start(self, function: Callable[..., None], *arguments: object) -> None:
+        self._at_work = asyncio.ensure_future(asyncio.to_thread(function, *arguments))
+
+    async def _settle(self) -> None:
+        """Waits for the thread; that goes on where whoever waits is cancelled."""
+        if self._at_work is not None:
+            await asyncio.shield(self._at_work)
+            self._at_work = None
+
+    def _give_back(self) -> None:
+        _spare.extend(buffer for buffer in self._buffers if len(buffer) == _STANDARD)
+        del _spare[SPARE_BUFFERS:]
+        self._buffers = []
 
 
 async def receive_framed(
@@ -114,46 +151,28 @@ async def receive_framed(
     start = bytearray()
     head: FrameHead | None = None
     receiving: Receiving | None = None
-    batches: Iterator[list[FrameFile]] = iter(())
-    batch: list[FrameFile] | None = None
-    buffers = (bytearray(), bytearray())
-    size = filled = 0
     try:
         async for chunk in chunks:
             view = memoryview(chunk)
             if head is None or receiving is None:
-                start += chunk
-                if len(start) < PREFIX.size or len(start) < PREFIX.size + head_length(start):
+                view = _fill(start, view, PREFIX.size)
+                if len(start) < PREFIX.size:
                     continue
                 end = PREFIX.size + head_length(start)
-                head = parse_head(start[PREFIX.size : end])
+                view = _fill(start, view, end)
+                if len(start) < end:
+                    continue
+                head = parse_head(start[PREFIX.size :])
                 _check_length(head, end, total)
                 receiving = head_of(head)
-                view = memoryview(bytes(start))[end:]
-                planned = in_batches(head.files)
-                # Two, in turns: while one is checked and written, the other is filled.
-                buffers = tuple(bytearray(max(map(_bytes, planned))) for _ in range(2))  # type: ignore[assignment]
-                batches = iter(planned)
-                batch = next(batches, None)
-                size = _bytes(batch or [])
-            while batch is not None:
-                piece = view[: size - filled]
-                buffers[0][filled : filled + len(piece)] = piece
-                filled += len(piece)
-                view = view[len(piece) :]
-                if filled < size:
-                    break
-                await receiving.files(batch, memoryview(buffers[0])[:size])
-                buffers = buffers[::-1]
-                batch, filled = next(batches, None), 0
-                size = _bytes(batch or [])
-            if batch is None and len(view):
-                raise FramingError(f"goes on for {len(view)} bytes and more behind its files; send none there")
+            if len(view) > receiving.missing:
+                over = len(view) - receiving.missing
+                raise FramingError(f"goes on for {over} bytes and more behind its files; send none there")
+            await receiving.take(view)
         if head is None or receiving is None:
             raise FramingError(f"ends after {len(start)} bytes, within its head; send the whole frame")
-        if batch is not None:
-            missing = size - filled + sum(map(_bytes, batches))
-            raise FramingError(f"ends {missing} bytes before its last file does; send the whole frame")
+        if receiving.missing:
+            raise FramingError(f"ends {receiving.missing} bytes before its last file does; send the whole frame")
         return head, receiving
     except BaseException as error:
         if receiving is not None:
@@ -163,6 +182,13 @@ async def receive_framed(
         if isinstance(error, OSError) and no_room(error):
             raise full_disk(error) from None
         raise
+
+
+def _fill(start: bytearray, view: memoryview, size: int) -> memoryview:
+    """Takes from `view` what is missing of the first `size` bytes; what is left."""
+    missing = size - len(start)
+    start += view[:missing]
+    return view[missing:]
 
 
 def framing_problem(error: FramingError) -> Problem:
@@ -189,3 +215,13 @@ def in_batches(files: Sequence[FrameFile]) -> list[list[FrameFile]]:
 
 def _bytes(files: Sequence[FrameFile]) -> int:
     return sum(file.size for file in files)
+
+
+_STANDARD = -(-(BATCH + BLOCK) // mmap.PAGESIZE) * mmap.PAGESIZE
+
+
+def _buffer(size: int) -> mmap.mmap:
+    """Memory that begins at a page."""
+    if size <= _STANDARD and _spare:
+        return _spare.pop()
+    return mmap.mmap(-1, max(size, _STANDARD))

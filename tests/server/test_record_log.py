@@ -146,10 +146,11 @@ def test_a_full_disk_leaves_the_journal_whole(tmp_path, monkeypatch):
 def upload(folder, data=b"picture"):
     head = FrameHead(index=3, files=[FrameFile(camera="c0", size=len(data)), FrameFile(camera="c1", size=2)])
     record = Upload(folder, head, 0.5)
-    for piece in (data, b"zz"):
-        record.write(memoryview(piece))
+    block = bytearray(record.begin + len(data) + 2)
+    block[record.begin :] = data + b"zz"
+    record.write(memoryview(block), record.begin)
     hashes = [blake3(data).hexdigest(), blake3(b"zz").hexdigest()]
-    record.finish()
+    record.finish([blake3(data).digest(), blake3(b"zz").digest()])
     return record, hashes
 
 
