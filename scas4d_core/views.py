@@ -52,7 +52,9 @@ class ViewFactory:
         """Zero-bordered scratch of the image loss, one per size."""
         key = (channels, height, width)
         if key not in self._scratch:
-            self._scratch[key] = np.zeros((6, channels, height + 2 * image_loss.REACH, width), np.float32)
+            self._scratch[key] = np.zeros(
+                (6, channels, height + 2 * image_loss.REACH, image_loss.stride(width)), np.float32
+            )
         return self._scratch[key]
 
     def views(self, frame: Frame, exposures: dict[str, Array], use_masks: bool = True) -> list[TrainingView]:

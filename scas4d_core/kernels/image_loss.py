@@ -1,7 +1,10 @@
 """The image loss 0.8 L1 + 0.2 (1 − SSIM) and its gradient, over planes [C, H, W]. Twin: ``losses.image_loss``.
 
 SSIM is that of the 3DGS world: 11×11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01², C2 = 0.03². The window is
-separable; each pass is a loop along a row, which vectorizes.
+separable; passes go along a row, sixteen pixels at a time, and read across rows.
+
+Most of many pictures is black, in the target and in the render. A window that is 0 in both has an SSIM of 1 and pulls
+at no pixel: of each row only the columns are computed that are near enough to something else.
 """
 
 from __future__ import annotations
@@ -9,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
+from scas4d_core.kernels import lanes
 from scas4d_core.kernels.jit import ONE, TWO, ZERO, inline, kernel, parallel_kernel
 
 REACH = 5
@@ -24,34 +28,43 @@ L1_SHARE = np.float32(0.8)
 SSIM_SHARE = np.float32(0.2)
 
 
-@kernel
-def filter_row(source, out, width):
-    """Filter a padded row [width + 10] along itself into ``out`` [width]."""
-    for x in range(width):
-        out[x] = (
-            T0 * (source[x] + source[x + 10])
-            + T1 * (source[x + 1] + source[x + 9])
-            + T2 * (source[x + 2] + source[x + 8])
-            + T3 * (source[x + 3] + source[x + 7])
-            + T4 * (source[x + 4] + source[x + 6])
-            + T5 * source[x + 5]
-        )
+PAD = lanes.COUNT
+"""Zeros on either side of a row that is filtered along itself."""
 
 
-@kernel
-def filter_column(plane, row, out, width):
-    """Filter across rows ``row`` … ``row + 10`` of a plane padded by 5 rows above and below into ``out`` [width]."""
-    a, b, c, d, e, f = plane[row], plane[row + 1], plane[row + 2], plane[row + 3], plane[row + 4], plane[row + 5]
-    g, h, i, j, k = plane[row + 6], plane[row + 7], plane[row + 8], plane[row + 9], plane[row + 10]
-    for x in range(width):
-        out[x] = (
-            T0 * (a[x] + k[x])
-            + T1 * (b[x] + j[x])
-            + T2 * (c[x] + i[x])
-            + T3 * (d[x] + h[x])
-            + T4 * (e[x] + g[x])
-            + T5 * f[x]
-        )
+BAND = 16
+"""Rows a task."""
+
+
+def stride(width: int) -> int:
+    """Numbers of a row of scratch: whole ``Lanes``."""
+    return -(-width // lanes.COUNT) * lanes.COUNT
+
+
+@inline
+def along(row, place):
+    """Sixteen numbers of a row filtered along itself, from flat index ``place`` on."""
+    return (
+        T0 * (lanes.load(row, place - 5) + lanes.load(row, place + 5))
+        + T1 * (lanes.load(row, place - 4) + lanes.load(row, place + 4))
+        + T2 * (lanes.load(row, place - 3) + lanes.load(row, place + 3))
+        + T3 * (lanes.load(row, place - 2) + lanes.load(row, place + 2))
+        + T4 * (lanes.load(row, place - 1) + lanes.load(row, place + 1))
+        + T5 * lanes.load(row, place)
+    )
+
+
+@inline
+def across(scratch, place, pitch):
+    """Sixteen numbers filtered across the eleven rows from flat index ``place`` on, ``pitch`` apart."""
+    return (
+        T0 * (lanes.load(scratch, place) + lanes.load(scratch, place + 10 * pitch))
+        + T1 * (lanes.load(scratch, place + pitch) + lanes.load(scratch, place + 9 * pitch))
+        + T2 * (lanes.load(scratch, place + 2 * pitch) + lanes.load(scratch, place + 8 * pitch))
+        + T3 * (lanes.load(scratch, place + 3 * pitch) + lanes.load(scratch, place + 7 * pitch))
+        + T4 * (lanes.load(scratch, place + 4 * pitch) + lanes.load(scratch, place + 6 * pitch))
+        + T5 * lanes.load(scratch, place + 5 * pitch)
+    )
 
 
 @inline
@@ -60,27 +73,177 @@ def exposed(value, gain, offset):
     return gain * value + offset
 
 
+@kernel
+def filter_rows(rows, quantities, scratch, kind, channel, y, span, cleared):
+    """Filter padded rows along themselves, into a row of scratch.
+
+    Args:
+        rows: [quantities or more, pitch + 2 PAD]. kind, channel, y: of the first quantity in ``scratch``.
+        span: first column and last but one that are filtered, whole ``Lanes``. cleared: the same around it, set to 0.
+    """
+    _, channels, height, pitch = scratch.shape
+    for k in range(quantities):
+        place = (((kind + k) * channels + channel) * height + y + REACH) * pitch
+        for x in range(cleared[0], min(span[0], cleared[1]), lanes.COUNT):
+            lanes.store(scratch, place + x, lanes.fill(ZERO))
+        for x in range(span[0], span[1], lanes.COUNT):
+            lanes.store(scratch, place + x, along(rows, k * (pitch + 2 * PAD) + PAD + x))
+        for x in range(max(span[1], cleared[0]), cleared[1], lanes.COUNT):
+            lanes.store(scratch, place + x, lanes.fill(ZERO))
+
+
+@kernel
+def span_of(rows, pitch, spans):
+    """Where the first two of the padded rows are not both 0, in whole ``Lanes``.
+
+    Args:
+        spans: out [4]: first column and last but one of the windows that hold such a pixel, then the same of the pixels
+            in these windows; (pitch, 0) where there is none.
+    """
+    first, last = pitch, 0
+    for x in range(0, pitch, lanes.COUNT):
+        one, two = lanes.load(rows, PAD + x), lanes.load(rows, pitch + 3 * PAD + x)
+        if lanes.any_of(one != ZERO) or lanes.any_of(two != ZERO):
+            first, last = min(first, x), x + lanes.COUNT
+    if last > 0:
+        while rows[0, PAD + first] == ZERO and rows[1, PAD + first] == ZERO:
+            first += 1
+        while rows[0, PAD + last - 1] == ZERO and rows[1, PAD + last - 1] == ZERO:
+            last -= 1
+    for k in range(2):
+        reach = (k + 1) * REACH if last > 0 else 0
+        spans[2 * k] = max(first - reach, 0) // lanes.COUNT * lanes.COUNT
+        spans[2 * k + 1] = min((last + reach + lanes.COUNT - 1) // lanes.COUNT * lanes.COUNT, pitch)
+
+
+@inline
+def hull(spans, which, y, reach):
+    """The columns of the rows around row y."""
+    first, last = spans[y, which], spans[y, which + 1]
+    for other in range(max(0, y - reach), min(spans.shape[0], y + reach + 1)):
+        first = min(first, spans[other, which])
+        last = max(last, spans[other, which + 1])
+    return first, last
+
+
 @parallel_kernel
 def target_moments(target, scratch, means, squares):
     """The window's mean of a target and of its square, once per frame and view.
 
     Args:
-        target: [C, H, W]. scratch: [2, C, H + 10, W], its upper and lower 5 rows 0. means, squares: out [C, H, W].
+        target: [C, H, W]. scratch: [2 or more, C, H + 10, stride(W)], its upper and lower 5 rows 0.
+        means, squares: out [C, H, W].
     """
     channels, height, width = target.shape
+    pitch = scratch.shape[3]
     for task in prange(channels * height):
         channel, y = task // height, task % height
-        row = np.zeros((2, width + 2 * REACH), np.float32)
+        rows = np.zeros((2, pitch + 2 * PAD), np.float32)
         for x in range(width):
             value = target[channel, y, x]
-            row[0, x + REACH] = value
-            row[1, x + REACH] = value * value
-        filter_row(row[0], scratch[0, channel, y + REACH], width)
-        filter_row(row[1], scratch[1, channel, y + REACH], width)
+            rows[0, PAD + x] = value
+            rows[1, PAD + x] = value * value
+        filter_rows(rows, 2, scratch, 0, channel, y, (0, pitch), (0, 0))
     for task in prange(channels * height):
         channel, y = task // height, task % height
-        filter_column(scratch[0, channel], y, means[channel, y], width)
-        filter_column(scratch[1, channel], y, squares[channel, y], width)
+        row = np.empty((2, pitch), np.float32)
+        for k in range(2):
+            place = ((k * channels + channel) * (height + 2 * REACH) + y) * pitch
+            for x in range(0, pitch, lanes.COUNT):
+                lanes.store(row, k * pitch + x, across(scratch, place + x, pitch))
+        for x in range(width):
+            means[channel, y, x] = row[0, x]
+            squares[channel, y, x] = row[1, x]
+
+
+@kernel
+def windows_of_row(image, exposure, target, scratch, spans, rows, channel, y):
+    """First pass of ``image_loss`` over a row: what is windowed, filtered along the row."""
+    width = target.shape[2]
+    gain, offset = exposure[channel, 0], exposure[channel, 1]
+    rows[:] = ZERO
+    first, last = spans[channel, y, 0], spans[channel, y, 1]
+    for x in range(first, min(last, width)):
+        value = exposed(image[channel, y, x], gain, offset)
+        rows[0, PAD + x] = value
+        rows[1, PAD + x] = value * value
+        rows[2, PAD + x] = value * target[channel, y, x]
+    filter_rows(rows, 3, scratch, 0, channel, y, (first, last), hull(spans[channel], 0, y, 2 * REACH))
+
+
+@kernel
+def loss_of_row(
+    image, exposure, target, target_means, target_squares, weights, scratch, spans, rows, given, losses, channel, y
+):
+    """Second pass: the loss of a row, and its gradients by what is windowed, filtered along the row."""
+    channels, height, width = target.shape
+    pitch = scratch.shape[3]
+    gain, offset = exposure[channel, 0], exposure[channel, 1]
+    first, last = hull(spans[channel], 0, y, REACH)
+    end = min(last, width)
+    for x in range(first, end):
+        given[0, x] = exposed(image[channel, y, x], gain, offset) - target[channel, y, x]
+        given[1, x] = target_means[channel, y, x]
+        given[2, x] = target_squares[channel, y, x]
+        given[3, x] = ONE  # inside the picture
+    given[:, end:last] = ZERO
+    rows[:] = ZERO
+    loss = squared = lanes.fill(ZERO)
+    place = (channel * (height + 2 * REACH) + y) * pitch
+    kind = channels * (height + 2 * REACH) * pitch
+    for x in range(first, last, lanes.COUNT):
+        m1 = across(scratch, place + x, pitch)
+        square = across(scratch, place + kind + x, pitch)
+        cross = across(scratch, place + 2 * kind + x, pitch)
+        m2, inside = lanes.load(given, pitch + x), lanes.load(given, 3 * pitch + x)
+        a1 = TWO * m1 * m2 + C1
+        a2 = TWO * (cross - m1 * m2) + C2
+        b1 = m1 * m1 + m2 * m2 + C1
+        b2 = square - m1 * m1 + lanes.load(given, 2 * pitch + x) - m2 * m2 + C2
+        inverse = lanes.fill(ONE) / (b1 * b2)
+        ssim = a1 * a2 * inverse
+        by_cross = TWO * a1 * inverse
+        by_square = -ssim * b1 * inverse
+        by_mean = TWO * (m2 * a2 * inverse - ssim * m1 * b2 * inverse - m1 * by_square) - m2 * by_cross
+        lanes.store(rows, PAD + x, inside * by_mean)
+        lanes.store(rows, pitch + 3 * PAD + x, inside * by_square)
+        lanes.store(rows, 2 * pitch + 5 * PAD + x, inside * by_cross)
+        difference = lanes.load(given, x)
+        squared += difference * difference
+        loss += L1_SHARE * lanes.magnitude(difference) + inside * (SSIM_SHARE * (ONE - ssim))
+    losses[channel, y, 0] = lanes.sum_of(loss) * (weights[channel] / np.float32(height * width))
+    losses[channel, y, 1] = lanes.sum_of(squared)
+    filtered, cleared = hull(spans[channel], 2, y, REACH), hull(spans[channel], 2, y, 3 * REACH)
+    filter_rows(rows, 3, scratch, 3, channel, y, filtered, cleared)
+
+
+@kernel
+def gradient_of_row(image, exposure, target, weights, scratch, spans, by, g_image, g_exposure, channel, y):
+    """Third pass: the gradient of a row."""
+    channels, height, width = target.shape
+    pitch = scratch.shape[3]
+    share = weights[channel] / np.float32(height * width)
+    gain, offset = exposure[channel, 0], exposure[channel, 1]
+    first, last = hull(spans[channel], 2, y, 2 * REACH)
+    begin, end = min(first, width), min(last, width)
+    for k in range(3):
+        place = (((3 + k) * channels + channel) * (height + 2 * REACH) + y) * pitch
+        for x in range(first, last, lanes.COUNT):
+            lanes.store(by, k * pitch + x, across(scratch, place + x, pitch))
+    g_gain = g_offset = ZERO
+    g_image[channel, y, :begin] = ZERO
+    for x in range(begin, end):
+        rendered = image[channel, y, x]
+        value = exposed(rendered, gain, offset)
+        truth = target[channel, y, x]
+        sign = ONE if value > truth else (-ONE if value < truth else ZERO)
+        g = share * (L1_SHARE * sign - SSIM_SHARE * (by[0, x] + TWO * value * by[1, x] + truth * by[2, x]))
+        g_gain += g * rendered
+        g_offset += g
+        g_image[channel, y, x] = g * gain
+    g_image[channel, y, max(begin, end) : width] = ZERO
+    g_exposure[channel, y, 0] = g_gain
+    g_exposure[channel, y, 1] = g_offset
 
 
 @parallel_kernel
@@ -90,77 +253,40 @@ def image_loss(image, exposure, target, target_means, target_squares, weights, s
     Args:
         image: [>= C, >= H, >= W] rendered planes. exposure: [C, 2] gain and offset of the camera per channel.
         target, target_means, target_squares: [C, H, W]. weights: [C] weight of each channel's mean.
-        scratch: [6, C, H + 10, W], its upper and lower 5 rows 0: three windowed quantities and their gradients.
+        scratch: [6, C, H + 10, stride(W)], its upper and lower 5 rows 0: three windowed quantities, their gradients.
         g_image: out [>= C, >= H, >= W] dL/dimage. losses: out [C, H, 2], each row's share of the loss and its sum
             of squared differences.
         g_exposure: out [C, H, 2], each row's share of the gradient of gain and offset.
     """
     channels, height, width = target.shape
-    for task in prange(channels * height):
-        channel, y = task // height, task % height
+    pitch = scratch.shape[3]
+    bands = (height + BAND - 1) // BAND
+    spans = np.empty((channels, height, 4), np.int64)
+    for task in prange(channels * bands):
+        channel, first = task // bands, task % bands * BAND
         gain, offset = exposure[channel, 0], exposure[channel, 1]
-        row = np.zeros((3, width + 2 * REACH), np.float32)
-        for x in range(width):
-            value = exposed(image[channel, y, x], gain, offset)
-            row[0, x + REACH] = value
-            row[1, x + REACH] = value * value
-            row[2, x + REACH] = value * target[channel, y, x]
-        for k in range(3):
-            filter_row(row[k], scratch[k, channel, y + REACH], width)
-    for task in prange(channels * height):
-        channel, y = task // height, task % height
-        share = weights[channel] / np.float32(height * width)
-        gain, offset = exposure[channel, 0], exposure[channel, 1]
-        mean = np.empty(width, np.float32)
-        square = np.empty(width, np.float32)
-        cross = np.empty(width, np.float32)
-        filter_column(scratch[0, channel], y, mean, width)
-        filter_column(scratch[1, channel], y, square, width)
-        filter_column(scratch[2, channel], y, cross, width)
-        loss = ZERO
-        squared = ZERO
-        row = np.zeros((3, width + 2 * REACH), np.float32)
-        for x in range(width):
-            m1, m2 = mean[x], target_means[channel, y, x]
-            a1 = TWO * m1 * m2 + C1
-            a2 = TWO * (cross[x] - m1 * m2) + C2
-            b1 = m1 * m1 + m2 * m2 + C1
-            b2 = square[x] - m1 * m1 + target_squares[channel, y, x] - m2 * m2 + C2
-            inverse = ONE / (b1 * b2)
-            ssim = a1 * a2 * inverse
-            by_cross = TWO * a1 * inverse
-            by_square = -ssim / b2
-            by_mean = TWO * m2 * a2 * inverse - TWO * ssim * m1 / b1 - TWO * m1 * by_square - m2 * by_cross
-            row[0, x + REACH] = by_mean
-            row[1, x + REACH] = by_square
-            row[2, x + REACH] = by_cross
-            difference = exposed(image[channel, y, x], gain, offset) - target[channel, y, x]
-            squared += difference * difference
-            loss += L1_SHARE * abs(difference) + SSIM_SHARE * (ONE - ssim)
-        losses[channel, y, 0] = loss * share
-        losses[channel, y, 1] = squared
-        for k in range(3):
-            filter_row(row[k], scratch[3 + k, channel, y + REACH], width)
-    for task in prange(channels * height):
-        channel, y = task // height, task % height
-        share = weights[channel] / np.float32(height * width)
-        gain, offset = exposure[channel, 0], exposure[channel, 1]
-        by_mean = np.empty(width, np.float32)
-        by_square = np.empty(width, np.float32)
-        by_cross = np.empty(width, np.float32)
-        filter_column(scratch[3, channel], y, by_mean, width)
-        filter_column(scratch[4, channel], y, by_square, width)
-        filter_column(scratch[5, channel], y, by_cross, width)
-        g_gain = ZERO
-        g_offset = ZERO
-        for x in range(width):
-            rendered = image[channel, y, x]
-            value = exposed(rendered, gain, offset)
-            truth = target[channel, y, x]
-            sign = ONE if value > truth else (-ONE if value < truth else ZERO)
-            g = share * (L1_SHARE * sign - SSIM_SHARE * (by_mean[x] + TWO * value * by_square[x] + truth * by_cross[x]))
-            g_gain += g * rendered
-            g_offset += g
-            g_image[channel, y, x] = g * gain
-        g_exposure[channel, y, 0] = g_gain
-        g_exposure[channel, y, 1] = g_offset
+        rows = np.zeros((2, pitch + 2 * PAD), np.float32)
+        for y in range(first, min(height, first + BAND)):
+            for x in range(width):
+                rows[0, PAD + x] = exposed(image[channel, y, x], gain, offset)
+                rows[1, PAD + x] = target[channel, y, x]
+            span_of(rows, pitch, spans[channel, y])
+    for task in prange(channels * bands):
+        channel, first = task // bands, task % bands * BAND
+        rows = np.empty((3, pitch + 2 * PAD), np.float32)
+        for y in range(first, min(height, first + BAND)):
+            windows_of_row(image, exposure, target, scratch, spans, rows, channel, y)
+    for task in prange(channels * bands):
+        channel, first = task // bands, task % bands * BAND
+        rows = np.empty((3, pitch + 2 * PAD), np.float32)
+        given = np.empty((4, pitch), np.float32)
+        for y in range(first, min(height, first + BAND)):
+            loss_of_row(
+                image, exposure, target, target_means, target_squares, weights, scratch, spans, rows, given, losses,
+                channel, y,
+            )  # fmt: skip
+    for task in prange(channels * bands):
+        channel, first = task // bands, task % bands * BAND
+        by = np.empty((3, pitch), np.float32)
+        for y in range(first, min(height, first + BAND)):
+            gradient_of_row(image, exposure, target, weights, scratch, spans, by, g_image, g_exposure, channel, y)

@@ -113,6 +113,7 @@ for _names, _method in (
         _operator(getattr(operator, _name), lanes_type, _method)
 for _name, _sign in (("lt", "<"), ("le", "<="), ("gt", ">"), ("ge", ">=")):
     _operator(getattr(operator, _name), mask_type, "fcmp_ordered", _sign)
+_operator(operator.ne, mask_type, "fcmp_unordered", "!=")  # NaN differs from everything
 
 
 class _Negative(AbstractTemplate):
