@@ -24,6 +24,15 @@ CARRIED = 13 * lanes.COUNT
 
 
 @kernel
+def ask_for(block, rows, one, two):
+    """Have what two arrays hold of the Gaussians of a block brought near: they lie anywhere in memory."""
+    block = min(block, rows.shape[0] - 1)
+    for lane in range(lanes.COUNT):
+        lanes.fetch(one, rows[block, lane])
+        lanes.fetch(two, rows[block, lane])
+
+
+@kernel
 def start_block(block, before, v):
     """Factors of frame t−1 and no turn into v [13, 16]."""
     for k in range(9):
@@ -96,6 +105,7 @@ def deform(
         v = np.empty(CARRIED, np.float32)
         moved_points = np.empty(3 * lanes.COUNT, np.float32)
         for block in range(task * BLOCKS, min(blocks, (task + 1) * BLOCKS)):
+            ask_for(block + 1, rows, means, factors)
             start_block(block, before, v)
             for layer in range(layers):
                 place = (layer * blocks + block) * 3 * lanes.COUNT
@@ -130,6 +140,7 @@ def deform_backward(
         v = np.empty((layers + 1) * CARRIED, np.float32)
         g = np.empty(16 * lanes.COUNT, np.float32)
         for block in range(task * BLOCKS, min(blocks, (task + 1) * BLOCKS)):
+            ask_for(block + 1, rows, g_means, g_factors)
             start_block(block, before, v)
             for layer in range(layers):
                 leaving = v[(layer + 1) * CARRIED : (layer + 2) * CARRIED]

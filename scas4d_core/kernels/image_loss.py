@@ -92,23 +92,32 @@ def filter_rows(rows, quantities, scratch, kind, channel, y, span, cleared):
             lanes.store(scratch, place + x, lanes.fill(ZERO))
 
 
+@inline
+def start_of(planes, channel, y):
+    """Flat index of a row."""
+    return (channel * planes.shape[1] + y) * planes.shape[2]
+
+
 @kernel
-def span_of(rows, pitch, spans):
-    """Where the first two of the padded rows are not both 0, in whole ``Lanes``.
+def span_of(image, gain, offset, target, channel, y, pitch, spans):
+    """Where a row is not black in both pictures, in whole ``Lanes``.
 
     Args:
         spans: out [4]: first column and last but one of the windows that hold such a pixel, then the same of the pixels
             in these windows; (pitch, 0) where there is none.
     """
+    width = target.shape[2]
+    here, there = start_of(image, channel, y), start_of(target, channel, y)
     first, last = pitch, 0
-    for x in range(0, pitch, lanes.COUNT):
-        one, two = lanes.load(rows, PAD + x), lanes.load(rows, pitch + 3 * PAD + x)
-        if lanes.any_of(one != ZERO) or lanes.any_of(two != ZERO):
-            first, last = min(first, x), x + lanes.COUNT
-    if last > 0:
-        while rows[0, PAD + first] == ZERO and rows[1, PAD + first] == ZERO:
+    for x in range(0, width, lanes.COUNT):
+        value = exposed(lanes.load_first(image, here + x, width - x), gain, offset)
+        truth = lanes.load_first(target, there + x, width - x)
+        if lanes.any_of(value != ZERO) or lanes.any_of(truth != ZERO):
+            first, last = min(first, x), min(x + lanes.COUNT, width)
+    if last > 0 and offset == ZERO:
+        while gain * image[channel, y, first] == ZERO and target[channel, y, first] == ZERO:
             first += 1
-        while rows[0, PAD + last - 1] == ZERO and rows[1, PAD + last - 1] == ZERO:
+        while gain * image[channel, y, last - 1] == ZERO and target[channel, y, last - 1] == ZERO:
             last -= 1
     for k in range(2):
         reach = (k + 1) * REACH if last > 0 else 0
@@ -159,35 +168,37 @@ def target_moments(target, scratch, means, squares):
 @kernel
 def windows_of_row(image, exposure, target, scratch, spans, rows, channel, y):
     """First pass of ``image_loss`` over a row: what is windowed, filtered along the row."""
-    width = target.shape[2]
+    width, pitch = target.shape[2], scratch.shape[3]
     gain, offset = exposure[channel, 0], exposure[channel, 1]
-    rows[:] = ZERO
+    here, there = start_of(image, channel, y), start_of(target, channel, y)
+    clear(rows)
     first, last = spans[channel, y, 0], spans[channel, y, 1]
-    for x in range(first, min(last, width)):
-        value = exposed(image[channel, y, x], gain, offset)
-        rows[0, PAD + x] = value
-        rows[1, PAD + x] = value * value
-        rows[2, PAD + x] = value * target[channel, y, x]
+    for x in range(first, last, lanes.COUNT):
+        value = lanes.only_first(exposed(lanes.load_first(image, here + x, width - x), gain, offset), width - x)
+        lanes.store(rows, PAD + x, value)
+        lanes.store(rows, pitch + 3 * PAD + x, value * value)
+        lanes.store(rows, 2 * pitch + 5 * PAD + x, value * lanes.load_first(target, there + x, width - x))
     filter_rows(rows, 3, scratch, 0, channel, y, (first, last), hull(spans[channel], 0, y, 2 * REACH))
 
 
 @kernel
+def clear(rows):
+    """Set padded rows to 0."""
+    for x in range(0, rows.size, lanes.COUNT):
+        lanes.store(rows, x, lanes.fill(ZERO))
+
+
+@kernel
 def loss_of_row(
-    image, exposure, target, target_means, target_squares, weights, scratch, spans, rows, given, losses, channel, y
+    image, exposure, target, target_means, target_squares, weights, scratch, spans, rows, losses, channel, y
 ):
     """Second pass: the loss of a row, and its gradients by what is windowed, filtered along the row."""
     channels, height, width = target.shape
     pitch = scratch.shape[3]
     gain, offset = exposure[channel, 0], exposure[channel, 1]
     first, last = hull(spans[channel], 0, y, REACH)
-    end = min(last, width)
-    for x in range(first, end):
-        given[0, x] = exposed(image[channel, y, x], gain, offset) - target[channel, y, x]
-        given[1, x] = target_means[channel, y, x]
-        given[2, x] = target_squares[channel, y, x]
-        given[3, x] = ONE  # inside the picture
-    given[:, end:last] = ZERO
-    rows[:] = ZERO
+    here, there = start_of(image, channel, y), start_of(target, channel, y)
+    clear(rows)
     loss = squared = lanes.fill(ZERO)
     place = (channel * (height + 2 * REACH) + y) * pitch
     kind = channels * (height + 2 * REACH) * pitch
@@ -195,22 +206,23 @@ def loss_of_row(
         m1 = across(scratch, place + x, pitch)
         square = across(scratch, place + kind + x, pitch)
         cross = across(scratch, place + 2 * kind + x, pitch)
-        m2, inside = lanes.load(given, pitch + x), lanes.load(given, 3 * pitch + x)
+        m2 = lanes.load_first(target_means, there + x, width - x)
         a1 = TWO * m1 * m2 + C1
         a2 = TWO * (cross - m1 * m2) + C2
         b1 = m1 * m1 + m2 * m2 + C1
-        b2 = square - m1 * m1 + lanes.load(given, 2 * pitch + x) - m2 * m2 + C2
+        b2 = square - m1 * m1 + lanes.load_first(target_squares, there + x, width - x) - m2 * m2 + C2
         inverse = lanes.fill(ONE) / (b1 * b2)
         ssim = a1 * a2 * inverse
         by_cross = TWO * a1 * inverse
         by_square = -ssim * b1 * inverse
         by_mean = TWO * (m2 * a2 * inverse - ssim * m1 * b2 * inverse - m1 * by_square) - m2 * by_cross
-        lanes.store(rows, PAD + x, inside * by_mean)
-        lanes.store(rows, pitch + 3 * PAD + x, inside * by_square)
-        lanes.store(rows, 2 * pitch + 5 * PAD + x, inside * by_cross)
-        difference = lanes.load(given, x)
+        lanes.store(rows, PAD + x, lanes.only_first(by_mean, width - x))
+        lanes.store(rows, pitch + 3 * PAD + x, lanes.only_first(by_square, width - x))
+        lanes.store(rows, 2 * pitch + 5 * PAD + x, lanes.only_first(by_cross, width - x))
+        difference = exposed(lanes.load_first(image, here + x, width - x), gain, offset)
+        difference = lanes.only_first(difference - lanes.load_first(target, there + x, width - x), width - x)
         squared += difference * difference
-        loss += L1_SHARE * lanes.magnitude(difference) + inside * (SSIM_SHARE * (ONE - ssim))
+        loss += L1_SHARE * lanes.magnitude(difference) + SSIM_SHARE * lanes.only_first(ONE - ssim, width - x)
     losses[channel, y, 0] = lanes.sum_of(loss) * (weights[channel] / np.float32(height * width))
     losses[channel, y, 1] = lanes.sum_of(squared)
     filtered, cleared = hull(spans[channel], 2, y, REACH), hull(spans[channel], 2, y, 3 * REACH)
@@ -218,32 +230,37 @@ def loss_of_row(
 
 
 @kernel
-def gradient_of_row(image, exposure, target, weights, scratch, spans, by, g_image, g_exposure, channel, y):
+def gradient_of_row(image, exposure, target, weights, scratch, spans, g_image, g_exposure, channel, y):
     """Third pass: the gradient of a row."""
     channels, height, width = target.shape
     pitch = scratch.shape[3]
     share = weights[channel] / np.float32(height * width)
     gain, offset = exposure[channel, 0], exposure[channel, 1]
     first, last = hull(spans[channel], 2, y, 2 * REACH)
-    begin, end = min(first, width), min(last, width)
-    for k in range(3):
-        place = (((3 + k) * channels + channel) * (height + 2 * REACH) + y) * pitch
-        for x in range(first, last, lanes.COUNT):
-            lanes.store(by, k * pitch + x, across(scratch, place + x, pitch))
-    g_gain = g_offset = ZERO
-    g_image[channel, y, :begin] = ZERO
-    for x in range(begin, end):
-        rendered = image[channel, y, x]
+    here, there, out = start_of(image, channel, y), start_of(target, channel, y), start_of(g_image, channel, y)
+    kind = channels * (height + 2 * REACH) * pitch
+    place = 3 * kind + (channel * (height + 2 * REACH) + y) * pitch
+    nothing = lanes.fill(ZERO)
+    g_gain = g_offset = nothing
+    for x in range(0, min(first, width), lanes.COUNT):
+        lanes.store_first(g_image, out + x, width - x, nothing)
+    for x in range(first, last, lanes.COUNT):
+        by_mean = across(scratch, place + x, pitch)
+        by_square = across(scratch, place + kind + x, pitch)
+        by_cross = across(scratch, place + 2 * kind + x, pitch)
+        rendered = lanes.load_first(image, here + x, width - x)
         value = exposed(rendered, gain, offset)
-        truth = target[channel, y, x]
-        sign = ONE if value > truth else (-ONE if value < truth else ZERO)
-        g = share * (L1_SHARE * sign - SSIM_SHARE * (by[0, x] + TWO * value * by[1, x] + truth * by[2, x]))
+        truth = lanes.load_first(target, there + x, width - x)
+        sign = lanes.choose(value > truth, lanes.fill(ONE), lanes.choose(value < truth, lanes.fill(-ONE), nothing))
+        g = L1_SHARE * sign - SSIM_SHARE * (by_mean + TWO * value * by_square + truth * by_cross)
+        g = lanes.only_first(share * g, width - x)
         g_gain += g * rendered
         g_offset += g
-        g_image[channel, y, x] = g * gain
-    g_image[channel, y, max(begin, end) : width] = ZERO
-    g_exposure[channel, y, 0] = g_gain
-    g_exposure[channel, y, 1] = g_offset
+        lanes.store_first(g_image, out + x, width - x, g * gain)
+    for x in range(max(min(first, width), last), width, lanes.COUNT):
+        lanes.store_first(g_image, out + x, width - x, nothing)
+    g_exposure[channel, y, 0] = lanes.sum_of(g_gain)
+    g_exposure[channel, y, 1] = lanes.sum_of(g_offset)
 
 
 @parallel_kernel
@@ -258,19 +275,15 @@ def image_loss(image, exposure, target, target_means, target_squares, weights, s
             of squared differences.
         g_exposure: out [C, H, 2], each row's share of the gradient of gain and offset.
     """
-    channels, height, width = target.shape
+    channels, height, _ = target.shape
     pitch = scratch.shape[3]
     bands = (height + BAND - 1) // BAND
     spans = np.empty((channels, height, 4), np.int64)
     for task in prange(channels * bands):
         channel, first = task // bands, task % bands * BAND
         gain, offset = exposure[channel, 0], exposure[channel, 1]
-        rows = np.zeros((2, pitch + 2 * PAD), np.float32)
         for y in range(first, min(height, first + BAND)):
-            for x in range(width):
-                rows[0, PAD + x] = exposed(image[channel, y, x], gain, offset)
-                rows[1, PAD + x] = target[channel, y, x]
-            span_of(rows, pitch, spans[channel, y])
+            span_of(image, gain, offset, target, channel, y, pitch, spans[channel, y])
     for task in prange(channels * bands):
         channel, first = task // bands, task % bands * BAND
         rows = np.empty((3, pitch + 2 * PAD), np.float32)
@@ -279,14 +292,12 @@ def image_loss(image, exposure, target, target_means, target_squares, weights, s
     for task in prange(channels * bands):
         channel, first = task // bands, task % bands * BAND
         rows = np.empty((3, pitch + 2 * PAD), np.float32)
-        given = np.empty((4, pitch), np.float32)
         for y in range(first, min(height, first + BAND)):
             loss_of_row(
-                image, exposure, target, target_means, target_squares, weights, scratch, spans, rows, given, losses,
+                image, exposure, target, target_means, target_squares, weights, scratch, spans, rows, losses,
                 channel, y,
             )  # fmt: skip
     for task in prange(channels * bands):
         channel, first = task // bands, task % bands * BAND
-        by = np.empty((3, pitch), np.float32)
         for y in range(first, min(height, first + BAND)):
-            gradient_of_row(image, exposure, target, weights, scratch, spans, by, g_image, g_exposure, channel, y)
+            gradient_of_row(image, exposure, target, weights, scratch, spans, g_image, g_exposure, channel, y)

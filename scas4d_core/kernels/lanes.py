@@ -273,6 +273,50 @@ def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
     return types.void(array, types.int64, lanes_type), generate
 
 
+def _first(builder: Any, count: Any) -> Any:
+    """Bits of the first ``count`` lanes."""
+    most = builder.select(builder.icmp_signed("<", count, _LONG(COUNT)), count, _LONG(COUNT))
+    nothing = ir.Constant(_INTS, ir.Undefined)
+    whole = builder.insert_element(nothing, builder.trunc(most, _INT), _INT(0))
+    whole = builder.shuffle_vector(whole, nothing, ir.Constant(_INTS, [0] * COUNT))
+    return builder.icmp_signed("<", ir.Constant(_INTS, list(range(COUNT))), whole)
+
+
+@emitted
+def load_first(typing_context: Any, array: Any, index: Any, count: Any) -> Any:
+    """As ``load``, of the first ``count`` numbers only (16 or more: all); 0 beyond, which is not read."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        place = _place(context, builder, signature.args[0], *arguments[:2])
+        given = [place, _INT(4), _first(builder, arguments[2]), _constant([0] * COUNT)]
+        return _call(builder, f"llvm.masked.load.v{COUNT}f32.p0", _FLOATS, given)
+
+    return lanes_type(array, types.int64, types.int64), generate
+
+
+@emitted
+def store_first(typing_context: Any, array: Any, index: Any, count: Any, value: Any) -> Any:
+    """As ``store``, of the first ``count`` lanes only (16 or more: all)."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        place = _place(context, builder, signature.args[0], *arguments[:2])
+        given = [arguments[3], place, _INT(4), _first(builder, arguments[2])]
+        _call(builder, f"llvm.masked.store.v{COUNT}f32.p0", ir.VoidType(), given)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, types.int64, lanes_type), generate
+
+
+@emitted
+def only_first(typing_context: Any, value: Any, count: Any) -> Any:
+    """The first ``count`` lanes (16 or more: all), 0 beyond."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.select(_first(builder, arguments[1]), arguments[0], _constant([0] * COUNT))
+
+    return lanes_type(lanes_type, types.int64), generate
+
+
 @inline
 def aligned(array):
     """The first flat index of a float32 array whose address is a multiple of 64 bytes: of a ``Lanes``."""

@@ -96,6 +96,24 @@ def test_whole_rows_and_sums_of_rows_named_twice():
 
 
 @kernel
+def beginnings(x, out):
+    for count in range(20):
+        some = lanes.load_first(x, 0, count)
+        lanes.store_first(out, 48 * count, count, some)
+        lanes.store(out, 48 * count + 16, some)
+        lanes.store(out, 48 * count + 32, lanes.only_first(lanes.load(x, 0), count))
+
+
+def test_beginnings_of_rows():
+    x = np.arange(1, 17, dtype=np.float32)
+    out = np.full((20, 3, 16), -1, np.float32)
+    beginnings(x, out)
+    for count in range(20):
+        np.testing.assert_array_equal(out[count, 0], np.where(np.arange(16) < count, x, -1))
+        np.testing.assert_array_equal(out[count, 1:], np.where(np.arange(16) < count, x, 0) * np.ones((2, 1)))
+
+
+@kernel
 def arithmetic(x, y, factor, out):
     a, b = lanes.load(x, 0), lanes.load(y, 0)
     lanes.store(out, 0, (a + b) * factor - a / b)
