@@ -28,6 +28,7 @@ def reconstruct(folder: Path, out: Path, *, frames: int | None, preset: str, cha
     from scas4d_core.history import History
     from scas4d_core.ply import write_ply
     from scas4d_core.reconstruction import Reconstruction
+    from scas4d_core.warm_up import warm_up_elsewhere
 
     settings = settings_of(preset, overrides=changes)
     given = open_capture(folder)  # the reconstruction resizes what it is given
@@ -38,6 +39,9 @@ def reconstruct(folder: Path, out: Path, *, frames: int | None, preset: str, cha
     if (out / "states" / "fixed.npz").exists():  # of an earlier run, like the pictures beside it
         shutil.rmtree(out / "states")
     history = History(out / "states")
+    if settings.device == "cpu":
+        with console.status("compiling the kernels (once)"):
+            warm_up_elsewhere()
     with Bars() as bars:
 
         def told(progress: Any) -> None:

@@ -30,6 +30,7 @@ from scas4d_core.bench.table import markdown, stage_table, with_means
 from scas4d_core.captures import open_capture
 from scas4d_core.presets import preset
 from scas4d_core.settings import Settings
+from scas4d_core.warm_up import warm_up_elsewhere
 
 Report = Callable[[str], None]
 
@@ -149,6 +150,8 @@ def run(
 def run_jobs(jobs: Sequence[Job], out: Path, *, again: bool = False, report: Report = print) -> list[Row]:
     """Measures what is not on disk yet, one process a row; prints the table and leaves it in ``out/table.md``."""
     store = Store(out)
+    if any(job.settings.device == "cpu" for job in jobs):
+        warm_up_elsewhere()
     rows = []
     for number, job in enumerate(jobs, 1):
         row = None if again else store.row(job.key)
