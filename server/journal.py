@@ -10,6 +10,7 @@ from pathlib import Path
 
 from scas4d_core.npz import sync_folder
 from server.facts import Fact, parse_fact
+from server.problems import Problem
 from server.record_log import Damage, Kind, Record, encoded, records
 
 
@@ -56,6 +57,7 @@ class Journal:
     def __init__(self, path: Path, good: int = 0) -> None:
         self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         self._good = good
+        self._closed = False
         os.ftruncate(self._file, good)
         os.fsync(self._file)
         sync_folder(path.parent)
@@ -67,7 +69,10 @@ class Journal:
 
         Raises:
             OSError: they are not; the file is as it was.
+            Problem: 503, the journal is closed.
         """
+        if self._closed:
+            raise Problem(503, "the scene has ended", remedy="ask again: a scene that was deleted is not found then")
         data = b"".join(encoded(Kind.FACT, _index(fact), fact.model_dump(mode="json")) for fact in facts)
         done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._waiting.append((data, done))
@@ -107,7 +112,8 @@ class Journal:
         self._good += len(data)
 
     async def close(self) -> None:
-        """Waits for what is being written."""
+        """Waits for what is being written; nothing is written after that, its number may be another file's by then."""
+        self._closed = True
         while self._flushing is not None:
             await asyncio.wait([self._flushing])
         os.close(self._file)

@@ -12,6 +12,7 @@ from client.wire import FrameFile, FrameHead
 from server.facts import Missing, Paused, Taken
 from server.frame_store import FrameDamage, Upload, read_pictures, stored
 from server.journal import Journal, read_journal
+from server.problems import Problem
 from server.record_log import Damage, Kind, Record, encoded, records
 
 PARTS = [
@@ -177,3 +178,22 @@ def test_every_cut_and_flipped_bit_of_a_record_of_pictures_is_found(tmp_path):
         read_pictures(tmp_path, record.name)
     with pytest.raises(FrameDamage, match="no name"):
         read_pictures(tmp_path, "../secret")
+
+
+def test_a_journal_that_is_closed_writes_nothing(tmp_path):
+    """The number of its file may be another file's by then: that of another scene."""
+
+    async def late():
+        journal = Journal(tmp_path / "journal.log")
+        await journal.append(FACTS[0])
+        await journal.close()
+        other = os.open(tmp_path / "other", os.O_RDWR | os.O_CREAT)
+        try:
+            with pytest.raises(Problem) as refused:
+                await journal.append(FACTS[1])
+            assert refused.value.status_code == 503
+            assert os.pread(other, 1, 0) == b""
+        finally:
+            os.close(other)
+
+    asyncio.run(late())
