@@ -17,8 +17,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from server import metrics, renderer
-from server.messages import Answer, Ask, LabelsQuery, Query, Refresh, Refused, RenderQuery, SceneSpec
+from server import metrics, renderer, track_answers
+from server.messages import Answer, Ask, LabelsQuery, Query, Refresh, Refused, RenderQuery, SceneSpec, TracksQuery
 from server.placement import Entry, Placement, Process
 from server.problems import Problem
 from server.settings import ServerSettings
@@ -28,8 +28,6 @@ GRACE_VIEWS_S, GRACE_BULK_S = 10.0, 1.0
 a second or two to start."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
 """Before a process that ended by itself is started again; twice as long after each further end without an answer."""
-MOST_WAITING = 64
-"""Questions before one process: more than a second or two of views, and beyond, waiting only makes it worse."""
 COUNTS_KEPT = 8
 """Numbers of parts whose labels are kept."""
 
@@ -82,10 +80,12 @@ class Line:
         Raises:
             Problem: 503, too many wait, or no answer within the time that the service allows.
         """
-        if len(self._waiting) >= MOST_WAITING:
+        if len(self._waiting) >= self._server.waiting_questions:
             raise Problem(
                 503,
                 f"{len(self._waiting)} questions wait for this scene's reader already",
+                field="SCAS4D_WAITING_QUESTIONS",
+                value=self._server.waiting_questions,
                 remedy="ask less often, or subscribe (WS …/stream): it sends the newest only",
                 headers={"Retry-After": "1"},
             )
@@ -213,6 +213,7 @@ class Readers:
     """
 
     def __init__(self, spec: SceneSpec, server: ServerSettings, placement: Placement) -> None:
+        self._spec = spec
         self.views = Line(renderer.views, spec, server, placement, eager=True, grace=GRACE_VIEWS_S)
         self.bulk = Line(renderer.bulk, spec, server, placement, eager=False, grace=GRACE_BULK_S)
         self._commits = 0
@@ -226,6 +227,8 @@ class Readers:
             Problem: 4xx where the question cannot be answered, 503 where it takes too long or too many wait, 500 for a
                 fault of the reader.
         """
+        if isinstance(query, TracksQuery):
+            return await self._tracks(query)
         if not isinstance(query, RenderQuery):
             return _checked(await self.bulk.ask(query))
         if "parts" not in query.kinds:
@@ -245,6 +248,14 @@ class Readers:
         for task in self._finding.values():
             task.cancel()
         await asyncio.gather(self.views.stop(seconds), self.bulk.stop(seconds))
+
+    async def _tracks(self, query: TracksQuery) -> Answer:
+        """Trajectories; a long question in pieces, so that others come in between."""
+        pieces = track_answers.pieces(query)
+        if len(pieces) * len(pieces[0]) == 1:
+            return _checked(await self.bulk.ask(query))
+        answers = [[_checked(await self.bulk.ask(piece)).body for piece in row] for row in pieces]
+        return Answer(0, *await asyncio.to_thread(track_answers.together, answers, query, self._spec))
 
     async def _labels_of(self, count: int | None) -> Labels:
         """The labels for a view: never waited for but the first time, then those found last.

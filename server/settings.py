@@ -118,6 +118,12 @@ class ServerSettings(BaseSettings):
         ge=1,
         description="Views, tracks and parts for subscribers that a scene's reader has before it at a time; more wait.",
     )
+    waiting_questions: int = Field(
+        default=64,
+        ge=1,
+        description="Views, or other questions, that wait for a scene's reader; more get 503. Beyond a second or two "
+        "of views, waiting only makes it worse.",
+    )
     answer_seconds: float = Field(
         default=120.0, gt=0, description="A render, track or part query that takes longer gets 503."
     )

@@ -1,7 +1,7 @@
 """Trajectories as the bytes of an answer, and long questions cut into short ones.
 
 A reader answers one question after the other; a long one is asked in pieces, so that others come in between, and put
-together at the door. docs/tracks.md has the layout of the npz.
+together again. docs/tracks.md has the layout of the npz.
 """
 
 from __future__ import annotations
@@ -122,6 +122,11 @@ def joined(answers: Sequence[Sequence[bytes]]) -> Arrays:
         else np.concatenate([row[name] for row in rows], axis=0 if name == "ids" else 1)
         for name in rows[0]
     }
+
+
+def together(answers: Sequence[Sequence[bytes]], query: TracksQuery, spec: SceneSpec) -> tuple[bytes, str]:
+    """Body and media type of the whole answer, from those of its pieces."""
+    return encoded(joined(answers), query, metres_per_unit(spec))
 
 
 def _in_time(found: Sequence[Arrays]) -> Arrays:

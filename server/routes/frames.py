@@ -20,6 +20,7 @@ from server.door import take_camera, take_file, take_form, take_framed
 from server.messages import PlyQuery
 from server.problems import Problem
 from server.routes.access import FrameIndex, TheScene
+from server.routes.asking import ask
 
 router = APIRouter(prefix="/v1/scenes", tags=["frames"])
 
@@ -134,9 +135,9 @@ async def report(scene: TheScene, n: FrameIndex) -> FrameReportModel:
     response_class=Response,
     responses={200: {"content": {"application/octet-stream": {}}, "description": "A 3DGS .ply."}},
 )
-async def ply(scene: TheScene, n: FrameIndex) -> Response:
+async def ply(scene: TheScene, n: FrameIndex, request: Request) -> Response:
     """The committed frame in the file format of 3D Gaussian Splatting."""
-    answer = await scene.ask(PlyQuery(scene.committed_frame(n, "n")))
+    answer = await ask(request, scene, PlyQuery(scene.committed_frame(n, "n")))
     return Response(answer.body, media_type=answer.media_type)
 
 

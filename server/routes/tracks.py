@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 from typing import Annotated, Any, Literal
 
@@ -68,19 +67,9 @@ async def tracks(
 
 
 async def answer(http: Request, scene: Scene, server: ServerSettings, request: TracksRequest) -> Response:
-    """Checks the request and asks the reader; a long one in pieces, so that other questions come in between."""
-    query = query_of(scene, server, request)
-    pieces = track_answers.pieces(query)
-    if len(pieces) * len(pieces[0]) == 1:
-        found = await ask(http, scene, query)
-        return Response(found.body, media_type=found.media_type)
-    answers = [[(await ask(http, scene, piece)).body for piece in row] for row in pieces]
-    body, media_type = await asyncio.to_thread(_together, answers, query, track_answers.metres_per_unit(scene.spec))
-    return Response(body, media_type=media_type)
-
-
-def _together(answers: list[list[bytes]], query: TracksQuery, unit: float) -> tuple[bytes, str]:
-    return track_answers.encoded(track_answers.joined(answers), query, unit)
+    """Checks the request and asks the reader."""
+    found = await ask(http, scene, query_of(scene, server, request))
+    return Response(found.body, media_type=found.media_type)
 
 
 def query_of(scene: Scene, server: ServerSettings, request: TracksRequest) -> TracksQuery:

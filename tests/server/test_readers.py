@@ -31,8 +31,8 @@ def impatient(tmp_path_factory):
     running.stop()
 
 
-@pytest.fixture
-def scene(impatient):
+@contextlib.contextmanager
+def two_frames(impatient):
     """A scene of two frames: id, its readers, and a client."""
     with Client(impatient.url, patience=20) as sdk, httpx.Client(base_url=impatient.url, timeout=PATIENCE_S) as http:
         id = sdk.create_scene(make_rig(), frames_per_second=10).id
@@ -41,6 +41,20 @@ def scene(impatient):
         sdk.wait(id, 1)
         yield id, impatient.app.state.scenes[id]._questions, http
         sdk.delete_scene(id)
+
+
+@pytest.fixture
+def scene(impatient):
+    """One that a test may do anything with."""
+    with two_frames(impatient) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def still(impatient):
+    """One for the tests that only look at it."""
+    with two_frames(impatient) as made:
+        yield made
 
 
 def until(condition):
@@ -87,13 +101,14 @@ def test_one_who_hangs_up_takes_the_question_back(scene):
     assert http.get(f"/v1/scenes/{id}/tracks?ids=1").status_code == 200
 
 
-def test_a_question_that_waits_and_is_given_up_is_never_begun(scene):
+@pytest.mark.parametrize("question", [f"tracks?ids={fakes.KILLS}", "parts", "frames/1/splat.ply"])
+def test_a_question_that_waits_and_is_given_up_is_never_begun(scene, question):
     id, readers, http = scene
     hanging = in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}"))
     until(lambda: readers.bulk._at_work is not None)
     asked = readers.bulk._asked
     with pytest.raises(httpx.ReadTimeout):
-        http.get(f"/v1/scenes/{id}/tracks?ids={fakes.KILLS}", timeout=0.5)
+        http.get(f"/v1/scenes/{id}/{question}", timeout=0.5)
     until(lambda: not readers.bulk._waiting)
     assert readers.bulk._asked == asked + 1
     assert not hanging.done()
@@ -123,9 +138,9 @@ def test_the_process_for_bulk_starts_with_the_first_question_and_yields_to_the_o
     assert nice(readers.bulk.process) == min(19, nice(readers.views.process) + 10)
 
 
-def test_too_many_questions_are_refused(scene, monkeypatch):
+def test_too_many_questions_are_refused(scene):
     id, readers, http = scene
-    monkeypatch.setattr("server.readers.MOST_WAITING", 1)
+    readers.bulk._server = readers.bulk._server.model_copy(update={"waiting_questions": 1})
     hanging = in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}"))
     until(lambda: readers.bulk._at_work is not None)
     in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids=0"))
@@ -183,8 +198,8 @@ def mine():
     return CameraModel.of(make_rig().cameras[0]).model_dump()
 
 
-def test_pictures_of_every_format(scene):
-    id, _, http = scene
+def test_pictures_of_every_format(still):
+    id, _, http = still
     for format in ("png", "jpeg", "webp"):
         response = http.get(f"/v1/scenes/{id}/render?format={format}&background=0,1,0.5&camera=c1")
         assert response.headers["content-type"] == f"image/{format}"
@@ -201,8 +216,8 @@ def test_pictures_of_every_format(scene):
     assert len(worst) < len(best)
 
 
-def test_the_width_scales_the_camera(scene):
-    id, _, http = scene
+def test_the_width_scales_the_camera(still):
+    id, _, http = still
     response = http.get(f"/v1/scenes/{id}/render?width=48")
     assert Image.open(io.BytesIO(response.content)).size == (48, round(48 * HEIGHT / WIDTH))
     response = http.post(f"/v1/scenes/{id}/render", json={"camera": mine(), "width": 12})
@@ -210,8 +225,8 @@ def test_the_width_scales_the_camera(scene):
     assert problem(http.get(f"/v1/scenes/{id}/render?width=16000"), 422)["field"] == "width"
 
 
-def test_raw_floats_have_their_shape_in_the_headers(scene):
-    id, _, http = scene
+def test_raw_floats_have_their_shape_in_the_headers(still):
+    id, _, http = still
     request = {"camera": "c0", "format": "float32", "kinds": ["depth", "colour", "alpha", "parts"], "parts": 2}
     response = http.post(f"/v1/scenes/{id}/render", json=request)
     assert response.headers["x-channels"] == "depth,red,green,blue,alpha,parts"
@@ -227,8 +242,8 @@ def test_raw_floats_have_their_shape_in_the_headers(scene):
     assert one.headers["x-shape"] == f"{HEIGHT},{WIDTH},1"
 
 
-def test_parts_are_labels_with_colours_that_stay(scene):
-    id, _, http = scene
+def test_parts_are_labels_with_colours_that_stay(still):
+    id, _, http = still
     picture = Image.open(io.BytesIO(http.get(f"/v1/scenes/{id}/render?kind=parts&parts=2").content))
     assert picture.mode == "P"
     assert np.array(picture)[3, 3] == 2
@@ -252,13 +267,13 @@ def test_parts_are_labels_with_colours_that_stay(scene):
         ("format=gif", "format"),
     ],
 )
-def test_what_is_wrong_with_an_address_is_named(scene, query, field):
-    id, _, http = scene
+def test_what_is_wrong_with_an_address_is_named(still, query, field):
+    id, _, http = still
     assert field in problem(http.get(f"/v1/scenes/{id}/render?{query}"), 422)["field"]
 
 
-def test_only_what_stays_may_be_kept_by_a_browser(scene):
-    id, _, http = scene
+def test_only_what_stays_may_be_kept_by_a_browser(still):
+    id, _, http = still
     assert http.get(f"/v1/scenes/{id}/render").headers["cache-control"] == "no-store"
     assert "max-age" in http.get(f"/v1/scenes/{id}/render?frame=0").headers["cache-control"]
 
