@@ -241,6 +241,9 @@ class History:
     def __len__(self) -> int:
         return len(self._times)
 
+    def __contains__(self, index: object) -> bool:
+        return index in self._times
+
     @property
     def indices(self) -> list[int]:
         """The committed frame numbers, rising."""

@@ -51,7 +51,7 @@ class ReportFiles:
             try:
                 if self._history is None:
                     self._history = History.load(self._states)
-                else:
+                elif index not in self._history:  # a look at every file of the folder, which may hold a day
                     self._history.refresh()
                 return self._history.report(index)
             except HistoryError:

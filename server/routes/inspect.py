@@ -29,7 +29,7 @@ async def frames(
     limit: Annotated[int, Query(ge=1, le=MOST_FRAMES, description="So many at most.")] = MOST_FRAMES,
 ) -> FrameList:
     """What became of many frames, from `first` on; `next` says where to go on."""
-    indices = sorted(index for index in scene.frames if index >= first)
-    reports = [await scene.report(index) for index in indices[:limit]]
+    after = min(first + limit, scene.next_frame)  # frames are numbered without gaps
+    reports = [await scene.report(index) for index in range(first, after)]
     without_loss = [report.model_copy(update={"loss": []}) for report in reports if report is not None]
-    return FrameList(frames=without_loss, next=indices[limit] if len(indices) > limit else None)
+    return FrameList(frames=without_loss, next=after if first <= after < scene.next_frame else None)
