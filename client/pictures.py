@@ -8,22 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from client.wire import part_colour
+
 DIFFERENCE_GAIN = 4
 """Differences are this much brighter, or nobody would see them."""
-PALETTE = np.array(
-    [
-        [0, 0, 0],
-        [230, 159, 0],
-        [86, 180, 233],
-        [0, 158, 115],
-        [240, 228, 66],
-        [0, 114, 178],
-        [213, 94, 0],
-        [204, 121, 167],
-    ],
-    dtype=np.uint8,
-)
-"""Black for nothing, then the colours of Okabe and Ito, told apart also by the colour-blind."""
 
 Picture = NDArray[np.uint8]
 
@@ -41,9 +29,9 @@ def psnr(truth: Picture, render: Picture) -> float:
 
 
 def coloured(labels: NDArray[np.uint8]) -> Picture:
-    """Labels [H, W] as colours [H, W, 3]; 0 is black, and colours repeat from the eighth label."""
-    result: Picture = np.where(labels[..., None] > 0, PALETTE[1 + (labels.astype(int) - 1) % 7], PALETTE[0])
-    return result
+    """Labels [H, W], one more than the part's and 0 for none, as [H, W, 3]: the service's colours, black for none."""
+    palette = [(0, 0, 0), *(part_colour(label) for label in range(int(labels.max(initial=0))))]
+    return np.array(palette, np.uint8)[labels]
 
 
 def brightness(depth: NDArray[np.floating]) -> Picture:

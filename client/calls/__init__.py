@@ -3,7 +3,7 @@
 from client.calls.call import Call
 from client.calls.frames import close_frame, declare_missing, frame, frames, ply, put_camera, put_frame
 from client.calls.parts import parts
-from client.calls.scenes import create_scene, delete_scene, pause, put_points, resume, rig, scene, scenes
+from client.calls.scenes import create_scene, delete_scene, estimate, pause, put_points, resume, rig, scene, scenes
 from client.calls.service import live, metrics, ready, ticket
 from client.calls.tracks import tracks, tracks_arrays
 from client.calls.views import render, render_arrays, render_file
@@ -14,6 +14,7 @@ __all__ = [
     "create_scene",
     "declare_missing",
     "delete_scene",
+    "estimate",
     "frame",
     "frames",
     "live",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from client.calls.call import NPZ, Call, body, nothing, path, reads
 from client.wire import IngestSettings, PointsReceipt, RigModel, SceneCreate, SceneList, SceneStatus
+from client.wire.estimate import SceneEstimate
 from scas4d_core.cameras import Rig
 from scas4d_core.captures import InitialPoints
 
@@ -43,6 +44,12 @@ def create_scene(
         ingest=ingest or IngestSettings(),
     )
     return Call("POST", path(), reads(SceneStatus), repeatable=False, arguments=body(request))
+
+
+def estimate(rig: Rig, *, preset: str = "scas4d", settings: Mapping[str, Any] | None = None) -> Call[SceneEstimate]:
+    """Memory and disk that a scene would take; arguments as `create_scene`, and nothing is created."""
+    request = SceneCreate(rig=RigModel.of(rig), preset=preset, settings=dict(settings or {}))
+    return Call("POST", "/v1/estimate", reads(SceneEstimate), arguments=body(request))
 
 
 def scenes() -> Call[list[SceneStatus]]:

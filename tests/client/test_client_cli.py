@@ -16,6 +16,7 @@ from client.overrides import overrides
 from client.pictures import coloured, comparison, psnr
 from client.rig import push
 from client.sdk import Client
+from client.wire import part_colour
 from scas4d_core.captures import open_capture
 
 FAKES = str(Path(__file__).parents[1] / "server")
@@ -178,4 +179,4 @@ def test_pictures():
     assert psnr(truth, truth) == float("inf")
     colours = coloured(np.array([[0, 1, 8]], np.uint8))
     assert colours[0, 0].tolist() == [0, 0, 0]
-    assert colours[0, 1].tolist() == colours[0, 2].tolist() != [0, 0, 0]
+    assert [tuple(colour) for colour in colours[0, 1:].tolist()] == [part_colour(0), part_colour(7)]

@@ -19,6 +19,7 @@ CALLS = [
     calls.metrics(),
     calls.ticket(),
     calls.create_scene(make_rig()),
+    calls.estimate(make_rig()),
     calls.scenes(),
     calls.scene("s"),
     calls.rig("s"),
