@@ -127,7 +127,11 @@ class Receiving:
     async def _settle(self) -> None:
         """Waits for the thread; that goes on where whoever waits is cancelled."""
         if self._at_work is not None:
-            await asyncio.shield(self._at_work)
+            try:
+                await asyncio.shield(self._at_work)
+            except FileNotFoundError:  # its folder is gone
+                remedy = "GET /v1/scenes lists the scenes"
+                raise Problem(404, "the scene was deleted meanwhile", field="id", remedy=remedy) from None
             self._at_work = None
 
     def _give_back(self) -> None:

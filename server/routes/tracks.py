@@ -21,6 +21,8 @@ from server.settings import ServerSettings
 router = APIRouter(prefix="/v1/scenes", tags=["tracks"])
 
 LARGEST_ID = 2**63 - 1
+FARTHEST = 1e15
+"""Coordinates beyond overflow where they are squared and scaled, and what comes out is no number."""
 
 Many = Annotated[list[str] | None, Query(max_length=1024)]
 ANSWERS: dict[int | str, dict[str, Any]] = {
@@ -114,6 +116,14 @@ def query_of(scene: Scene, server: ServerSettings, request: TracksRequest) -> Tr
         raise Problem(422, "ids count from 0", field="ids", value=request.ids, remedy="give ids of Gaussians")
     if request.pixels is not None and request.camera is None:
         raise Problem(422, "pixels of which camera?", field="camera", remedy=f"one of {', '.join(scene.rig.names)}")
+    if request.points is not None and max(abs(value) for row in request.points for value in row) > FARTHEST:
+        raise Problem(
+            422,
+            "a point too far away to compute with",
+            field="points",
+            value=max((row for row in request.points), key=lambda row: max(map(abs, row))),
+            remedy=f"give coordinates up to {FARTHEST:g}, in the rig's units",
+        )
     query = TracksQuery(
         frames=frames,
         at=scene.committed_frame(scene.committed[0] if request.at is None else request.at, "at"),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from running import HEIGHT, WIDTH, make_rig, picture, pictures, problem
 
+from client.calls import put_frame
 from client.sdk import ServiceError
 from client.wire import RigModel
 from scas4d_core.captures import InitialPoints
@@ -175,3 +176,18 @@ def test_progress_ends_with_the_first_frame(sdk, scene):
     sdk.put_frame(scene, 0, {"c0": picture(), "c1": picture()})
     sdk.wait(scene, 0)
     assert sdk.scene(scene).progress is None
+
+
+@pytest.mark.parametrize("address", ["frames/0", "frames/0/cameras/c0"])
+def test_a_frame_whose_scene_is_deleted_while_it_comes_in_is_not_found(sdk, http, address):
+    id = sdk.create_scene(make_rig()).id
+    whole = put_frame(id, 0, pictures()).arguments
+    body, headers = (pictures()["c0"], {"Content-Type": "image/png"}) if "cameras" in address else whole.values()
+
+    def chunks():
+        yield body[:-1]
+        sdk.delete_scene(id)
+        yield body[-1:]
+
+    answer = http.put(f"/v1/scenes/{id}/{address}", content=chunks(), headers=headers)
+    assert problem(answer, 404)["field"] == "id"

@@ -166,3 +166,10 @@ def test_ids_name_the_same_point_for_the_life_of_the_scene(http, finished):
     carried = ask(http, finished, points=[[0.5, 0.01, 0]], at=0).json()["ids"]
     later = ask(http, finished, points=[[0.5 + 4 * fakes.STEP_M, 0.01, 0]], at=4).json()["ids"]
     assert carried == later == [1]
+
+
+def test_a_point_beyond_all_numbers_is_refused(http, finished):
+    """It was answered with a confidence that is no number."""
+    refused = http.post(f"/v1/scenes/{finished}/tracks/query", json={"points": [[0, 0, 0], [0, 1e300, 0]]})
+    assert problem(refused, 422)["field"] == "points"
+    assert ask(http, finished, points=[[0, -1e15, 0]]).json()["confidence"] == [[0] * FRAMES]
