@@ -106,6 +106,7 @@ def push(
             said("interrupted")
             delivery.lateness.ended = delivery.lateness.ended or time.monotonic()
         delivery.status = client.scene(status.id)
+        told("frames", _finished(delivery.status), count)
     return delivery
 
 

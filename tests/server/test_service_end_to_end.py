@@ -30,10 +30,10 @@ def pushed(tmp_path_factory):
     told = []
     try:
         with Client(running.url) as client:
-            status = rig.push(
+            delivery = rig.push(
                 open_capture(CAPTURE), client, frames=FRAMES, settings=SETTINGS, told=lambda *now: told.append(now)
             )
-            yield client, status, told
+            yield client, delivery.status, told
     finally:
         running.stop()
 
