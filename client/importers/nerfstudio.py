@@ -59,11 +59,12 @@ def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: F
     if not isinstance(file, str) or not PurePosixPath(file).name:
         raise CaptureError(f"{where} has no file_path")
     where = f"{where} ({file})"
+    file = file.replace("\\", "/")  # written on Windows
     to_world = _matrix(where, frame, "transform_matrix")
     to_world[:3, 3] /= scale
     given = {**meta, **frame}
     size = (_whole(where, given, "w"), _whole(where, given, "h"))
-    model = given.get("camera_model", "OPENCV" if any(given.get(key) for key in COEFFICIENTS) else "PINHOLE")
+    model = given.get("camera_model") or _model_unsaid(given)
     if not isinstance(model, str):
         raise CaptureError(f"{where}: camera_model is {model!r}; give one of {', '.join(MODELS)}")
     fx = _focal(where, given, "x", size[0])
@@ -82,6 +83,13 @@ def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: F
     path = PurePosixPath(file)
     time = _number(where, frame, "time") if frame.get("time") is not None else None
     return View(path, camera, time)
+
+
+def _model_unsaid(given: Mapping[str, Any]) -> str:
+    """instant-ngp names no model: it has `is_fisheye`, and coefficients where there is distortion."""
+    if given.get("is_fisheye"):
+        return "OPENCV_FISHEYE"
+    return "OPENCV" if any(given.get(key) for key in COEFFICIENTS) else "PINHOLE"
 
 
 def _undo_world(path: Path, meta: Mapping[str, Any]) -> Float:

@@ -75,6 +75,13 @@ def test_coefficients_without_a_model_mean_opencv(tmp_path):
     assert read_transforms(write(tmp_path / "t.json", meta)).cameras[0].model == "OPENCV"
 
 
+def test_instant_ngp_says_fisheye_in_its_own_way_and_windows_writes_paths_its_own_way(tmp_path):
+    rig = lenses("OPENCV_FISHEYE")
+    meta = transforms(rig, "OPENCV_FISHEYE", is_fisheye=True, path="./data\\{}\\0.jpg")
+    del meta["camera_model"]
+    assert_same(read_transforms(write(tmp_path / "t.json", meta)), rig)
+
+
 def test_a_rig_over_time_has_one_camera_a_folder(tmp_path):
     rig = lenses()
     meta = transforms(rig, path="images/{}/f2.jpg")
