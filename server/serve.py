@@ -11,6 +11,7 @@ import uvicorn
 
 from server import logs
 from server.app import create_app
+from server.connection import Connection, keep_freed_memory
 from server.placement.local import LocalPlacement
 from server.settings import ServerSettings, unknown
 
@@ -27,10 +28,12 @@ def serve(settings: ServerSettings) -> None:
     prepare()
     for name in unknown(os.environ):
         log.warning("%s is no setting and was ignored; docs/operations.md lists them", name)
+    keep_freed_memory()
     config = uvicorn.Config(
         create_app(settings, LocalPlacement(prepare)),
         host=settings.host,
         port=settings.port,
+        http=Connection,
         log_config=None,
         access_log=False,
         server_header=False,

@@ -1,7 +1,8 @@
 """How fast frames come in over the loopback, against what plain fsynced writes of the same records reach.
 
-Both in one run and in turns, because a disk's speed drifts: a record is the encoded pictures of one frame. The scene is
-paused, so that what is measured is the door: receive, check each picture's structure, hash, write, sync, acknowledge.
+All in one run and in turns, because a disk's speed drifts and what follows heavy writing pays for it: a record is the
+encoded pictures of one frame. The scene is paused, so that what is measured is the door: receive, check each picture's
+structure, hash, write, sync, acknowledge.
 """
 
 from __future__ import annotations
@@ -13,31 +14,33 @@ import shutil
 import statistics
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from websockets.sync.client import connect
 
-from client.wire import FRAME_MEDIA_TYPE, frame_chunks
+from client.wire import FRAME_MEDIA_TYPE, IngestAnswer, frame_chunks
 from scas4d_core.cameras import Camera, Rig
 from server.bench.service import Service, StudyError
 
 BAR = 0.8
+UNANSWERED = 2
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Megabytes a second of both ways, one number a round."""
+    """Megabytes a second of plain writes, over HTTP and over a WebSocket, one number a round."""
 
     plain: list[float]
     ingest: list[float]
+    socket: list[float]
 
-    @property
-    def share(self) -> float:
+    def share(self, ingest: Sequence[float]) -> float:
         """Median of the rounds' ratios."""
-        return statistics.median(took / plain for took, plain in zip(self.ingest, self.plain, strict=True))
+        return statistics.median(took / plain for took, plain in zip(ingest, self.plain, strict=True))
 
 
 def jpeg(size_bytes: int, seed: int, side: int = 1024) -> bytes:
@@ -84,17 +87,22 @@ def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds:
         scene = service.create(rig, {}, ingest={"queue_frames": 10_000, "keep_frames": {}})
         service.http.post(f"/v1/scenes/{scene}/pause").raise_for_status()
         bodies = [b"".join(record.values()) for record in records]
-        plain, ingest = [], []
+        megabytes = frames * len(bodies[0]) / 1e6
+        ways: list[Callable[[int], float]] = [
+            lambda first: _plain(plain_folder, bodies, frames, first),
+            lambda first: _ingest(service, scene, records, first, frames, senders),
+            lambda first: _socket(service, scene, records, first, frames),
+        ]
+        found: list[list[float]] = [[], [], []]
         first = 0
         for number in range(rounds + 1):
-            took_plain = _plain(plain_folder, bodies, frames, first)
-            took_ingest = _ingest(service, scene, records, first, frames, senders)
-            first += frames
-            if number:  # the first round warms caches, connections and the pool of threads
-                megabytes = frames * len(bodies[0]) / 1e6
-                plain.append(megabytes / took_plain)
-                ingest.append(megabytes / took_ingest)
-        return Measured(plain, ingest)
+            for turn in range(3):
+                way = (turn + number) % 3
+                took = ways[way](first)
+                first += frames if way else 0
+                if number:  # the first round warms caches, connections and the pool of threads
+                    found[way].append(megabytes / took)
+        return Measured(*found)
     finally:
         service.stop()
         shutil.rmtree(plain_folder, ignore_errors=True)
@@ -153,15 +161,48 @@ def _ingest(
     return took
 
 
+def _socket(service: Service, scene: str, records: Sequence[dict[str, bytes]], first: int, frames: int) -> float:
+    """The same over one WebSocket, `UNANSWERED` messages on their way at most."""
+    faults: list[str] = []
+    room = threading.Semaphore(UNANSWERED)
+
+    def hear() -> None:
+        for _ in range(frames):
+            answer = IngestAnswer.model_validate_json(socket.recv(timeout=60))
+            if answer.status != 202:
+                faults.append(f"frame {answer.index}: {answer.status} {answer.problem}")
+            room.release()
+
+    address = f"ws://127.0.0.1:{service.port}/v1/scenes/{scene}/ingest"
+    with connect(address, compression=None) as socket:
+        listener = threading.Thread(target=hear)
+        began = time.perf_counter()
+        listener.start()
+        for index in range(first, first + frames):
+            room.acquire()
+            socket.send(iter(frame_chunks(index, records[index % len(records)])))
+        listener.join()
+        took = time.perf_counter() - began
+    if faults:
+        raise StudyError("; ".join(faults))
+    return took
+
+
 def page(measured: Measured, *, frames: int, cameras: int, size_bytes: int, senders: int) -> str:
     """As Markdown."""
+    shares = [f"{100 * measured.share(took):.0f} %" for took in (measured.ingest, measured.socket)]
     rows = "\n".join(
-        f"| {number + 1} | {plain:.0f} | {ingest:.0f} | {100 * ingest / plain:.0f} % |"
-        for number, (plain, ingest) in enumerate(zip(measured.plain, measured.ingest, strict=True))
+        f"| {number + 1} | {plain:.0f} | {ingest:.0f} | {100 * ingest / plain:.0f} % "
+        f"| {socket:.0f} | {100 * socket / plain:.0f} % |"
+        for number, (plain, ingest, socket) in enumerate(
+            zip(measured.plain, measured.ingest, measured.socket, strict=True)
+        )
     )
-    verdict = "reached" if measured.share >= BAR else "missed"
+    verdict = "reached" if measured.share(measured.ingest) >= BAR else "missed"
     return (
-        f"{frames} frames of {cameras} JPEGs of {size_bytes / 1e6:g} MB a round, {senders} connections\n\n"
-        f"| round | plain fsynced writes, MB/s | ingest, MB/s | share |\n|---|---|---|---|\n{rows}\n\n"
-        f"Median share {100 * measured.share:.0f} %, bar {100 * BAR:.0f} %: {verdict}."
+        f"{frames} frames of {cameras} JPEGs of {size_bytes / 1e6:g} MB a round and way; "
+        f"HTTP over {senders} connections, one WebSocket with {UNANSWERED} messages unanswered\n\n"
+        "| round | plain fsynced writes, MB/s | HTTP, MB/s | share | WebSocket, MB/s | share |\n"
+        f"|---|---|---|---|---|---|\n{rows}\n\n"
+        f"Median shares {shares[0]} and {shares[1]}, bar {100 * BAR:.0f} % (HTTP): {verdict}."
     )

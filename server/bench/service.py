@@ -51,7 +51,7 @@ class Service:
 
     def start(self) -> None:
         """Starts it and waits until it answers."""
-        program = [sys.executable, "-m", "uvicorn", "--factory", "server.app:create_app", "--log-level", "error"]
+        program = [sys.executable, "-m", "client.cli", "serve"]
         with (self.data.parent / f"{self.data.name}.log").open("ab") as log:
             self._process = subprocess.Popen(
                 [*program, "--port", str(self.port)], env=self._environment, stdout=log, stderr=log

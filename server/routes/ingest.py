@@ -8,7 +8,16 @@ from collections.abc import AsyncIterator
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 
-from client.wire import FramingError, IngestAnswer, ProblemDetails, head_length, parse_head
+from client.wire import (
+    FrameHead,
+    FrameReceipt,
+    FramingError,
+    IngestAnswer,
+    PartReceipt,
+    ProblemDetails,
+    head_length,
+    parse_head,
+)
 from client.wire.framing import PREFIX
 from server.door import take_camera, take_framed
 from server.problems import Problem
@@ -22,16 +31,23 @@ log = logging.getLogger("scas4d.server")
 
 SCENE_GONE = 4404
 UNSUPPORTED = 1003
+AHEAD = 1
+"""Messages that wait while one is being taken; one more is in the hands of uvicorn."""
 
 
 @router.websocket("/{id}/ingest")
 async def ingest(socket: WebSocket, id: str) -> None:
     """Takes binary messages as `client.wire.framing` writes them, each answered by an `IngestAnswer` as text.
 
-    What is refused is answered and the socket stays open. The message with `part` is as PUT …/cameras/{c}.
+    Whoever does not wait for an answer before the next message has the next one received while this one is synced; the
+    answers keep the order of the messages. What is refused is answered and the socket stays open. The message with
+    `part` is as PUT …/cameras/{c}.
     """
     scenes: Scenes = socket.app.state.scenes
     await socket.accept()
+    taking: asyncio.Queue[asyncio.Task[IngestAnswer]] = asyncio.Queue(AHEAD)
+    answering = asyncio.create_task(_answer(socket, taking))
+    whole_before = True
     try:
         while True:
             message = await socket.receive()
@@ -39,43 +55,69 @@ async def ingest(socket: WebSocket, id: str) -> None:
                 return
             data = message.get("bytes")
             if data is None:
+                await taking.join()
                 await socket.close(UNSUPPORTED, "frames are binary messages")
                 return
             try:
                 scene = scenes[id]
             except Problem as problem:
+                await taking.join()
                 await socket.send_text(_refusal(None, problem.document).model_dump_json())
                 await socket.close(SCENE_GONE, "the scene is not here")
                 return
-            answer = await _take(scene, data)
-            await socket.send_text(answer.model_dump_json())
+            head = _head(data)
+            whole = isinstance(head, FrameHead) and not head.part
+            if not (whole and whole_before):
+                await taking.join()  # what a part decides may depend on all that came before, and the other way round
+            whole_before = whole
+            # They begin in this order, and so they are taken in this order.
+            await taking.put(asyncio.create_task(_take(scene, head, data)))
     except WebSocketDisconnect:
         return
+    finally:
+        # What was received whole is taken whole, whether or not somebody hears of it.
+        answering.cancel()
 
 
-async def _take(scene: Scene, data: bytes) -> IngestAnswer:
-    index: int | None = None
-    try:
+async def _answer(socket: WebSocket, taking: asyncio.Queue[asyncio.Task[IngestAnswer]]) -> None:
+    while True:
+        answer = await asyncio.shield(await taking.get())
         try:
-            head = parse_head(memoryview(data)[PREFIX.size : PREFIX.size + head_length(data)])
-        except FramingError as error:
-            raise framing_problem(error) from None
-        index = head.index
-        take = (
-            take_camera(scene, None, None, _one(data), len(data))
-            if head.part
-            else take_framed(scene, None, _one(data), len(data))
-        )
-        return IngestAnswer(index=index, status=202, receipt=await take)
+            await socket.send_text(answer.model_dump_json())
+        except (WebSocketDisconnect, RuntimeError):  # the sender has gone
+            pass
+        finally:
+            taking.task_done()
+
+
+def _head(data: bytes) -> FrameHead | Problem:
+    try:
+        return parse_head(memoryview(data)[PREFIX.size : PREFIX.size + head_length(data)])
+    except FramingError as error:
+        return framing_problem(error)
+
+
+async def _take(scene: Scene, head: FrameHead | Problem, data: bytes) -> IngestAnswer:
+    if isinstance(head, Problem):
+        return _refusal(None, head.document)
+    body, size = _one(data), len(data)
+    try:
+        receipt: FrameReceipt | PartReceipt
+        if head.part:
+            receipt = await take_camera(scene, None, None, body, size)
+        else:
+            receipt = await take_framed(scene, None, body, size)
+        return IngestAnswer(index=head.index, status=202, receipt=receipt)
     except Problem as problem:
-        return _refusal(index, problem.document)
+        return _refusal(head.index, problem.document)
     except asyncio.CancelledError:
         raise
     except Exception as error:
         log.exception("scene %s: a frame over the WebSocket failed", scene.id)
         detail = f"the service failed: {type(error).__name__}"
         remedy = "this is a fault of the service; its log has the traceback"
-        return _refusal(index, ProblemDetails(title="Internal Server Error", status=500, detail=detail, remedy=remedy))
+        document = ProblemDetails(title="Internal Server Error", status=500, detail=detail, remedy=remedy)
+        return _refusal(head.index, document)
 
 
 def _refusal(index: int | None, document: ProblemDetails) -> IngestAnswer:

@@ -299,6 +299,38 @@ def test_frames_over_a_websocket(http, make, service):
         assert json.loads(socket.recv())["status"] == 404
 
 
+def test_messages_that_do_not_wait_are_taken_and_answered_in_order(http, make, service):
+    id = make(queue_frames=20)
+    http.post(f"/v1/scenes/{id}/pause")
+    with connect(f"{service.url.replace('http', 'ws')}/v1/scenes/{id}/ingest") as socket:
+        bodies = [framed(index) for index in range(5)]
+        bodies.append(framed(5, {"c0": picture()}, part=True))
+        bodies.append(framed(6))  # its turn comes when the part's frame is closed: here it is not
+        bodies.append(framed(5, {"c1": picture()}, part=True))
+        bodies += [framed(6), framed(6), framed(7, {"c0": picture()[:-9], "c1": picture()}), framed(8), framed(7)]
+        for body in bodies:
+            socket.send(body)
+        answers = [json.loads(socket.recv()) for _ in bodies]
+    expected = [*range(6), 6, 5, 6, 6, 7, 8, 7]
+    assert [answer["index"] for answer in answers] == expected
+    assert [answer["status"] for answer in answers] == [202] * 6 + [409] + [202] * 3 + [422, 409, 202]
+    assert status(http, id)["next_frame"] == 8
+    assert status(http, id)["frames_held"] == 8
+
+
+def test_a_sender_that_goes_away_loses_nothing_that_it_sent_whole(http, make, service):
+    id = make(queue_frames=20)
+    http.post(f"/v1/scenes/{id}/pause")
+    with connect(f"{service.url.replace('http', 'ws')}/v1/scenes/{id}/ingest") as socket:
+        for index in range(3):
+            socket.send(framed(index))
+        assert json.loads(socket.recv())["status"] == 202
+    wait_for(lambda: status(http, id)["next_frame"] >= 1)
+    scene = service.app.state.scenes[id]
+    wait_for(lambda: len(list(scene.spec.frames.iterdir())) == status(http, id)["next_frame"])
+    assert put(http, id, status(http, id)["next_frame"]).status_code == 202
+
+
 def test_a_frame_that_raises_keeps_its_reason(http, make):
     id = make()
     put(http, id, 0)
