@@ -19,6 +19,7 @@ from server.journal import read_journal
 
 FORMAT = 1
 SCENE_FILE, JOURNAL_FILE, FRAMES_FOLDER = "scene.json", "journal.log", "frames"
+STATES_FOLDER = "states"
 
 
 class DefinitionError(ValueError):
@@ -91,7 +92,6 @@ def read_definition(folder: Path) -> tuple[Definition, str | None]:
     """The definition in a scene's folder, from `scene.json` or else from the journal; and what was damaged, or None.
 
     Raises:
-        FileNotFoundError: there is no `scene.json`: the scene was never acknowledged.
         DefinitionError: it is in neither of them.
     """
     try:
@@ -100,13 +100,20 @@ def read_definition(folder: Path) -> tuple[Definition, str | None]:
             raise DefinitionError("it fails its checksum")
         return Definition.of_json(data["scene"]), None
     except FileNotFoundError:
-        raise
+        said = f"{SCENE_FILE} is gone"
     except (OSError, KeyError, TypeError, ValueError) as error:
         said = f"{SCENE_FILE} is damaged ({error})"
     for fact in read_journal(folder / JOURNAL_FILE).facts:
         if isinstance(fact, Created):
             return Definition.of_json(fact.definition), f"{said}; taken from the journal"
     raise DefinitionError(f"{said}, and the journal does not have it either")
+
+
+def is_nothing(folder: Path) -> bool:
+    """Whether a folder without `scene.json` is of a scene that was never acknowledged: it has no frame and no state."""
+    if (folder / SCENE_FILE).exists():
+        return False
+    return not any(any((folder / inside).glob("*")) for inside in (FRAMES_FOLDER, STATES_FOLDER))
 
 
 def _digest(text: str) -> str:

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from typing import Any, TypeVar
 
 from fastapi import Request
 from starlette.datastructures import UploadFile
 
 from client.wire import FileKind, FrameFile, FrameHead, FrameReceipt, PartReceipt
 from server.disk import full_disk, no_room
+from server.ingest import whole
 from server.pictures import MASK, check_files, check_picture
 from server.problems import Problem
 from server.scene import Scene
 from server.upload import Received, Receiving, receive_framed
+
+T = TypeVar("T")
 
 
 async def take_framed(scene: Scene, index: int | None, body: AsyncIterator[bytes], length: int | None) -> FrameReceipt:
@@ -33,9 +37,9 @@ async def take_framed(scene: Scene, index: int | None, body: AsyncIterator[bytes
         head, receiving = await receive_framed(_to_the_end(body), begin, length)
         return await _taken(scene, head, receiving)
     finally:
-        await _drain(body)
         for number in begun:
             scene.ingest.came(number)
+        await _drain(body)
 
 
 async def take_form(scene: Scene, index: int, request: Request) -> FrameReceipt:
@@ -145,21 +149,25 @@ async def _feed(receiving: Receiving, files: Sequence[bytes]) -> None:
 
 
 async def _taken(scene: Scene, head: FrameHead, receiving: Receiving) -> FrameReceipt:
-    received = await _finished(receiving)
-    try:
-        return await scene.ingest.take(head, received)
-    finally:
-        if not received.kept:
-            await receiving.abort()
+    return await _kept_or_removed(receiving, lambda received: scene.ingest.take(head, received))
 
 
 async def _part_taken(scene: Scene, head: FrameHead, camera: str, receiving: Receiving) -> PartReceipt:
-    received = await _finished(receiving)
-    try:
-        return await scene.ingest.take_part(head, camera, received)
-    finally:
-        if not received.kept:
-            await receiving.abort()
+    return await _kept_or_removed(receiving, lambda received: scene.ingest.take_part(head, camera, received))
+
+
+async def _kept_or_removed(receiving: Receiving, take: Callable[[Received], Coroutine[Any, Any, T]]) -> T:
+    """Whole, even where the request is cancelled: what a fact names, or is just about to name, must not be removed."""
+
+    async def taken() -> T:
+        received = await _finished(receiving)
+        try:
+            return await take(received)
+        finally:
+            if not received.kept:
+                await receiving.abort()
+
+    return await whole(taken())
 
 
 async def _finished(receiving: Receiving) -> Received:

@@ -75,7 +75,7 @@ class Ingest:
         """
         while (before := self._coming.get(head.index - 1)) is not None and head.index > self._scene.next_frame:
             await before.wait()
-        return await _whole(self._take(head, received))
+        return await whole(self._take(head, received))
 
     async def _take(self, head: FrameHead, received: Received) -> FrameReceipt:
         scene = self._scene
@@ -117,11 +117,11 @@ class Ingest:
             Problem: as `take`; 409 for other content than the camera has sent before, and for a part of a frame that
                 was closed without it.
         """
-        return await _whole(self._open.take(head, camera, received))
+        return await whole(self._open.take(head, camera, received))
 
     async def close_what_can_be(self) -> None:
         """Closes frames, in order, whose cameras are all in or whose deadline is over, while there is room for them."""
-        await _whole(self._open.close_due())
+        await whole(self._open.close_due())
 
     async def close(self, index: int) -> FrameReceipt:
         """Closes a frame on request, with the cameras that are in. Closed already, it answers as before.
@@ -130,7 +130,7 @@ class Ingest:
             Problem: 404, nothing of it is here; 409, one before it is not closed, or fewer cameras are in than the
                 scene's minimum; 429, 507 as `take`.
         """
-        return await _whole(self._open.close(index))
+        return await whole(self._open.close(index))
 
     async def declare_missing(self, index: int, reason: str) -> FrameReportModel:
         """Declares the next frame missing, for ever; declared already, it answers the same.
@@ -138,7 +138,7 @@ class Ingest:
         Raises:
             Problem: 409 for a gap, for a frame that was taken, and for a failed scene; 507 when the disk is full.
         """
-        return await _whole(self._declare_missing(index, reason))
+        return await whole(self._declare_missing(index, reason))
 
     async def _declare_missing(self, index: int, reason: str) -> FrameReportModel:
         scene = self._scene
@@ -181,7 +181,7 @@ class Ingest:
                 if self._scene.ledger.paused != paused:
                     await self._append(Paused(paused=paused))
 
-        await _whole(change())
+        await whole(change())
 
     async def _append(self, *facts: Fact) -> None:
         """Facts on disk, then in the ledger."""
@@ -202,6 +202,6 @@ class Ingest:
         self._open.stop()
 
 
-async def _whole(coroutine: Coroutine[Any, Any, T]) -> T:
+async def whole(coroutine: Coroutine[Any, Any, T]) -> T:
     """Runs to its end even where whoever asked is gone: the ledger must not stay behind the journal."""
     return await asyncio.shield(asyncio.ensure_future(coroutine))

@@ -26,6 +26,7 @@ from server.facts import (
     Taken,
 )
 
+HOPELESS = "the scene has failed at a frame before"
 LOST = "the journal's record of this frame is damaged, and so it is not known what was sent"
 
 
@@ -209,6 +210,12 @@ class Ledger:
             if self.frames[index].report.state == FrameState.QUEUED:
                 found.append(index)
         return found[::-1]
+
+    def hopeless(self) -> list[SetAside]:
+        """Nothing will become of frames that wait behind a first one that failed: as facts, not applied."""
+        if self.fatal is None:
+            return []
+        return [SetAside(index=index, reason=f"{HOPELESS}: {self.fatal}") for index in self.waiting()]
 
     def last_time(self) -> float | None:
         """Seconds of the newest closed frame that has a time."""

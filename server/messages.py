@@ -35,6 +35,11 @@ class SceneSpec:
         return self.folder / "frames"
 
     @property
+    def journal(self) -> Path:
+        """Of the scene's facts (`server.journal`)."""
+        return self.folder / "journal.log"
+
+    @property
     def points(self) -> Path:
         """The initial cloud, where one was given."""
         return self.folder / "points.npz"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from client.wire import FileKind, FrameHead, FrameReceipt, PartReceipt
@@ -11,6 +12,7 @@ from server import metrics
 from server.admission import Admission
 from server.facts import PartTaken, Taken
 from server.frame_store import FrameDamage, read_pictures
+from server.journal import read_journal
 from server.ledger import OpenFrame, frame_identity
 from server.problems import Problem
 from server.upload import Received
@@ -67,8 +69,11 @@ class OpenFrames:
     async def take(self, head: FrameHead, camera: str, received: Received) -> PartReceipt:
         """See `Ingest.take_part`."""
         scene, index, kinds = self._scene, head.index, received.hashes[camera]
+        closed = await self._parts_of(index) if index < scene.next_frame else None
         async with scene.door:
-            known = await self._parts_of(index) if index < scene.next_frame else scene.ledger.open.get(index)
+            known = scene.ledger.open.get(index)
+            if index < scene.next_frame:
+                known = closed or await self._parts_of(index)
             before = {} if known is None else known.hashes.get(camera, {})
             if any(before.get(kind, value) != value for kind, value in kinds.items()):
                 raise Problem(
@@ -121,6 +126,8 @@ class OpenFrames:
             except FrameDamage:
                 return None
             entry.parts = parts
+        if entry.parts is None and entry.receipt is not None:  # its pictures are deleted; what they were is known
+            return await asyncio.to_thread(_parts_told, self._scene.spec.journal, index)
         return entry.parts
 
     def _set_deadline(self, index: int) -> None:
@@ -206,3 +213,12 @@ class OpenFrames:
         """No deadline comes any more."""
         for handle in self._deadlines.values():
             handle.cancel()
+
+
+def _parts_told(journal: Path, index: int) -> OpenFrame | None:
+    """What the journal says that a frame was closed from: slow, for who sends again what was deleted long ago."""
+    parts = OpenFrame(index)
+    for fact in read_journal(journal).facts:
+        if isinstance(fact, PartTaken) and fact.index == index:
+            parts.add(fact)
+    return parts if parts.hashes else None

@@ -51,6 +51,9 @@ def recover(folder: Path, scene: str) -> Recovered:
     sizes = {name: size for name, size in sizes.items() if name not in debris}
     indices, damaged = _states(folder / "states", damage)
     facts += ledger.reconcile(indices, damaged)
+    for fact in ledger.hopeless():  # its scene failed, and the service ended before it could say so of this one
+        ledger.apply(fact)
+        facts.append(fact)
     for index, entry in ledger.frames.items():
         lost = [name for name in entry.files if name not in sizes]
         entry.files = tuple(name for name in entry.files if name in sizes)

@@ -11,7 +11,7 @@ from typing import Any
 from client.wire import FrameReportModel, FrameState, ProgressModel, SceneState, SceneStatus
 from scas4d_core.cameras import Camera
 from server import metrics, reports, worker
-from server.definition import JOURNAL_FILE, Definition
+from server.definition import Definition
 from server.disk import no_room
 from server.facts import Died, Fact, FramesDeleted, SetAside, StatesDeleted
 from server.frame_store import remove
@@ -69,7 +69,7 @@ class Scene:
         self.ledger = found.ledger
         self.held = Held(found.sizes)
         self.damage = found.damage
-        self.journal = Journal(folder / JOURNAL_FILE, found.good)
+        self.journal = Journal(self.spec.journal, found.good)
         self.supervision = Supervision()
         self.progress: ProgressModel | None = None
         self.points_sha256: str | None = None
@@ -288,16 +288,16 @@ class Scene:
         self._at_work, self.progress = None, None
         self.trouble = f"frame {fact.index} was set aside: {fact.reason}"
         if fact.fatal:
-            await self._fail_those_that_wait(fact)
+            async with self.door:  # from here on none is taken; the one that is just being taken waits like the others
+                pass
+            await self._fail_those_that_wait()
         log.warning("scene %s: %s", self.id, self.trouble)
         self._tell(FrameFinished(self.frames[fact.index].report))
         self.work()
         await self.ingest.close_what_can_be()
 
-    async def _fail_those_that_wait(self, fatal: SetAside) -> None:
-        """Nothing will become of frames behind a first one that failed."""
-        reason = f"frame {fatal.index} could not be reconstructed: {fatal.reason}"
-        facts = [SetAside(index=index, reason=reason, fatal=True) for index in self.ledger.waiting()]
+    async def _fail_those_that_wait(self) -> None:
+        facts = self.ledger.hopeless()
         if facts:
             await self._write(*facts)
         for fact in facts:

@@ -19,6 +19,7 @@ from server.definition import (
     JOURNAL_FILE,
     Definition,
     DefinitionError,
+    is_nothing,
     read_definition,
     write_definition,
 )
@@ -77,7 +78,7 @@ class Scenes:
     def _clean(self) -> None:
         """Removes scenes that are deleted, and folders of scenes that were never acknowledged."""
         for path in self._folder.iterdir():
-            if path.is_dir() and not (path / "scene.json").exists():
+            if path.is_dir() and is_nothing(path):
                 path.rename(self._deleted / f"{path.name}-{secrets.token_hex(4)}")
         sync_folder(self._folder)
         for path in self._deleted.iterdir():
@@ -91,15 +92,15 @@ class Scenes:
             if damage is not None:
                 await asyncio.to_thread(write_definition, folder, definition)
             found = await asyncio.to_thread(recover, folder, definition.id)
+            found.damage[:0] = [damage] if damage is not None else []
+            scene = Scene(definition, folder, found, self.server, self.placement, self.hub)
+            scene.points_sha256 = await asyncio.to_thread(points_sha256, scene.spec.points)
         except (DefinitionError, OSError) as error:
             self.unreadable[folder.name] = str(error)
             log.error("folder %s holds no scene that can be read; it is left as it is: %s", folder, error)
             return
-        found.damage[:0] = [damage] if damage is not None else []
         for said in found.damage:
             log.warning("scene %s: %s", definition.id, said)
-        scene = Scene(definition, folder, found, self.server, self.placement, self.hub)
-        scene.points_sha256 = await asyncio.to_thread(points_sha256, scene.spec.points)
         self.by_id[definition.id] = scene
 
     async def create(self, request: SceneCreate, settings: Settings) -> Scene:
