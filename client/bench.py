@@ -133,7 +133,7 @@ def kernels(
     Leave the machine alone meanwhile; NUMBA_NUM_THREADS sets the threads. Frame 0 is fitted anew, for its memory.
     """
     from scas4d_core.bench import kernels as of_kernels
-    from scas4d_core.bench.quality import settings_of
+    from scas4d_core.bench.job import settings_of
 
     settings = settings_of(preset, overrides=changes or ())
     row = of_kernels.study(capture, settings, store, frames=frames, repeats=repeats)

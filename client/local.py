@@ -24,7 +24,7 @@ def reconstruct(folder: Path, out: Path, *, frames: int | None, preset: str, cha
         preset: named settings.
         changes: what differs, as ``update.iterations=200``.
     """
-    from scas4d_core.bench.quality import settings_of
+    from scas4d_core.bench.job import settings_of
     from scas4d_core.history import History
     from scas4d_core.ply import write_ply
     from scas4d_core.reconstruction import Reconstruction

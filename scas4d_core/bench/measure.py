@@ -8,6 +8,8 @@ Definitions, beside those in ``scas4d_core.metrics``:
 - 3D tracks start from the true points at frame 0. 2D tracks start from the pixels where a test camera has the moving
   points that it sees at frame 0, go through rendered depth, and count where the camera truly sees the point.
 - Parts are rendered with as many labels as the scene has foreground parts, and compared where the true label is a part.
+- *Still* pixels of a test camera show something, and their true values stay within 6 of 255 levels over the frames that
+  are measured. *Flicker* is the standard deviation over time of what is rendered there, in levels.
 """
 
 from __future__ import annotations
@@ -33,6 +35,10 @@ MOVING_SHARE = 0.01
 """Of the extent: a true point that moves less than this counts as standing."""
 CHANGED = 0.1
 """In 0…1: a pixel that differs more from frame 0 in some channel has changed."""
+STILL_LEVELS = 6
+"""Of 255: the true pictures' own noise; a pixel that stays within them in every channel does not change."""
+FEWEST_STILL = 500
+"""Still pixels over all test cameras from which flicker is told; fewer are chance."""
 DIFFERENCE_GAIN = 4.0
 """Differences are this much brighter in comparison pictures."""
 
@@ -130,6 +136,21 @@ def measure_parts(reconstruction: Reconstruction, capture: Capture, indices: Seq
             rendered.append(render_parts(reconstruction, camera, index, labels))
             true.append(truth.labels(camera.name, index))
     return {"parts_ari": metrics.adjusted_rand_index(np.stack(rendered), np.stack(true)), "parts_count": float(count)}
+
+
+def measure_flicker(reconstruction: Reconstruction, capture: Capture, indices: Sequence[int]) -> Scores:
+    """Mean temporal standard deviation, in 255ths, of the still pixels of the test cameras; how many there are."""
+    rig = capture.test_rig
+    assert rig is not None
+    deviations: list[NDArray[Any]] = []
+    for camera in rig.cameras:
+        true = np.stack([capture.test_frame(index).images[camera.name] for index in indices])
+        lowest, highest = true.min(axis=0).astype(np.int16), true.max(axis=0).astype(np.int16)
+        still = ((highest - lowest).max(axis=-1) <= STILL_LEVELS) & (highest.max(axis=-1) > 0)
+        shown = np.stack([np.clip(reconstruction.render(camera, index).colour[still], 0, 1) for index in indices])
+        deviations.append(255 * shown.std(axis=0, dtype=np.float64))
+    found = np.concatenate(deviations)
+    return {"still_pixels": float(len(found)), "flicker": float(found.mean()) if len(found) >= FEWEST_STILL else None}
 
 
 def render_parts(reconstruction: Reconstruction, camera: Camera, index: int, labels: NDArray[Any]) -> NDArray[np.uint8]:

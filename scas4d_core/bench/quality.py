@@ -8,13 +8,11 @@ was cut off begins again at its frame 0.
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,67 +22,14 @@ from rich.console import Console
 from rich.progress import Progress
 
 from scas4d_core.bench import measure as measures
+from scas4d_core.bench.job import Job, settings_of
 from scas4d_core.bench.machine import core_version, machine
-from scas4d_core.bench.store import Row, Store, digest
+from scas4d_core.bench.store import Row, Store
 from scas4d_core.bench.table import markdown, stage_table, with_means
 from scas4d_core.captures import open_capture
-from scas4d_core.presets import preset
-from scas4d_core.settings import Settings
 from scas4d_core.warm_up import warm_up_elsewhere
 
 Report = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Job:
-    """One row to be measured.
-
-    Attributes:
-        capture: folder.
-        preset: name, for the table.
-        settings: what is run, complete.
-        frames: only so many frames of the capture; None: all.
-        masks: whether the method gets the masks (they are always used to measure).
-        points: whether the method gets the initial cloud.
-        pictures: frames whose comparison pictures are saved; negative ones count from the end.
-        lpips: also LPIPS; loads torch.
-    """
-
-    capture: Path
-    preset: str
-    settings: Settings
-    frames: int | None = None
-    masks: bool = True
-    points: bool = True
-    pictures: tuple[int, ...] = (0, 1, -1)
-    lpips: bool = False
-
-    @property
-    def variant(self) -> str:
-        """What is the same over captures: preset, iterations and everything else that is set."""
-        update = self.settings.update
-        given: Row = {"frames": self.frames, "masks": self.masks, "points": self.points}
-        if self.lpips:
-            given["lpips"] = True
-        return (
-            f"{self.preset}-{update.iterations}-s{update.seed}-{digest(self.settings.model_dump(mode='json'), given)}"
-        )
-
-    @property
-    def changes(self) -> str:
-        """What differs from the preset beside iterations and seed, and what is withheld, in words for the table."""
-        usual, own = preset(self.preset).model_dump(mode="json"), self.settings.model_dump(mode="json")
-        words = [
-            f"{name}={json.dumps(value, separators=(',', ':'))}"
-            for name, value in _flat(own)
-            if name not in ("update.iterations", "update.seed", "static.seed") and dict(_flat(usual)).get(name) != value
-        ]
-        return ", ".join(words + ["no masks"] * (not self.masks) + ["no points"] * (not self.points))
-
-    @property
-    def key(self) -> str:
-        """Names the row; another setting is another row."""
-        return f"{self.capture.resolve().name}-{self.variant}"
 
 
 def run(
@@ -173,41 +118,6 @@ def run_jobs(jobs: Sequence[Job], out: Path, *, again: bool = False, report: Rep
     return rows
 
 
-def settings_of(
-    name: str,
-    iterations: int | None = None,
-    seed: int = 0,
-    overrides: Sequence[str] = (),
-    device: str | None = None,
-) -> Settings:
-    """A preset with changes, checked.
-
-    Raises:
-        ValueError: an unknown preset or setting, or a value out of range.
-    """
-    values = preset(name).model_dump()
-    values["static"]["seed"] = values["update"]["seed"] = seed
-    if iterations is not None:
-        values["update"]["iterations"] = iterations
-    if device is not None:
-        values["device"] = device
-    for change in overrides:
-        path, sign, text = change.partition("=")
-        if not sign:
-            raise ValueError(f"override {change!r} has no '='; write it as update.iterations=100")
-        *groups, last = path.strip().split(".")
-        inner = values
-        for group in groups:
-            if not isinstance(inner.get(group), dict):
-                raise ValueError(f"override {change!r}: there is no group of settings {group!r}")
-            inner = inner[group]
-        try:
-            inner[last] = json.loads(text)
-        except json.JSONDecodeError:
-            inner[last] = text.strip()
-    return Settings.model_validate(values)
-
-
 def measure(job: Job, folder: Path, report: Report = print) -> Row:
     """Reconstructs one capture and measures everything that it can be measured by.
 
@@ -249,9 +159,9 @@ def measure(job: Job, folder: Path, report: Report = print) -> Row:
         for index in range(count):
             line: Row = {"index": index, "seconds": seconds_first, "stages": {}}
             if index:
-                started = time.perf_counter()
+                started, cpu = time.perf_counter(), time.process_time()
                 done = reconstruction.step(given.frame(index))
-                line["seconds"] = time.perf_counter() - started
+                line["seconds"], line["cpu_seconds"] = time.perf_counter() - started, time.process_time() - cpu
                 line["stages"] = {name: float(value) for name, value in done.seconds.items()}
                 line["moving"], line["gaussians"] = int(done.moving), int(done.gaussians)
             scores, by_camera = measures.measure_pictures(reconstruction, truth, index, with_lpips=job.lpips)
@@ -285,6 +195,8 @@ def measure(job: Job, folder: Path, report: Report = print) -> Row:
     if truth.ground_truth is not None and count > 1:
         row |= measures.measure_tracks(reconstruction, truth, indices)
         row |= measures.measure_parts(reconstruction, truth, indices)
+    if count > 1:
+        row |= measures.measure_flicker(reconstruction, truth, indices)
     row["peak_mb"] = peak_megabytes()
     pictures = folder / "pictures" / job.key
     for index in sorted({range(count)[i] for i in job.pictures if -count <= i < count}):
@@ -310,17 +222,9 @@ def summary(lines: Sequence[Row]) -> Row:
         "psnr_by_frame": [round(line["psnr"], 3) for line in lines],
         # The first update compiles or loads kernels; medians do not see it.
         "seconds_update": float(np.median([line["seconds"] for line in updates])),
+        "cpu_seconds_update": float(np.median([line["cpu_seconds"] for line in updates])),
         "seconds_stages": stages,
     }
-
-
-def _flat(values: Mapping[str, Any], under: str = "") -> Iterator[tuple[str, Any]]:
-    """``{"update": {"iterations": 100}}`` as ``("update.iterations", 100)``."""
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{under}{name}.")
-        else:
-            yield f"{under}{name}", value
 
 
 def _stages(lines: Sequence[Row]) -> list[str]:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from scas4d_core.bench.quality import Job, Report, run_jobs, settings_of
+from scas4d_core.bench.job import Job, settings_of
+from scas4d_core.bench.quality import Report, run_jobs
 from scas4d_core.bench.store import Row, Store
 from scas4d_core.bench.table import OBJECT_CAPTURES
 from scas4d_core.presets import preset

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from client.cli import app
 from scas4d_core.bench import runs
 from scas4d_core.bench.bars import BARS, KERNELS, Bar, bar_table, count_words, judge, left_out, page, read_study
-from scas4d_core.bench.quality import Job
+from scas4d_core.bench.job import Job
 from scas4d_core.bench.runs import CAPTURES, RUNS, measure_runs, measured_runs
 from scas4d_core.bench.store import Store
 
