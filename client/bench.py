@@ -7,7 +7,10 @@ from typing import Annotated
 
 import typer
 
+from client import bench_frontier
+
 app = typer.Typer(no_args_is_help=True, help="Studies that measure the method.")
+bench_frontier.register(app)
 
 Study = Annotated[Path, typer.Option(help="Folder of the study: rows, pictures, frames 0. Run again to go on.")]
 Again = Annotated[bool, typer.Option("--again", help="Measure anew what is there already (kept frames 0 are used).")]
