@@ -57,7 +57,10 @@ class Camera:
     def _check(self) -> None:
         k, r = self.intrinsics, self.rotation
         if k[0, 0] <= 0 or k[1, 1] <= 0:
-            raise CameraError(f"camera {self.name!r}: focal lengths {k[0, 0]:g}, {k[1, 1]:g} must be positive pixels")
+            raise CameraError(
+                f"camera {self.name!r}: focal lengths {k[0, 0]:g}, {k[1, 1]:g} must be positive; "
+                "give positive focal lengths in pixels"
+            )
         if abs(k[0, 1]) + abs(k[1, 0]) + abs(k[2, 0]) + abs(k[2, 1]) + abs(k[2, 2] - 1) > 1e-6:
             raise CameraError(
                 f"camera {self.name!r}: intrinsics must be [[fx,0,cx],[0,fy,cy],[0,0,1]]; undo skew first"
@@ -65,12 +68,14 @@ class Camera:
         if not np.abs(r @ r.T - np.eye(3)).max() <= ROTATION_TOLERANCE or np.linalg.det(r) < 0:
             raise CameraError(
                 f"camera {self.name!r}: world_to_camera[:3,:3] is no rotation "
-                f"(determinant {np.linalg.det(r):.4g}); give world-to-camera with OpenCV axes"
+                f"(determinant {np.linalg.det(r):.4g}); give the rotation of world-to-camera with OpenCV axes"
             )
         if not np.allclose(self.world_to_camera[3], (0, 0, 0, 1)):
-            raise CameraError(f"camera {self.name!r}: last row of world_to_camera must be 0 0 0 1")
+            raise CameraError(f"camera {self.name!r}: the last row of world_to_camera is not 0 0 0 1; give a 4x4 pose")
         if self.width < 1 or self.height < 1:
-            raise CameraError(f"camera {self.name!r}: size {self.width}x{self.height} must be at least 1x1")
+            raise CameraError(
+                f"camera {self.name!r}: size {self.width}x{self.height} is empty; give at least 1x1 pixels"
+            )
 
     @property
     def fx(self) -> float:
@@ -183,10 +188,12 @@ class Rig:
     def __post_init__(self) -> None:
         names = [camera.name for camera in self.cameras]
         if not names:
-            raise CameraError("a rig needs at least one camera")
+            raise CameraError("a rig needs at least one camera; add one")
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise CameraError(f"camera names must be unique within a rig; given twice: {', '.join(twice)}")
+            raise CameraError(
+                f"camera names must be unique within a rig, given twice: {', '.join(twice)}; rename all but one"
+            )
 
     def __len__(self) -> int:
         return len(self.cameras)

@@ -94,9 +94,13 @@ def parts(
     newest = history.gaussians(history.indices[-1])
     rows = np.flatnonzero(newest.moving)
     if rows.size == 0:
-        raise ValueError("no Gaussian moves (foreground > 0.5), so there are no parts")
+        raise ValueError(
+            "no Gaussian moves (foreground > 0.5), so there are no parts; ask again when something has moved"
+        )
     if count is not None and not 1 <= count <= rows.size:
-        raise ValueError(f"count {count} must be between 1 and the {rows.size} moving Gaussians")
+        raise ValueError(
+            f"count {count} must be between 1 and the {rows.size} moving Gaussians; give no more than these"
+        )
 
     if previous is not None and previous.shape != (len(newest),):
         raise ValueError(f"previous labels {previous.shape} must be [{len(newest)}], one a Gaussian")

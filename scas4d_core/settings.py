@@ -198,7 +198,9 @@ class UpdateSettings(Model):
     @classmethod
     def _ascend(cls, clusters: tuple[int, ...]) -> tuple[int, ...]:
         if any(size < 1 for size in clusters) or list(clusters) != sorted(set(clusters)):
-            raise ValueError(f"clusters {clusters} must be at least 1 and ascend from the coarsest layer to the finest")
+            raise ValueError(
+                f"clusters {clusters} do not ascend; give numbers from 1, the coarsest layer's first and the finest's last"
+            )
         return clusters
 
 

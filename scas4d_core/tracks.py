@@ -230,7 +230,9 @@ def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indice
     place = np.minimum(np.searchsorted(held, wanted, sorter=order), len(held) - 1)
     unknown = wanted[held[order[place]] != wanted] if len(held) else wanted
     if len(unknown):
-        raise ValueError(f"ids {unknown[:5].tolist()} are no Gaussians of this history; it holds {len(held)}")
+        raise ValueError(
+            f"ids {unknown[:5].tolist()} are no Gaussians of this scene; take ids out of an answer, or of its {len(held)} Gaussians"
+        )
     positions = world.to_user(history.stacked("means", indices, order[place]))
     return Tracks(positions, np.ones(positions.shape[:2]), wanted, np.asarray(indices, dtype=np.int64))
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from client.wire import FrameReceipt, FrameState
 from server.facts import Fact, Skipped
 from server.ledger import LOST
-from server.problems import Problem
+from server.problems import Problem, counted
 
 if TYPE_CHECKING:
     from server.scene import Scene
@@ -113,10 +113,10 @@ class Admission:
         wait = min(60, max(1, math.ceil(scene.last_seconds)))
         return Problem(
             429,
-            f"{scene.queued} frames wait already",
+            f"{counted(scene.queued, 'frame')} of at most {scene.queue_limit} wait already",
             field="n",
             value=index,
-            remedy=f"send the same frame again in {wait} s",
+            remedy=f"send the same frame again in {counted(wait, 'second')}",
             headers={"Retry-After": str(wait)},
             queued=scene.queued,
         )

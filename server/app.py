@@ -6,18 +6,19 @@ import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from fastapi import APIRouter, FastAPI
+from fastapi import APIRouter, Depends, FastAPI
 from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import WebSocketRoute
 
 from client import __version__
-from server import problems
+from server import handlers, problems
 from server.auth import Door
 from server.hub import Hub
 from server.limits import BodyLimit
 from server.logs import AccessLog
+from server.parameters import only_known
 from server.placement import Placement
 from server.placement.local import LocalPlacement
 from server.problems import Problem
@@ -69,7 +70,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     )
     app.state.settings = settings
     app.state.tickets = Tickets(settings.ticket_seconds, settings.max_tickets)
-    problems.install(app)
+    handlers.install(app)
     # The last one added is the first that a request meets.
     app.add_middleware(BodyLimit, limit=int(settings.max_body_mb * 1e6))
     if settings.allowed_origins:
@@ -87,7 +88,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         *(estimate, tickets, health, metrics, viewer),
     )
     for resource in resources:
-        app.include_router(resource.router)
+        app.include_router(resource.router, dependencies=[] if resource is viewer else [Depends(only_known)])
         _answer_plain_requests(app, resource.router)
 
     return app

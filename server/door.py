@@ -13,7 +13,7 @@ from client.wire import FileKind, FrameFile, FrameHead, FrameReceipt, PartReceip
 from server.disk import full_disk, no_room
 from server.ingest import whole
 from server.pictures import MASK, check_files, check_picture
-from server.problems import Problem
+from server.problems import Problem, counted
 from server.scene import Scene
 from server.upload import Received, Receiving, receive_framed
 
@@ -53,7 +53,13 @@ async def take_form(scene: Scene, index: int, request: Request) -> FrameReceipt:
                 time = _seconds(value)
             elif isinstance(value, UploadFile):
                 if name in given:
-                    raise Problem(422, f"{name!r} is here twice", field=name, remedy="send one file a field")
+                    raise Problem(
+                        422,
+                        f"{name!r} is here twice",
+                        field=name,
+                        value=value.filename,
+                        remedy="send one file a camera",
+                    )
                 given[name] = value
             else:
                 raise Problem(
@@ -122,7 +128,13 @@ def scene_camera(scene: Scene, camera: str, field: str) -> None:
 
 def _head(index: int, time: float | None, files: Sequence[FrameFile], *, part: bool) -> FrameHead:
     if not files:
-        raise Problem(422, "no picture is here", field="body", remedy="send one file a camera")
+        raise Problem(
+            422,
+            "no picture is here",
+            field="body",
+            value="nothing",
+            remedy="send one file a camera, named like the camera",
+        )
     return FrameHead(index=index, time=time, files=list(files), part=part)
 
 
@@ -207,7 +219,7 @@ def _one_camera(head: FrameHead, camera: str | None) -> str:
     if len(names) != 1 or camera not in (None, names[0]):
         raise Problem(
             422,
-            f"files of {', '.join(names)}",
+            f"the files are of {counted(len(names), 'camera')}: {', '.join(names)}",
             field="head.files",
             value=", ".join(names),
             remedy="send the files of one camera" + ("" if camera is None else f", {camera!r}, as the address says"),
@@ -221,5 +233,7 @@ def _seconds(value: str) -> float:
     except ValueError:
         seconds = math.nan
     if not math.isfinite(seconds):
-        raise Problem(422, "time is no finite number", field="time", value=value, remedy="give seconds")
+        raise Problem(
+            422, "time is no finite number", field="time", value=value, remedy="give seconds, as 1.25, or leave it out"
+        )
     return seconds

@@ -8,7 +8,7 @@ from pathlib import Path
 from client.wire import RigModel
 from client.wire.estimate import SceneEstimate
 from scas4d_core.settings import Settings
-from server.problems import Problem
+from server.problems import Problem, counted
 from server.settings import ServerSettings
 
 PROCESS = 280e6
@@ -90,7 +90,7 @@ def check(rig: RigModel, settings: Settings, server: ServerSettings) -> None:
         422,
         f"the scene is estimated to take {found.memory_mb:.0f} MB, more than {found.limit_mb:.0f} MB",
         field="rig.cameras",
-        value=f"{len(rig.cameras)} cameras, {found.scaled_pixels} pixels, {found.gaussians} Gaussians",
+        value=f"{counted(len(rig.cameras), 'camera')}, {found.scaled_pixels} pixels, {found.gaussians} Gaussians",
         remedy=remedy,
         estimate=found.model_dump(),
     )

@@ -90,7 +90,7 @@ class Hub:
         if len(room.listeners) >= self.max_listeners:
             raise Problem(
                 429,
-                f"{len(room.listeners)} subscribers listen to this scene already",
+                f"this scene has all the subscribers that it may have: {len(room.listeners)}",
                 field="SCAS4D_MAX_SUBSCRIBERS",
                 value=self.max_listeners,
                 remedy="close another subscriber of the scene, or raise the limit",

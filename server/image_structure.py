@@ -21,6 +21,7 @@ class StructureError(ValueError):
 
     def __init__(self, message: str, value: str | None = None) -> None:
         super().__init__(message)
+        self.fault, _, self.remedy = message.rpartition("; ")
         self.value = value
 
 
@@ -52,11 +53,17 @@ def walk(data: bytes | memoryview) -> ImageHeader:
         return _png(data)
     if start[:4] == b"RIFF" and start[8:] == b"WEBP":
         return _webp(data)
-    raise StructureError(f"begins with {start[:8].hex(' ') or 'nothing'}: not a JPEG, PNG or WebP; send one of these")
+    if not start:
+        raise StructureError("an empty file; send the picture as JPEG, PNG or WebP")
+    raise StructureError(
+        f"begins with {start[:8].hex(' ')}, which is no JPEG, PNG or WebP; encode the picture as one of these"
+    )
 
 
 def _truncated(kind: str, size: int) -> StructureError:
-    return StructureError(f"a {kind} that ends early, after {size} bytes; send the whole file")
+    return StructureError(
+        f"a {kind} that ends early, after {size} bytes; it was cut short on its way here: send it again from its source"
+    )
 
 
 def _jpeg(data: memoryview) -> ImageHeader:
@@ -67,7 +74,9 @@ def _jpeg(data: memoryview) -> ImageHeader:
         if at + 2 > len(data):
             raise _truncated("JPEG", len(data))
         if data[at] != 0xFF:
-            raise StructureError(f"a JPEG without a marker at byte {at}; the file is damaged: send it again")
+            raise StructureError(
+                f"a JPEG without a marker at byte {at}; the file is damaged: send it again from its source"
+            )
         marker = data[at + 1]
         if marker == 0xD9:
             break
@@ -78,7 +87,9 @@ def _jpeg(data: memoryview) -> ImageHeader:
             raise _truncated("JPEG", len(data))
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             if length < 8:
-                raise StructureError("a JPEG with a short frame header; the file is damaged: send it again")
+                raise StructureError(
+                    "a JPEG with a short frame header; the file is damaged: send it again from its source"
+                )
             bits, height, width, channels = struct.unpack(">BHHB", data[at + 4 : at + 10])
             if bits != 8 or channels not in (1, 3):
                 kind = "CMYK, " if channels == 4 else ""
@@ -95,7 +106,7 @@ def _jpeg(data: memoryview) -> ImageHeader:
                 break
             at = _end_of_scan(data, at)
     if header is None:
-        raise StructureError("a JPEG without a frame header; the file is damaged: send it again")
+        raise StructureError("a JPEG without a frame header; the file is damaged: send it again from its source")
     return replace(header, exif=exif)
 
 
@@ -117,10 +128,14 @@ def _png(data: memoryview) -> ImageHeader:
         if end > len(data):
             raise _truncated("PNG", len(data))
         if zlib.crc32(data[at + 4 : end - 4]) != struct.unpack(">I", data[end - 4 : end])[0]:
-            raise StructureError(f"a PNG whose {kind!r} chunk at byte {at} fails its checksum; send the file again")
+            raise StructureError(
+                f"a PNG whose {kind!r} chunk at byte {at} fails its checksum; it was damaged on its way: send it again"
+            )
         if header is None:
             if kind != b"IHDR" or length != 13:
-                raise StructureError("a PNG that does not begin with its header; the file is damaged: send it again")
+                raise StructureError(
+                    "a PNG that does not begin with its header; the file is damaged: send it again from its source"
+                )
             header = ImageHeader("png", *struct.unpack(">II", data[at + 8 : at + 16]))
             if data[at + 16] == 16:
                 raise StructureError(
@@ -133,7 +148,7 @@ def _png(data: memoryview) -> ImageHeader:
             break
         at = end
     if not pixels:
-        raise StructureError("a PNG without pixels; the file is damaged: send it again")
+        raise StructureError("a PNG without pixels; the file is damaged: send it again from its source")
     return header
 
 
@@ -160,5 +175,5 @@ def _webp(data: memoryview) -> ImageHeader:
             header, pixels = header or ImageHeader("webp", (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1), True
         at += 8 + length + length % 2
     if header is None or not pixels:
-        raise StructureError("a WebP without pixels; the file is damaged: send it again")
+        raise StructureError("a WebP without pixels; the file is damaged: send it again from its source")
     return header

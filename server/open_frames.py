@@ -14,7 +14,7 @@ from server.facts import PartTaken, Taken
 from server.frame_store import FrameDamage, read_pictures
 from server.journal import read_journal
 from server.ledger import OpenFrame, frame_identity
-from server.problems import Problem
+from server.problems import Problem, counted
 from server.upload import Received
 
 if TYPE_CHECKING:
@@ -177,10 +177,10 @@ class OpenFrames:
             if len(frame.cameras) < scene.minimum_cameras:
                 raise Problem(
                     409,
-                    f"{len(frame.cameras)} cameras are in, the scene's minimum is {scene.minimum_cameras}",
+                    f"{counted(len(frame.cameras), 'camera')} of at least {scene.minimum_cameras} sent a picture",
                     field="n",
                     value=index,
-                    remedy="send more cameras, or declare the frame missing",
+                    remedy="send those of more cameras, or declare the frame missing",
                     received=frame.cameras,
                 )
             if not self.rules.room():

@@ -10,7 +10,7 @@ from PIL import Image
 from client.wire import FileKind, FrameFile
 from scas4d_core.cameras import Rig
 from server.image_structure import StructureError, walk
-from server.problems import Problem
+from server.problems import Problem, counted
 
 MASK = "mask."
 EXIF_ORIENTATION = 0x0112
@@ -40,7 +40,13 @@ def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
                 remedy=f"the cameras are {', '.join(rig.names)}",
             )
         if file.camera in seen[file.kind]:
-            raise Problem(422, f"{field!r} is here twice", field=field, remedy="send one file a camera and kind")
+            raise Problem(
+                422,
+                f"{field!r} is here twice",
+                field=field,
+                value=file.camera,
+                remedy="send one file a camera and kind",
+            )
         seen[file.kind].add(file.camera)
     if not whole:
         return
@@ -50,9 +56,13 @@ def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
             image = kind == FileKind.IMAGE
             raise Problem(
                 422,
-                f"no {'picture' if image else 'mask'} of {len(missing)} cameras: {', '.join(missing)}",
+                f"no {'picture' if image else 'mask'} of {counted(len(missing), 'camera')}: {', '.join(missing)}",
                 field=missing[0] if image else MASK + missing[0],
-                remedy="send one for every camera" + ("" if image else ", or no masks at all"),
+                value="nothing",
+                remedy=f"add {'one' if len(missing) == 1 else 'one each'}"
+                + (
+                    ", or send camera by camera: PUT …/frames/{n}/cameras/{c}" if image else ", or send no masks at all"
+                ),
             )
 
 
@@ -66,9 +76,8 @@ def check_picture(rig: Rig, file: FrameFile, data: memoryview) -> None:
     try:
         header = walk(data)
     except StructureError as error:
-        fault = str(error)
-        value = error.value or f"{len(data)} bytes"
-        raise Problem(422, f"{field}: {fault}", field=field, value=value, remedy=fault.rpartition("; ")[2]) from None
+        value = error.value or counted(len(data), "byte")
+        raise Problem(422, f"{field}: {error.fault}", field=field, value=value, remedy=error.remedy) from None
     if (header.width, header.height) != (camera.width, camera.height):
         raise Problem(
             422,

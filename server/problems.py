@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import json
-import logging
-import re
 from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any
 
-from fastapi import FastAPI, Request
-from fastapi.exceptions import RequestValidationError
+from fastapi import FastAPI
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
-from starlette.routing import compile_path
 from starlette.types import Receive, Scope, Send
 
 from client.wire import ProblemDetails
@@ -21,10 +17,6 @@ from client.wire import ProblemDetails
 MEDIA_TYPE = "application/problem+json"
 VALUE_LENGTH = 200
 """A value quoted in an answer is cut here: it may be a whole cloud."""
-
-JSON = re.compile(r"application/([\w.-]+\+)?json")
-
-log = logging.getLogger("scas4d.server")
 
 
 class Problem(HTTPException):
@@ -63,6 +55,11 @@ class Problem(HTTPException):
         )
 
 
+def counted(count: int, noun: str) -> str:
+    """A number and its noun: 1 camera, 2 cameras."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def quoted(value: object) -> str:
     """A value as text, short enough to be sent back."""
     text = value if isinstance(value, str) else repr(value)
@@ -82,87 +79,6 @@ async def refuse(problem: Problem, scope: Scope, receive: Receive, send: Send) -
         await send({"type": "websocket.close", "code": 1008, "reason": str(problem.document.detail)[:120]})
         return
     await answer(problem.document, problem.headers)(scope, receive, send)
-
-
-def install(app: FastAPI) -> None:
-    """Makes the application answer every error as a problem document."""
-
-    async def from_problem(request: Request, error: Exception) -> Response:
-        assert isinstance(error, HTTPException)
-        if isinstance(error, Problem):
-            return answer(error.document, error.headers)
-        headers = dict(error.headers or {})
-        if error.status_code == 405:  # Starlette names the methods of the first route at this address only
-            headers["Allow"] = ", ".join(methods(request.app, request.url.path)) or headers.get("Allow", "")
-        return answer(_of_framework(request, error.status_code, str(error.detail), headers), headers)
-
-    async def from_validation(request: Request, error: Exception) -> Response:
-        assert isinstance(error, RequestValidationError)
-        first = error.errors()[0]
-        given = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-        if first["loc"][0] == "body" and given and not JSON.fullmatch(given):
-            problem = Problem(
-                415, f"the body is {given}", field="Content-Type", value=given, remedy="send application/json"
-            )
-            return answer(problem.document)
-        field = ".".join(str(part) for part in first["loc"])
-        fault = first["msg"].removeprefix("Value error, ")
-        others = len(error.errors()) - 1
-        document = ProblemDetails(
-            title=HTTPStatus.UNPROCESSABLE_ENTITY.phrase,
-            status=422,
-            detail=f"{field}: {fault}" + (f" (and {others} more)" if others else ""),
-            field=field,
-            value=quoted(first.get("input")),
-            remedy=f"{fault}; the schema is at /openapi.json",
-        )
-        return answer(document)
-
-    async def from_fault(request: Request, error: Exception) -> Response:
-        log.exception("%s %s failed", request.method, request.url.path, exc_info=error)
-        document = ProblemDetails(
-            title=HTTPStatus.INTERNAL_SERVER_ERROR.phrase,
-            status=500,
-            detail=f"the service failed: {type(error).__name__}",
-            remedy="this is a fault of the service; its log has the traceback",
-        )
-        return answer(document)
-
-    app.openapi = lambda: document(app)  # type: ignore[method-assign]
-    app.add_exception_handler(HTTPException, from_problem)
-    app.add_exception_handler(RequestValidationError, from_validation)
-    app.add_exception_handler(Exception, from_fault)
-
-
-def methods(app: FastAPI, path: str) -> list[str]:
-    """The methods that the document has for an address."""
-    return sorted(
-        {
-            method.upper()
-            for template, operations in document(app)["paths"].items()
-            if compile_path(template)[0].match(path)
-            for method in operations
-        }
-    )
-
-
-def _of_framework(request: Request, status: int, detail: str, headers: Mapping[str, str]) -> ProblemDetails:
-    """What Starlette and FastAPI refuse by themselves: no such path, no such method, a body that is no form."""
-    field = value = remedy = None
-    if status == 404:
-        field, value, remedy = "path", quoted(request.url.path), "GET /openapi.json lists all paths"
-    elif status == 405:
-        field, value, remedy = "method", request.method, f"use {headers.get('Allow') or 'another'}"
-    elif status == 400:
-        field, remedy = "body", "send the body that Content-Type says; the schema is at /openapi.json"
-    return ProblemDetails(
-        title=HTTPStatus(status).phrase,
-        status=status,
-        detail=detail,
-        field=field,
-        value=value,
-        remedy=remedy,
-    )
 
 
 def plain_tuples(schema: Any) -> None:

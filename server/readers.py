@@ -18,9 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server import metrics, renderer, track_answers
-from server.messages import Answer, Ask, LabelsQuery, Query, Refresh, Refused, RenderQuery, SceneSpec, TracksQuery
+from server.messages import (
+    Answer,
+    Ask,
+    LabelsQuery,
+    PartsQuery,
+    Query,
+    Refresh,
+    Refused,
+    RenderQuery,
+    SceneSpec,
+    TracksQuery,
+)
 from server.placement import Entry, Placement, Process
-from server.problems import Problem
+from server.problems import Problem, counted
 from server.settings import ServerSettings
 
 GRACE_VIEWS_S, GRACE_BULK_S = 10.0, 1.0
@@ -83,7 +94,7 @@ class Line:
         if len(self._waiting) >= self._server.waiting_questions:
             raise Problem(
                 503,
-                f"{len(self._waiting)} questions wait for this scene's reader already",
+                f"{counted(len(self._waiting), 'question')} of this scene wait for an answer already",
                 field="SCAS4D_WAITING_QUESTIONS",
                 value=self._server.waiting_questions,
                 remedy="ask less often, or subscribe (WS …/stream): it sends the newest only",
@@ -230,11 +241,11 @@ class Readers:
         if isinstance(query, TracksQuery):
             return await self._tracks(query)
         if not isinstance(query, RenderQuery):
-            return _checked(await self.bulk.ask(query))
+            return _checked(await self.bulk.ask(query), query)
         if "parts" not in query.kinds:
-            return _checked(await self.views.ask(query))
+            return _checked(await self.views.ask(query), query)
         labels = await self._labels_of(query.parts)
-        answer = _checked(await self.views.ask(replace(query, labels=labels.labels)))
+        answer = _checked(await self.views.ask(replace(query, labels=labels.labels)), query)
         return replace(answer, headers={**answer.headers, "X-Parts-Frame": labels.frame})
 
     def refresh(self) -> None:
@@ -253,8 +264,8 @@ class Readers:
         """Trajectories; a long question in pieces, so that others come in between."""
         pieces = track_answers.pieces(query)
         if len(pieces) * len(pieces[0]) == 1:
-            return _checked(await self.bulk.ask(query))
-        answers = [[_checked(await self.bulk.ask(piece)).body for piece in row] for row in pieces]
+            return _checked(await self.bulk.ask(query), query)
+        answers = [[_checked(await self.bulk.ask(piece), piece).body for piece in row] for row in pieces]
         return Answer(0, *await asyncio.to_thread(track_answers.together, answers, query, self._spec))
 
     async def _labels_of(self, count: int | None) -> Labels:
@@ -274,7 +285,7 @@ class Readers:
 
     async def _find(self, count: int | None) -> Labels:
         commits = self._commits
-        answer = _checked(await self.bulk.ask(LabelsQuery(count)))
+        answer = _checked(await self.bulk.ask(LabelsQuery(count)), LabelsQuery(count))
         labels = np.frombuffer(answer.body, "<i2")
         return Labels(commits, answer.headers["X-Parts-Frame"], labels)
 
@@ -288,10 +299,26 @@ class Readers:
             self._labels.popitem(last=False)
 
 
-def _checked(answer: Answer | Refused) -> Answer:
+def _checked(answer: Answer | Refused, query: Query) -> Answer:
     if isinstance(answer, Answer):
         return answer
-    remedies = {500: "the log of the service says more", 503: "ask again later"}
-    remedy = remedies.get(answer.status, "change what the sentence names")
-    headers = {"Retry-After": "1"} if answer.status == 503 else None
-    raise Problem(answer.status, answer.detail, remedy=remedy, headers=headers)
+    if answer.status != 422:
+        remedies = {404: "ask for a frame that the scene's status counts as committed", 503: "ask again later"}
+        remedy = remedies.get(answer.status, "this is a fault of the service; its log has the traceback")
+        raise Problem(
+            answer.status, answer.detail, remedy=remedy, headers={"Retry-After": "1"} if answer.status == 503 else None
+        )
+    field, value = _asked(query)
+    fault, _, remedy = answer.detail.rpartition("; ")
+    raise Problem(
+        422, fault or answer.detail, field=field, value=value, remedy=remedy if fault else f"give another {field}"
+    )
+
+
+def _asked(query: Query) -> tuple[str, object]:
+    """What of a question the reader can find wrong that the door cannot: its field and value."""
+    if isinstance(query, TracksQuery):
+        return ("ids", list(query.ids)) if query.ids is not None else ("at", query.at)
+    if isinstance(query, LabelsQuery | PartsQuery):
+        return "count", query.count if query.count is not None else "chosen by rule"
+    return "frame", query.frame

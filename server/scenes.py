@@ -28,7 +28,7 @@ from server.facts import Created
 from server.hub import Hub
 from server.journal import Journal
 from server.placement import Placement
-from server.problems import Problem
+from server.problems import Problem, counted
 from server.recovery import recover
 from server.scene import Scene
 from server.settings import ServerSettings
@@ -36,6 +36,21 @@ from server.settings import ServerSettings
 __all__ = ["Scene", "Scenes"]
 
 log = logging.getLogger("scas4d.server")
+
+
+def hold(data: Path) -> FolderLock:
+    """The data folder, for this service alone; made where there is none.
+
+    Raises:
+        RuntimeError: another service is at work in it.
+    """
+    data.mkdir(parents=True, exist_ok=True)
+    try:
+        return FolderLock(data / "service.lock", wait=False)
+    except BlockingIOError:
+        raise RuntimeError(
+            f"another service is at work in {data}; stop it, or give this one another folder: --data FOLDER"
+        ) from None
 
 
 class Scenes:
@@ -64,12 +79,7 @@ class Scenes:
         """
         for folder in (self._folder, self._deleted):
             folder.mkdir(parents=True, exist_ok=True)
-        try:
-            self._lock = FolderLock(self.server.data / "service.lock", wait=False)
-        except BlockingIOError:
-            raise RuntimeError(
-                f"another service is at work in {self.server.data}; stop it, or give this one another folder (data)"
-            ) from None
+        self._lock = hold(self.server.data)
         await asyncio.to_thread(self._clean)
         for folder in sorted(path for path in self._folder.iterdir() if path.is_dir()):
             await self._restore(folder)
@@ -112,7 +122,7 @@ class Scenes:
         if len(self.by_id) + self._making >= self.server.max_scenes:
             raise Problem(
                 429,
-                f"{len(self.by_id)} scenes run already",
+                f"{counted(len(self.by_id), 'scene')} of at most {self.server.max_scenes} are here already",
                 field="SCAS4D_MAX_SCENES",
                 value=self.server.max_scenes,
                 remedy="delete a scene, or raise the limit",

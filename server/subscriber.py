@@ -26,14 +26,17 @@ from client.wire.stream import (
     Unsubscribed,
     Update,
 )
+from server import validation
 from server.feeds import Feed, PartsFeed, RenderFeed, TracksFeed
 from server.hub import Event, FrameFinished, Room
 from server.mailbox import Mailbox
-from server.problems import Problem, quoted
+from server.problems import Problem, counted
 from server.scenes import Scene
 from server.settings import ServerSettings
 
 T = TypeVar("T")
+
+WHERE = "docs/stream.md lists the messages"
 
 FEEDS: dict[Topic, type[Feed]] = {Topic.RENDER: RenderFeed, Topic.TRACKS: TracksFeed, Topic.PARTS: PartsFeed}
 
@@ -118,11 +121,12 @@ class Subscriber:
         return self._topics[id]
 
     def _begin(self, message: Subscribe) -> Model:
-        request = _valid(REQUESTS[message.topic].model_validate, message.request, "request")
+        wanted = REQUESTS[message.topic]
+        request = _valid(wanted.model_validate, message.request, "request", wanted)
         if message.id not in self._topics and len(self._topics) >= self.server.max_subscriptions:
             raise Problem(
                 429,
-                f"{len(self._topics)} subscriptions are open already",
+                f"{counted(len(self._topics), 'subscription')} open already, and no more are taken",
                 field="SCAS4D_MAX_SUBSCRIPTIONS",
                 value=self.server.max_subscriptions,
                 remedy="unsubscribe from another one, or open a second stream",
@@ -155,7 +159,7 @@ class Subscriber:
             )
         feed, _ = self._feeds[message.id]
         changed = feed.request.model_dump() | message.request
-        feed.ask_for(_valid(REQUESTS[topic].model_validate, changed, "request"), message.tag)
+        feed.ask_for(_valid(REQUESTS[topic].model_validate, changed, "request", REQUESTS[topic]), message.tag)
 
     def _end(self, id: str) -> None:
         self._topics.pop(id, None)
@@ -179,17 +183,10 @@ def _text(kind: str, id: str, missed: int, name: str, value: str) -> str:
     return f'{{"type":"{kind}","id":{json.dumps(id)},"missed":{missed},"{name}":{value}}}'
 
 
-def _valid(validate: Callable[[Any], T], given: Any, within: str = "") -> T:
+def _valid(validate: Callable[[Any], T], given: Any, within: str = "", model: object = None) -> T:
     try:
         return validate(given)
     except ValidationError as error:
-        first = error.errors()[0]
-        path = ".".join(part for part in (within, *(str(part) for part in first["loc"])) if part)
-        fault = first["msg"].removeprefix("Value error, ")
-        raise Problem(
-            422,
-            f"{path or 'message'}: {fault}",
-            field=path or "message",
-            value=quoted(first.get("input")),
-            remedy=f"{fault}; docs/stream.md lists the messages",
+        raise validation.invalid(
+            error.errors()[0], model=model, prefix=within, text=given if isinstance(given, str) else None, schema=WHERE
         ) from None

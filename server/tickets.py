@@ -11,7 +11,7 @@ import secrets
 import time
 from collections.abc import Callable
 
-from server.problems import Problem
+from server.problems import Problem, counted
 
 SUBPROTOCOL = "scas4d.ticket."
 
@@ -42,7 +42,7 @@ class Tickets:
         if len(self._until) >= self.limit:
             raise Problem(
                 429,
-                f"{len(self._until)} tickets wait to be used",
+                f"{counted(len(self._until), 'ticket')} of at most {self.limit} wait to be used",
                 field="SCAS4D_MAX_TICKETS",
                 value=self.limit,
                 remedy=f"use them, or wait {self.seconds:g} s",

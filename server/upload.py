@@ -197,8 +197,8 @@ def _fill(start: bytearray, view: memoryview, size: int) -> memoryview:
 
 def framing_problem(error: FramingError) -> Problem:
     """The answer to bytes that are no frame."""
-    text = str(error)
-    return Problem(422, f"the frame {text}", field="body", value=text, remedy=text.rpartition("; ")[2])
+    fault, _, remedy = str(error).rpartition("; ")
+    return Problem(422, f"the frame {fault}", field="body", value=fault, remedy=remedy)
 
 
 def _check_length(head: FrameHead, start: int, total: int | None) -> None:

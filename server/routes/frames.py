@@ -126,7 +126,13 @@ async def report(scene: TheScene, n: FrameIndex) -> FrameReportModel:
     """Where the frame is, and its numbers once it is committed."""
     found = await scene.report(n)
     if found is None:
-        raise Problem(404, f"frame {n} is not here", field="n", value=n, remedy=f"the next frame is {scene.next_frame}")
+        raise Problem(
+            404,
+            f"frame {n} has not come",
+            field="n",
+            value=n,
+            remedy=f"send it, or wait for it: the next is {scene.next_frame}",
+        )
     return found
 
 

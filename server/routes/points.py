@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from client.wire import PointsReceipt
 from scas4d_core.npz import write_npz
 from server.disk import full_disk, no_room
-from server.problems import Problem
+from server.problems import Problem, counted
 from server.routes.access import TheScene, TheSettings
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
@@ -71,6 +71,7 @@ def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
                 413,
                 f"the cloud unpacks to {unpacked} bytes",
                 field="points",
+                value=unpacked,
                 remedy=f"give at most {limit} points, or raise SCAS4D_MAX_POINTS",
             )
         with np.load(io.BytesIO(body), allow_pickle=False) as file:
@@ -80,6 +81,7 @@ def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
             422,
             f"the body is no npz that can be read without pickle ({error})",
             field="points",
+            value=counted(len(body), "byte"),
             remedy="send numpy.savez(positions=…, colours=…, foreground=…) of plain numbers",
         ) from None
     count = len(arrays["positions"]) if "positions" in arrays and arrays["positions"].ndim else 0

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 
 from client.wire import MAX_PIXELS_A_SIDE, RenderFormat, RenderKind, RenderRequest
 from server.messages import RenderQuery
-from server.problems import Problem
+from server.problems import Problem, counted
 from server.routes.access import TheScene, TheSettings
 from server.routes.asking import ask
 from server.scenes import Scene
@@ -88,7 +88,7 @@ def query_of(scene: Scene, server: ServerSettings, request: RenderRequest) -> Re
     if request.format not in SEVERAL and len(kinds) > 1:
         raise Problem(
             422,
-            f"{request.format} holds one kind",
+            f"{request.format} cannot hold {counted(len(kinds), 'kind')}",
             field="kinds",
             value=", ".join(kinds),
             remedy="ask for one kind, or for npz or float32",
@@ -119,6 +119,10 @@ def _colour(text: str) -> tuple[float, float, float]:
         red = green = blue = math.nan
     if not all(0 <= value <= 1 for value in (red, green, blue)):
         raise Problem(
-            422, "background is three numbers in 0…1", field="background", value=text, remedy="give background=1,1,1"
+            422,
+            "background is not three numbers in 0…1",
+            field="background",
+            value=text,
+            remedy="give background=1,1,1",
         )
     return red, green, blue

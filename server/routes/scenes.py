@@ -8,9 +8,9 @@ from fastapi import APIRouter, Response
 from pydantic import ValidationError
 
 from client.wire import SceneCreate, SceneList, SceneStatus
-from scas4d_core.presets import preset
+from scas4d_core.presets import PRESETS
 from scas4d_core.settings import Settings
-from server import estimate
+from server import devices, estimate, validation
 from server.problems import Problem
 from server.routes.access import AllScenes, TheScene, TheSettings
 
@@ -28,18 +28,19 @@ def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 def scene_settings(request: SceneCreate) -> Settings:
     """The preset with the request's changes."""
-    try:
-        base = preset(request.preset)
-    except ValueError as error:
-        raise Problem(422, str(error), field="preset", value=request.preset, remedy=str(error)) from None
+    base = PRESETS.get(request.preset)
+    if base is None:
+        raise Problem(
+            422,
+            f"there is no preset {request.preset!r}",
+            field="preset",
+            value=request.preset,
+            remedy=f"give one of {', '.join(sorted(PRESETS))}, and what differs from it as settings",
+        )
     try:
         return Settings.model_validate(merged(base.model_dump(), request.settings))
     except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(("settings", *(str(part) for part in first["loc"])))
-        raise Problem(
-            422, f"{field}: {first['msg']}", field=field, value=first.get("input"), remedy=first["msg"]
-        ) from None
+        raise validation.first_of(error, model=Settings, prefix="settings") from None
 
 
 @router.post("", status_code=201)
@@ -57,6 +58,7 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
                 remedy="send smaller pictures with the intrinsics to match, or raise SCAS4D_MAX_IMAGE_PIXELS",
             )
     estimate.check(request.rig, settings, server)
+    await devices.require(settings.device)
     scene = await scenes.create(request, settings)
     response.headers["Location"] = f"/v1/scenes/{scene.id}"
     return scene.status()

@@ -12,7 +12,7 @@ from client.wire import CameraModel, TracksModel, TracksRequest
 from scas4d_core.cameras import Camera
 from server import track_answers
 from server.messages import TracksQuery
-from server.problems import Problem
+from server.problems import Problem, counted
 from server.routes.access import TheScene, TheSettings
 from server.routes.asking import ask
 from server.scenes import Scene
@@ -81,7 +81,7 @@ def query_of(scene: Scene, server: ServerSettings, request: TracksRequest) -> Tr
     if len(asked) != 1:
         given = ", ".join(name for name, _ in asked) or "none"
         raise Problem(
-            422, f"asked by {given} of ids, pixels, points", field="ids", value=given, remedy="give exactly one"
+            422, f"asked by {given}", field="ids", value=given, remedy="give exactly one of ids, pixels, points"
         )
     scene.committed_frame(None, "from")
     start = scene.committed[0] if request.first is None else request.first
@@ -99,7 +99,7 @@ def query_of(scene: Scene, server: ServerSettings, request: TracksRequest) -> Tr
     if len(queries) * len(frames) > server.max_track_points:
         raise Problem(
             422,
-            f"{len(queries)} points over {len(frames)} frames",
+            f"{counted(len(queries), 'point')} over {counted(len(frames), 'frame')}",
             field=field,
             value=len(queries) * len(frames),
             remedy=f"ask for at most {server.max_track_points} at once, or raise SCAS4D_MAX_TRACK_POINTS",
@@ -107,15 +107,24 @@ def query_of(scene: Scene, server: ServerSettings, request: TracksRequest) -> Tr
     if request.format == "json" and len(queries) * len(frames) > server.max_track_json_points:
         raise Problem(
             422,
-            f"{len(queries)} points over {len(frames)} frames are too many for JSON",
+            f"{counted(len(queries), 'point')} over {counted(len(frames), 'frame')} as JSON",
             field="format",
             value="json",
             remedy=f"ask for npz, or for at most {server.max_track_json_points} (SCAS4D_MAX_TRACK_JSON_POINTS)",
         )
     if request.ids is not None and not all(0 <= id <= LARGEST_ID for id in request.ids):
-        raise Problem(422, "ids count from 0", field="ids", value=request.ids, remedy="give ids of Gaussians")
+        below = next(id for id in request.ids if not 0 <= id <= LARGEST_ID)
+        raise Problem(
+            422, f"no Gaussian can have the id {below}", field="ids", value=below, remedy="take ids out of an answer"
+        )
     if request.pixels is not None and request.camera is None:
-        raise Problem(422, "pixels of which camera?", field="camera", remedy=f"one of {', '.join(scene.rig.names)}")
+        raise Problem(
+            422,
+            "pixels of which camera is not said",
+            field="camera",
+            value="nothing",
+            remedy=f"name one of {', '.join(scene.rig.names)}",
+        )
     if request.points is not None and max(abs(value) for row in request.points for value in row) > FARTHEST:
         raise Problem(
             422,
@@ -134,17 +143,35 @@ def query_of(scene: Scene, server: ServerSettings, request: TracksRequest) -> Tr
         project=_different([_camera(scene, server, camera) for camera in request.project]),
         format=request.format,
     )
+    _check_pixels(query)
     cameras = track_answers.cameras_of(query)
     if len(cameras) * len(frames) > server.max_track_views:
         raise Problem(
             422,
-            f"visibility in {len(cameras)} cameras over {len(frames)} frames",
+            f"visibility in {counted(len(cameras), 'camera')} over {counted(len(frames), 'frame')}",
             field="project" if request.project else "camera",
             value=len(cameras) * len(frames),
             remedy=f"ask for at most {server.max_track_views} cameras times frames (SCAS4D_MAX_TRACK_VIEWS): "
             "fewer frames or cameras at once",
         )
     return query
+
+
+def _check_pixels(query: TracksQuery) -> None:
+    """Refuses pixels outside the picture."""
+    if query.camera is None or query.pixels is None:
+        return
+    width, height = query.camera.width, query.camera.height
+    outside = np.flatnonzero(~((query.pixels >= 0) & (query.pixels < (width, height))).all(axis=1))
+    if outside.size:
+        value = query.pixels[outside[0]].tolist()
+        raise Problem(
+            422,
+            f"pixel {int(outside[0])} lies outside the picture of camera {query.camera.name!r}",
+            field="pixels",
+            value=value,
+            remedy=f"give 0 ≤ u < {width}, 0 ≤ v < {height}",
+        )
 
 
 def _different(cameras: list[Camera]) -> tuple[Camera, ...]:
@@ -183,7 +210,13 @@ def _ids(text: str) -> list[int]:
     try:
         return [int(part) for part in text.split(",")]
     except ValueError:
-        raise Problem(422, "ids are whole numbers", field="ids", value=text, remedy="give 3,17,2048") from None
+        raise Problem(
+            422,
+            "ids are not whole numbers",
+            field="ids",
+            value=text,
+            remedy="give them with commas between: ids=3,17,2048",
+        ) from None
 
 
 def _numbers(texts: list[str], field: str, count: int) -> list[list[float]]:
@@ -196,7 +229,7 @@ def _numbers(texts: list[str], field: str, count: int) -> list[list[float]]:
         if len(row) != count or not all(math.isfinite(value) for value in row):
             example = ",".join("12.5" for _ in range(count))
             raise Problem(
-                422, f"{field} is {count} finite numbers", field=field, value=text, remedy=f"give {field}={example}"
+                422, f"{field} is not {count} finite numbers", field=field, value=text, remedy=f"give {field}={example}"
             )
         rows.append(row)
     return rows

@@ -29,16 +29,16 @@ def animated_webp():
 
 
 BAD = {
-    "truncated JPEG": (lambda: picture(format="JPEG")[:-5], "bytes", "send the whole file"),
-    "truncated PNG": (lambda: picture()[:-5], "bytes", "send the whole file"),
-    "truncated WebP": (lambda: picture(format="WEBP")[:-5], "bytes", "send the whole file"),
+    "truncated JPEG": (lambda: picture(format="JPEG")[:-5], "bytes", "again from its source"),
+    "truncated PNG": (lambda: picture()[:-5], "bytes", "again from its source"),
+    "truncated WebP": (lambda: picture(format="WEBP")[:-5], "bytes", "again from its source"),
     "wrong size": (lambda: picture(size=(WIDTH + 1, HEIGHT)), f"{WIDTH + 1}x{HEIGHT}", "size the camera was"),
     "16 bits": (sixteen_bits, "16 bits", "send 8 bits"),
     "CMYK": (lambda: picture(format="JPEG", mode="CMYK"), "CMYK", "send RGB or grey"),
     "animated PNG": (animated, "animated", "one picture a file"),
     "animated WebP": (animated_webp, "animated", "one picture a file"),
     "50,000 x 50,000 header": (lambda: declares(50_000, 50_000), "50000x50000", "size the camera was"),
-    "no picture": (lambda: b"GIF89a or so", "bytes", "send one of these"),
+    "no picture": (lambda: b"GIF89a or so", "bytes", "encode the picture"),
 }
 
 

@@ -324,7 +324,7 @@ def test_tickets_expire_are_bounded_and_kept_hashed():
     tickets = Tickets(30, 2, clock=lambda: now[0])
     first, second = tickets.issue(), tickets.issue()
     assert not any(first.encode() in digest for digest in tickets._until)
-    with pytest.raises(Exception, match="2 tickets wait"):
+    with pytest.raises(Exception, match="2 tickets of at most 2 wait"):
         tickets.issue()
     assert tickets.redeem(first)
     assert not tickets.redeem(first)

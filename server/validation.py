@@ -1,0 +1,148 @@
+"""What pydantic finds wrong with a request, as a problem: which field, which value, and what to send instead.
+
+Its messages say what is wrong ("Input should be less than or equal to 100"); the remedies here say what to send.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+
+from server.problems import Problem, counted
+
+MISSING = "nothing"
+"""The value of a field that is not there."""
+EXCERPT = 20
+"""Characters on either side of the place where JSON breaks."""
+
+BOUNDS = {"gt": "above", "ge": "of at least", "lt": "below", "le": "of at most"}
+UNION = re.compile(r"constrained-\w+|(function|literal|lax-or-strict|nullable).*|.*\[.*\]|str|int|float|[A-Z]\w+")
+"""Parts of pydantic's `loc` that name a member of a union, not a field."""
+
+KINDS = {
+    "int": "a whole number",
+    "float": "a number",
+    "decimal": "a number",
+    "finite": "a finite number: neither NaN nor infinity",
+    "bool": "true or false",
+    "string": "text",
+    "list": "a list: […]",
+    "tuple": "a list: […]",
+    "dict": "an object: {…}",
+    "model": "an object: {…}",
+    "mapping": "an object: {…}",
+}
+"""What a type error asks for, by the first word of its name."""
+
+
+def invalid(
+    error: Mapping[str, Any],
+    *,
+    model: object = None,
+    prefix: str = "",
+    others: int = 0,
+    text: str | None = None,
+    schema: str = "the schema is at /openapi.json",
+) -> Problem:
+    """The answer to one error of a validation.
+
+    Args:
+        error: as in `ValidationError.errors()`.
+        model: what was validated against, without the first part of `loc` where that says "body": it knows the names
+            of fields. prefix: of the field in the answer. others: how many errors there are besides.
+        text: what was sent, where it may be broken JSON. schema: where all fields are listed.
+    """
+    loc = tuple(part for part in error["loc"] if isinstance(part, int) or not UNION.fullmatch(part))
+    fault = str(error["msg"]).removeprefix("Value error, ")
+    if error["type"] == "json_invalid":
+        return _broken_json(error, loc, prefix, text)
+    field = ".".join(str(part) for part in ((prefix,) if prefix else ()) + loc) or "message"
+    value = MISSING if error["type"] in ("missing", "union_tag_not_found") else error.get("input")
+    inner = loc[1:] if loc[:1] == ("body",) else loc
+    more = f" (and {others} more)" if others else ""
+    return Problem(
+        422,
+        f"{field}: {_complaint(error, fault)}{more}",
+        field=field,
+        value="null" if value is None else value,
+        remedy=_remedy(error, fault, field, fields_of(model, inner[:-1]), schema),
+    )
+
+
+def first_of(error: ValidationError, *, model: object = None, prefix: str = "", text: str | None = None) -> Problem:
+    """The answer to the first error of a failed validation."""
+    found = error.errors()
+    return invalid(found[0], model=model, prefix=prefix, others=len(found) - 1, text=text)
+
+
+def fields_of(model: object, loc: tuple[int | str, ...] = ()) -> list[str]:
+    """Names of the fields of the model that lies at `loc` inside another; none where that is no model."""
+    here = list(_models(model))
+    for part in loc:
+        if isinstance(part, str):
+            inner = [one.model_fields[part].annotation for one in here if part in one.model_fields]
+            here = [found for annotation in inner for found in _models(annotation)]
+    return list(dict.fromkeys(name for one in here for name in one.model_fields))
+
+
+def _models(annotation: object) -> Iterator[type[BaseModel]]:
+    """The models that a type is made of."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _models(inner)
+
+
+def _broken_json(error: Mapping[str, Any], loc: tuple[Any, ...], prefix: str, text: str | None) -> Problem:
+    at = loc[-1] if loc and isinstance(loc[-1], int) else None
+    sent = text if text is not None else str(error.get("input", ""))
+    value = sent if at is None else sent[max(0, at - EXCERPT) : at + EXCERPT]
+    reason = error.get("ctx", {}).get("error", error["msg"])
+    place = "" if at is None else f" at character {at}"
+    field = prefix or (str(loc[0]) if loc else "message")
+    return Problem(
+        422,
+        f"the {field} is no JSON: {str(reason)[:1].lower()}{str(reason)[1:]}{place}",
+        field=field,
+        value=value or MISSING,
+        remedy="send well-formed JSON: names and text in double quotes, no comma behind the last one, no comments",
+    )
+
+
+def _complaint(error: Mapping[str, Any], fault: str) -> str:
+    """Our own messages end in what to do, behind a semicolon."""
+    return (fault.rpartition("; ")[0] or fault) if error["type"] == "value_error" else fault
+
+
+def _remedy(error: Mapping[str, Any], fault: str, field: str, known: list[str], schema: str) -> str:
+    kind, context = str(error["type"]), error.get("ctx", {})
+    name = field.rpartition(".")[2]
+    if kind == "missing":
+        return f"add {name!r}; {schema}"
+    if kind == "extra_forbidden":
+        near = difflib.get_close_matches(name, known, 1)
+        meant = f"it may be {near[0]!r} that is meant; " if near else ""
+        return f"{meant}leave it out, or take one of {', '.join(known)}" if known else f"leave it out; {schema}"
+    if bounds := [f"{words} {context[bound]:g}" for bound, words in BOUNDS.items() if bound in context]:
+        return f"give a number {' and '.join(bounds)}"
+    if kind in ("literal_error", "enum"):
+        return f"give one of {context['expected']}"
+    if kind == "union_tag_invalid":
+        return f"give one of {context['expected_tags']} as {str(context['discriminator']).strip(chr(39))!r}"
+    if kind == "union_tag_not_found":
+        return f"add {str(context['discriminator']).strip(chr(39))!r}; {schema}"
+    if kind in ("too_short", "too_long", "string_too_short", "string_too_long"):
+        count = context.get("min_length", context.get("max_length"))
+        what = "character" if kind.startswith("string") else "item"
+        return f"give at {'least' if 'min_length' in context else 'most'} {counted(int(count), what)}"
+    if kind == "string_pattern_mismatch":
+        return f"give text that matches {context['pattern']}"
+    if kind == "value_error":
+        _, _, ours = fault.rpartition("; ")
+        return ours if ours != fault else f"give what {schema.removeprefix('the ')} asks for"
+    wanted = KINDS.get(kind.partition("_")[0])
+    return f"give {wanted}" if wanted else f"send another value; {schema}"
