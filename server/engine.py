@@ -136,11 +136,13 @@ class CoreEngine:
     def reader(self, rig: Rig, settings: Any, history: History) -> Reader:
         """`Committed`, on one thread: the others belong to the update."""
         import numba
+        from threadpoolctl import threadpool_limits
 
         from scas4d_core.committed import Committed
         from scas4d_core.rasterize.limits import scene_limits
 
         numba.set_num_threads(1)
+        threadpool_limits(1)  # of OpenMP and BLAS: scikit-learn's spin while they wait, 16 s for parts on busy cores
         world = rig.world_frame(settings.scene.metres_per_unit)
         limits = scene_limits(settings.scene.near, rig.radius * world.metres_per_unit)
         return Committed(history, world, limits)

@@ -1,10 +1,14 @@
-"""Structured logs: one JSON object a line on stderr, from every process of the service. No secret is ever in one."""
+"""Logs on stderr from every process of the service: one JSON object a line, or in a terminal one that people read.
+
+No secret is ever in one.
+"""
 
 from __future__ import annotations
 
 import json
 import logging
 import re
+import sys
 import time
 from datetime import UTC, datetime
 from typing import Any, Literal
@@ -43,26 +47,46 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """For people."""
+    """For people: the time of day, the level where it is no mere information, the message."""
 
     def __init__(self) -> None:
-        super().__init__("%(asctime)s %(levelname)s %(name)s: %(message)s")
+        super().__init__("%(asctime)s %(message)s", datefmt="%H:%M:%S")
 
     def format(self, record: logging.LogRecord) -> str:
         """A line, or several with a traceback."""
-        more = " ".join(f"{name}={value}" for name, value in record.__dict__.items() if name not in _PLAIN)
-        return hidden(super().format(record) + (f" [{more}]" if more else ""))
+        said = super().format(record)
+        if record.levelno > logging.INFO:
+            moment, _, message = said.partition(" ")
+            said = f"{moment} {record.levelname.lower()}: {message}"
+        return hidden(said)
 
 
-def configure(format: Literal["json", "text"] = "json", level: str = "info") -> None:
-    """Sends all logs of this process to stderr. Called first thing in the service and in each of its processes."""
+def told_to_people(record: logging.LogRecord) -> bool:
+    """Not the requests that only read and succeed: a viewer or a rig that waits asks several times a second."""
+    return record.levelno > logging.INFO or not (
+        getattr(record, "method", "") in ("GET", "HEAD") and getattr(record, "status", 500) < 400
+    )
+
+
+def configure(format: Literal["auto", "json", "text"] = "auto", level: str = "info") -> None:
+    """Sends all logs of this process to stderr. Called first thing in the service and in each of its processes.
+
+    Args:
+        format: json; text; auto: text where stderr is a terminal, else json.
+        level: debug, info, warning or error.
+    """
+    text = format == "text" or (format == "auto" and sys.stderr.isatty())
     handler = logging.StreamHandler()
-    handler.setFormatter(JsonFormatter() if format == "json" else TextFormatter())
+    handler.setFormatter(TextFormatter() if text else JsonFormatter())
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(logging.WARNING)
     for name in ("scas4d", "uvicorn"):
         logging.getLogger(name).setLevel(level.upper())
+    if text:
+        handler.addFilter(told_to_people)
+        # Its start and end; the service says both itself.
+        logging.getLogger("uvicorn").setLevel(max(logging.WARNING, logging.getLogger("uvicorn").level))
     # uvicorn logs a WebSocket with its whole address; `AccessLog` logs it without what follows the question mark.
     logging.getLogger("uvicorn.error").addFilter(lambda record: '"WebSocket %s"' not in str(record.msg))
 

@@ -62,6 +62,7 @@ class Readiness:
         self.stopping = False
         self._process: Process | None = None
         if settings.warm_up:
+            log.info("warming up the kernels; the first time they are compiled, which takes about a minute")
             self._process = placement.start(main, settings.engine, self._told, self._ended)
         else:
             self.after = 0.0
@@ -70,7 +71,7 @@ class Readiness:
         """Seconds from the start until it was ready.
 
         Raises:
-            Problem: 503, not ready.
+            Problem: 503, not ready; `warming_up` says that it will be, without anybody's doing.
         """
         waited = time.monotonic() - self._began
         if self.stopping:
@@ -89,6 +90,7 @@ class Readiness:
                 remedy="ask again",
                 headers={"Retry-After": "1"},
                 seconds=waited,
+                warming_up=True,
             )
         return self.after
 

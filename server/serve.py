@@ -2,20 +2,44 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import logging
 import os
 import signal
+import socket
 from functools import partial
+from typing import Any
 
 import uvicorn
 
 from server import logs
 from server.app import create_app
-from server.connection import Connection, keep_freed_memory
+from server.connection import Connection, Socket, keep_freed_memory
 from server.placement.local import LocalPlacement
+from server.scenes import hold
 from server.settings import ServerSettings, unknown
 
 log = logging.getLogger("scas4d.server")
+
+
+class Server(uvicorn.Server):
+    """uvicorn's, which says in words where it is.
+
+    Args:
+        config: of uvicorn.
+        told: the sentence, logged once requests are answered.
+    """
+
+    def __init__(self, config: uvicorn.Config, told: str) -> None:
+        super().__init__(config)
+        self._told = told
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Starts the application and listens."""
+        await super().startup(sockets)
+        if self.started:
+            log.info(self._told)
 
 
 def serve(settings: ServerSettings) -> None:
@@ -23,28 +47,93 @@ def serve(settings: ServerSettings) -> None:
 
     Then it takes no more connections, closes WebSockets (1012), answers what was asked, and asks the scenes' processes
     to end: each has `stop_seconds`. What they do not finish is in the frame log, and is taken up at the next start.
+
+    Raises:
+        RuntimeError: the address or the data folder is in use, or cannot be had.
     """
     prepare = partial(logs.configure, settings.log_format, settings.log_level)
     prepare()
     for name in unknown(os.environ):
         log.warning("%s is no setting and was ignored; docs/operations.md lists them", name)
+    try:
+        hold(settings.data).release()  # said here in a sentence; taken for good when the application starts
+    except OSError as error:
+        raise RuntimeError(f"data folder {settings.data}: {error.strerror}; name another with --data") from None
+    sockets = listen(settings.host, settings.port)
     keep_freed_memory()
     config = uvicorn.Config(
         create_app(settings, LocalPlacement(prepare)),
-        host=settings.host,
-        port=settings.port,
         http=Connection,
+        ws=Socket,
         log_config=None,
         access_log=False,
         server_header=False,
         proxy_headers=False,  # what a client says about itself is not believed
         timeout_graceful_shutdown=max(1, round(settings.stop_seconds)),
-        ws_max_size=int(settings.max_body_mb * 1e6),
         ws_per_message_deflate=False,  # pictures are compressed already: a hundred subscribers would cost a core
     )
     # uvicorn ends gracefully and then raises the signal again, for whoever called it: here that is nobody, and the
     # process ends with status 0.
     for ending in (signal.SIGTERM, signal.SIGINT):
         signal.signal(ending, lambda *_: None)
-    uvicorn.Server(config).run()
+    told = f"listening; viewer at {address(settings.host, sockets)}, scenes in {settings.data}; Ctrl-C ends the service"
+    Server(config, told).run(sockets)
     log.info("ended")
+
+
+def listen(host: str, port: int) -> list[socket.socket]:
+    """Sockets bound to every address of the host that this machine has, all at one port; uvicorn listens at them.
+
+    Raises:
+        RuntimeError: there is no such address, or the port cannot be had.
+    """
+    sockets: list[socket.socket] = []
+    try:
+        for family, kind, protocol, _, where in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+            # Where any port will do, all addresses get that of the first.
+            free = sockets[0].getsockname()[1] if sockets else port
+            with contextlib.suppress(_NotHere):
+                sockets.append(_bound(family, kind, protocol, (where[0], free, *where[2:])))
+        if not sockets:
+            raise OSError(errno.EADDRNOTAVAIL, os.strerror(errno.EADDRNOTAVAIL))
+    except OSError as error:
+        for opened in sockets:
+            opened.close()
+        if error.errno == errno.EADDRINUSE:
+            raise RuntimeError(
+                f"port {port} of {host} is in use, perhaps by another `scas4d serve`; stop that, or take another port: "
+                f"--port {port + 1 if port < 65535 else 8000}, or 0 for any that is free"
+            ) from None
+        raise RuntimeError(
+            f"cannot listen at {host}, port {port}: {error.strerror}; give an address of this machine (--host) and a "
+            "port that this user may take (--port)"
+        ) from None
+    return sockets
+
+
+class _NotHere(Exception):
+    """An address that this machine does not have, as ::1 where IPv6 is off."""
+
+
+def _bound(family: int, kind: int, protocol: int, where: tuple[Any, ...]) -> socket.socket:
+    try:
+        opened = socket.socket(family, kind, protocol)
+    except OSError:
+        raise _NotHere from None
+    try:
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if family == socket.AF_INET6:
+            opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)  # IPv4 has a socket of its own
+        opened.bind(where)
+    except OSError as error:
+        opened.close()
+        if error.errno == errno.EADDRNOTAVAIL:
+            raise _NotHere from None
+        raise
+    return opened
+
+
+def address(host: str, sockets: list[socket.socket]) -> str:
+    """Where a browser on this machine finds the service."""
+    name = "127.0.0.1" if host in ("0.0.0.0", "::", "") else host
+    return f"http://{f'[{name}]' if ':' in name else name}:{sockets[0].getsockname()[1]}"

@@ -34,7 +34,7 @@ Names = Annotated[tuple[str, ...], NoDecode]
 
 
 class SettingsError(ValueError):
-    """A setting that cannot be: which, and what to do. Never quotes the value: it may be a secret."""
+    """A setting that cannot be: which, its value unless that may be a secret, and what to do."""
 
 
 class ServerSettings(BaseSettings):
@@ -76,7 +76,11 @@ class ServerSettings(BaseSettings):
     )
     max_tickets: int = Field(default=1024, ge=1, description="Tickets that wait to be used; more get 429.")
 
-    log_format: Literal["json", "text"] = Field(default="json", description="One JSON object a line, or plain lines.")
+    log_format: Literal["auto", "json", "text"] = Field(
+        default="auto",
+        description="json: one object a line. text: plain lines, without requests that only read and succeed. auto: "
+        "text where the service runs in a terminal, else json.",
+    )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info", description="info has a line a request."
     )
@@ -91,7 +95,13 @@ class ServerSettings(BaseSettings):
     queue_frames: int = Field(
         default=4, ge=1, description="Frames of a scene acknowledged and not finished; more get 429."
     )
-    max_body_mb: float = Field(default=256, gt=0, description="Largest request body: 64 cameras of 4 MB.")
+    max_body_mb: float = Field(default=256, gt=0, description="Largest request body: 64 cameras of 4 MB. Pictures, and frames over WebSockets, may have what the "
+        "rig's pictures can have at most (docs/operations.md), where that is less.")
+    max_ingest_sockets: int = Field(
+        default=64,
+        ge=1,
+        description="WebSockets that send frames to one scene: one a camera where each has a sender of its own.",
+    )
     max_image_pixels: int = Field(
         default=40_000_000,
         ge=1,
@@ -203,14 +213,17 @@ class ServerSettings(BaseSettings):
             written = {} if file is None else TomlConfigSettingsSource(cls, toml_file=Path(file))()
         except ValueError as error:  # tomllib's says line and column
             raise SettingsError(f"{CONFIG}: {file} is no TOML ({error})") from None
+        merged = {**written, **read, **{n: v for n, v in given.items() if v is not None}}
         try:
-            return cls.model_validate({**written, **read, **{n: v for n, v in given.items() if v is not None}})
+            return cls.model_validate(merged)
         except ValidationError as error:
             first = error.errors(include_input=False)[0]
             name = ".".join(str(part) for part in first["loc"])
             known = "" if first["type"] != "extra_forbidden" else f"; the settings are {', '.join(cls.model_fields)}"
             fault = first["msg"].removeprefix("Value error, ")
-            raise SettingsError((f"setting {name}: " if name else "") + fault + known) from None
+            quotable = name in cls.model_fields and name != "token"
+            value = f" is {merged[name]!r}, which cannot be" if quotable and name in merged else ""
+            raise SettingsError((f"setting {name}{value}: " if name else "") + fault + known) from None
 
 
 def unknown(environment: Mapping[str, str]) -> list[str]:

@@ -51,7 +51,8 @@ def test_what_happens_to_frames_and_questions_is_counted(http, sdk, scene):
 
 
 def record(message, **extra):
-    return logging.makeLogRecord({"msg": message, "levelname": "INFO", "name": "scas4d.x", **extra})
+    given = {"msg": message, "levelname": "INFO", "levelno": logging.INFO, "name": "scas4d.x"}
+    return logging.makeLogRecord({**given, **extra})
 
 
 def test_a_log_line_is_one_json_object_without_secrets():

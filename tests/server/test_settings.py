@@ -44,6 +44,14 @@ def test_a_bad_file_is_refused_by_name(tmp_path, text, said):
         ServerSettings.from_environment({"SCAS4D_CONFIG": str(file)})
 
 
+def test_the_value_is_quoted_unless_it_may_be_a_secret():
+    with pytest.raises(SettingsError, match=r"setting port is 'abc', which cannot be: .*integer"):
+        ServerSettings.from_environment({"SCAS4D_PORT": "abc"})
+    with pytest.raises(SettingsError) as refused:
+        ServerSettings.from_environment({"SCAS4D_TOKEN": "hush"})
+    assert "hush" not in str(refused.value)
+
+
 def test_a_file_that_is_not_there_is_refused():
     with pytest.raises(SettingsError, match="no file"):
         ServerSettings.from_environment({"SCAS4D_CONFIG": "nowhere.toml"})
