@@ -18,6 +18,7 @@ from pydantic import Field
 from scipy.optimize import linear_sum_assignment
 from sklearn.cluster import KMeans
 from sklearn.metrics import silhouette_score
+from threadpoolctl import threadpool_limits
 
 from scas4d_core.gaussians import Gaussians, quaternions_to_matrices
 from scas4d_core.history import History, moving_extent
@@ -112,12 +113,13 @@ def parts(
     weights = coverage(newest)
     inside = np.searchsorted(rows, chosen)
     features = part_features(positions[:, inside], rotations[:, inside], extent, settings)
-    model = _cluster(features, weights[chosen], count, settings, rng, None if previous is None else previous[chosen])
-
+    before = None if previous is None else previous[chosen]
     labels = np.empty(rows.size, dtype=np.int64)
-    for start in range(0, rows.size, ROWS_AT_ONCE):
-        block = slice(start, start + ROWS_AT_ONCE)
-        labels[block] = model.predict(part_features(positions[:, block], rotations[:, block], extent, settings))
+    with threadpool_limits(limits=1):  # threads would sum in another order and tip what lies between two parts
+        model = _cluster(features, weights[chosen], count, settings, rng, before)
+        for start in range(0, rows.size, ROWS_AT_ONCE):
+            block = slice(start, start + ROWS_AT_ONCE)
+            labels[block] = model.predict(part_features(positions[:, block], rotations[:, block], extent, settings))
     size = np.bincount(labels, weights[rows], minlength=model.n_clusters)
     rank = np.empty(model.n_clusters, dtype=np.int64)
     rank[np.argsort(-size, kind="stable")] = np.arange(model.n_clusters)

@@ -185,7 +185,7 @@ class Reconstruction(Committed):
             raise ValueError(f"frame {frame.index}: time {frame.time} s must be finite")
         self = cls._of(rig, settings, History() if history is None else history)
         began = perf_counter()
-        result = static or self._fit_static(rig, self._scaled(frame), points, progress or (lambda _: None))
+        result = static or self._fit_static(self._scaled(frame), points, progress or (lambda _: None))
         result = replace(result, gaussians=settled(result.gaussians))
         fitted = perf_counter()
         self.static = result
@@ -287,20 +287,24 @@ class Reconstruction(Committed):
         moving = self.history.gaussians(index).moving
         return None if self._masked or moving.all() else moving
 
-    def _fit_static(
-        self, rig: Rig, frame: Frame, points: InitialPoints | None, tell: Callable[[Progress], None]
-    ) -> StaticResult:
-        """Frame 0 from a first cloud, which is made from the pictures where none is given."""
+    def _fit_static(self, frame: Frame, points: InitialPoints | None, tell: Callable[[Progress], None]) -> StaticResult:
+        """Frame 0 from a first cloud, which is made from the pictures where none is given.
+
+        It is made inside: the same wherever the user's origin is and whatever the unit.
+        """
         scene, static = self.settings.scene, self.settings.static
         if points is None:
             points = initial_points(
-                rig.scaled(scene.image_scale), frame.images, frame.masks, None,
+                self.rig, frame.images, frame.masks, None,
                 lambda stage, done, total: tell(Progress(stage, done, total)),
             )  # fmt: skip
+            positions = points.positions
+        else:
+            positions = self.world.to_inside(points.positions)
         return fit_static_scene(
             self._factory,
             self._factory.views(frame, {}),
-            self.world.to_inside(points.positions),
+            positions,
             points.colours,
             points.foreground,
             scene,

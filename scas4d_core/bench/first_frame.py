@@ -22,6 +22,9 @@ from scas4d_core.static_scene import StaticResult
 VERSION = 1
 """Raise this when frame 0 comes out different from the same pictures and settings: what is kept is then fitted anew."""
 
+CLOUD_VERSION = 2
+"""The same, where the first cloud is made from the pictures."""
+
 ARRAYS = tuple(field.name for field in fields(Gaussians))
 
 
@@ -41,7 +44,9 @@ def first_frame_key(capture: Capture, settings: Settings) -> str:
     for kind, files in (("image", capture.image_files[0]), ("mask", capture.mask_files[0])):
         for name in sorted(files):
             hasher.update(f"{kind} {name} ".encode() + files[name].read_bytes())
-    if capture.points is not None:
+    if capture.points is None:
+        hasher.update(f"cloud {CLOUD_VERSION}".encode())
+    else:
         for array in (capture.points.positions, capture.points.colours, capture.points.foreground):
             hasher.update(b"points" if array is None else array.tobytes())
     return f"{capture.name}-{hasher.hexdigest()[:12]}"
