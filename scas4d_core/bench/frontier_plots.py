@@ -62,14 +62,16 @@ def draw_frontier(points: Sequence[Point], title: str, file: Path) -> None:
     plt = _pyplot()
     figure, axes = plt.subplots(figsize=(6.6, 4.2))
     best = undominated([point for axis in ("iterations", *OTHER_AXES) for point in of_axis(points, axis)])
-    axes.step(
+    (frontier,) = axes.step(
         [p.seconds for p in best], [p.psnr for p in best], where="post", color="#c8c8c8", linewidth=5, zorder=1,
-        solid_capstyle="round", label="not dominated",
+        solid_capstyle="round", label="not dominated (hollow: dominated)",
     )  # fmt: skip
+    shown = [frontier]
     for method in METHODS:
         line = curve(points, method)
         axes.plot([p.seconds for p in line], [p.psnr for p in line], color=COLOURS[method], linewidth=1.4, zorder=2)
-        _markers(axes, line, best, "o", COLOURS[method], f"{method}, by iterations", 34)
+        _markers(axes, line, best, "o", COLOURS[method], 34)
+        shown.append(_key(plt, "o", COLOURS[method], f"{method}, by iterations"))
         for point in line:
             where, side = ((-3, 5), "right") if method == METHODS[0] else ((4, -9), "left")
             axes.annotate(
@@ -77,11 +79,13 @@ def draw_frontier(points: Sequence[Point], title: str, file: Path) -> None:
                 fontsize=7, color=COLOURS[method], ha=side,
             )  # fmt: skip
     for axis, (words, marker, colour) in OTHER_AXES.items():
-        _markers(axes, of_axis(points, axis), best, marker, colour, words, 22)
+        if found := of_axis(points, axis):
+            _markers(axes, found, best, marker, colour, 22)
+            shown.append(_key(plt, marker, colour, words))
     _log_seconds(axes)
     axes.set_ylabel(PSNR)
     axes.set_title(title, loc="left")
-    axes.legend(loc="lower right", handletextpad=0.4)
+    axes.legend(handles=shown, loc="lower right", handletextpad=0.5)
     _save(plt, figure, file)
 
 
@@ -127,10 +131,14 @@ def draw_convergence(row: Row, file: Path) -> None:
         colour = COLOURS.get(drawn["preset"], OKABE_ITO[7])
         axes.plot(drawn["iterations"], drawn["psnr"], style, color=colour, linewidth=1.5)
         axes.plot(drawn["iterations"][-1], drawn["psnr"][-1], "o", color=colour, markersize=4)
-        _end_label(axes, drawn["iterations"][-1], drawn["psnr"][-1], drawn["label"], colour)
+    longest = max(drawn["iterations"][-1] for drawn in row["curves"])
+    for drawn in row["curves"]:
+        end = drawn["iterations"][-1]
+        colour = COLOURS.get(drawn["preset"], OKABE_ITO[7])
+        _end_label(axes, end, drawn["psnr"][-1], drawn["label"], colour, below=end < longest)
     axes.set_xlabel("iterations done")
     axes.set_ylabel(PSNR)
-    axes.set_xlim(0, 1.3 * max(drawn["iterations"][-1] for drawn in row["curves"]))
+    _room_for_labels(axes, longest, 1.3)
     axes.set_title(f"{row['capture']}, mean of the first {row['updates']} updates", loc="left")
     _save(plt, figure, file)
 
@@ -149,8 +157,7 @@ def draw_drift(points: Sequence[Point], capture: str, file: Path) -> None:
         _end_label(axes, len(point.psnr_by_frame) - 1, point.psnr_by_frame[-1], point.variant.label, COLOURS[method])
     axes.set_xlabel("frame")
     axes.set_ylabel(PSNR)
-    axes.set_xlim(0, 1.25 * max(len(p.psnr_by_frame) for p in drift))
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    _room_for_labels(axes, max(len(p.psnr_by_frame) for p in drift) - 1, 1.27)
     axes.set_title(capture, loc="left")
     _save(plt, figure, file)
 
@@ -208,32 +215,43 @@ def _save(plt: Any, figure: Any, file: Path) -> None:
     plt.close(figure)
 
 
-def _markers(
-    axes: Any, points: Sequence[Point], best: Sequence[Point], marker: str, colour: str, words: str, size: float
-) -> None:
+def _markers(axes: Any, points: Sequence[Point], best: Sequence[Point], marker: str, colour: str, size: float) -> None:
     """Full markers for what is not dominated, hollow ones for the rest."""
-    for full in (True, False):
-        chosen = [p for p in points if (p in best) == full]
-        label = words if (full or not any(p in best for p in points)) and chosen else None
-        axes.scatter(
-            [p.seconds for p in chosen], [p.psnr for p in chosen], s=size, marker=marker, linewidths=1.1, zorder=3,
-            facecolors=colour if full else "white", edgecolors=colour, label=label,
-        )  # fmt: skip
+    axes.scatter(
+        [p.seconds for p in points], [p.psnr for p in points], s=size, marker=marker, linewidths=1.1, zorder=3,
+        facecolors=[colour if p in best else "white" for p in points], edgecolors=colour,
+    )  # fmt: skip
+
+
+def _key(plt: Any, marker: str, colour: str, words: str) -> Any:
+    """An entry of the legend."""
+    return plt.Line2D([], [], linestyle="none", marker=marker, color=colour, markersize=5, label=words)
 
 
 def _log_seconds(axes: Any, label: bool = True) -> None:
+    """A logarithmic axis; without a label it is a small panel's, with a tick a decade."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if label else (1,)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     if label:
         axes.set_xlabel(SECONDS)
 
 
-def _end_label(axes: Any, x: float, y: float, words: str, colour: str) -> None:
-    axes.annotate(words, (x, y), xytext=(5, 0), textcoords="offset points", va="center", fontsize=8, color=colour)
+def _end_label(axes: Any, x: float, y: float, words: str, colour: str, below: bool = False) -> None:
+    axes.annotate(
+        words, (x, y), xytext=(5, -8 if below else 0), textcoords="offset points", va="center", fontsize=8, color=colour
+    )
+
+
+def _room_for_labels(axes: Any, last: float, factor: float) -> None:
+    """The axis goes on behind the last value, for the labels there, but its ticks do not."""
+    from matplotlib.ticker import MaxNLocator
+
+    axes.set_xticks([tick for tick in MaxNLocator(nbins=7, integer=True).tick_values(0, last) if tick <= last])
+    axes.set_xlim(0, factor * last)
 
 
 def _grouped_stages(points: Sequence[Point]) -> Mapping[str, list[float]]:
