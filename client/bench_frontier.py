@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 STUDY = Path("out/frontier")
+STEPS = ("rows", "times", "convergence", "page")
 
 
 def frontier(
@@ -18,16 +19,43 @@ def frontier(
     ] = None,
     updates: Annotated[int, typer.Option(min=1, help="Of each row.")] = 5,
     most_iterations: Annotated[int | None, typer.Option(min=1, help="Leave out settings with more.")] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Only this step: rows, times, convergence or page. May be repeated.")
+    ] = None,
+    rounds: Annotated[int, typer.Option(min=1, help="In which every setting is timed once.")] = 5,
+    page: Annotated[
+        Path | None, typer.Option(help="The page, as Markdown; plots go into a folder of its name. [OUT/frontier.md]")
+    ] = None,
 ) -> None:
     """Measures accuracy against time: iterations by method, and one setting at a time around the default.
 
-    Example: scas4d bench frontier captures/robot --axes iterations --updates 5
-    """
-    from scas4d_core.bench.frontier import measure_frontier
+    Rows (accuracy) may be measured beside other work; times are measured in turns and want a quiet machine. Then the
+    page with its plots is written from all that the study's folder holds.
 
-    rows = measure_frontier(captures, out, axes or (), updates=updates, most_iterations=most_iterations)
-    if any("error" in row for row in rows):
-        raise typer.Exit(1)
+    Example: scas4d bench frontier captures/robot --axes iterations --axes layers
+    """
+    from scas4d_core.bench.convergence import measure_convergence
+    from scas4d_core.bench.frontier import measure_frontier, variants
+    from scas4d_core.bench.frontier_page import write_page
+    from scas4d_core.bench.timing import measure_times
+
+    for step in only or ():
+        if step not in STEPS:
+            raise typer.BadParameter(f"step {step!r} is unknown; choose of {', '.join(STEPS)}")
+    steps = only or STEPS
+    if "rows" in steps:
+        rows = measure_frontier(captures, out, axes or (), updates=updates, most_iterations=most_iterations)
+        if any("error" in row for row in rows):
+            raise typer.Exit(1)
+    for capture in captures:
+        if "times" in steps:
+            measure_times(capture, variants(axes or (), most_iterations), out, rounds=rounds)
+        if "convergence" in steps:
+            measure_convergence(capture, out, updates=updates)
+    if "page" in steps:
+        file = page or out / "frontier.md"
+        write_page(out, [capture.resolve().name for capture in captures], file, updates)
+        print(f"wrote {file}")
 
 
 def register(app: typer.Typer) -> None:

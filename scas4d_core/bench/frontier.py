@@ -100,8 +100,11 @@ AXES: Mapping[str, tuple[Variant, ...]] = {
 """One setting at a time; layers in between are spaced evenly in their logarithm, and the default is on every axis."""
 
 
-def variants(axes: Sequence[str] = ()) -> list[Variant]:
-    """The settings of some axes, each once, the default always; none: all axes.
+def variants(axes: Sequence[str] = (), most_iterations: int | None = None) -> list[Variant]:
+    """The settings of some axes, each once, the default first and always; none: all axes.
+
+    Args:
+        axes: of ``AXES``. most_iterations: leave out settings with more.
 
     Raises:
         ValueError: an unknown axis.
@@ -109,7 +112,10 @@ def variants(axes: Sequence[str] = ()) -> list[Variant]:
     for name in axes:
         if name not in AXES:
             raise ValueError(f"axis {name!r} is unknown; choose of {', '.join(AXES)}")
-    return list(dict.fromkeys([DEFAULT, *(variant for name in axes or AXES for variant in AXES[name])]))
+    asked = [variant for name in axes or AXES for variant in AXES[name]]
+    return list(
+        dict.fromkeys([DEFAULT, *(v for v in asked if most_iterations is None or v.iterations <= most_iterations)])
+    )
 
 
 def measure_frontier(
@@ -136,9 +142,8 @@ def measure_frontier(
     Raises:
         ValueError: an unknown axis.
     """
-    chosen = [v for v in variants(axes) if most_iterations is None or v.iterations <= most_iterations]
     known = list(Store(out).rows())
-    wanted = [(variant, capture) for variant in chosen for capture in captures]
+    wanted = [(variant, capture) for variant in variants(axes, most_iterations) for capture in captures]
     jobs = [
         variant.job(capture, updates)
         for variant, capture in sorted(wanted, key=lambda pair: pair[0].iterations * (5 if pair[0].whole else 1))

@@ -19,9 +19,10 @@ OTHER_AXES = {
     "layers": ("number of layers K", "s", OKABE_ITO[2]),
     "clusters": ("clusters of the first layer N", "D", OKABE_ITO[3]),
     "pyramid": ("image pyramid", "^", OKABE_ITO[5]),
+    "gaussians": ("budget of Gaussians", "v", OKABE_ITO[4]),
     "adaptive": ("other presets", "P", OKABE_ITO[7]),
 }
-"""In words, marker and colour; Gaussians are an axis of their own table: their frame 0 is another."""
+"""In words, marker and colour."""
 STYLE = {
     "font.size": 9,
     "axes.titlesize": 9,
