@@ -116,5 +116,5 @@ class IngestSocket:
 def _as_response(answer: IngestAnswer) -> httpx.Response:
     """The answer as the HTTP door would have given it, so that the same rules hold."""
     problem = {} if answer.problem is None else answer.problem.model_dump(mode="json", exclude_none=True)
-    headers = {"Retry-After": str(problem["retry_after"])} if "retry_after" in problem else {}
+    headers = {} if answer.retry_after is None else {"Retry-After": str(answer.retry_after)}
     return httpx.Response(answer.status, headers=headers, json=problem)

@@ -10,9 +10,10 @@ from fastapi import Request
 from starlette.datastructures import UploadFile
 
 from client.wire import FileKind, FrameFile, FrameHead, FrameReceipt, PartReceipt
+from scas4d_core.cameras import Camera
 from server.disk import full_disk, no_room
 from server.ingest import whole
-from server.pictures import MASK, check_files, check_picture
+from server.pictures import MASK, check_files, check_picture, check_size
 from server.problems import Problem, counted
 from server.scene import Scene
 from server.upload import Received, Receiving, receive_framed
@@ -103,15 +104,35 @@ async def take_camera(
 
 
 async def take_file(
-    scene: Scene, index: int, camera: str, kind: FileKind, time: float | None, data: bytes
+    scene: Scene,
+    index: int,
+    camera: str,
+    kind: FileKind,
+    time: float | None,
+    body: AsyncIterator[bytes],
+    length: int | None,
 ) -> PartReceipt:
     """One camera's picture or mask, the file as it is."""
     scene_camera(scene, camera, "c")
+    data = await _read(scene.rig[camera], camera, body, length)
     head = _head(index, time, [FrameFile(camera=camera, kind=kind, size=len(data))], part=True)
     scene.ingest.expects_part(head, camera)
     receiving = _receiving(scene, head, time, index >= scene.next_frame)
     await _feed(receiving, [data])
     return await _part_taken(scene, head, camera, receiving)
+
+
+async def _read(camera: Camera, field: str, body: AsyncIterator[bytes], length: int | None) -> bytearray:
+    """A file of a camera; no more of it is kept than the camera's pictures can have."""
+    data = bytearray()
+    try:
+        check_size(camera, field, length or 0)
+        async for chunk in body:
+            check_size(camera, field, len(data) + len(chunk))
+            data += chunk
+        return data
+    finally:
+        await _drain(body)
 
 
 def scene_camera(scene: Scene, camera: str, field: str) -> None:
@@ -149,7 +170,7 @@ def _receiving(scene: Scene, head: FrameHead, seconds: float | None, keep: bool)
     )
 
 
-async def _feed(receiving: Receiving, files: Sequence[bytes]) -> None:
+async def _feed(receiving: Receiving, files: Sequence[bytes | bytearray]) -> None:
     try:
         for data in files:
             await receiving.take(memoryview(data))

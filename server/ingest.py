@@ -14,7 +14,7 @@ from server.facts import Fact, Missing, Paused, Skipped, Taken
 from server.frame_store import remove
 from server.ledger import frame_identity
 from server.open_frames import OpenFrames
-from server.problems import Problem
+from server.problems import Problem, counted
 from server.upload import Received
 
 if TYPE_CHECKING:
@@ -30,8 +30,31 @@ class Ingest:
         self._scene = scene
         self.rules = Admission(scene)
         self._open = OpenFrames(scene, self.rules, self._append)
+        self._sockets = 0
         self._coming: dict[int, asyncio.Event] = {}
         """Whole frames that are being received, and the event of their end: the next may come in meanwhile."""
+
+    def join(self) -> None:
+        """One more WebSocket sends frames; to be told `leave` when it ends.
+
+        Raises:
+            Problem: 429, as many do as may.
+        """
+        most = self._scene.server.max_ingest_sockets
+        if self._sockets >= most:
+            raise Problem(
+                429,
+                f"{counted(self._sockets, 'WebSocket')} send frames to this scene already",
+                field="SCAS4D_MAX_INGEST_SOCKETS",
+                value=most,
+                remedy="close another one, send over HTTP, or raise the limit",
+                headers={"Retry-After": "5"},
+            )
+        self._sockets += 1
+
+    def leave(self) -> None:
+        """A WebSocket has ended."""
+        self._sockets -= 1
 
     def time_of(self, index: int, time: float | None) -> float:
         """Seconds of a frame: as given, or by the scene's frame rate."""

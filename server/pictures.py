@@ -8,12 +8,18 @@ from collections.abc import Sequence
 from PIL import Image
 
 from client.wire import FileKind, FrameFile
-from scas4d_core.cameras import Rig
+from client.wire.framing import MAX_HEAD, PREFIX
+from scas4d_core.cameras import Camera, Rig
 from server.image_structure import StructureError, walk
 from server.problems import Problem, counted
 
 MASK = "mask."
 EXIF_ORIENTATION = 0x0112
+
+PIXEL_BYTES = 5
+"""Of one file for each of its pixels, at most: RGBA of noise as PNG has 4, and a little."""
+METADATA_BYTES = 1_000_000
+"""Beside the pixels: a colour profile, a preview."""
 
 
 def field_of(file: FrameFile) -> str:
@@ -21,11 +27,37 @@ def field_of(file: FrameFile) -> str:
     return MASK + file.camera if file.kind == FileKind.MASK else file.camera
 
 
+def largest_file(camera: Camera) -> int:
+    """Bytes that one encoded picture or mask of the camera can have at most; what is larger is something else."""
+    return camera.width * camera.height * PIXEL_BYTES + METADATA_BYTES
+
+
+def largest_frame(rig: Rig) -> int:
+    """Bytes that a frame with masks can have at most on the wire."""
+    return PREFIX.size + MAX_HEAD + 2 * sum(largest_file(camera) for camera in rig.cameras)
+
+
+def check_size(camera: Camera, field: str, size: int) -> None:
+    """Refuses a file by its announced size, before it is received.
+
+    Raises:
+        Problem: 413.
+    """
+    if size > (most := largest_file(camera)):
+        raise Problem(
+            413,
+            f"{field}: a file of {size} bytes; a picture of {camera.width}x{camera.height} has {most} at most",
+            field=field,
+            value=size,
+            remedy="send the picture alone, encoded as JPEG, PNG or WebP",
+        )
+
+
 def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
     """Every camera once, of the rig; of a whole frame all of them, and masks of all or of none.
 
     Raises:
-        Problem: 422, names the file.
+        Problem: 422, names the file; 413, it announces more bytes than it can have.
     """
     names = set(rig.names)
     seen: dict[FileKind, set[str]] = {FileKind.IMAGE: set(), FileKind.MASK: set()}
@@ -47,6 +79,7 @@ def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
                 value=file.camera,
                 remedy="send one file a camera and kind",
             )
+        check_size(rig[file.camera], field, file.size)
         seen[file.kind].add(file.camera)
     if not whole:
         return

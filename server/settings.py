@@ -95,8 +95,12 @@ class ServerSettings(BaseSettings):
     queue_frames: int = Field(
         default=4, ge=1, description="Frames of a scene acknowledged and not finished; more get 429."
     )
-    max_body_mb: float = Field(default=256, gt=0, description="Largest request body: 64 cameras of 4 MB. Pictures, and frames over WebSockets, may have what the "
-        "rig's pictures can have at most (docs/operations.md), where that is less.")
+    max_body_mb: float = Field(
+        default=256,
+        gt=0,
+        description="Largest request body: 64 cameras of 4 MB. One file, and a frame over a WebSocket, may have what "
+        "pictures of the rig can have at most, where that is less.",
+    )
     max_ingest_sockets: int = Field(
         default=64,
         ge=1,

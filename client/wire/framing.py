@@ -68,6 +68,9 @@ class IngestAnswer(Model):
 
     index: int | None = Field(description="Of the frame; null where the message could not be read.")
     status: int = Field(description="What the HTTP door would have answered: 202, 409, 422, 429, 507 …")
+    retry_after: int | None = Field(
+        default=None, description="Seconds; what the HTTP door would have put into Retry-After."
+    )
     receipt: FrameReceipt | PartReceipt | None = Field(default=None, description="With status 202: it is on disk.")
     problem: ProblemDetails | None = Field(default=None, description="Otherwise.")
 

@@ -101,7 +101,7 @@ async def put_camera(
     try:
         if _media_type(request) == FRAME_MEDIA_TYPE:
             return await take_camera(scene, n, c, _body(request), _length(request))
-        return await take_file(scene, n, c, kind, time, await request.body())
+        return await take_file(scene, n, c, kind, time, _body(request), _length(request))
     except ClientDisconnect:
         raise Problem(400, "the sender went away", field="body", remedy="send the picture again") from None
 

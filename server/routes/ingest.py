@@ -14,15 +14,18 @@ from client.wire import (
     FramingError,
     IngestAnswer,
     PartReceipt,
-    ProblemDetails,
     head_length,
     parse_head,
 )
 from client.wire.framing import PREFIX
+from server import problems
+from server.connection import limit_messages
 from server.door import take_camera, take_framed
+from server.pictures import largest_frame
 from server.problems import Problem
 from server.scene import Scene
 from server.scenes import Scenes
+from server.settings import ServerSettings
 from server.upload import framing_problem
 
 router = APIRouter(prefix="/v1/scenes", tags=["frames"])
@@ -41,10 +44,27 @@ async def ingest(socket: WebSocket, id: str) -> None:
 
     Whoever does not wait for an answer before the next message has the next one received while this one is synced; the
     answers keep the order of the messages. What is refused is answered and the socket stays open. The message with
-    `part` is as PUT …/cameras/{c}.
+    `part` is as PUT …/cameras/{c}. A scene that is not here, or that has as many senders as it may, refuses the
+    handshake (404, 429); a message larger than any frame of the rig can be ends the connection (1009).
     """
     scenes: Scenes = socket.app.state.scenes
-    await socket.accept()
+    server: ServerSettings = socket.app.state.settings
+    try:
+        scene = scenes[id]
+        scene.ingest.join()
+    except Problem as problem:  # the handshake is answered like any request
+        await socket.send_denial_response(problems.answer(problem.document, problem.headers))
+        return
+    limit_messages(socket.scope, min(int(server.max_body_mb * 1e6), largest_frame(scene.rig)))
+    try:
+        await socket.accept()
+        await _serve(socket, scenes, id)
+    finally:
+        scene.ingest.leave()
+
+
+async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:
+    """Until the sender has enough, or sends what is no frame."""
     taking: asyncio.Queue[asyncio.Task[IngestAnswer]] = asyncio.Queue(AHEAD)
     answering = asyncio.create_task(_answer(socket, taking))
     whole_before = True
@@ -62,7 +82,7 @@ async def ingest(socket: WebSocket, id: str) -> None:
                 scene = scenes[id]
             except Problem as problem:
                 await taking.join()
-                await socket.send_text(_refusal(None, problem.document).model_dump_json())
+                await socket.send_text(_refusal(None, problem).model_dump_json())
                 await socket.close(SCENE_GONE, "the scene is not here")
                 return
             head = _head(data)
@@ -99,7 +119,7 @@ def _head(data: bytes) -> FrameHead | Problem:
 
 async def _take(scene: Scene, head: FrameHead | Problem, data: bytes) -> IngestAnswer:
     if isinstance(head, Problem):
-        return _refusal(None, head.document)
+        return _refusal(None, head)
     body, size = _one(data), len(data)
     try:
         receipt: FrameReceipt | PartReceipt
@@ -109,19 +129,21 @@ async def _take(scene: Scene, head: FrameHead | Problem, data: bytes) -> IngestA
             receipt = await take_framed(scene, None, body, size)
         return IngestAnswer(index=head.index, status=202, receipt=receipt)
     except Problem as problem:
-        return _refusal(head.index, problem.document)
+        return _refusal(head.index, problem)
     except asyncio.CancelledError:
         raise
     except Exception as error:
         log.exception("scene %s: a frame over the WebSocket failed", scene.id)
         detail = f"the service failed: {type(error).__name__}"
         remedy = "this is a fault of the service; its log has the traceback"
-        document = ProblemDetails(title="Internal Server Error", status=500, detail=detail, remedy=remedy)
-        return _refusal(head.index, document)
+        return _refusal(head.index, Problem(500, detail, remedy=remedy))
 
 
-def _refusal(index: int | None, document: ProblemDetails) -> IngestAnswer:
-    return IngestAnswer(index=index, status=document.status, problem=document)
+def _refusal(index: int | None, problem: Problem) -> IngestAnswer:
+    """With the seconds that the HTTP door would have put into Retry-After."""
+    seconds = (problem.headers or {}).get("Retry-After")
+    wait = None if seconds is None else int(seconds)
+    return IngestAnswer(index=index, status=problem.status_code, retry_after=wait, problem=problem.document)
 
 
 async def _one(data: bytes) -> AsyncIterator[bytes]:

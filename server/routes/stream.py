@@ -11,6 +11,7 @@ from starlette.websockets import WebSocketDisconnect, WebSocketState
 
 from client.wire.stream import SCENE_GONE, STREAM_PROTOCOL, TOO_BIG
 from server import problems
+from server.connection import limit_messages
 from server.hub import Hub
 from server.problems import Problem
 from server.scenes import Scenes
@@ -35,6 +36,7 @@ async def stream(websocket: WebSocket, id: str) -> None:
     except Problem as problem:  # the handshake is answered like any request: browsers see only that it failed
         await websocket.send_denial_response(problems.answer(problem.document, problem.headers))
         return
+    limit_messages(websocket.scope, 4 * subscriber.limits().message_bytes)  # `_read` says more
     try:
         await websocket.accept(subprotocol=STREAM_PROTOCOL)
         await _serve(websocket, subscriber)

@@ -13,7 +13,7 @@ from PIL import Image
 
 from scas4d_core.cameras import Camera, Rig
 from server.app import create_app
-from server.connection import Connection
+from server.connection import Connection, Socket
 from server.settings import ServerSettings
 
 WIDTH, HEIGHT = 24, 16
@@ -27,7 +27,7 @@ class Running:
             free.bind(("127.0.0.1", 0))
             self.port = port or free.getsockname()[1]
         self.app = create_app(settings)
-        config = uvicorn.Config(self.app, port=self.port, http=Connection, log_level="error")
+        config = uvicorn.Config(self.app, port=self.port, http=Connection, ws=Socket, log_level="error")
         self.server = uvicorn.Server(config)
         self.thread = threading.Thread(target=self.server.run)
         self.thread.start()
@@ -54,6 +54,7 @@ def fake_settings(folder, **changes):
         max_track_points=5000,
         max_track_json_points=4000,
         max_track_views=60,
+        max_ingest_sockets=3,
         warm_up=False,
     )
     return ServerSettings(**given | changes)

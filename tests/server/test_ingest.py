@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import threading
 import time
@@ -9,9 +10,11 @@ import time
 import fakes
 import pytest
 from running import make_rig, picture, pictures, problem
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from client.wire import FRAME_MEDIA_TYPE, RigModel, frame_chunks
+from server.pictures import largest_frame
 
 FRAMED = {"Content-Type": FRAME_MEDIA_TYPE}
 
@@ -294,9 +297,74 @@ def test_frames_over_a_websocket(http, make, service):
         with pytest.raises(Exception, match="1003"):
             socket.recv()
     assert finished(http, id, 1)["state"] == "committed"
-    with connect(f"{service.url.replace('http', 'ws')}/v1/scenes/none/ingest") as socket:
+    with pytest.raises(InvalidStatus) as refused:
+        connect(f"{service.url.replace('http', 'ws')}/v1/scenes/none/ingest")
+    assert json.loads(refused.value.response.body)["status"] == 404
+
+
+def test_a_full_queue_says_over_a_websocket_when_to_come_again(http, make, service):
+    id = make(queue_frames=1)
+    http.post(f"/v1/scenes/{id}/pause")
+    with connect(f"{service.url.replace('http', 'ws')}/v1/scenes/{id}/ingest") as socket:
         socket.send(framed(0))
-        assert json.loads(socket.recv())["status"] == 404
+        first = json.loads(socket.recv())
+        assert (first["status"], first["retry_after"]) == (202, None)
+        socket.send(framed(1))
+        full = json.loads(socket.recv())
+    by_http = http.put(f"/v1/scenes/{id}/frames/1", content=framed(1), headers={"Content-Type": FRAME_MEDIA_TYPE})
+    assert (full["status"], by_http.status_code) == (429, 429)
+    assert full["retry_after"] == int(by_http.headers["Retry-After"]) >= 1
+
+
+def test_a_scene_has_only_so_many_sending_websockets(http, make, service):
+    id = make()
+    address = f"{service.url.replace('http', 'ws')}/v1/scenes/{id}/ingest"
+    most = service.app.state.settings.max_ingest_sockets
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(connect(address)) for _ in range(most)]
+        with pytest.raises(InvalidStatus) as refused:
+            connect(address)
+        document = json.loads(refused.value.response.body)
+        assert (document["status"], document["field"]) == (429, "SCAS4D_MAX_INGEST_SOCKETS")
+        assert refused.value.response.headers["Retry-After"]
+        sockets[0].close()
+        stack.enter_context(retried(lambda: connect(address), InvalidStatus))  # there is room again
+
+
+def retried(action, error):
+    until = time.monotonic() + 20
+    while True:
+        try:
+            return action()
+        except error:
+            assert time.monotonic() < until
+            time.sleep(0.02)
+
+
+def test_nothing_larger_than_a_picture_of_the_rig_is_received(http, make, service):
+    id = make()
+    large = picture() + bytes(1_100_000)
+    assert len(large) < service.app.state.settings.max_body_mb * 1e6
+    frame = framed(0, {"c0": picture(), "c1": large})
+    url = f"/v1/scenes/{id}/frames/0"
+    answers = [
+        http.put(f"{url}/cameras/c1", content=large),
+        http.put(f"{url}/cameras/c1", content=iter([large])),  # no length announced
+        http.put(url, content=frame, headers={"Content-Type": FRAME_MEDIA_TYPE}),
+        http.put(url, files={"c0": ("c0", picture()), "c1": ("c1", large)}),
+    ]
+    for answer in answers:
+        document = problem(answer, 413)
+        assert document["field"] == "c1"
+    with connect(f"{service.url.replace('http', 'ws')}/v1/scenes/{id}/ingest", max_size=None) as socket:
+        socket.send(frame)
+        assert json.loads(socket.recv())["status"] == 413
+        with contextlib.suppress(ConnectionClosed):  # it may hear of it while it sends
+            socket.send(bytes(largest_frame(make_rig()) + 1))
+        with pytest.raises(ConnectionClosed) as closed:
+            socket.recv()
+        assert closed.value.rcvd.code == 1009
+    assert put(http, id, 0).status_code == 202
 
 
 def test_messages_that_do_not_wait_are_taken_and_answered_in_order(http, make, service):
