@@ -58,6 +58,35 @@ def frontier(
         print(f"wrote {file}")
 
 
+def paper(
+    captures: Annotated[list[Path], typer.Argument(metavar="CAPTURE...", help="Folders with test cameras.")],
+    out: Annotated[Path, typer.Option(help="Folder of the study, shared with frontier. Run again to go on.")] = STUDY,
+    quality: Annotated[
+        Path | None, typer.Option(help="Folder of the study of the bars, for captures that have rows there alone.")
+    ] = Path("out/quality"),
+    updates: Annotated[int, typer.Option(min=1, help="Of each row.")] = 5,
+    measure: Annotated[
+        bool, typer.Option("--measure/--no-measure", help="Measure rows that are missing; else leave them out.")
+    ] = True,
+    page: Annotated[Path | None, typer.Option(help="The page, as Markdown. [OUT/paper.md]")] = None,
+) -> None:
+    """Reproduces the paper's experiments on captures, beside the paper's figures, and says where they agree.
+
+    A capture without rows in either study is measured, its cheapest rows first.
+
+    Example: scas4d bench paper captures/robot --page docs/paper-tables.md
+    """
+    from scas4d_core.bench.frontier import measure_variants
+    from scas4d_core.bench.paper_page import needed, write_paper_page
+
+    if measure and any("error" in row for row in measure_variants(captures, needed(), out, updates=updates)):
+        raise typer.Exit(1)
+    file = page or out / "paper.md"
+    write_paper_page(out, [capture.resolve().name for capture in captures], file, updates, quality)
+    print(f"wrote {file}")
+
+
 def register(app: typer.Typer) -> None:
     """Adds the commands to `scas4d bench`."""
     app.command()(frontier)
+    app.command()(paper)

@@ -142,8 +142,16 @@ def measure_frontier(
     Raises:
         ValueError: an unknown axis.
     """
+    chosen = variants(axes, most_iterations)
+    return measure_variants(captures, chosen, out, updates=updates, report=report)
+
+
+def measure_variants(
+    captures: Sequence[Path], chosen: Sequence[Variant], out: Path, *, updates: int = UPDATES, report: Report = print
+) -> list[Row]:
+    """Measures the rows of some settings that are not on disk yet, see ``measure_frontier``."""
     known = list(Store(out).rows())
-    wanted = [(variant, capture) for variant in variants(axes, most_iterations) for capture in captures]
+    wanted = [(variant, capture) for variant in chosen for capture in captures]
     jobs = [
         variant.job(capture, updates)
         for variant, capture in sorted(wanted, key=lambda pair: pair[0].iterations * (5 if pair[0].whole else 1))
