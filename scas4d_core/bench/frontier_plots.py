@@ -93,9 +93,11 @@ def draw_frontier(points: Sequence[Point], title: str, file: Path) -> None:
 def draw_captures(points: Sequence[Point], captures: Sequence[str], file: Path) -> None:
     """Both methods by iterations, a panel a capture."""
     plt = _pyplot()
-    columns = 3
+    columns = min(3, len(captures))
     rows = -(-len(captures) // columns)
-    figure, grid = plt.subplots(rows, columns, figsize=(6.8, 2.1 * rows + 0.2), squeeze=False, sharex=True)
+    figure, grid = plt.subplots(
+        rows, columns, figsize=(0.5 + 2.1 * columns, 2.1 * rows + 0.2), squeeze=False, sharex=True
+    )
     for capture, axes in zip(captures, grid.flat, strict=False):
         for method in METHODS:
             line = curve(points, method, capture)
