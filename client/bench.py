@@ -220,7 +220,10 @@ def ingest(
     out: Annotated[Path | None, typer.Option(help="Write the table here, as Markdown.")] = None,
 ) -> None:
     """Measures ingest over the loopback against plain fsynced writes of the same records, in turns."""
+    from client.extras import need_server
     from server.bench import ingest as of_ingest
+
+    need_server()
 
     size = int(megabytes * 1e6)
     measured = of_ingest.measure(

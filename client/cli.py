@@ -9,12 +9,15 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from pydantic import ValidationError
 
-from client import __version__, bench, commands
+from client import __version__, bench, commands, extras
 from client.errors import ServiceError, ServiceUnreachable
-from client.overrides import overrides
+from client.importers.door import open_prepared
+from client.overrides import overrides, refusal
 from client.progress import console
-from scas4d_core.captures import CaptureError, ImageError, open_capture
+from client.sdk import DEFAULT_URL
+from scas4d_core.captures import CaptureError, ImageError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Online 4D reconstruction of multi-camera rigs.")
 app.add_typer(bench.app, name="bench")
@@ -53,7 +56,8 @@ def demo(
     out: Out = Path("out/demo"),
     port: Annotated[int, typer.Option(min=1, max=65535, help="Another is taken where this is in use.")] = 8000,
     stay: Annotated[
-        bool | None, typer.Option(help="Leave the service running until Ctrl-C; the default in a terminal.")
+        bool | None,
+        typer.Option(help="Leave the service running until Ctrl-C; the default in a terminal, and only there."),
     ] = None,
     frames: Frames = None,
     preset: Preset = "scas4d",
@@ -62,18 +66,22 @@ def demo(
     """Starts a service, streams the sample capture through it, and leaves renders beside the truth."""
     from client import demo as main_job
 
-    opened = open_capture(capture)
-    with main_job.running_service(out / "data", out / "service.log", port) as url:
-        console.print(f"service at {url}, its log in {out / 'service.log'}; the first run also compiles kernels")
-        id = main_job.run(opened, url, out, frames=frames, preset=preset, settings=overrides(changes or []))
-        console.print(f"pictures (truth | render | difference x4): {out}")
-        if sys.stdout.isatty() if stay is None else stay:
+    opened, settings = open_prepared(capture), overrides(changes or [])
+    stays = sys.stdout.isatty() if stay is None else stay
+    data, log = out / "data", out / "service.log"
+    with main_job.running_service(data, log, port) as url:
+        console.print(f"service at {url}, its log in {log}", soft_wrap=True)
+        id = main_job.run(opened, url, out, frames=frames, preset=preset, settings=settings)
+        console.print(f"pictures (truth | render | difference x4): {out}", soft_wrap=True)
+        if stays:
             console.print(f"open {url}/#scene={id} (the API: {url}/docs); Ctrl-C ends the service", soft_wrap=True)
             try:
                 while True:
                     time.sleep(3600)
             except KeyboardInterrupt:
                 console.print("ending the service")
+    console.print("the service has ended (--stay leaves it running); to look at the scene:", soft_wrap=True)
+    console.print(f"scas4d serve --data {data}, and open {DEFAULT_URL}/#scene={id}", highlight=False, soft_wrap=True)
 
 
 @app.command()
@@ -102,6 +110,10 @@ def evaluate(
     again: bench.Again = False,
 ) -> None:
     """Prints a capture's scores on its test cameras and ground truth; reconstructs it unless `out` has them already."""
+    if open_prepared(capture).full_test_rig is None:
+        raise CaptureError(
+            f"{capture}: no test cameras (test_meta.json) to measure on; `scas4d reconstruct` needs none"
+        )
     bench.quality([capture], out=out, frames=frames, preset=[preset], changes=changes, again=again)
 
 
@@ -120,10 +132,17 @@ def main() -> None:
     """The entry point: errors that a user can mend are one line, not a traceback."""
     try:
         app()
-    except (ServiceError, CaptureError, ImageError, RuntimeError, ValueError) as error:
-        raise SystemExit(f"scas4d: {error}") from None
+    except ModuleNotFoundError as error:
+        remedy = extras.remedy(error)
+        if remedy is None:
+            raise
+        raise SystemExit(f"scas4d: {remedy}") from None
+    except ValidationError as error:
+        raise SystemExit(f"scas4d: {refusal(error)}") from None
     except ServiceUnreachable as error:
         raise SystemExit(f"scas4d: {error}; start one with: scas4d serve") from None
+    except (ServiceError, CaptureError, ImageError, RuntimeError, ValueError, OSError) as error:
+        raise SystemExit(f"scas4d: {error}") from None
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from client import rig
 from client.importers.door import open_source
@@ -122,14 +121,17 @@ def push(
 
 def scenes(url: Url = DEFAULT_URL, token: Token = None) -> None:
     """Lists the scenes of a running service."""
-    table = Table(box=None, pad_edge=False)
-    for heading in ("scene", "name", "state", "cameras", "next frame", "queued", "committed", "error"):
-        table.add_column(heading)
+    rows: list[tuple[str, ...]] = [("scene", "name", "state", "cameras", "next frame", "queued", "committed", "error")]
     with Client(url, token=token, outage=0) as client:
         for status in client.scenes():
             numbers = (len(status.cameras), status.next_frame, status.queued, status.committed)
-            table.add_row(status.id, status.name, status.state, *map(str, numbers), status.error or "")
-    console.print(table)
+            rows.append((status.id, status.name, status.state, *map(str, numbers), status.error or ""))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:  # whole words, however narrow the terminal: they are read by programs too
+        line = "  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True))
+        console.print(line.rstrip(), highlight=False, markup=False, soft_wrap=True)
+    if len(rows) == 1:
+        console.print("no scene yet; make one with: scas4d push CAPTURE", highlight=False, soft_wrap=True)
 
 
 def watch(scene: Scene, url: Url = DEFAULT_URL, token: Token = None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
 import sys
@@ -15,20 +16,26 @@ import numpy as np
 
 from client import pictures, rig
 from client.errors import ServiceError, ServiceUnreachable
+from client.extras import need_server
 from client.progress import Bars, console
 from client.sdk import Client
 from scas4d_core.captures import Capture
 
-START_S = 60.0
+POLL_S = 1.0
+"""Between two questions whether the service is ready."""
 
 
 @contextmanager
 def running_service(data: Path, log: Path, port: int = 8000) -> Iterator[str]:
     """A service of its own on the loopback, at `port` or where that is taken at a free one; its address.
 
+    The first start of all compiles the kernels: it is waited for as long as the process lives.
+
     Raises:
-        RuntimeError: it ended, or did not answer in time; the message names its log.
+        RuntimeError: it ended, or cannot become ready; the message says why, and names its log.
+        ModuleNotFoundError: the service is not installed.
     """
+    need_server()
     port = port if _free(port) else _free(0)
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("w") as file:
@@ -36,11 +43,12 @@ def running_service(data: Path, log: Path, port: int = 8000) -> Iterator[str]:
         process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
     try:
         url = f"http://127.0.0.1:{port}"
-        until = time.monotonic() + START_S
-        while not _answers(url):
-            if process.poll() is not None or time.monotonic() > until:
-                raise RuntimeError(f"the service did not start; see {log}")
-            time.sleep(0.1)
+        with Bars() as bars:
+            while not _ready(url, log):
+                if process.poll() is not None:
+                    raise RuntimeError(f"the service has ended: {_last_words(log)}; its log is {log}")
+                bars("making the kernels ready", 0, 1)
+                time.sleep(POLL_S)
         yield url
     finally:
         process.terminate()
@@ -61,12 +69,28 @@ def _free(port: int) -> int:
         return int(probe.getsockname()[1])
 
 
-def _answers(url: str) -> bool:
+def _ready(url: str, log: Path) -> bool:
     try:
-        with Client(url, outage=0) as client:
-            return client.ready().status == "ready"
-    except (ServiceError, ServiceUnreachable):
+        with Client(url, token=_token(), outage=0) as client:
+            client.ready()
+    except ServiceUnreachable:
         return False
+    except ServiceError as error:
+        if (error.problem.model_extra or {}).get("warming_up"):
+            return False
+        raise RuntimeError(f"the service cannot become ready: {error}; its log is {log}") from None
+    return True
+
+
+def _token() -> str | None:
+    """The service that was started here reads it too."""
+    return os.environ.get("SCAS4D_TOKEN")
+
+
+def _last_words(log: Path) -> str:
+    """The last line that a person wrote for people, of a log that is JSON otherwise."""
+    said = [line for line in log.read_text(errors="replace").splitlines() if line and not line.startswith("{")]
+    return said[-1].removeprefix("scas4d: ") if said else "it says no reason"
 
 
 def run(capture: Capture, url: str, out: Path, *, frames: int | None, preset: str, settings: Mapping[str, Any]) -> str:
@@ -75,9 +99,13 @@ def run(capture: Capture, url: str, out: Path, *, frames: int | None, preset: st
     `out` gets truth | render | difference of every test camera and frame (of one training camera where there are no
     test cameras), and depth and parts of the last frame.
     """
-    with Client(url) as client:
+    name = f"demo of {capture.name}"
+    with Client(url, token=_token()) as client:
+        for earlier in client.scenes():
+            if earlier.name == name:  # each would be one of the few that the service takes
+                client.delete_scene(earlier.id)
         with Bars() as bars:
-            delivery = rig.push(capture, client, frames=frames, preset=preset, settings=settings, told=bars)
+            delivery = rig.push(capture, client, name=name, frames=frames, preset=preset, settings=settings, told=bars)
         status = client.scene(delivery.scene)
         if status.last_committed is None:
             raise RuntimeError(f"no frame was committed: {status.error}")
@@ -118,6 +146,7 @@ def save_views(capture: Capture, client: Client, id: str, frames: int, out: Path
                 pictures.save(out / f"camera_{camera.name}" / f"{index:06d}.png", pictures.comparison(true, render))
             scores.append(float(np.mean(by_camera)))
             bars("pictures", index + 1, frames)
+        bars("depth and parts", 0, 1)
         try:
             views = client.render_arrays(id, cameras[0], None, kinds=["depth", "parts"])
         except ServiceError as error:
@@ -125,4 +154,5 @@ def save_views(capture: Capture, client: Client, id: str, frames: int, out: Path
         else:
             pictures.save(out / "depth.png", pictures.brightness(views["depth"]))
             pictures.save(out / "parts.png", pictures.coloured(views["parts"]))
+            bars("depth and parts", 1, 1)
     return scores

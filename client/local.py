@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from client import pictures
+from client.importers.door import open_prepared
 from client.progress import Bars, console
 from scas4d_core.captures import open_capture
 
@@ -24,6 +25,8 @@ def reconstruct(folder: Path, out: Path, *, frames: int | None, preset: str, cha
         preset: named settings.
         changes: what differs, as ``update.iterations=200``.
     """
+    given = open_prepared(folder)  # the reconstruction resizes what it is given
+
     from scas4d_core.bench.job import settings_of
     from scas4d_core.history import History
     from scas4d_core.ply import write_ply
@@ -31,7 +34,6 @@ def reconstruct(folder: Path, out: Path, *, frames: int | None, preset: str, cha
     from scas4d_core.warm_up import warm_up_elsewhere
 
     settings = settings_of(preset, overrides=changes)
-    given = open_capture(folder)  # the reconstruction resizes what it is given
     capture = open_capture(folder, image_scale=settings.scene.image_scale)
     count = min(frames or capture.frame_count, capture.frame_count)
     rig = capture.test_rig or capture.rig

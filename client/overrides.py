@@ -6,6 +6,8 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
+from pydantic import ValidationError
+
 
 def overrides(changes: Sequence[str]) -> dict[str, Any]:
     """``["update.iterations=200"]`` to ``{"update": {"iterations": 200}}``; JSON behind the sign, else text.
@@ -29,3 +31,15 @@ def overrides(changes: Sequence[str]) -> dict[str, Any]:
         except json.JSONDecodeError:
             inner[last] = text.strip()
     return result
+
+
+def refusal(error: ValidationError) -> str:
+    """What settings that the core refused lack, as one sentence: the name, the value, the fault."""
+    found = error.errors(include_url=False)
+    name = ".".join(str(part) for part in found[0]["loc"])
+    if found[0]["type"] == "extra_forbidden":
+        fault = "there is none of this name"
+    else:
+        fault = f"it cannot be {found[0]['input']!r}: {found[0]['msg'].removeprefix('Value error, ')}"
+    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    return f"setting {name}: {fault}{more}; docs/settings.md lists all"

@@ -1,7 +1,8 @@
-"""Progress bars in the terminal."""
+"""Progress of what takes long: bars in a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 
+import time
 from types import TracebackType
 
 from rich.console import Console
@@ -9,34 +10,65 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 console = Console()
 
+LINE_S = 10.0
+"""Seconds between two lines about one stage, where there is no terminal."""
+
 
 class Bars:
-    """One bar a stage; a stage that is over keeps its bar. Call it with (stage, done, total)."""
+    """One bar a stage; a stage that is over keeps its bar. Call it with (stage, done, total).
 
-    def __init__(self) -> None:
+    Args:
+        to: the terminal, or what stands in its place.
+        every: seconds between two lines about one stage.
+    """
+
+    def __init__(self, to: Console | None = None, every: float = LINE_S) -> None:
+        self._console = console if to is None else to
+        self._every = every
         self._progress = Progress(
             TextColumn("{task.description:<28}"),
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
-            console=console,
+            console=self._console,
         )
         self._tasks: dict[str, TaskID] = {}
+        self._began: dict[str, float] = {}
+        self._said = 0.0
 
     def __enter__(self) -> Bars:
-        self._progress.start()
+        if self._console.is_terminal:
+            self._progress.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._progress.stop()
+        if self._console.is_terminal:
+            self._progress.stop()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        """Moves the bar of a stage. A new stage means that those before it are over."""
+        """Moves the bar of a stage. Those before it are over."""
+        if self._console.is_terminal:
+            self._move(stage, done, total)
+        else:
+            self._say(stage, done, total)
+
+    def _move(self, stage: str, done: int, total: int) -> None:
         if stage not in self._tasks:
-            for task in self._progress.tasks:
-                if not task.finished:
-                    self._progress.update(task.id, completed=task.total)
             self._tasks[stage] = self._progress.add_task(stage, total=total)
+        for task in self._progress.tasks[: list(self._tasks).index(stage)]:
+            if task.completed != task.total:
+                self._progress.update(task.id, completed=task.total)
         self._progress.update(self._tasks[stage], completed=done, total=total)
+
+    def _say(self, stage: str, done: int, total: int) -> None:
+        now = time.monotonic()
+        new = stage not in self._began
+        began = self._began.setdefault(stage, now)
+        if not new and now - self._said < self._every:
+            return
+        self._said = now
+        counted = f" {done} of {total}" if total > 1 else ""
+        seconds = "" if new else f", {now - began:.0f} s"
+        self._console.print(f"{stage}{counted}{seconds}", highlight=False, soft_wrap=True)

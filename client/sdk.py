@@ -62,6 +62,8 @@ class _Settings:
     """What both clients keep."""
 
     def __init__(self, url: str, token: str | None, patience: float, outage: float, on_retry: Told | None) -> None:
+        if not url.startswith(("http://", "https://")):
+            raise ValueError(f"url {url!r} is no address of a service; write http://{url.partition('://')[2] or url}")
         self.url = url.rstrip("/")
         self.token = token
         self.patience = patience

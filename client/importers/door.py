@@ -11,7 +11,7 @@ from client.importers.nerfstudio import FILE, read_transforms
 from client.importers.pictures import PictureFiles, folders_of, named_files
 from client.importers.source import CaptureSource, Encoding, ImportedSource, Pictures, Source
 from client.importers.videos import Videos, find_videos
-from scas4d_core.captures import CaptureError, open_capture
+from scas4d_core.captures import Capture, CaptureError, open_capture
 from scas4d_core.captures.dynamic3dgs import TRAIN_META
 
 COLMAP_FOLDERS = ("sparse/0", "sparse", ".", "colmap/sparse/0", "colmap", "calibration")
@@ -61,6 +61,22 @@ def open_source(
             "or none (--no-masks)"
         )
     return ImportedSource(folder.resolve().name, found, seen, masks=files, fps=fps, encoding=encoding)
+
+
+def open_prepared(folder: Path | str) -> Capture:
+    """A capture that the method reads without the importers: `reconstruct`, `evaluate` and `demo` take only such.
+
+    Raises:
+        CaptureError: another layout, or none; the message names the layouts and the way to this one.
+    """
+    folder = Path(folder)
+    if not folder.is_dir() or (folder / TRAIN_META).exists():
+        return open_capture(folder)
+    raise CaptureError(
+        f"{folder}: no {TRAIN_META} here, so this is no capture in the Dynamic3DGaussians layout; nerfstudio's {FILE} "
+        "and COLMAP models are read by `scas4d push`, and made ready for this command by `scas4d import FOLDER OUT` "
+        "(docs/captures.md)"
+    )
 
 
 def read_calibration(folder: Path, given: Path | None = None) -> Calibration:

@@ -16,6 +16,8 @@ class Lateness:
         late: by how much each frame was acknowledged after its moment, plus one period: 0 means before the next one.
         busy: waited for a full queue, and how often.
         outage: waited for a service that did not answer, and how often.
+        began: when the clock of the rig started: with the first frame, or once frame 0 was finished.
+        before: how many of `late` were acknowledged before the clock started.
     """
 
     late: list[float] = field(default_factory=list)
@@ -24,17 +26,21 @@ class Lateness:
     outage: float = 0.0
     outage_count: int = 0
     began: float = field(default_factory=time.monotonic)
+    before: int = 0
     ended: float | None = None
 
     def summary(self, fps: float | None) -> str:
         """One line for a person."""
         count = len(self.late)
+        timed = count - self.before
         seconds = (self.ended or time.monotonic()) - self.began
-        rate = f"{(count - 1) / seconds:.2f}" if count > 1 and seconds > 0 else "-"
-        asked = f" of {fps:g}" if fps else ""
-        parts = [f"sent {count} frames at {rate}{asked} a second"]
-        if fps and count:
-            behind = [value for value in self.late if value > 0]
+        parts = [f"sent {count} frame{'' if count == 1 else 's'}"]
+        if timed > 1 and seconds > 0:
+            asked = f" of {fps:g}" if fps else ""
+            which = ", those after frame 0" if self.before else ""
+            parts[0] += f"{which} at {(timed - 1) / seconds:.2f}{asked} a second"
+        if fps and timed:
+            behind = [value for value in self.late[self.before :] if value > 0]
             worst = f", at most {max(behind):.2f} s" if behind else ""
             parts.append(f"{len(behind)} acknowledged after the next was due{worst}")
         if self.busy_count:

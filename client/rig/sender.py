@@ -88,11 +88,11 @@ class Sender:
         self.start_clock()
 
     def start_clock(self) -> None:
-        """The next frame is due now."""
+        """The next frame is due now; the rate is counted from here."""
         self._began = time.monotonic()
         self._sent = 0
-        if not self._delivery.lateness.late:
-            self._delivery.lateness.began = self._began
+        self._delivery.lateness.began = self._began
+        self._delivery.lateness.before = len(self._delivery.lateness.late)
 
     def send_all(self, first: int, count: int) -> Iterator[int]:
         """Every index in order, once it is acknowledged or given up; goes where the service says it goes on."""

@@ -27,6 +27,7 @@ def push(
     client: Client,
     *,
     scene: str | None = None,
+    name: str | None = None,
     pace: Pace | None = None,
     frames: int | None = None,
     start: int = 0,
@@ -48,6 +49,7 @@ def push(
         source: what is sent, at the size of the files. The service scales, if `settings` say so.
         client: of the service.
         scene: id of a scene to go on with, from its next frame; a new one where None.
+        name: of a new scene; that of the source where None.
         pace: of the rig; as fast as the service takes them where None. The times of the frames are those of the capture
             either way.
         frames: how many the scene shall have; all where None, or without end with `loop`.
@@ -75,7 +77,7 @@ def push(
         if scene is None:
             status = client.create_scene(
                 source.rig,
-                name=source.name,
+                name=source.name if name is None else name,
                 preset=preset,
                 settings=settings,
                 frames_per_second=source.fps,
@@ -101,7 +103,9 @@ def push(
                 else:
                     told("frames", _finished(client.scene(status.id)), count)
             delivery.lateness.ended = time.monotonic()
-            _follow(client, status.id, count - 1, count, told)
+            # A frame that was lost is finished at once, those before it are not.
+            last = next((index for index in reversed(range(count)) if index not in delivery.lost), 0)
+            _follow(client, status.id, last, count, told)
         except KeyboardInterrupt:  # how a loop without end is ended
             said("interrupted")
             delivery.lateness.ended = delivery.lateness.ended or time.monotonic()
@@ -157,8 +161,8 @@ def _follow(client: Client, id: str, index: int, count: int, told: Told) -> None
             raise RuntimeError(f"scene {id} failed: {status.error}")
         if status.progress is not None:
             told(status.progress.stage, status.progress.done, status.progress.total)
-        elif status.state in ("awaiting_first_frame", "initialising"):
-            told("starting, compiling kernels", 0, 1)
+        elif index == 0 and not _finished(status):
+            told("starting the scene", 0, 1)
         else:
             told("frames", _finished(status), count)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from running import HEIGHT, WIDTH
+from running import HEIGHT, WIDTH, make_rig
 
 from client.overrides import overrides
 from client.pictures import coloured, comparison, psnr
@@ -57,7 +57,7 @@ def test_push_as_a_rig_scenes_and_going_on(service, capture_folder):
     done = scas4d("push", str(capture_folder), "--url", service.url, *rig)
     assert done.returncode == 0, done.stderr
     assert "6 of 6 frames committed, ready" in done.stdout
-    assert "of 20 a second" in done.stdout
+    assert re.search(r"sent 6 frames, those after frame 0 at [\d.]+ of 20 a second", done.stdout), done.stdout
     id = re.search(r"scene (\w+):", done.stdout)[1]
     listed = scas4d("scenes", "--url", service.url)
     assert re.search(rf"{id}\s+tiny\s+ready\s+2\s+6\s+0\s+6", listed.stdout), listed.stdout
@@ -112,23 +112,18 @@ def test_import_makes_a_capture_that_can_be_pushed(service, tmp_path):
     assert "put each camera's video into videos/<camera>.mp4" in broken.stderr
 
 
-def test_the_demo_starts_a_service_and_leaves_pictures(capture_folder, tmp_path):
-    done = scas4d(
-        "demo",
-        "--capture",
-        str(capture_folder),
-        "--no-stay",
-        "--out",
-        str(tmp_path / "out"),
-        SCAS4D_ENGINE="fakes:engine",
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "http://127.0.0.1:" in done.stdout
-    assert "dB PSNR" in done.stdout
-    pictures = sorted(path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.png"))
-    assert pictures == [*(f"camera_2/{t:06d}.png" for t in range(4)), "depth.png", "parts.png"]
-    with Image.open(tmp_path / "out/camera_2/000001.png") as picture:
-        assert picture.size == (3 * WIDTH, HEIGHT)
+def test_scenes_are_listed_whole_in_a_narrow_terminal(service):
+    with Client(service.url) as client:
+        rig = make_rig(2)
+        long = client.create_scene(rig, name="a name that is longer than the terminal is wide " * 2)
+        try:
+            lines = scas4d("scenes", "--url", service.url, COLUMNS="40").stdout.splitlines()
+        finally:
+            client.delete_scene(long.id)
+    assert len(lines) == 2
+    assert lines[1].startswith(f"{long.id}  {long.name}")
+    assert "awaiting_first_frame" in lines[1]
+    assert lines[0].index("state") == lines[1].index("awaiting_first_frame")
 
 
 def test_serve_refuses_to_listen_beyond_this_machine():

@@ -72,7 +72,9 @@ def test_the_summary_says_how_far_behind():
     assert "1 acknowledged after the next was due, at most 0.40 s" in said
     assert "1.5 s for a full queue (2 times)" in said
     assert "3.0 s for the service (4 tries)" in said
-    assert Lateness().summary(None) == "sent 0 frames at - a second"
+    assert Lateness().summary(None) == "sent 0 frames"
+    first = Lateness(late=[40.0, -0.1, -0.1, 0.4], began=40, ended=42, before=1)
+    assert "sent 4 frames, those after frame 0 at 1.00 of 5 a second; 1 acknowledged after" in first.summary(5)
 
 
 @pytest.mark.parametrize("websocket", [False, True])

@@ -1,0 +1,33 @@
+"""What the client alone does without: packages of the service and the method, asked for where a command needs them."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+SERVER = (
+    *("numba", "scipy", "sklearn", "threadpoolctl", "plyfile", "pycolmap", "flip_evaluator"),
+    *("fastapi", "uvicorn", "pydantic_settings", "prometheus_client", "httptools", "blake3", "python_multipart"),
+)
+"""Modules of the extra `server`."""
+CUDA = ("torch", "gsplat")
+"""Modules of the extra `cuda`."""
+
+
+def need_server() -> None:
+    """For commands that start other processes: these would fail where nobody looks.
+
+    Raises:
+        ModuleNotFoundError: something of the extra `server` is not installed.
+    """
+    for module in SERVER:
+        if find_spec(module) is None:
+            raise ModuleNotFoundError(f"No module named {module!r}", name=module)
+
+
+def remedy(missing: ModuleNotFoundError) -> str | None:
+    """What to install, in a sentence; None where the module is none of an extra."""
+    package = (missing.name or "").partition(".")[0]
+    extra = "server" if package in SERVER else "cuda" if package in CUDA else None
+    if extra is None:
+        return None
+    return f"this needs {package}, which is not installed; in the project's folder: pip install -e '.[{extra}]'"
