@@ -31,9 +31,10 @@ from scas4d_core.rasterize import cuda, twin
 from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
 from scas4d_core.rasterize.limits import GSPLAT
 from scas4d_core.settings import SceneSettings, UpdateSettings
-from scas4d_core.update import FrameUpdate, Updated
+from scas4d_core.update import FrameUpdate
 from scas4d_core.update_device import DeviceUpdate
 from scas4d_core.update_plan import first_lengths
+from scas4d_core.updated import Updated
 from scas4d_core.views import ViewFactory
 from scas4d_core.warm_start import Motion
 

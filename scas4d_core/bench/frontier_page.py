@@ -316,7 +316,10 @@ def _provenance(out: Path, captures: Sequence[str]) -> str:
     days = sorted({str(row["measured"])[:10] for row in [*rows, *times]})
     when = " to ".join(dict.fromkeys((days[0], days[-1])))
     cores = sorted({str(row["core"]) for row in [*rows, *times]})
-    where = "; ".join(sorted({in_words(row["machine"]) for row in times})) or "as the rows, not in turns"
+    where = (
+        "; ".join(sorted({in_words(row["machine"]) for row in times}))
+        or "not in turns, but CPU seconds of rows on one thread"
+    )
     accuracy = "; ".join(sorted({in_words(row["machine"]) for row in rows}))
     return (
         f"Measured {when}. Seconds: {where}. Accuracy: {accuracy}. "

@@ -1,7 +1,7 @@
 """Rows and times of the frontier as points: what a setting reaches in how many seconds, and who is ahead at equal ones.
 
-Accuracy is that of the rows, over the same updates for all of a capture; seconds are those of ``bench.timing`` where
-they were measured and the row's own otherwise.
+Accuracy is that of the rows, over the same updates for all of a capture. Seconds are those of ``bench.timing``; where
+there are none, those of the row: CPU seconds if it ran on one thread, for they mind little what else a machine does.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Point:
 
     Attributes:
         capture: name, or what is averaged. updates: how many the scores cover.
-        seconds: of an update, wall clock. cpu_seconds: of all threads, None where not measured.
+        seconds: of an update, see above. cpu_seconds: of all threads, None where not measured.
         timed: whether the seconds were measured in turns. stages: median seconds by stage.
         gaussians: in the scene. scores: by name of ``SCORES``, None where the capture has no truth for them.
         psnr_by_frame: dB, frame 0 first; empty for a mean.
@@ -161,8 +161,9 @@ def spread(points: Iterable[Point], method: str, capture: str, score: str = "psn
 
 
 def _point(variant: Variant, row: Row, timed: Row | None) -> Point:
+    alone = row["machine"].get("threads") == 1 and "cpu_seconds_update" in row
     known: Any = timed or {
-        "seconds": row["seconds_update"],
+        "seconds": row["cpu_seconds_update" if alone else "seconds_update"],
         "cpu_seconds": row.get("cpu_seconds_update"),
         "stages": row["seconds_stages"],
     }

@@ -170,8 +170,11 @@ def test_seconds_are_those_measured_in_turns_where_there_are_any(tmp_path):
     assert (timed["wheel"].seconds, timed["wheel"].timed) == (made_seconds(DEFAULT), False)
     (mean,) = [p for p in mean_points(points, ["robot", "wheel"]) if p.variant == DEFAULT]
     assert mean.seconds == pytest.approx((0.125 + made_seconds(DEFAULT)) / 2)
-    assert mean.cpu_seconds is None
+    assert mean.cpu_seconds == pytest.approx((0.25 + made_seconds(DEFAULT)) / 2)
     assert not mean.timed
+    Store(tmp_path).put(made_row(DEFAULT, "wheel", 5, machine={"system": "Linux", "threads": 2}))
+    (on_two,) = [p for p in read_points(tmp_path, ["wheel"], 5) if p.variant == DEFAULT]
+    assert on_two.seconds == pytest.approx(7 * made_seconds(DEFAULT))  # two threads: the wall clock
 
 
 def test_a_mean_needs_the_row_of_every_capture(tmp_path):
@@ -216,7 +219,7 @@ def test_the_page_has_its_plots_and_tables(tmp_path):
             assert picture.width > 900
             assert (colours == (0, 0x72, 0xB2)).all(axis=1).sum() > 500  # the line of scas4d
     assert "ahead at 10 of 10 budgets" in text
-    assert f"| scas4d 100 | 1.00 | 1.00 | – | {made_psnr(DEFAULT):.2f} |" in text
+    assert f"| scas4d 100 | 1.00 | 1.00 | 1.00 | {made_psnr(DEFAULT):.2f} |" in text
     assert "`scas4d` robot 0.20, cloth 0.20 (3 seeds)" in text
     refused = CliRunner().invoke(app, [*command, "--only", "plots"])
     assert refused.exit_code == 2
