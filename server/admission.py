@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from client.wire import FrameReceipt, FrameState
 from server.facts import Fact, Skipped
-from server.ledger import LOST
+from server.frame_table import LOST
 from server.problems import Problem, counted
 
 if TYPE_CHECKING:
@@ -27,11 +27,12 @@ class Admission:
     def again(self, index: int, identity: str) -> FrameReceipt:
         """The receipt of a frame that is known, if it has the same content; else 409."""
         entry = self._scene.frames[index]
-        if entry.receipt is None or entry.receipt.identity != identity:
-            state = entry.report.state
+        receipt = entry.receipt
+        if receipt is None or receipt.identity != identity:
+            state = entry.state
             known = "known with other content or another time"
-            if entry.receipt is None:
-                known = "declared missing" if state == FrameState.MISSING else f"{state}: {entry.report.error or LOST}"
+            if receipt is None:
+                known = "declared missing" if state == FrameState.MISSING else f"{state}: {entry.error or LOST}"
             raise Problem(
                 409,
                 f"frame {index} is {known}",
@@ -39,9 +40,9 @@ class Admission:
                 value=index,
                 remedy=f"send the next frame, {self._scene.next_frame}; what was acknowledged does not change",
                 expected=self._scene.next_frame,
-                identity=entry.report.identity,
+                identity=entry.identity,
             )
-        return entry.receipt
+        return receipt
 
     def admit(self, index: int, seconds: float | None) -> None:
         """Refuses a frame that cannot be the next; `seconds` None leaves its time unjudged."""
@@ -130,10 +131,10 @@ class Admission:
 
     def never_taken(self, index: int) -> Problem:
         """409 for a frame that is finished and never had pictures."""
-        report = self._scene.frames[index].report
+        entry = self._scene.frames[index]
         return Problem(
             409,
-            f"frame {index} is {report.state}: {report.error}",
+            f"frame {index} is {entry.state}: {entry.error}",
             field="n",
             value=index,
             remedy=f"send frame {self._scene.next_frame}",

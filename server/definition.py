@@ -15,7 +15,7 @@ from client.wire import SceneCreate
 from scas4d_core.npz import sync_folder
 from scas4d_core.settings import Settings
 from server.facts import Created
-from server.journal import read_journal
+from server.journal import replay
 
 FORMAT = 1
 SCENE_FILE, JOURNAL_FILE, FRAMES_FOLDER = "scene.json", "journal.log", "frames"
@@ -103,9 +103,10 @@ def read_definition(folder: Path) -> tuple[Definition, str | None]:
         said = f"{SCENE_FILE} is gone"
     except (OSError, KeyError, TypeError, ValueError) as error:
         said = f"{SCENE_FILE} is damaged ({error})"
-    for fact in read_journal(folder / JOURNAL_FILE).facts:
-        if isinstance(fact, Created):
-            return Definition.of_json(fact.definition), f"{said}; taken from the journal"
+    told: list[Created] = []
+    replay(folder / JOURNAL_FILE, lambda fact: told.append(fact) if isinstance(fact, Created) else None)
+    if told:
+        return Definition.of_json(told[0].definition), f"{said}; taken from the journal"
     raise DefinitionError(f"{said}, and the journal does not have it either")
 
 

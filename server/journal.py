@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from scas4d_core.npz import sync_folder
-from server.facts import Fact, parse_fact
+from server.facts import Fact, no_fact, parse_fact
 from server.problems import Problem
-from server.record_log import Damage, Kind, Record, encoded, records
+from server.record_log import Damage, Kind, encoded, streamed
 
 
 @dataclass(frozen=True)
@@ -24,26 +26,42 @@ class JournalRead:
 
 
 def read_journal(path: Path) -> JournalRead:
-    """Every fact that is whole; never raises for what the file holds.
+    """All of a journal that is not large; see `replay`."""
+    facts: list[Fact] = []
+    told = replay(path, facts.append)
+    return JournalRead(facts, told.good, told.damage)
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """How a journal was read: the bytes that are whole, and a sentence for each damage."""
+
+    good: int
+    damage: list[str]
+
+
+def replay(path: Path, take: Callable[[Fact], object]) -> Replayed:
+    """Tells `take` every fact that is whole, in order, reading piece by piece; never raises for what the file holds.
 
     A torn tail is what an append leaves that was cut short: it was never acknowledged, and it is dropped.
     """
-    data = path.read_bytes() if path.exists() else b""
-    facts: list[Fact] = []
     said: list[str] = []
-    good = len(data)
-    for found in records(data):
-        if isinstance(found, Damage):
-            if found.torn:
-                good = found.start
-            said.append(f"{path.name}: bytes {found.start} to {found.end} dropped: {found.reason}")
-            continue
-        assert isinstance(found, Record)
-        try:
-            facts.append(parse_fact(found.head))
-        except ValueError as error:
-            said.append(f"{path.name}: a record of kind {found.kind}, frame {found.index}, is no fact: {error}")
-    return JournalRead(facts, good, said)
+    if not path.exists():
+        return Replayed(0, said)
+    with path.open("rb") as file:
+        good = os.fstat(file.fileno()).st_size
+        for found in streamed(file):
+            if isinstance(found, Damage):
+                if found.torn:
+                    good = found.start
+                said.append(f"{path.name}: bytes {found.start} to {found.end} dropped: {found.reason}")
+                continue
+            try:
+                take(parse_fact(found.text))
+            except ValidationError as error:
+                fault = no_fact(error)
+                said.append(f"{path.name}: a record of kind {found.kind}, frame {found.frame}, is no fact: {fault}")
+    return Replayed(good, said)
 
 
 class Journal:

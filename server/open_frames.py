@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Literal
 from client.wire import FileKind, FrameHead, FrameReceipt, PartReceipt
 from server import metrics
 from server.admission import Admission
-from server.facts import PartTaken, Taken
+from server.facts import Fact, PartTaken, Taken
 from server.frame_store import FrameDamage, read_pictures
-from server.journal import read_journal
+from server.journal import replay
 from server.ledger import OpenFrame, frame_identity
 from server.problems import Problem, counted
 from server.upload import Received
@@ -117,18 +117,19 @@ class OpenFrames:
     async def _parts_of(self, index: int) -> OpenFrame | None:
         """What a closed frame consists of; None where its pictures are gone or it never had any."""
         entry = self._scene.frames[index]
-        if entry.parts is None and entry.files:
-            parts = OpenFrame(index, entry.report.time)
+        known = entry.note.parts
+        if known is None and entry.files:
+            parts = OpenFrame(index, entry.time)
             try:
                 for name in entry.files:
                     pictures = await asyncio.to_thread(read_pictures, self._scene.spec.frames, name)
                     parts.hashes.update(pictures.hashes)
             except FrameDamage:
                 return None
-            entry.parts = parts
-        if entry.parts is None and entry.receipt is not None:  # its pictures are deleted; what they were is known
+            self._scene.frames.note(index).parts = known = parts
+        if known is None and entry.receipt is not None:  # its pictures are deleted; what they were is known
             return await asyncio.to_thread(_parts_told, self._scene.spec.journal, index)
-        return entry.parts
+        return known
 
     def _set_deadline(self, index: int) -> None:
         seconds = self._scene.rules.part_seconds
@@ -218,7 +219,10 @@ class OpenFrames:
 def _parts_told(journal: Path, index: int) -> OpenFrame | None:
     """What the journal says that a frame was closed from: slow, for who sends again what was deleted long ago."""
     parts = OpenFrame(index)
-    for fact in read_journal(journal).facts:
+
+    def look(fact: Fact) -> None:
         if isinstance(fact, PartTaken) and fact.index == index:
             parts.add(fact)
+
+    replay(journal, look)
     return parts if parts.hashes else None

@@ -94,7 +94,7 @@ class Line:
         if len(self._waiting) >= self._server.waiting_questions:
             raise Problem(
                 503,
-                f"{counted(len(self._waiting), 'question')} of this scene wait for an answer already",
+                f"{counted(len(self._waiting), 'question')} of this scene waiting for an answer already",
                 field="SCAS4D_WAITING_QUESTIONS",
                 value=self._server.waiting_questions,
                 remedy="ask less often, or subscribe (WS …/stream): it sends the newest only",

@@ -28,9 +28,9 @@ import json
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any
+from typing import Any, BinaryIO, NamedTuple
 
 from blake3 import blake3
 
@@ -63,6 +63,15 @@ class Record:
     body: memoryview
     files: tuple[memoryview, ...] = ()
     digests: tuple[bytes, ...] = ()
+
+
+class Head(NamedTuple):
+    """A record of which only the head matters: its JSON, not parsed, and the bytes of the whole record."""
+
+    kind: int
+    frame: int
+    text: bytes
+    size: int
 
 
 @dataclass(frozen=True)
@@ -158,6 +167,59 @@ def records(data: bytes | memoryview) -> Iterator[Record | Damage]:
     while at < len(view):
         found, at = read_at(view, at)
         yield found
+
+
+PIECE = 1 << 22
+"""Bytes that are read at a time."""
+ENOUGH = 2 * (MAX_HEAD + PREFIX + CHECKSUM)
+"""So much of a log behind a place tells whether a record without a body, as facts are, is whole there."""
+
+
+def streamed(file: BinaryIO) -> Iterator[Head | Damage]:
+    """Heads of a log of small records, in order, and what lies between them; the log need not fit in memory."""
+    data, start, at, ended = b"", 0, 0, False
+    while True:
+        head = _whole(data, at)
+        if head is not None:
+            yield head
+            at += head.size
+            continue
+        damage, after = _damage(data, at)
+        unsure = damage is None or len(data) - at < ENOUGH or after == len(data)
+        if unsure and not ended:
+            piece = file.read(PIECE)
+            ended = not piece
+            data, start, at = data[at:] + piece, start + at, 0
+            continue
+        if damage is None:
+            return
+        yield replace(damage, start=start + damage.start, end=start + damage.end)
+        at = after
+
+
+def _whole(data: bytes, at: int) -> Head | None:
+    """The record that begins at a byte, if it is whole, of version 1, and nothing is wrong with it."""
+    if len(data) - at < PREFIX:
+        return None
+    magic, version, kind, nought, head_length, index, body_length = HEADER.unpack_from(data, at)
+    head_end = at + PREFIX + head_length
+    end = head_end + body_length + CHECKSUM
+    if magic != MAGIC or version != WHOLE or nought or head_length > MAX_HEAD or end > len(data):
+        return None
+    text = data[at + PREFIX : head_end]
+    if CRC.unpack_from(data, at + HEADER.size)[0] != zlib.crc32(text, zlib.crc32(data[at : at + HEADER.size])):
+        return None
+    if blake3(data[at : end - CHECKSUM]).digest(CHECKSUM) != data[end - CHECKSUM : end]:
+        return None
+    return Head(kind, index, text, end - at)
+
+
+def _damage(data: bytes, at: int) -> tuple[Damage | None, int]:
+    """Why there is no such record at a byte, and where to go on; None where there is nothing at all."""
+    if at == len(data):
+        return None, at
+    found, after = read_at(memoryview(data), at)
+    return found if isinstance(found, Damage) else Damage(at, after, "of a version that has no place here"), after
 
 
 def _skip(data: memoryview, at: int, reason: str) -> tuple[Damage, int]:

@@ -11,7 +11,7 @@ from scas4d_core.history import History, HistoryError
 from server.definition import FRAMES_FOLDER, JOURNAL_FILE
 from server.facts import Fact, PartTaken, SetAside, Taken
 from server.frame_store import FrameDamage, Pictures, frame_of, read_pictures, remove, stored
-from server.journal import read_journal
+from server.journal import replay
 from server.ledger import Ledger, frame_identity
 
 
@@ -35,10 +35,9 @@ def recover(folder: Path, scene: str) -> Recovered:
     """Reads a scene's folder. Removes what interrupted uploads left; appends nothing. Blocking."""
     frames = folder / FRAMES_FOLDER
     frames.mkdir(exist_ok=True)
-    told = read_journal(folder / JOURNAL_FILE)
-    ledger, damage = Ledger(scene), list(told.damage)
-    for fact in told.facts:
-        ledger.apply(fact)
+    ledger = Ledger(scene)
+    told = replay(folder / JOURNAL_FILE, ledger.apply)
+    damage = list(told.damage)
     sizes = stored(frames)
     facts: list[Fact] = []
     if told.damage:
@@ -54,13 +53,13 @@ def recover(folder: Path, scene: str) -> Recovered:
     for fact in ledger.hopeless():  # its scene failed, and the service ended before it could say so of this one
         ledger.apply(fact)
         facts.append(fact)
-    for index, entry in ledger.frames.items():
+    for entry in list(ledger.frames.held()):
         lost = [name for name in entry.files if name not in sizes]
-        entry.files = tuple(name for name in entry.files if name in sizes)
-        entry.report.held = bool(entry.files)
-        if entry.report.state == FrameState.QUEUED and (reason := _unusable(frames, entry.files, lost)):
-            damage.append(f"frame {index}: {reason}")
-            gone = SetAside(index=index, reason=reason)
+        if lost:
+            ledger.frames.set_files(entry.index, tuple(name for name in entry.files if name in sizes))
+        if entry.state == FrameState.QUEUED and (reason := _unusable(frames, entry.files, lost)):
+            damage.append(f"frame {entry.index}: {reason}")
+            gone = SetAside(index=entry.index, reason=reason)
             ledger.apply(gone)
             facts.append(gone)
     return Recovered(ledger, told.good, facts, sizes, damage)
@@ -68,7 +67,7 @@ def recover(folder: Path, scene: str) -> Recovered:
 
 def _unnamed(ledger: Ledger, sizes: dict[str, int]) -> set[str]:
     """Records that no fact names."""
-    named = {name for entry in ledger.frames.values() for name in entry.files}
+    named = {name for entry in ledger.frames.held() for name in entry.files}
     named |= {name for frame in ledger.open.values() for name in frame.files}
     return set(sizes) - named
 
@@ -81,7 +80,7 @@ def _found(folder: Path, names: list[str], ledger: Ledger) -> Iterator[Taken | P
     for name in names:
         index = frame_of(name)
         entry = ledger.frames.get(index)
-        known = entry is not None and (entry.receipt is not None or entry.report.state != FrameState.SET_ASIDE)
+        known = entry is not None and (entry.receipt is not None or entry.state != FrameState.SET_ASIDE)
         if known or (entry is None and index != ledger.next_frame):
             continue
         try:
@@ -109,7 +108,8 @@ def _unusable(folder: Path, files: tuple[str, ...], lost: list[str]) -> str | No
 
 def _whole(index: int, name: str, pictures: Pictures, ledger: Ledger) -> Taken | None:
     before = max(
-        (e.report.time for i, e in ledger.frames.items() if i < index and e.report.time is not None), default=None
+        (time for i in range(min(index, ledger.next_frame)) if (time := ledger.frames[i].time) is not None),
+        default=None,
     )
     if pictures.time is None or (before is not None and pictures.time <= before):
         return None

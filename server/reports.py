@@ -32,11 +32,6 @@ def fill(report: FrameReportModel, committed: Mapping[str, Any]) -> None:
     }
 
 
-def strip(report: FrameReportModel) -> None:
-    """Lets go of the numbers that take room; they are on disk."""
-    report.iterations, report.loss, report.seconds, report.cameras = None, [], {}, {}
-
-
 class ReportFiles:
     """Reads reports from the states of a scene. Blocking, for threads."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,10 @@ from server.definition import Definition
 from server.disk import no_room
 from server.facts import Died, Fact, FramesDeleted, SetAside, StatesDeleted
 from server.frame_store import remove
+from server.frame_table import FrameTable
 from server.hub import Event, FrameFinished, Hub, SceneChanged
 from server.ingest import Ingest
 from server.journal import Journal
-from server.ledger import FrameEntry
 from server.messages import Answer, Broken, Committed, FrameReady, Progressed, Query, Ready, SceneSpec, Stalled
 from server.messages import SetAside as SetAsideMessage
 from server.placement import Ended, Placement, Process
@@ -100,12 +100,12 @@ class Scene:
         self._hub.publish(self.id, event)
 
     @property
-    def frames(self) -> dict[int, FrameEntry]:
+    def frames(self) -> FrameTable:
         """All frames that are closed, by index."""
         return self.ledger.frames
 
     @property
-    def committed(self) -> list[int]:
+    def committed(self) -> Sequence[int]:
         """Frames whose state can be read, rising."""
         return self.ledger.committed
 
@@ -163,9 +163,9 @@ class Scene:
         if index is None:
             return self.committed[-1]
         entry = self.frames.get(index)
-        if entry is None or entry.report.state != FrameState.COMMITTED or entry.report.deleted:
-            state = "not here" if entry is None else entry.report.state.value
-            said = "deleted by the scene's retention" if entry is not None and entry.report.deleted else state
+        if entry is None or entry.state != FrameState.COMMITTED or entry.deleted:
+            state = "not here" if entry is None else entry.state.value
+            said = "deleted by the scene's retention" if entry is not None and entry.deleted else state
             raise Problem(
                 404,
                 f"frame {index} is {said}; only committed frames that are kept can be read",
@@ -186,8 +186,7 @@ class Scene:
                 scene=self.id, index=index, time=parts.time, state=FrameState.OPEN, received=parts.cameras, held=True
             )
         found = entry.report
-        if found.state == FrameState.COMMITTED and not found.deleted and found.iterations is None:
-            found = found.model_copy()
+        if found.state == FrameState.COMMITTED and not found.deleted and not entry.measured:
             reports.fill(found, await asyncio.to_thread(self._files.read, index))
         return found
 
@@ -213,10 +212,11 @@ class Scene:
             return
         index = waiting[0]
         entry = ledger.frames[index]
-        assert entry.receipt is not None
+        receipt = entry.receipt
+        assert receipt is not None
         ledger.move(index, FrameState.UPDATING)
         self._at_work = index
-        self._worker.send(FrameReady(index, entry.receipt.time, entry.files, entry.receipt.identity))
+        self._worker.send(FrameReady(index, receipt.time, entry.files, receipt.identity))
         self._tell(SceneChanged())
 
     def _from_worker(self, message: Any) -> None:
@@ -272,7 +272,6 @@ class Scene:
         )
         self._questions.refresh()
         self._tell(FrameFinished(report))
-        self._forget_old_reports()
         self.work()
         if message.deleted:
             deleted = StatesDeleted(frames=message.deleted)
@@ -305,14 +304,10 @@ class Scene:
             self._tell(FrameFinished(self.frames[fact.index].report))
 
     def _fill(self, index: int, committed: dict[str, Any]) -> None:
+        self.frames.set_numbers(index, committed)
         report = self.frames[index].report
-        reports.fill(report, committed)
         self.gaussians = report.gaussians
         self.last_seconds = report.seconds.get("total", self.last_seconds)
-
-    def _forget_old_reports(self) -> None:
-        if len(self.committed) > reports.KEPT:
-            reports.strip(self.frames[self.committed[-1 - reports.KEPT]].report)
 
     async def retain(self) -> None:
         """Deletes pictures from the frame log by the scene's rule."""
@@ -358,7 +353,7 @@ class Scene:
 
     async def _after_death(self, reason: str, own: bool, delay: float) -> None:
         index, self._at_work = self._at_work, None
-        if index is not None and self.frames[index].report.state == FrameState.UPDATING:
+        if index is not None and self.frames[index].state == FrameState.UPDATING:
             self.ledger.move(index, FrameState.QUEUED)
             death = Died(index=index, reason=reason, own=own)
             self.ledger.apply(death)

@@ -6,7 +6,7 @@ import signal
 from pathlib import Path
 
 from server.facts import Died, SetAside
-from server.ledger import FrameEntry
+from server.frame_table import FrameEntry
 
 OWN_SIGNALS = frozenset(
     {signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSYS, signal.SIGTRAP}
@@ -65,10 +65,11 @@ class Supervision:
 
 def given_up(entry: FrameEntry, death: Died) -> SetAside | None:
     """That the frame is set aside for this death, counted already; or None: it is tried again."""
-    if entry.own_deaths >= OWN_DEATHS:
-        reason = f"the worker died {entry.own_deaths} times while it reconstructed this frame: {death.reason}"
-    elif entry.other_deaths >= OTHER_DEATHS:
-        reason = f"the worker was killed {entry.other_deaths} times while it reconstructed this frame: {death.reason}"
+    own, other = entry.note.own_deaths, entry.note.other_deaths
+    if own >= OWN_DEATHS:
+        reason = f"the worker died {own} times while it reconstructed this frame: {death.reason}"
+    elif other >= OTHER_DEATHS:
+        reason = f"the worker was killed {other} times while it reconstructed this frame: {death.reason}"
     else:
         return None
     return SetAside(index=death.index, reason=reason)

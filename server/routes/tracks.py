@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, bisect_right
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -86,7 +87,7 @@ def query_of(scene: Scene, server: ServerSettings, request: TracksRequest) -> Tr
     scene.committed_frame(None, "from")
     start = scene.committed[0] if request.first is None else request.first
     end = scene.committed[-1] if request.last is None else request.last
-    frames = tuple(index for index in scene.committed if start <= index <= end)
+    frames = tuple(scene.committed[bisect_left(scene.committed, start) : bisect_right(scene.committed, end)])
     if not frames:
         raise Problem(
             422,

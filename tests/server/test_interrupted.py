@@ -94,7 +94,7 @@ def test_a_scene_that_failed_is_found_with_nothing_waiting(tmp_path):
     async def write():
         journal = Journal(tmp_path / "journal.log")
         taken = [
-            Taken(index=index, time=index / 10, identity="ab", files=(f"{index:010d}-{0:012x}.frame",))
+            Taken(index=index, time=index / 10, identity="ab" * 32, files=(f"{index:010d}-{0:012x}.frame",))
             for index in (0, 1)
         ]
         await journal.append(taken[0], SetAside(index=0, reason="told to", fatal=True), taken[1])

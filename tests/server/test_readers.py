@@ -146,7 +146,7 @@ def test_too_many_questions_are_refused(scene):
     in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids=0"))
     until(lambda: readers.bulk._waiting)
     refused = http.get(f"/v1/scenes/{id}/parts")
-    assert problem(refused, 503)["detail"] == "1 questions wait for this scene's reader already"
+    assert problem(refused, 503)["detail"] == "1 question of this scene waiting for an answer already"
     assert refused.headers["retry-after"] == "1"
     assert not hanging.done()
 

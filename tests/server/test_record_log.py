@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import io
+import json
 import os
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 from blake3 import blake3
 
 from client.wire import FrameFile, FrameHead
+from server import record_log
 from server.facts import Missing, Paused, Taken
 from server.frame_store import FrameDamage, Upload, read_pictures, stored
 from server.journal import Journal, read_journal
@@ -80,7 +83,11 @@ def test_a_length_that_was_made_up_reads_no_further_than_the_file():
     assert [type(found) for found in records(big[:-50])] == [Damage]
 
 
-FACTS = [Taken(index=0, time=0.5, identity="ab", files=("f",)), Paused(paused=True), Missing(index=1, reason="lost")]
+FACTS = [
+    Taken(index=0, time=0.5, identity="ab" * 32, files=("f",)),
+    Paused(paused=True),
+    Missing(index=1, reason="lost"),
+]
 
 
 def write_journal(path, *facts, good=0):
@@ -117,6 +124,27 @@ def test_a_journal_cut_at_every_byte_starts_and_says_what_it_dropped(tmp_path):
         assert again.facts == [*FACTS[: len(read.facts)], Missing(index=9, reason="")]
         assert again.damage == []
     assert sorted(set(ends)) == [0, 1, 2]
+
+
+def test_a_log_that_is_read_piece_by_piece_says_the_same(monkeypatch):
+    """Wherever a piece ends: of a log that is whole, cut, damaged by flipped bits, or has rubbish in it."""
+    rng = np.random.default_rng(0)
+    facts = [
+        encoded(Kind.FACT, index, {"fact": "missing", "index": index, "reason": "é" * index}) for index in range(9)
+    ]
+    log = b"".join(facts)
+    logs = [log, log[:-1], log[: len(log) // 2], b"", b"S4DR", facts[0] + b"S4DR" * 40 + facts[1], bytes(300) + log]
+    for at in rng.integers(0, len(log), 40):
+        damaged = bytearray(log)
+        damaged[at] ^= 1 << int(rng.integers(8))
+        logs.append(bytes(damaged))
+    monkeypatch.setattr(record_log, "ENOUGH", 400)
+    for piece in (1, 7, 64, 10_000):
+        monkeypatch.setattr(record_log, "PIECE", piece)
+        for data in logs:
+            told = [one if isinstance(one, Damage) else (one.frame, json.loads(one.text))
+                    for one in record_log.streamed(io.BytesIO(data))]  # fmt: skip
+            assert told == [one if isinstance(one, Damage) else (one.index, one.head) for one in records(data)]
 
 
 def test_a_full_disk_leaves_the_journal_whole(tmp_path, monkeypatch):
