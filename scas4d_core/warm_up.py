@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import subprocess
 import sys
@@ -19,14 +20,18 @@ log = logging.getLogger("scas4d.kernels")
 
 
 def marker() -> Path | None:
-    """The file that says that this version's kernels are in the cache for this processor; None where there is none."""
+    """The file that says that this version's kernels are in the cache for this processor; None where there is none.
+
+    Numba keeps what it compiled by the path of the source, so a checkout elsewhere has a mark of its own.
+    """
     import numba
     from llvmlite import binding
 
-    from scas4d_core.kernels import jit  # noqa: F401  (names the cache's folder)
+    from scas4d_core.kernels import jit  # names the cache's folder
 
     folder = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-    return Path(folder) / f"warm-{binding.get_host_cpu_name()}" if folder else None
+    where = hashlib.sha256(str(Path(jit.__file__).parent).encode()).hexdigest()[:8]
+    return Path(folder) / f"warm-{binding.get_host_cpu_name()}-{where}" if folder else None
 
 
 def warm_up_elsewhere() -> None:

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from scas4d_core import warm_up
+from scas4d_core.kernels import jit
 
 
 @pytest.mark.parametrize("there", [False, True])
@@ -29,6 +30,14 @@ def test_the_mark_is_in_the_cache_of_this_version():
     assert mark is not None
     assert mark.parent.name.startswith("kernels-")
     assert mark.name.startswith("warm-")
+
+
+def test_a_checkout_elsewhere_has_a_mark_of_its_own(monkeypatch):
+    here = warm_up.marker()
+    monkeypatch.setattr(jit, "__file__", "/elsewhere/scas4d_core/kernels/jit.py")
+    there = warm_up.marker()
+    assert here != there
+    assert here.parent == there.parent
 
 
 def test_where_it_fails_the_scene_is_not_kept_from_starting(tmp_path, monkeypatch, caplog):
