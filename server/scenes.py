@@ -70,9 +70,12 @@ class Scenes:
         self._deleted = (server.data / "deleted").resolve()
         self._lock: FolderLock | None = None
         self._making = 0
+        self._found: list[str] = []
+        """Folders found at the start. What comes after `by_id` and `unreadable` have it is recovered."""
+        self._recovering: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
-        """Finds the scenes of the data folder and takes them up again; finishes deletions that were interrupted.
+        """Finds the scenes of the data folder; taking them up again goes on behind, a journal may be that of a day.
 
         Raises:
             RuntimeError: another service is at work in the data folder.
@@ -80,19 +83,50 @@ class Scenes:
         for folder in (self._folder, self._deleted):
             folder.mkdir(parents=True, exist_ok=True)
         self._lock = hold(self.server.data)
-        await asyncio.to_thread(self._clean)
-        for folder in sorted(path for path in self._folder.iterdir() if path.is_dir()):
-            await self._restore(folder)
-        self.by_id = dict(sorted(self.by_id.items(), key=lambda item: item[1].created))
+        self._found = await asyncio.to_thread(self._folders)
+        self._recovering = asyncio.create_task(self._recover())
 
-    def _clean(self) -> None:
-        """Removes scenes that are deleted, and folders of scenes that were never acknowledged."""
-        for path in self._folder.iterdir():
-            if path.is_dir() and is_nothing(path):
+    def _folders(self) -> list[str]:
+        """Of scenes; those that were never acknowledged are put with what is deleted."""
+        found = []
+        for path in sorted(path for path in self._folder.iterdir() if path.is_dir()):
+            if is_nothing(path):
                 path.rename(self._deleted / f"{path.name}-{secrets.token_hex(4)}")
+            else:
+                found.append(path.name)
         sync_folder(self._folder)
-        for path in self._deleted.iterdir():
-            shutil.rmtree(path, ignore_errors=True)
+        return found
+
+    async def _recover(self) -> None:
+        """Takes up what was found, one scene after the other, and finishes deletions that were interrupted."""
+        graves = list(self._deleted.iterdir())
+        for name in self._found:
+            try:
+                await self._restore(self._folder / name)
+            except Exception as error:  # a fault of one scene is none of the others
+                self.unreadable[name] = f"the service failed: {type(error).__name__}: {error}"
+                log.exception("scene %s cannot be taken up", name)
+        for path in graves:
+            await asyncio.to_thread(shutil.rmtree, path, ignore_errors=True)
+
+    def check_recovered(self, id: str | None = None) -> None:
+        """Returns where what was found at the start, or one scene of it, is taken up again.
+
+        Raises:
+            Problem: 503, with how many are.
+        """
+        missing = [name for name in self._found if name not in self.by_id and name not in self.unreadable]
+        if id not in missing and (id is not None or not missing):
+            return
+        raise Problem(
+            503,
+            f"recovering {len(self._found) - len(missing)} of {counted(len(self._found), 'scene')}",
+            field="id" if id is not None else None,
+            value=id,
+            remedy="ask again: what was acknowledged is on disk, and is being read",
+            headers={"Retry-After": "1"},
+            recovering=missing,
+        )
 
     async def _restore(self, folder: Path) -> None:
         try:
@@ -111,14 +145,16 @@ class Scenes:
             return
         for said in found.damage:
             log.warning("scene %s: %s", definition.id, said)
-        self.by_id[definition.id] = scene
+        self.by_id = dict(sorted([*self.by_id.items(), (scene.id, scene)], key=lambda item: item[1].created))
 
     async def create(self, request: SceneCreate, settings: Settings) -> Scene:
         """A new scene with its processes started; it is on disk when this returns.
 
         Raises:
-            Problem: 429, as many scenes run as may; 507, the disk is full.
+            Problem: 429, as many scenes run as may; 503, those found at the start are still being recovered; 507, the
+                disk is full.
         """
+        self.check_recovered()  # they count
         if len(self.by_id) + self._making >= self.server.max_scenes:
             raise Problem(
                 429,
@@ -159,6 +195,7 @@ class Scenes:
     def __getitem__(self, id: str) -> Scene:
         scene = self.by_id.get(id)
         if scene is None:
+            self.check_recovered(id)
             reason = f": {self.unreadable[id]}" if id in self.unreadable else ""
             raise Problem(
                 404, f"no scene {id!r}{reason}", field="id", value=id, remedy="GET /v1/scenes lists the scenes"
@@ -168,6 +205,7 @@ class Scenes:
     async def delete(self, id: str) -> None:
         """Ends the scene's processes and removes its folder. From the rename on it is gone, whatever happens."""
         scene = self[id]
+        self._found = [name for name in self._found if name != id]
         del self.by_id[id]
         self.hub.close(id, "the scene was deleted")
         await scene.stop()
@@ -182,6 +220,9 @@ class Scenes:
 
     async def stop(self) -> None:
         """Ends all processes; the folders stay."""
+        if self._recovering is not None:
+            self._recovering.cancel()
+            await asyncio.wait([self._recovering])
         await asyncio.gather(*(scene.stop() for scene in self.by_id.values()))
         if self._lock is not None:
             self._lock.release()

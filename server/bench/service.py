@@ -59,7 +59,7 @@ class Service:
         until = time.monotonic() + START_S
         while True:
             with contextlib.suppress(httpx.TransportError):
-                if self.http.get("/health/live").status_code == 200:
+                if self.http.get("/health/ready").status_code == 200:
                     return
             if self._process.poll() is not None or time.monotonic() > until:
                 raise StudyError(f"the service does not start; {self.data.name}.log beside its folder says why")

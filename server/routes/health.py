@@ -20,6 +20,7 @@ async def live(scenes: AllScenes) -> Health:
 
 @router.get("/ready")
 async def ready(request: Request, scenes: AllScenes) -> Health:
-    """The kernels are compiled and the service takes frames; `ready_after` says how long that took. 503 until then."""
+    """Scenes are recovered and kernels compiled; `ready_after` says how long the kernels took. 503 until then."""
+    scenes.check_recovered()
     readiness: Readiness = request.app.state.readiness
     return Health(status="ready", version=__version__, scenes=len(scenes.by_id), ready_after=readiness.check())

@@ -66,7 +66,8 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
 
 @router.get("")
 async def listed(scenes: AllScenes) -> SceneList:
-    """All scenes."""
+    """All scenes; 503 while those of an earlier run are being recovered."""
+    scenes.check_recovered()
     return SceneList(scenes=[scene.status() for scene in scenes.by_id.values()])
 
 

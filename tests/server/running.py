@@ -14,6 +14,7 @@ from PIL import Image
 from scas4d_core.cameras import Camera, Rig
 from server.app import create_app
 from server.connection import Connection, Socket
+from server.problems import Problem
 from server.settings import ServerSettings
 
 WIDTH, HEIGHT = 24, 16
@@ -22,7 +23,7 @@ WIDTH, HEIGHT = 24, 16
 class Running:
     """A uvicorn server in a thread."""
 
-    def __init__(self, settings, port=None):
+    def __init__(self, settings, port=None, ready=True):
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = port or free.getsockname()[1]
@@ -32,10 +33,18 @@ class Running:
         self.thread = threading.Thread(target=self.server.run)
         self.thread.start()
         until = time.monotonic() + 20
-        while not self.server.started:
+        while not (self.server.started and self.recovered(ready)):
             assert time.monotonic() < until
             time.sleep(0.02)
         self.url = f"http://127.0.0.1:{self.port}"
+
+    def recovered(self, asked):
+        try:
+            if asked:
+                self.app.state.scenes.check_recovered()
+        except Problem:
+            return False
+        return True
 
     def stop(self):
         self.server.should_exit = True

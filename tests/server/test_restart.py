@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import threading
 import time
 
 import fakes
@@ -15,6 +16,7 @@ from running import Running, fake_settings, make_rig, picture, pictures, problem
 from client.sdk import Client
 from client.wire import RigModel
 from scas4d_core.captures import InitialPoints
+from server import recovery
 from server.ledger import LOST
 
 
@@ -116,7 +118,10 @@ def test_a_deletion_that_was_cut_short_is_finished_and_half_a_scene_is_none(tmp_
     (tmp_path / "scenes" / "half" / "frames").mkdir(parents=True)  # made, never acknowledged
     with serving(tmp_path) as (http, _):
         assert [scene["id"] for scene in http.get("/v1/scenes").json()["scenes"]] == [kept]
-        assert list((tmp_path / "deleted").iterdir()) == []
+        until = time.monotonic() + 20
+        while list((tmp_path / "deleted").iterdir()):  # behind the service that answers already
+            assert time.monotonic() < until
+            time.sleep(0.02)
         assert sorted(path.name for path in (tmp_path / "scenes").iterdir()) == [kept]
 
 
@@ -155,6 +160,59 @@ def test_a_lost_journal_costs_the_facts_and_no_state(tmp_path):
         assert sdk.render(id, "c0", 0).shape
         put(http, id, 4)
         assert sdk.wait(id, 4).state == "committed"
+
+
+def test_it_answers_while_scenes_are_recovered(tmp_path, monkeypatch):
+    with serving(tmp_path) as (http, _):
+        first, second = create(http), create(http)
+        put(http, first, 0)
+    go_on = threading.Semaphore(0)
+
+    def recover(*given):
+        assert go_on.acquire(timeout=60)
+        return recovery.recover(*given)
+
+    monkeypatch.setattr("server.scenes.recover", recover)
+    running = Running(fake_settings(tmp_path), ready=False)
+    try:
+        with httpx.Client(base_url=running.url, timeout=30) as http:
+            assert http.get("/health/live").json()["status"] == "live"
+            answer = http.get("/health/ready")
+            assert "recovering 0 of 2 scenes" in problem(answer, 503)["detail"]
+            assert answer.headers["Retry-After"]
+            for call in (http.get(f"/v1/scenes/{first}"), http.get("/v1/scenes"), http.delete(f"/v1/scenes/{second}")):
+                assert "recovering" in problem(call, 503)["detail"]
+            assert problem(put(http, second, 0), 503)["value"] == second
+            problem(http.get("/v1/scenes/none"), 404)
+            problem(http.post("/v1/scenes", json={"rig": RigModel.of(make_rig()).model_dump(mode="json")}), 503)
+            go_on.release()
+            until = time.monotonic() + 20
+            while not (found := [id for id in (first, second) if http.get(f"/v1/scenes/{id}").status_code == 200]):
+                assert time.monotonic() < until
+                time.sleep(0.02)
+            assert len(found) == 1
+            assert problem(http.get("/health/ready"), 503)["recovering"] == [({first, second} - set(found)).pop()]
+            go_on.release()
+            while http.get("/health/ready").status_code != 200:
+                assert time.monotonic() < until
+                time.sleep(0.02)
+            assert [scene["id"] for scene in http.get("/v1/scenes").json()["scenes"]] == [first, second]
+    finally:
+        go_on.release(5)
+        running.stop()
+
+
+def test_a_service_that_ends_while_scenes_are_recovered_leaves_them_as_they_are(tmp_path, monkeypatch):
+    with serving(tmp_path) as (http, _):
+        id = create(http)
+    go_on = threading.Semaphore(0)
+    monkeypatch.setattr("server.scenes.recover", lambda *given: go_on.acquire(timeout=60) and recovery.recover(*given))
+    running = Running(fake_settings(tmp_path), ready=False)
+    threading.Timer(0.5, go_on.release).start()
+    running.stop()
+    monkeypatch.undo()
+    with serving(tmp_path) as (http, _):
+        assert http.get(f"/v1/scenes/{id}").json()["damage"] == []
 
 
 def test_two_services_do_not_share_a_folder(tmp_path):
