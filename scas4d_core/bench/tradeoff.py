@@ -2,6 +2,8 @@
 
 Accuracy is that of the rows, over the same updates for all of a capture. Seconds are those of ``bench.timing``; where
 there are none, those of the row: CPU seconds if it ran on one thread, for they mind little what else a machine does.
+A setting that was not timed on a capture where others were has the seconds of its row, times what the default's timed
+seconds are to those of its row: so all seconds of a capture mean the same.
 """
 
 from __future__ import annotations
@@ -70,10 +72,13 @@ def read_points(out: Path, captures: Sequence[str], updates: int) -> list[Point]
     points = []
     for capture in captures:
         times = read_times(out, capture)
+        default, scale = time_of(times, DEFAULT.settings), 1.0
+        if default is not None and (row := row_of(rows, DEFAULT, capture, updates)) is not None:
+            scale = default["seconds"] / _own_seconds(row)
         for variant in variants():
             row = row_of(rows, variant, capture, updates)
             if row is not None:
-                points.append(_point(variant, row, time_of(times, variant.settings)))
+                points.append(_point(variant, row, time_of(times, variant.settings), scale))
     return points
 
 
@@ -160,12 +165,18 @@ def spread(points: Iterable[Point], method: str, capture: str, score: str = "psn
     return (float(np.std(known, ddof=1)), len(known)) if len(known) > 1 else None
 
 
-def _point(variant: Variant, row: Row, timed: Row | None) -> Point:
+def _own_seconds(row: Row) -> float:
+    """Of an update, as the row itself has them."""
     alone = row["machine"].get("threads") == 1 and "cpu_seconds_update" in row
+    return float(row["cpu_seconds_update" if alone else "seconds_update"])
+
+
+def _point(variant: Variant, row: Row, timed: Row | None, scale: float) -> Point:
+    seconds = scale * _own_seconds(row)
     known: Any = timed or {
-        "seconds": row["cpu_seconds_update" if alone else "seconds_update"],
+        "seconds": seconds,
         "cpu_seconds": row.get("cpu_seconds_update"),
-        "stages": row["seconds_stages"],
+        "stages": {name: seconds * part / row["seconds_update"] for name, part in row["seconds_stages"].items()},
     }
     return Point(
         variant=variant,

@@ -168,6 +168,10 @@ def test_seconds_are_those_measured_in_turns_where_there_are_any(tmp_path):
     timed = {p.capture: p for p in points if p.variant == DEFAULT}
     assert (timed["robot"].seconds, timed["robot"].cpu_seconds, timed["robot"].timed) == (0.125, 0.25, True)
     assert (timed["wheel"].seconds, timed["wheel"].timed) == (made_seconds(DEFAULT), False)
+    (beside,) = [p for p in points if p.capture == "robot" and p.variant.label == "scas4d 300"]
+    assert beside.seconds == pytest.approx(3 * 0.125)  # not timed itself: as its row is to the default's
+    assert not beside.timed
+    assert sum(beside.stages.values()) == pytest.approx(beside.seconds / 7)  # as its row's were of its row's seconds
     (mean,) = [p for p in mean_points(points, ["robot", "wheel"]) if p.variant == DEFAULT]
     assert mean.seconds == pytest.approx((0.125 + made_seconds(DEFAULT)) / 2)
     assert mean.cpu_seconds == pytest.approx((0.25 + made_seconds(DEFAULT)) / 2)
