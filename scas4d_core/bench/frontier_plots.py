@@ -232,11 +232,11 @@ def _key(plt: Any, marker: str, colour: str, words: str) -> Any:
 
 
 def _log_seconds(axes: Any, label: bool = True) -> None:
-    """A logarithmic axis; without a label it is a small panel's, with a tick a decade."""
+    """A logarithmic axis; without a label it is a small panel's, with fewer ticks."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if label else (1,)))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if label else (1, 3)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     if label:
