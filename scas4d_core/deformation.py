@@ -14,6 +14,8 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from scas4d_core.guards import EMPTY_CLUSTER, HALF_TURN
+
 ClusterMap = Literal["centred", "published"]
 """Which form of equation (6): scaling about the cluster's pivot, or about the world's origin as published."""
 
@@ -154,14 +156,14 @@ def polar_rotation(f: Tensor, y: Tensor, c: Tensor) -> Tensor:
     sine = g * torch.linalg.cross(c, y)
     radius: Tensor = torch.linalg.vector_norm(torch.cat([cosine, sine], dim=-1), dim=-1, keepdim=True)
     # A half turn (cosine < 0, sine = 0) needs a map that folds space; it then counts as no rotation instead of NaN.
-    return _normalized(torch.cat([(radius + cosine).clamp_min(1e-12), sine], dim=-1))
+    return _normalized(torch.cat([(radius + cosine).clamp_min(HALF_TURN), sine], dim=-1))
 
 
 def cluster_pivots(points: Tensor, labels: Tensor, count: int) -> Tensor:
     """[count, 3] means of the clusters' points, detached: no gradient flows through a pivot. Empty clusters get 0."""
     points = points.detach()
     sums = torch.zeros(count, 3, dtype=points.dtype, device=points.device).index_add_(0, labels, points)
-    sizes = torch.bincount(labels, minlength=count).clamp_min(1)
+    sizes = torch.bincount(labels, minlength=count).clamp_min(int(EMPTY_CLUSTER))
     return sums / sizes[:, None].to(points.dtype)
 
 

@@ -1,6 +1,9 @@
 """D_t on the CPU: the parameters of one frame's deformation, and the fused kernels that apply and differentiate it.
 
 Twin: ``deformation``. Buffers are allocated once per hierarchy.
+
+A Gaussian that is not finite when an update starts is held back: it stays as it is, weighs nothing in the pivots of its
+clusters and in the neighbour terms, and is counted.
 """
 
 from __future__ import annotations
@@ -11,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.guards import GuardCounts
 from scas4d_core.hierarchy import Hierarchy
 from scas4d_core.kernels import neighbour_terms
-from scas4d_core.kernels.cascade import PARAMETERS, RECORD, TABLE
-from scas4d_core.kernels.deform import block_sums, deform, deform_backward
+from scas4d_core.kernels.cascade import ACTED, PARAMETERS, RECORD, TABLE
+from scas4d_core.kernels.deform import BLOCKS, block_sums, deform, deform_backward
 from scas4d_core.kernels.deltas import PREVIOUS, STATE, TIED, TURN
 from scas4d_core.kernels.lanes import COUNT
 from scas4d_core.neighbours import Neighbours
@@ -30,6 +34,9 @@ class CpuDeformation:
         cluster_gradients, delta_gradients: the same shapes, filled by ``backward``.
         means [N, 3], factors [N, 3, 3]: of all Gaussians, filled by ``forward``.
         turns: [M, 4], rotation since the frame before, filled by ``forward``.
+        held_back: [held] int64, rows of Θ_{t−1} that are not finite, found by ``start``.
+        guards: how often each guard acted since the last ``reset`` of the counts: those of ``cascade.ACTED`` each
+            ``forward``, the others each ``start``.
     """
 
     def __init__(
@@ -48,6 +55,8 @@ class CpuDeformation:
         blocks = Blocks.of(hierarchy)
         self._offsets, self._ranges, self._clusters_of = blocks.offsets, blocks.ranges, blocks.clusters
         self._entries, self._rows, self._present = blocks.entries, hierarchy.rows[blocks.entries], blocks.present
+        self._all_present, self._all_ranges = blocks.present, blocks.ranges
+        self._weights = np.zeros((count, 0), np.float32) if neighbours is None else neighbours.weights
         self._parameters = np.zeros((blocks.offsets[-1], PARAMETERS), np.float32)
         self._gradients = np.zeros_like(self._parameters)
         self._tables = np.zeros((len(self._parameters), TABLE), np.float32)
@@ -70,23 +79,57 @@ class CpuDeformation:
         self._neighbour_sums = np.zeros((neighbour_terms.TASKS, 3), np.float32)
         self.means = np.zeros((0, 3), np.float32)
         self.factors = np.zeros((0, 3, 3), np.float32)
+        self.guards = GuardCounts(*ACTED, "held_back", "empty_cluster")
+        self._acted = np.zeros((-(-held // BLOCKS), len(ACTED)), np.int64)
+        self.held_back = np.zeros(0, np.int64)
+        self._held: tuple[Array, Array] = self.means, self.factors
 
     def start(self, previous: Gaussians) -> None:
         """Take Θ_{t−1} to deform; standing Gaussians stay as they are in it."""
-        self._state[:, PREVIOUS : PREVIOUS + 3] = previous.means[self.hierarchy.rows]
-        self._points[0] = np.swapaxes(previous.means[self._rows], 1, 2)
-        self._before[:] = np.swapaxes(previous.factors[self._rows].reshape(*self._rows.shape, 9), 1, 2)
+        moving = self.hierarchy.rows
+        held = np.concatenate([previous.means[moving], previous.factors[moving].reshape(-1, 9)], axis=1)
+        sound: NDArray[np.bool_] = np.isfinite(held).all(axis=1)
+        self.held_back = moving[~sound]
+        self._held = previous.means[self.held_back], previous.factors[self.held_back]
+        means, factors = previous.means, previous.factors
+        if len(self.held_back):
+            means, factors = means.copy(), factors.copy()
+            means[self.held_back] = means[moving[sound]].mean(axis=0) if sound.any() else 0
+            factors[self.held_back] = 0
+        self._hold_back(sound)
+        self._state[:, PREVIOUS : PREVIOUS + 3] = means[moving]
+        self._points[0] = np.swapaxes(means[self._rows], 1, 2)
+        self._before[:] = np.swapaxes(factors[self._rows].reshape(*self._rows.shape, 9), 1, 2)
         block_sums(self._points, self._present, self._sums)
         self.means = previous.means.copy()
         self.factors = previous.factors.copy()
+
+    def _hold_back(self, sound: NDArray[np.bool_]) -> None:
+        """Pivots and neighbour terms without the entries [M] that are not sound; count them."""
+        self._present, self._ranges = self._all_present, self._all_ranges
+        if self.neighbours is not None:
+            self._weights = self.neighbours.weights
+        if not sound.all():
+            self._present = self._all_present * sound[self._entries]
+            self._ranges = self._all_ranges.copy()
+            for layer, starts in enumerate(self.hierarchy.starts):
+                held = np.concatenate([[0], np.cumsum(~sound)])
+                self._ranges[self._offsets[layer] : self._offsets[layer + 1], 2] -= held[starts[1:]] - held[starts[:-1]]
+            if self.neighbours is not None:
+                pairs = sound[:, None] & sound[self.neighbours.index]
+                self._weights = np.where(pairs, self.neighbours.weights, np.float32(0))
+        empty = int(np.count_nonzero(self._ranges[:, 2] == 0))
+        self.guards.add(("held_back", "empty_cluster"), np.array([len(self.held_back), empty]))
 
     def forward(self) -> None:
         """Equations (5) to (7): fill ``means``, ``factors`` and ``turns``."""
         deform(
             self._parameters, self._offsets, self._ranges, self._clusters_of, self._entries, self._rows, self._present,
             self._before, self.deltas, self._about_origin, self._points, self._sums, self._tables,
-            self.means, self.factors, self._state,
+            self.means, self.factors, self._state, self._acted,
         )  # fmt: skip
+        self.means[self.held_back], self.factors[self.held_back] = self._held
+        self.guards.add(ACTED, self._acted)
 
     def neighbour_losses(self, sample: NDArray[np.int64], weights: tuple[float, float, float]) -> Array:
         """Means over the sampled pairs of rigidity, isometry and rotation; ``backward`` adds their gradients.
@@ -99,7 +142,7 @@ class CpuDeformation:
             return np.zeros(3, np.float32)
         pairs = max(1, len(sample) * self.neighbours.index.shape[1])
         neighbour_terms.neighbour_terms(
-            self._state, sample, self.neighbours.index, self.neighbours.weights, self.neighbours.distances,
+            self._state, sample, self.neighbours.index, self._weights, self.neighbours.distances,
             np.array(weights, np.float32) / np.float32(pairs), self._accumulators, self._neighbour_sums,
         )  # fmt: skip
         means: Array = self._neighbour_sums.sum(axis=0) / pairs

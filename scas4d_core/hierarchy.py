@@ -2,6 +2,8 @@
 
 Clusters are numbered so that, with Gaussians sorted by their finest cluster, every cluster of every layer is one
 contiguous range: the kernels and the sums of gradients rely on it.
+
+Gaussians that are not finite are in no cluster: they stand, and are counted (``guards.LEFT_OUT``).
 """
 
 from __future__ import annotations
@@ -32,11 +34,13 @@ class Hierarchy:
         rows: [M] int64, the moving Gaussians' rows in Θ, in the order that makes clusters contiguous.
         labels: per layer, coarse to fine, [M] int32 cluster of each entry of ``rows``; ascending.
         starts: per layer [K + 1] int64, each cluster's range of entries.
+        left_out: moving Gaussians that are not finite and so in no cluster.
     """
 
     rows: Int
     labels: tuple[NDArray[np.int32], ...]
     starts: tuple[Int, ...]
+    left_out: int = 0
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -50,7 +54,7 @@ def build_hierarchy(
     """Cluster the moving Gaussians.
 
     Args:
-        means: [N, 3] metres. moving: [N]; the others belong to no cluster.
+        means: [N, 3] metres; not finite ones belong to no cluster. moving: [N]; nor do the others.
         clusters: wished clusters per layer, coarse to fine, ascending; capped so that ``smallest`` Gaussians fall into
             each on average. Empty: no layer.
         seed: of K-means.
@@ -60,11 +64,13 @@ def build_hierarchy(
     """
     if any(a >= b for a, b in pairwise(clusters)):
         raise ValueError(f"clusters {clusters} must ascend from the coarsest layer to the finest")
-    rows = np.flatnonzero(moving)
+    finite = np.isfinite(means).all(axis=1)
+    rows = np.flatnonzero(moving & finite)
+    left_out = int(np.count_nonzero(moving & ~finite))
     cap = max(1, len(rows) // smallest)
     sizes = tuple(dict.fromkeys(min(size, cap) for size in clusters)) if len(rows) else ()
     if not sizes:
-        return Hierarchy(rows, (), ())
+        return Hierarchy(rows, (), (), left_out)
     points = np.asarray(means, dtype=np.float64)[rows]
     # Libraries sum in the order of their threads: one thread, so that the same scene gets the same clusters.
     with threadpool_limits(limits=1):
@@ -80,7 +86,7 @@ def build_hierarchy(
         begin = np.concatenate([[0], changes, [len(ordered)]]).astype(np.int64)
         labels.append(np.repeat(np.arange(len(begin) - 1, dtype=np.int32), np.diff(begin)))
         starts.append(begin)
-    return Hierarchy(rows[order], tuple(labels), tuple(starts))
+    return Hierarchy(rows[order], tuple(labels), tuple(starts), left_out)
 
 
 def _kmeans(points: NDArray[np.float64], count: int, seed: int) -> Int:

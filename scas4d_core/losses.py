@@ -14,19 +14,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from scas4d_core.deformation import quaternion_matrices
+from scas4d_core.guards import ROOT_FLOOR, SMALLEST_SQUARE, SSIM_C1, SSIM_C2
 
 SSIM_WINDOW = 11
 """Pixels across the Gaussian window (Wang et al. 2004)."""
 SSIM_SIGMA = 1.5
 """Pixels, standard deviation of the window."""
-SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
-"""Stabilizers, for values in 0…1."""
 SSIM_SHARE = 0.2
 """Share of 1 − SSIM in the image loss; the rest is L1 (Kerbl et al. 2023)."""
-SMALLEST_SQUARE = 1e-9
-"""Sum of squared differences below which two pictures count as equal: PSNR stays finite."""
-ROOT_FLOOR = 1e-20
-"""Under the square roots of the neighbour terms, so that their gradient is 0 and not NaN where nothing has moved."""
 
 
 @functools.cache

@@ -1,15 +1,18 @@
 """Frame 0's free parameters to what the rasterizer reads, and back. Twin: the same formulas in torch, in the tests.
 
-F = R(q/|q|) diag(exp s); opacity = sigmoid(o); label = sigmoid(m).
+F = R(q/|q|) diag(exp s); opacity = sigmoid(o); label = sigmoid(m). A quaternion without a direction is no rotation:
+``guards.QUATERNION_FLOOR``.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numba import prange
+from numpy.typing import NDArray
 
+from scas4d_core.guards import EXPONENT, QUATERNION_FLOOR
 from scas4d_core.kernels.cascade import rotation_entries, rotation_gradient
-from scas4d_core.kernels.jit import ONE, ZERO, exp, parallel_kernel
+from scas4d_core.kernels.jit import LOG2_E, ONE, ZERO, exp, inline, parallel_kernel
 
 CHUNK = 256
 
@@ -17,15 +20,57 @@ CHUNK = 256
 COLUMNS = 15
 
 
+SHORTEST = np.float32(QUATERNION_FLOOR)
+LARGEST = np.float32(EXPONENT) / LOG2_E
+
+ACTED = ("quaternion_floor", "exponent")
+"""What ``activate`` counts."""
+
+
+def activate(
+    parameters: NDArray[np.float32],
+    means: NDArray[np.float32],
+    factors: NDArray[np.float32],
+    opacities: NDArray[np.float32],
+    features: NDArray[np.float32],
+) -> NDArray[np.int64]:
+    """Fill means [N, 3], factors [N, 3, 3], opacities [N], features [N, 4] (RGB, label) from parameters [N, 15].
+
+    Returns:
+        [2] for how many Gaussians the guards in ``ACTED`` acted.
+    """
+    acted = np.zeros((-(-len(parameters) // CHUNK), len(ACTED)), np.int64)
+    activate_rows(parameters, means, factors, opacities, features, acted)
+    total: NDArray[np.int64] = acted.sum(axis=0)
+    return total
+
+
+@inline
+def direction(p):
+    """The unit quaternion of a row of parameters, and 1 over its length; no rotation and 0 where it has none."""
+    square = p[3] * p[3] + p[4] * p[4] + p[5] * p[5] + p[6] * p[6]
+    directed = square > SHORTEST
+    norm = ONE / np.float32(np.sqrt(square)) if directed else ZERO
+    w = p[3] * norm if directed else ONE
+    x = p[4] * norm if directed else ZERO
+    y = p[5] * norm if directed else ZERO
+    z = p[6] * norm if directed else ZERO
+    return w, x, y, z, norm
+
+
 @parallel_kernel
-def activate(parameters, means, factors, opacities, features):
-    """Fill means [N, 3], factors [N, 3, 3], opacities [N], features [N, 4] (RGB, label) from parameters [N, 15]."""
+def activate_rows(parameters, means, factors, opacities, features, acted):
+    """As ``activate``. ``acted``: out [tasks, 2]."""
     count = parameters.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):
+        aimless = clamped = 0
         for i in range(task * CHUNK, min(count, (task + 1) * CHUNK)):
             p = parameters[i]
-            norm = ONE / np.float32(np.sqrt(p[3] * p[3] + p[4] * p[4] + p[5] * p[5] + p[6] * p[6]))
-            entries = rotation_entries(p[3] * norm, p[4] * norm, p[5] * norm, p[6] * norm)
+            w, x, y, z, norm = direction(p)
+            aimless += norm == ZERO
+            largest = max(max(abs(p[7]), abs(p[8])), max(max(abs(p[9]), abs(p[10])), abs(p[14])))
+            clamped += largest > LARGEST
+            entries = rotation_entries(w, x, y, z)
             for column in range(3):
                 means[i, column] = p[column]
                 scale = exp(p[7 + column])
@@ -35,6 +80,8 @@ def activate(parameters, means, factors, opacities, features):
                 features[i, column] = p[11 + column]
             opacities[i] = ONE / (ONE + exp(-p[10]))
             features[i, 3] = ONE / (ONE + exp(-p[14]))
+        acted[task, 0] = aimless
+        acted[task, 1] = clamped
 
 
 @parallel_kernel
@@ -44,8 +91,7 @@ def activate_backward(parameters, factors, opacities, features, g_means, g_facto
     for task in prange((count + CHUNK - 1) // CHUNK):
         for i in range(task * CHUNK, min(count, (task + 1) * CHUNK)):
             p = parameters[i]
-            norm = ONE / np.float32(np.sqrt(p[3] * p[3] + p[4] * p[4] + p[5] * p[5] + p[6] * p[6]))
-            w, x, y, z = p[3] * norm, p[4] * norm, p[5] * norm, p[6] * norm
+            w, x, y, z, norm = direction(p)
             s0, s1, s2 = exp(p[7]), exp(p[8]), exp(p[9])
             g = g_factors[i]
             gw, gx, gy, gz = rotation_gradient(

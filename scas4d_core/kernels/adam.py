@@ -1,17 +1,26 @@
-"""A step of Adam (Kingma and Ba 2015) over a table of parameters, a rate per column. Twin: ``torch.optim.Adam``."""
+"""A step of Adam (Kingma and Ba 2015) over a table of parameters, a rate per column. Twin: ``torch.optim.Adam``.
+
+What is not finite or would not stay so is held, and counted: ``guards.GRADIENT_CEILING``, ``guards.MOMENT_FLOOR``.
+"""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import prange
+from numpy.typing import NDArray
 
-from scas4d_core.kernels.jit import ONE, parallel_kernel
+from scas4d_core.guards import ADAM_EPSILON, GRADIENT_CEILING, MOMENT_FLOOR
+from scas4d_core.kernels import lanes
+from scas4d_core.kernels.jit import ONE, ZERO, kernel, parallel_kernel
 
-EPSILON = np.float32(1e-15)
-"""As in Dynamic3DGaussians: gradients of single Gaussians are far below the usual 1e-8."""
+EPSILON = np.float32(ADAM_EPSILON)
+SMALLEST = np.float32(MOMENT_FLOOR)
+LARGEST = np.float32(GRADIENT_CEILING)
 
-SMALLEST = np.float32(1e-19)
-"""Gradients below are taken as 0: their squares would be denormal, which costs tens of times a normal number."""
+ACTED = ("gradient_ceiling", "moment_floor")
+"""What ``adam`` counts."""
 
 EVERY_ROW = np.ones(1, np.float32)
 """All rows alike."""
@@ -19,28 +28,75 @@ EVERY_ROW = np.ones(1, np.float32)
 ROWS = 1024
 
 
-@parallel_kernel
-def adam(parameters, gradients, first, second, rates, by_row, beta1, beta2, step):
+def adam(
+    parameters: NDArray[np.float32],
+    gradients: NDArray[np.float32],
+    first: NDArray[np.float32],
+    second: NDArray[np.float32],
+    rates: NDArray[np.float32],
+    by_row: NDArray[np.float32],
+    beta1: Any,
+    beta2: Any,
+    step: int,
+) -> NDArray[np.int64]:
     """Update ``parameters`` [n, columns] in place.
 
     Args:
-        gradients, first, second: [n, columns]; the moments are updated in place. rates: [columns].
+        gradients: [n, columns], C-contiguous; numbers that a guard holds are overwritten with what is taken for them.
+        first, second: [n, columns], moments, updated in place. rates: [columns].
         by_row: [n], what the rates of each row are multiplied with, or ``EVERY_ROW``.
         beta1, beta2: decays (float32). step: 1 for the first update.
+
+    Returns:
+        [2] how many numbers of the gradient the guards in ``ACTED`` held.
     """
+    acted = np.zeros((-(-len(parameters) // ROWS), len(ACTED)), np.int64)
+    adam_rows(parameters, gradients, first, second, rates, by_row, beta1, beta2, step, acted)
+    total: NDArray[np.int64] = acted.sum(axis=0)
+    return total
+
+
+@kernel
+def hold(gradients, first, last, acted):
+    """Bring the numbers from flat index ``first`` to before ``last`` within the guards; add to ``acted`` [2]."""
+    columns = gradients.shape[1]
+    # First whether there is anything to do: NaN and infinity stay in a sum.
+    total, least = lanes.fill(ZERO), lanes.fill(ONE)
+    for place in range(first, last, lanes.COUNT):
+        size = lanes.magnitude(lanes.load_first(gradients, place, last - place))
+        total += size
+        least = lanes.choose(size > ZERO, lanes.minimum(size, least), least)
+    if lanes.sum_of(total) <= LARGEST and not lanes.any_of(least <= SMALLEST):
+        return
+    for k in range(first, last):
+        given = gradients[k // columns, k % columns]
+        size = abs(given)
+        if not size <= LARGEST:
+            # NaN is neither above nor below 0: it becomes 0.
+            gradients[k // columns, k % columns] = LARGEST if given > ZERO else (-LARGEST if given < ZERO else ZERO)
+            acted[0] += 1
+        elif ZERO < size <= SMALLEST:
+            gradients[k // columns, k % columns] = ZERO
+            acted[1] += 1
+
+
+@parallel_kernel
+def adam_rows(parameters, gradients, first, second, rates, by_row, beta1, beta2, step, acted):
+    """As ``adam``. ``acted``: [tasks, 2], added to."""
     rows, columns = parameters.shape
     correction1 = ONE - np.float32(beta1**step)
     correction2 = ONE - np.float32(beta2**step)
+    for task in prange((rows + ROWS - 1) // ROWS):
+        hold(gradients, task * ROWS * columns, min(rows, (task + 1) * ROWS) * columns, acted[task])
     for task in prange((rows + ROWS - 1) // ROWS):
         for i in range(task * ROWS, min(rows, (task + 1) * ROWS)):
             row = by_row[i] if by_row.shape[0] > 1 else by_row[0]
             for k in range(columns):
                 g = gradients[i, k]
-                g = g if abs(g) > SMALLEST else np.float32(0.0)
                 m = beta1 * first[i, k] + (ONE - beta1) * g
                 v = beta2 * second[i, k] + (ONE - beta2) * g * g
-                m = m if abs(m) > SMALLEST else np.float32(0.0)
-                v = v if v > SMALLEST * SMALLEST else np.float32(0.0)
+                m = m if abs(m) > SMALLEST else ZERO
+                v = v if v > SMALLEST * SMALLEST else ZERO
                 first[i, k] = m
                 second[i, k] = v
                 parameters[i, k] -= row * rates[k] * (m / correction1) / (np.sqrt(v / correction2) + EPSILON)

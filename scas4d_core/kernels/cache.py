@@ -2,7 +2,8 @@
 
 Numba keeps a compiled function as long as the file that holds it does not change. A kernel also contains what it calls
 from other files, which Numba does not look at: after an edit there it would go on with the old code. So the folder is
-named by a digest of all files here, and folders of earlier versions are removed.
+named by a digest of all files here and of the guards, whose values they contain; folders of earlier versions are
+removed.
 """
 
 from __future__ import annotations
@@ -20,10 +21,13 @@ KEPT = 3
 """Versions: several checkouts may share a cache."""
 
 
+GUARDS = Path(__file__).parent.parent / "guards.py"
+
+
 def digest(folder: Path = Path(__file__).parent) -> str:
-    """Of the names and contents of a folder's Python files."""
+    """Of the names and contents of a folder's Python files, and of the guards."""
     found = hashlib.sha256()
-    for path in sorted(folder.glob("*.py")):
+    for path in [*sorted(folder.glob("*.py")), GUARDS]:
         found.update(f"{path.name}\0".encode() + hashlib.sha256(path.read_bytes()).digest())
     return found.hexdigest()[:16]
 

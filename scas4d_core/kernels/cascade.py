@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from scas4d_core.guards import EMPTY_CLUSTER, EXPONENT, HALF_TURN
 from scas4d_core.kernels import lanes
-from scas4d_core.kernels.jit import ONE, TWO, ZERO, inline, kernel
+from scas4d_core.kernels.jit import LOG2_E, ONE, TWO, ZERO, inline, kernel
 
 # Columns of a cluster's table: rotation matrix 0–8, quaternion 9–12, pivot 13–15, translation 16–18, c 19–21, s 22.
 TABLE = 23
@@ -23,6 +24,13 @@ TABLE = 23
 PARAMETERS = 10
 # A block's share of its cluster's gradient: rotation matrix 0–8, quaternion 9–12, t 13–15; then c 16–18, s 19.
 RECORD = 2 * lanes.COUNT
+
+LEAST = np.float32(HALF_TURN)
+FEWEST = int(EMPTY_CLUSTER)
+LARGEST = np.float32(EXPONENT) / LOG2_E
+
+ACTED = ("exponent", "half_turn", "folded")
+"""What ``carry`` counts."""
 
 
 @inline
@@ -70,7 +78,7 @@ def cluster_table(parameters, sums, first, last, count, table):
         px += sums[block, 0]
         py += sums[block, 1]
         pz += sums[block, 2]
-    count = max(count, 1)
+    count = max(count, FEWEST)
     table[13], table[14], table[15] = px / count, py / count, pz / count
     rx, ry, rz = parameters[0], parameters[1], parameters[2]
     w = ONE / np.float32(np.sqrt(ONE + rx * rx + ry * ry + rz * rz))
@@ -85,7 +93,7 @@ def cluster_table(parameters, sums, first, last, count, table):
 
 @inline
 def scaled(table, about_origin, x, y, z):
-    """f, y and u of points: u is what the factor multiplies, R y or R y + p + t."""
+    """f, y and u of points: u is what the factor multiplies, R y or R y + p + t; and −2z."""
     r0, r1, r2, r3, r4, r5, r6, r7, r8 = (
         table[0], table[1], table[2], table[3], table[4], table[5], table[6], table[7], table[8]
     )  # fmt: skip
@@ -95,13 +103,13 @@ def scaled(table, about_origin, x, y, z):
     ux = yx * r0 + yy * r1 + yz * r2 + about_origin * (table[13] + table[16])
     uy = yx * r3 + yy * r4 + yz * r5 + about_origin * (table[14] + table[17])
     uz = yx * r6 + yy * r7 + yz * r8 + about_origin * (table[15] + table[18])
-    return f, yx, yy, yz, ux, uy, uz
+    return f, yx, yy, yz, ux, uy, uz, exponent
 
 
 @inline
 def moved(table, about_origin, x, y, z):
     """Points after a layer."""
-    f, _, _, _, ux, uy, uz = scaled(table, about_origin, x, y, z)
+    f, _, _, _, ux, uy, uz, _ = scaled(table, about_origin, x, y, z)
     centred = ONE - about_origin
     return (
         f * ux + centred * (table[13] + table[16]),
@@ -115,8 +123,8 @@ def polar(table, about_origin, f, yx, yy, yz):
     """The polar rotation of f I + f' e cᵀ, which acts in the plane of e and c; the common factor f is left out.
 
     Returns:
-        The quaternion a (4); what the backward needs: e (3), e·c, c × e (3), cosine, sine (3), their length rho, and
-        the quaternion's scale.
+        The quaternion a (4); what the backward needs: e (3), e·c, c × e (3), cosine, sine (3), their length rho, the
+        quaternion's scale, and rho + cosine.
     """
     cx, cy, cz = table[19], table[20], table[21]
     mx, my, mz = table[13] + table[16], table[14] + table[17], table[15] + table[18]
@@ -130,23 +138,28 @@ def polar(table, about_origin, f, yx, yy, yz):
     sx, sy, sz = m * nx, m * ny, m * nz
     square = sx * sx + sy * sy + sz * sz
     rho = lanes.square_root(cosine * cosine + square)
-    h = lanes.maximum(lanes.fill(np.float32(1e-12)), rho + cosine)
+    half = rho + cosine
+    h = lanes.maximum(lanes.fill(LEAST), half)
     scale = lanes.fill(ONE) / lanes.square_root(h * h + square)
-    return h * scale, sx * scale, sy * scale, sz * scale, ex, ey, ez, dot, nx, ny, nz, cosine, sx, sy, sz, rho, scale
+    return (
+        h * scale, sx * scale, sy * scale, sz * scale, ex, ey, ez, dot, nx, ny, nz, cosine, sx, sy, sz, rho, scale, half
+    )  # fmt: skip
 
 
 @kernel
-def carry(table, about_origin, points, place, v):
+def carry(table, about_origin, points, place, v, present, lane, acted):
     """Factors and turns of a block through a layer, in place.
 
     Args:
         table: [23] of its cluster. points: x, y, z of the block from flat index ``place`` on, as they enter.
         v: [13, 16] factors 0–8 and turns 9–12.
+        present: flat; from ``lane`` on, 0 for a Gaussian that is not counted, else 1.
+        acted: [3 or more] int64, added to: for how many of them the guards in ``ACTED`` acted.
     """
     x, y, z = (
         lanes.load(points, place), lanes.load(points, place + lanes.COUNT), lanes.load(points, place + 2 * lanes.COUNT)
     )  # fmt: skip
-    f, yx, yy, yz, ux, uy, uz = scaled(table, about_origin, x, y, z)
+    f, yx, yy, yz, ux, uy, uz, exponent = scaled(table, about_origin, x, y, z)
     slope = f * (TWO - f)
     for column in range(3):
         j0, j1, j2 = (
@@ -168,6 +181,15 @@ def carry(table, about_origin, points, place, v):
     lanes.store(v, 10 * lanes.COUNT, ox)
     lanes.store(v, 11 * lanes.COUNT, oy)
     lanes.store(v, 12 * lanes.COUNT, oz)
+    clamped = lanes.magnitude(exponent) > LARGEST
+    # det J = f³ (1 + (2 − f) e·c), and the cosine is 1 more than its second factor. Half turns are among the folds.
+    folded = a[11] <= ONE
+    if lanes.any_of(clamped):
+        acted[0] += lanes.count_of(clamped & (lanes.load(present, lane) > ZERO))
+    if lanes.any_of(folded):
+        counts = lanes.load(present, lane) > ZERO
+        acted[1] += lanes.count_of((a[17] < LEAST) & counts)
+        acted[2] += lanes.count_of(folded & counts)
 
 
 @kernel
@@ -186,7 +208,7 @@ def carry_backward(table, about_origin, points, place, v, entering, g, records, 
     )  # fmt: skip
     cx, cy, cz = table[19], table[20], table[21]
     x, y, z = lanes.load(points, place), lanes.load(points, place + n), lanes.load(points, place + 2 * n)
-    f, yx, yy, yz, ux, uy, uz = scaled(table, about_origin, x, y, z)
+    f, yx, yy, yz, ux, uy, uz, _ = scaled(table, about_origin, x, y, z)
     slope = f * (TWO - f)
     gx, gy, gz = lanes.load(g, 0), lanes.load(g, n), lanes.load(g, 2 * n)
     g_f = gx * ux + gy * uy + gz * uz
@@ -228,7 +250,7 @@ def carry_backward(table, about_origin, points, place, v, entering, g, records, 
         lanes.store(g, n * (6 + column), f * h1 + g_along * cy)
         lanes.store(g, n * (9 + column), f * h2 + g_along * cz)
     # The rotations: Q' = (q(r) ∘ polar) ∘ Q.
-    aw, ax, ay, az, ex, ey, ez, dot, nx, ny, nz, cosine, sx, sy, sz, rho, scale = polar(
+    aw, ax, ay, az, ex, ey, ez, dot, nx, ny, nz, cosine, sx, sy, sz, rho, scale, half = polar(
         table, about_origin, f, yx, yy, yz
     )
     kw, kx, ky, kz = table[9], table[10], table[11], table[12]
@@ -248,7 +270,9 @@ def carry_backward(table, about_origin, points, place, v, entering, g, records, 
     unit = aw * bw + ax * bx + ay * by + az * bz
     g_h = (bw - aw * unit) * scale
     gsx, gsy, gsz = (bx - ax * unit) * scale, (by - ay * unit) * scale, (bz - az * unit) * scale
-    shrink = g_h / lanes.maximum(lanes.fill(np.float32(1e-12)), rho)
+    # Where the floor acts it is a constant.
+    g_h = lanes.choose(half < LEAST, nothing, g_h)
+    shrink = g_h / lanes.maximum(lanes.fill(LEAST), rho)
     g_cosine = g_h + cosine * shrink
     gsx += sx * shrink
     gsy += sy * shrink

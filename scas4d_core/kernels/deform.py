@@ -74,7 +74,7 @@ def block_sums(points, present, sums):
 @parallel_kernel
 def deform(
     parameters, offsets, ranges, clusters, entries, rows, present, before, deltas, about_origin,
-    points, sums, tables, means, factors, state,
+    points, sums, tables, means, factors, state, acted,
 ):  # fmt: skip
     """The moved Gaussians: M that move, of N, in B blocks, under L layers of K clusters together.
 
@@ -89,6 +89,7 @@ def deform(
         points: [max(L, 1), B, 3, 16] as they enter each layer; the first is given, the others are filled.
         sums: [max(L, 1), B, 3] of them; likewise. tables: out [K, 23].
         means [N, 3], factors [N, 3, 3]: out at ``rows``. state: [M, 16], out its means and turns, see ``deltas``.
+        acted: out [tasks of ``BLOCKS`` blocks, 3] int64, how often the guards in ``cascade.ACTED`` acted.
     """
     blocks, layers = clusters.shape
     tasks = (blocks + BLOCKS - 1) // BLOCKS
@@ -102,6 +103,7 @@ def deform(
                     move_points(block, tables[clusters[block, layer]], about_origin, points, layer, points, place)
                     sum_block(block, points, layer + 1, present, sums)
     for task in prange(tasks):
+        acted[task] = 0
         v = np.empty(CARRIED, np.float32)
         moved_points = np.empty(3 * lanes.COUNT, np.float32)
         for block in range(task * BLOCKS, min(blocks, (task + 1) * BLOCKS)):
@@ -109,7 +111,10 @@ def deform(
             start_block(block, before, v)
             for layer in range(layers):
                 place = (layer * blocks + block) * 3 * lanes.COUNT
-                carry(tables[clusters[block, layer]], about_origin, points, place, v)
+                carry(
+                    tables[clusters[block, layer]], about_origin, points, place, v, present, block * lanes.COUNT,
+                    acted[task],
+                )  # fmt: skip
             if layers > 0:
                 move_points(
                     block, tables[clusters[block, layers - 1]], about_origin, points, layers - 1, moved_points, 0
@@ -117,7 +122,9 @@ def deform(
             else:
                 for k in range(3):
                     lanes.store(moved_points, lanes.COUNT * k, lanes.load(points, (3 * block + k) * lanes.COUNT))
-            apply_own(deltas, entries, rows, block * lanes.COUNT, v, moved_points, means, factors, state)
+            apply_own(
+                deltas, entries, rows, block * lanes.COUNT, present, v, moved_points, means, factors, state, acted[task]
+            )
 
 
 @parallel_kernel
@@ -137,6 +144,7 @@ def deform_backward(
     """
     blocks, layers = clusters.shape
     for task in prange((blocks + BLOCKS - 1) // BLOCKS):
+        counted = np.zeros(3, np.int64)  # by the forward already
         v = np.empty((layers + 1) * CARRIED, np.float32)
         g = np.empty(16 * lanes.COUNT, np.float32)
         for block in range(task * BLOCKS, min(blocks, (task + 1) * BLOCKS)):
@@ -146,7 +154,10 @@ def deform_backward(
                 leaving = v[(layer + 1) * CARRIED : (layer + 2) * CARRIED]
                 leaving[:] = v[layer * CARRIED : (layer + 1) * CARRIED]
                 place = (layer * blocks + block) * 3 * lanes.COUNT
-                carry(tables[clusters[block, layer]], about_origin, points, place, leaving)
+                carry(
+                    tables[clusters[block, layer]], about_origin, points, place, leaving, present, block * lanes.COUNT,
+                    counted,
+                )  # fmt: skip
             losses[block] = apply_own_backward(
                 deltas, entries, rows, block * lanes.COUNT, present, v, layers * CARRIED, scale_weight, bounds,
                 g_means, g_factors, g_tied, g, g_deltas,

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from scas4d_core.guards import EXPONENT
 from scas4d_core.kernels import lanes
 from scas4d_core.kernels.cascade import product, rotation_entries, rotation_gradient
-from scas4d_core.kernels.jit import ONE, ZERO, inline, kernel
+from scas4d_core.kernels.jit import LOG2_E, ONE, ZERO, inline, kernel
+
+LARGEST = np.float32(EXPONENT) / LOG2_E
 
 COLUMNS = 9
 """Columns of ``deltas``: Δp 0–2, Δr 3–5, Δs 6–8."""
@@ -34,14 +37,16 @@ def own_quaternion(deltas, entries, place):
 
 
 @kernel
-def apply_own(deltas, entries, rows, place, v, points, means, factors, state):
+def apply_own(deltas, entries, rows, place, present, v, points, means, factors, state, acted):
     """Write sixteen moved Gaussians.
 
     Args:
         deltas: [M, 9]. entries, rows: flat int64; from ``place`` on, the Gaussians' rows among the M that move and
             among all N.
+        present: flat; from ``place`` on, 0 for a Gaussian that is not counted, else 1.
         v: [13, 16] factors 0–8 and turns 9–12 from the cascade. points: [3, 16] likewise.
         means [N, 3], factors [N, 3, 3]: out at those rows. state: [M, 16], out mean and turn.
+        acted: [1 or more] int64, added to: for how many Gaussians the exponent of a stretch was clamped.
     """
     n = lanes.COUNT
     for k in range(3):
@@ -50,14 +55,19 @@ def apply_own(deltas, entries, rows, place, v, points, means, factors, state):
         lanes.put(state, entries, place, STATE, MEAN + k, mean)
     w, x, y, z = own_quaternion(deltas, entries, place)
     r0, r1, r2, r3, r4, r5, r6, r7, r8 = rotation_entries(w, x, y, z)
+    largest = lanes.fill(ZERO)
     for column in range(3):
-        stretch = lanes.exp(lanes.pick(deltas, entries, place, COLUMNS, 6 + column))
+        exponent = lanes.pick(deltas, entries, place, COLUMNS, 6 + column)
+        largest = lanes.maximum(largest, lanes.magnitude(exponent))
+        stretch = lanes.exp(exponent)
         e0 = stretch * lanes.load(v, n * column)
         e1 = stretch * lanes.load(v, n * (3 + column))
         e2 = stretch * lanes.load(v, n * (6 + column))
         lanes.put(factors, rows, place, 9, column, r0 * e0 + r1 * e1 + r2 * e2)
         lanes.put(factors, rows, place, 9, 3 + column, r3 * e0 + r4 * e1 + r5 * e2)
         lanes.put(factors, rows, place, 9, 6 + column, r6 * e0 + r7 * e1 + r8 * e2)
+    if lanes.any_of(largest > LARGEST):
+        acted[0] += lanes.count_of((largest > LARGEST) & (lanes.load(present, place) > ZERO))
     qw, qx, qy, qz = product(
         w, x, y, z, lanes.load(v, 9 * n), lanes.load(v, 10 * n), lanes.load(v, 11 * n), lanes.load(v, 12 * n)
     )
@@ -115,9 +125,9 @@ def apply_own_backward(
         g8 += h2 * e2
         # Scale loss on the length of the axis, which ΔR leaves as it is.
         length = lanes.square_root(e0 * e0 + e1 * e1 + e2 * e2)
-        over = length - lanes.pick(bounds, entries, place, 3, column)
-        pull = scale_weight / lanes.maximum(lanes.fill(np.float32(1e-20)), length)
-        pull = lanes.choose(over > ZERO, pull, nothing)
+        bound = lanes.pick(bounds, entries, place, 3, column)
+        over = length - bound
+        pull = lanes.choose(over > ZERO, scale_weight / lanes.maximum(bound, length), nothing)
         excess += lanes.maximum(nothing, over)
         p0 = r0 * h0 + r3 * h1 + r6 * h2 + pull * e0
         p1 = r1 * h0 + r4 * h1 + r7 * h2 + pull * e1

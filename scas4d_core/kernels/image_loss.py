@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
+from scas4d_core.guards import SSIM_C1, SSIM_C2
 from scas4d_core.kernels import lanes
 from scas4d_core.kernels.jit import ONE, TWO, ZERO, inline, kernel, parallel_kernel
 
@@ -22,8 +23,8 @@ _taps = np.exp(-((np.arange(2 * REACH + 1) - REACH) ** 2) / (2 * 1.5**2))
 _taps = (_taps / _taps.sum()).astype(np.float32)
 T0, T1, T2, T3, T4, T5 = (np.float32(tap) for tap in _taps[: REACH + 1])
 
-C1 = np.float32(0.01**2)
-C2 = np.float32(0.03**2)
+C1 = np.float32(SSIM_C1)
+C2 = np.float32(SSIM_C2)
 L1_SHARE = np.float32(0.8)
 SSIM_SHARE = np.float32(0.2)
 

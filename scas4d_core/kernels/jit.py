@@ -11,6 +11,7 @@ from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 
+from scas4d_core.guards import EXPONENT
 from scas4d_core.kernels import cache
 
 cache.use(cache.base())
@@ -37,6 +38,8 @@ ZERO = np.float32(0.0)
 HALF = np.float32(0.5)
 ONE = np.float32(1.0)
 TWO = np.float32(2.0)
+LOG2_E = np.float32(1.4426950408889634)
+MOST = np.float32(EXPONENT)
 
 
 def threads() -> int:
@@ -57,7 +60,7 @@ def _float_of_bits(typing_context: Any, bits: Any) -> Any:
 @inline
 def exp(x):
     """The exponential in float32, relative error 2e-7, clamped to ±87; unlike libm's, loops over it vectorize."""
-    v = min(max(x, np.float32(-87.0)), np.float32(87.0)) * np.float32(1.4426950408889634)
+    v = min(max(x * LOG2_E, -MOST), MOST)
     whole = np.floor(v + HALF)
     r = v - whole
     y = np.float32(1.535336188319500e-4)

@@ -17,7 +17,7 @@ from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
 
-from scas4d_core.kernels.jit import inline
+from scas4d_core.kernels.jit import LOG2_E, MOST, inline
 
 COUNT = 16
 """Lanes of a value."""
@@ -318,6 +318,12 @@ def only_first(typing_context: Any, value: Any, count: Any) -> Any:
 
 
 @inline
+def count_of(mask):
+    """How many lanes a mask holds for."""
+    return np.int64(sum_of(choose(mask, fill(np.float32(1.0)), fill(np.float32(0.0)))))
+
+
+@inline
 def aligned(array):
     """The first flat index of a float32 array whose address is a multiple of 64 bytes: of a ``Lanes``."""
     return -(array.ctypes.data // 4) & (COUNT - 1)
@@ -476,8 +482,7 @@ def exp2(x):
 @inline
 def exp(x):
     """The exponential in float32, relative error 2e-7, clamped to ±87; NaN stays NaN."""
-    bound = np.float32(125.5)
-    v = minimum(fill(bound), maximum(fill(-bound), x * np.float32(1.4426950408889634)))
+    v = minimum(fill(MOST), maximum(fill(-MOST), x * LOG2_E))
     whole = nearest(v)
     r = v - whole
     y = r * np.float32(1.535336188319500e-4) + np.float32(1.339887440266574e-3)

@@ -11,14 +11,15 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
+from scas4d_core.guards import ROOT_FLOOR
 from scas4d_core.kernels import lanes
 from scas4d_core.kernels.cascade import rotation_entries, rotation_gradient
 from scas4d_core.kernels.deltas import TIED
 from scas4d_core.kernels.jit import ONE, ZERO, kernel, parallel_kernel
 
 TASKS = 4
-UNDER_ROOT = np.float32(1e-20)
-"""Added under each root, as in Dynamic3DGaussians: the gradient at zero distance is zero, not NaN."""
+UNDER_ROOT = np.float32(ROOT_FLOOR)
+"""Added under each root."""
 
 CHUNK = 4096
 """Numbers a task sums."""

@@ -2,6 +2,9 @@
 
 A camera enters as ``pose`` [3, 4] float32 (world to camera, OpenCV axes) and ``lens`` [6] float32
 (fx, fy, cx, cy, width, height) in pixels; pixel centres at +0.5.
+
+A Gaussian that cannot be drawn without spoiling the pixels of others is left out, and counted; so is a gradient that
+overflows (``guards``).
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ from math import log2
 import numpy as np
 from numba import prange
 
+from scas4d_core.guards import FEATURE_CEILING, FOOTPRINT_CEILING, GRADIENT_NOT_FINITE, NOT_FINITE
 from scas4d_core.kernels import lanes
 from scas4d_core.kernels.jit import HALF, ONE, TWO, ZERO, inline, kernel, parallel_kernel
 
@@ -22,6 +26,16 @@ CHUNK = 256
 
 AHEAD = 16
 """Gaussians that one's records are asked for before they are used: they lie anywhere in memory."""
+
+FARTHEST = np.float32(NOT_FINITE)
+BRIGHTEST = np.float32(FEATURE_CEILING)
+WIDEST = np.float32(FOOTPRINT_CEILING)
+STEEPEST = np.float32(GRADIENT_NOT_FINITE)
+
+ACTED = ("not_finite", "footprint_ceiling")
+"""What ``project`` counts."""
+ACTED_BACKWARD = ("gradient_not_finite",)
+"""What ``project_backward`` counts."""
 
 # Columns of ``splats`` [N, 16], what later kernels read of a Gaussian. REACH is the support's squared Mahalanobis
 # radius. At a column dx right of the centre, the support is at SLOPE dx ± sqrt(SPREAD (REACH - THIN dx²)) below it; it
@@ -51,12 +65,28 @@ def turned(pose, row, x, y, z):
     return x * pose[row, 0] + y * pose[row, 1] + z * pose[row, 2]
 
 
+@inline
+def sound_features(features, first):
+    """1 for each of sixteen Gaussians from row ``first`` on whose features are finite and not too large, else 0."""
+    columns = features.shape[1]
+    sound = lanes.fill(ONE)
+    total = lanes.fill(ZERO)
+    for k in range(columns):
+        total += lanes.magnitude(lanes.load(features, first * columns + lanes.COUNT * k))
+    if lanes.any_of(lanes.choose(total <= BRIGHTEST, lanes.fill(ZERO), lanes.fill(ONE)) > ZERO):
+        for k in range(columns):
+            size = lanes.magnitude(lanes.gather(features, first * columns + k, columns))
+            sound = lanes.choose(size <= BRIGHTEST, sound, lanes.fill(ZERO))
+    return sound
+
+
 @kernel
-def project_group(first, means, factors, opacities, pose, lens, limits, splats, place, boxes):
+def project_group(first, means, factors, opacities, features, pose, lens, limits, splats, place, boxes, acted):
     """Project sixteen Gaussians from row ``first`` on; see ``project``.
 
     Args:
         splats: out, from row ``place`` on. boxes: out [5 · 16]: tiles x0, y0, x1, y1 of each, and how many.
+        acted: [2], added to.
     """
     alpha_floor, low_pass, near, margin = limits[0], limits[3], limits[4], limits[5]
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
@@ -71,7 +101,7 @@ def project_group(first, means, factors, opacities, pose, lens, limits, splats, 
     z = turned(pose, 2, px, py, pz) + pose[2, 3]
     inverse = lanes.fill(ONE) / z
     opacity = lanes.load(opacities, first)
-    visible = (z >= near) & (opacity >= alpha_floor)
+    size = lanes.magnitude(px) + lanes.magnitude(py) + lanes.magnitude(pz) + lanes.magnitude(opacity)
     u, v, _, _ = tangents(x * inverse, y * inverse, lens, margin)
     sxx = syy = lanes.fill(low_pass)
     sxy = zero
@@ -80,6 +110,7 @@ def project_group(first, means, factors, opacities, pose, lens, limits, splats, 
         f0 = lanes.gather(factors, 9 * first + k, 9)
         f1 = lanes.gather(factors, 9 * first + 3 + k, 9)
         f2 = lanes.gather(factors, 9 * first + 6 + k, 9)
+        size = size + (lanes.magnitude(f0) + lanes.magnitude(f1) + lanes.magnitude(f2))
         a2 = turned(pose, 2, f0, f1, f2)
         m0 = fx * inverse * (turned(pose, 0, f0, f1, f2) - u * a2)
         m1 = fy * inverse * (turned(pose, 1, f0, f1, f2) - v * a2)
@@ -93,7 +124,15 @@ def project_group(first, means, factors, opacities, pose, lens, limits, splats, 
     n1 = m02 * m10 - m00 * m12
     n2 = m00 * m11 - m01 * m10
     determinant = n0 * n0 + n1 * n1 + n2 * n2 + low_pass * (sxx + syy - low_pass)
-    visible = visible & (determinant > ZERO) & (determinant < np.float32(1e30))
+    sound = lanes.choose(size <= FARTHEST, sound_features(features, first), zero)
+    if lanes.any_of(sound <= ZERO):
+        acted[0] += lanes.count_of(sound <= ZERO)
+    visible = (z >= near) & (opacity >= alpha_floor) & (sound > ZERO)
+    drawable = (determinant > ZERO) & (determinant < WIDEST)
+    lost = lanes.choose(drawable, zero, lanes.choose(visible, lanes.fill(ONE), zero))
+    if lanes.any_of(lost > ZERO):
+        acted[1] += lanes.count_of(lost > ZERO)
+    visible = visible & drawable
     mx = fx * x * inverse + cx
     my = fy * y * inverse + cy
     log_opacity = lanes.log2(opacity)
@@ -129,28 +168,37 @@ def project_group(first, means, factors, opacities, pose, lens, limits, splats, 
 
 
 @parallel_kernel
-def project(means, factors, opacities, pose, lens, limits, splats, rects, counts):
+def project(means, factors, opacities, features, pose, lens, limits, splats, rects, counts, acted):
     """Project N Gaussians, sixteen at a time.
 
     Args:
         means: [N, 3] float32 world. factors: [N, 3, 3] float32, Σ = F Fᵀ. opacities: [N] float32.
+        features: [N, C] float32; only whether they are finite is read.
         pose, lens: the camera. limits: [6] float32, the fields of ``Limits`` in order.
         splats: out [N + 15 or more, 16] float32, columns above.
         rects: out [N, 4] int32, tiles x0, y0, x1, y1 (exclusive) of the support's box; empty where culled.
         counts: out [N] int32, tiles in the box.
+        acted: out [tasks of ``CHUNK``, 2] int64, for how many Gaussians the guards in ``ACTED`` acted.
     """
     count = means.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):
+        acted[task] = 0
         boxes = np.empty(5 * lanes.COUNT, np.float32)
         for first in range(task * CHUNK, min(count, (task + 1) * CHUNK), lanes.COUNT):
             some = min(lanes.COUNT, count - first)
             if some == lanes.COUNT:
-                project_group(first, means, factors, opacities, pose, lens, limits, splats, first, boxes)
+                project_group(
+                    first, means, factors, opacities, features, pose, lens, limits, splats, first, boxes, acted[task]
+                )
             else:
                 last_means = padded(means[first:])
                 last_factors = padded(factors[first:])
                 last_opacities = padded(opacities[first:])
-                project_group(0, last_means, last_factors, last_opacities, pose, lens, limits, splats, first, boxes)
+                last_features = padded(features[first:])
+                project_group(
+                    0, last_means, last_factors, last_opacities, last_features, pose, lens, limits, splats, first,
+                    boxes, acted[task],
+                )  # fmt: skip
             for k in range(some):
                 for side in range(4):
                     rects[first + k, side] = np.int32(boxes[side * lanes.COUNT + k])
@@ -174,7 +222,8 @@ def project_backward_group(
 
     Args:
         first: row of the Gaussians in ``means`` and ``factors``. place: their row in ``splats``.
-        sums: [16, columns], each Gaussian's record summed over its pairs, and 1 behind it if there was one, else 0.
+        sums: [16, columns], each Gaussian's record summed over its pairs, and 1 behind it if there was one, else 0;
+            0 is written there of a Gaussian whose gradient overflows.
         g_means, g_factors, g_opacities, g_screen: out, from row ``first`` on.
     """
     margin = limits[5]
@@ -208,7 +257,7 @@ def project_backward_group(
     s00 = zero - (p00 * a + p01 * b)
     s01 = zero - (p00 * b + p01 * c)
     s11 = zero - (p10 * b + p11 * c)
-    g_u = g_v = g_z = zero
+    g_u = g_v = g_z = size = zero
     for k in range(3):
         f0 = lanes.gather(factors, 9 * first + k, 9)
         f1 = lanes.gather(factors, 9 * first + 3 + k, 9)
@@ -226,6 +275,7 @@ def project_backward_group(
         g_z = g_z - (gm0 * m0 + gm1 * m1) * inverse
         for j in range(3):
             g = ga0 * pose[0, j] + ga1 * pose[1, j] + ga2 * pose[2, j]
+            size = size + lanes.magnitude(g)
             lanes.scatter(g_factors, 9 * first + 3 * j + k, 9, lanes.choose(seen, g, zero))
     # The clamped tangents are constants; the projected centre always moves.
     g_u = lanes.choose(free_u, g_u, zero) * inverse
@@ -235,7 +285,22 @@ def project_backward_group(
     gz = g_z + g_depth - inverse * (x * gx + y * gy)
     for k in range(3):
         g = gx * pose[0, k] + gy * pose[1, k] + gz * pose[2, k]
+        size = size + lanes.magnitude(g)
         lanes.scatter(g_means, 3 * first + k, 3, lanes.choose(seen, g, zero))
+    lost = lanes.choose(size <= STEEPEST, zero, lanes.choose(seen, lanes.fill(ONE), zero))
+    if lanes.any_of(lost > ZERO):
+        for lane in range(lanes.COUNT):
+            steep = np.float32(0.0)
+            for k in range(9):
+                steep += abs(g_factors[first + lane, k // 3, k % 3])
+            for k in range(3):
+                steep += abs(g_means[first + lane, k])
+            if not steep <= STEEPEST:
+                sums[lane, columns - 1] = ZERO
+                g_factors[first + lane] = ZERO
+                g_means[first + lane] = ZERO
+                g_screen[first + lane] = ZERO
+                g_opacities[first + lane] = ZERO
 
 
 @parallel_kernel
@@ -255,6 +320,7 @@ def project_backward(
     g_opacities,
     g_features,
     g_screen,
+    acted,
 ):
     """Sum each Gaussian's pairs (in a fixed order) and carry the gradients to the world, sixteen at a time.
 
@@ -264,12 +330,14 @@ def project_backward(
         depth_channel: the feature channel that holds the depth of the centre, or -1.
         g_means [N, 3], g_factors [N, 3, 3], g_opacities [N], g_features [N, C], g_screen [N, 2]: out, float32; 0 where
             culled. ``g_screen`` is dL/d(projected centre) per pixel, which density control reads.
+        acted: out [tasks of ``CHUNK``, 1] int64, for how many Gaussians the guard in ``ACTED_BACKWARD`` acted.
     """
     channels = g_features.shape[1]
     columns = records.shape[1]
     count = means.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):
         sums = np.empty((lanes.COUNT, columns + 1), np.float32)
+        acted[task] = 0
         for first in range(task * CHUNK, min(count, (task + 1) * CHUNK), lanes.COUNT):
             some = min(lanes.COUNT, count - first)
             sums[:, columns] = ZERO
@@ -284,6 +352,11 @@ def project_backward(
                     for pair in range(firsts[i], firsts[i] + counts[i]):
                         total += lanes.load(records, pair * columns + column)
                     lanes.store(sums, k * (columns + 1) + column, total)
+                    used = lanes.magnitude(lanes.only_first(total, 6 + channels - column))
+                    if lanes.any_of(lanes.choose(used <= STEEPEST, lanes.fill(ZERO), lanes.fill(ONE)) > ZERO):
+                        sums[k, columns] = ZERO
+                if counts[i] > 0 and sums[k, columns] == ZERO:
+                    sums[k, :columns] = ZERO
                 for channel in range(channels):
                     g_features[i, channel] = sums[k, 6 + channel]
             if some == lanes.COUNT:
@@ -304,3 +377,7 @@ def project_backward(
                 g_factors[first:] = last[1][:some]
                 g_opacities[first:] = last[2][:some]
                 g_screen[first:] = last[3][:some]
+            for k in range(some):
+                if counts[first + k] > 0 and sums[k, columns] == ZERO:
+                    g_features[first + k] = ZERO
+                    acted[task, 0] += 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
+from scas4d_core.guards import COVER_SLACK
 from scas4d_core.kernels import lanes
 from scas4d_core.kernels.jit import HALF, ZERO, inline, kernel, parallel_kernel
 from scas4d_core.kernels.projection import (
@@ -19,6 +20,8 @@ from scas4d_core.kernels.projection import (
     TILE,
 )
 
+SLACK = np.float32(COVER_SLACK)
+WIDER = np.float32(1.0 + COVER_SLACK)
 RADIX_BITS = 12
 DIGITS = 1 << RADIX_BITS
 
@@ -36,7 +39,7 @@ def cover(splat, tile_x, tile_y):
     # Eight lanes for the upper ends of the columns of blocks, eight for the lower.
     down = lanes.ends()
     # Rounding must not cull what the blending kernels would still draw.
-    reach = splat[REACH] * np.float32(1.0001) + np.float32(1e-4)
+    reach = splat[REACH] * WIDER + SLACK
     dx = lanes.minimum(lanes.maximum(down * splat[LOWEST_X], left), left + np.float32(lanes.ACROSS - 1))
     room = reach - dx * dx * splat[THIN]
     dy = dx * splat[SLOPE] + down * lanes.square_root(lanes.maximum(room * splat[SPREAD], lanes.fill(ZERO)))

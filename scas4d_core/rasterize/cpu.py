@@ -2,6 +2,9 @@
 
 Buffers are allocated once and grow only; forward and backward of the same view share them. Results do not depend
 on the number of threads. Twin: ``rasterize.twin``.
+
+A Gaussian that is not finite, or so large that its footprint overflows, is left out of the picture and its gradients
+are 0; so are gradients that overflow. ``CpuRasterizer.guards`` says how often.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera
+from scas4d_core.guards import GuardCounts
 from scas4d_core.kernels import blend as blend_kernels
 from scas4d_core.kernels import projection, tiles
 from scas4d_core.kernels.jit import threads
@@ -81,9 +85,14 @@ class ForwardPass(NamedTuple):
 
 
 class CpuRasterizer:
-    """Renders any number of feature channels in one pass, and carries gradients back."""
+    """Renders any number of feature channels in one pass, and carries gradients back.
+
+    Attributes:
+        guards: how often each guard acted in all passes since the last ``reset`` of the counts.
+    """
 
     def __init__(self, limits: Limits = DEFAULT) -> None:
+        self.guards = GuardCounts(*projection.ACTED, *projection.ACTED_BACKWARD)
         self.limits = np.array(limits, dtype=np.float32)
         self._last: ForwardPass
         self._buffers: dict[str, NDArray[Any]] = {}
@@ -129,7 +138,23 @@ class CpuRasterizer:
         splats = self._buffer("splats", (count + 15, projection.SPLAT_COLUMNS))[:count]
         rects = self._buffer("rects", (count, 4), np.int32)
         counts = self._buffer("counts", (count,), np.int32)
-        projection.project(means, factors, opacities, camera.pose, camera.lens, self.limits, splats, rects, counts)
+        if depth_channel >= 0:
+            features[:, depth_channel] = 0
+        acted = self._buffer("acted", (-(-count // projection.CHUNK), len(projection.ACTED)), np.int64)
+        projection.project(
+            means,
+            factors,
+            opacities,
+            features,
+            camera.pose,
+            camera.lens,
+            self.limits,
+            splats,
+            rects,
+            counts,
+            acted,
+        )
+        self.guards.add(projection.ACTED, acted)
         if depth_channel >= 0:
             features[:, depth_channel] = splats[:, projection.DEPTH]
         visible, order = tiles.depth_order(
@@ -257,6 +282,8 @@ class CpuRasterizer:
             self._buffer("g_features", (count, channels)),
             self._buffer("g_screen", (count, 2)),
         )
+        shape = (-(-count // projection.CHUNK), len(projection.ACTED_BACKWARD))
+        acted = self._buffer("acted_backward", shape, np.int64)
         projection.project_backward(
             last.means,
             last.factors,
@@ -269,7 +296,9 @@ class CpuRasterizer:
             records,
             last.depth_channel,
             *gradients,
+            acted,
         )
+        self.guards.add(projection.ACTED_BACKWARD, acted)
         return gradients
 
     @property

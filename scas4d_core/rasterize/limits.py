@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from scas4d_core import guards
+
 
 class Limits(NamedTuple):
     """Constants that two rasterizers must share to agree.
@@ -19,12 +21,12 @@ class Limits(NamedTuple):
             before the projection's Jacobian is evaluated at the clamped place instead.
     """
 
-    alpha_floor: float = 1.0 / 255.0
-    alpha_cap: float = 0.99
-    transmittance_stop: float = 1e-4
-    low_pass: float = 0.3
-    near: float = 0.01
-    tangent_margin: float = 0.3
+    alpha_floor: float = guards.ALPHA_FLOOR
+    alpha_cap: float = guards.ALPHA_CAP
+    transmittance_stop: float = guards.TRANSMITTANCE_STOP
+    low_pass: float = guards.LOW_PASS
+    near: float = guards.NEAR
+    tangent_margin: float = guards.TANGENT_MARGIN
 
 
 NEAR_SHARE = 0.1
@@ -39,7 +41,8 @@ def scene_limits(near: float | str, rig_radius: float) -> Limits:
         rig_radius: metres.
     """
     if isinstance(near, str):
-        near = max(Limits().near, NEAR_SHARE * rig_radius)
+        # A single camera has no radius; a rig of millimetres still sees what is nearer than 1 cm.
+        near = NEAR_SHARE * rig_radius if rig_radius > 0 else Limits().near
     return Limits(near=near)
 
 

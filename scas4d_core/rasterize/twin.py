@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from scas4d_core.cameras import Camera
+from scas4d_core.guards import FEATURE_CEILING, NOT_FINITE
 from scas4d_core.rasterize.limits import DEFAULT, Limits
 
 PAIRS_AT_ONCE = 4_000_000
@@ -134,6 +135,12 @@ def _composite(
     return (alpha * before) @ features + remaining[:, None] * background, 1 - remaining
 
 
+def sound(means: Tensor, factors: Tensor, opacities: Tensor, features: Tensor) -> Tensor:
+    """[N] whether a Gaussian can be drawn: finite, within ``guards.NOT_FINITE`` metres, features not too large."""
+    size = means.detach().abs().sum(-1) + factors.detach().abs().sum((-2, -1)) + opacities.detach().abs()
+    return (size <= NOT_FINITE) & (features.detach().abs() <= FEATURE_CEILING).all(-1)
+
+
 def render(
     means: Tensor,
     factors: Tensor,
@@ -147,7 +154,7 @@ def render(
 
     alpha = min(cap, o·exp(−½ dᵀ cov2d⁻¹ d)) with d from the projected mean to the pixel's centre; a Gaussian
     contributes exactly where alpha ≥ floor; a pixel is finished, that Gaussian not drawn, once T·(1 − alpha) < stop.
-    Through the cap no gradient flows.
+    Through the cap no gradient flows. Gaussians that are not ``sound`` are left out; their gradients are 0.
 
     Args:
         means: [N, 3] metres.
@@ -158,6 +165,14 @@ def render(
         background: [C].
         limits: of the backend to agree with.
     """
+    finite = sound(means, factors, opacities, features)
+    if not bool(finite.all()):
+        # Behind the near plane of any camera, and without anything that a product with 0 would turn into NaN.
+        away = (-camera.translation - camera.rotation[2]) @ camera.rotation
+        means = torch.where(finite[:, None], means, away)
+        factors = torch.where(finite[:, None, None], factors, 0)
+        opacities = torch.where(finite, opacities, 0)
+        features = torch.where(finite[:, None], features, 0)
     projected = project(means, factors, camera, limits)
     visible = torch.nonzero(projected.depths.detach() >= limits.near)[:, 0]
     order = visible[torch.argsort(projected.depths.detach()[visible], stable=True)]

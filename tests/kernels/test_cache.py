@@ -38,7 +38,8 @@ def test_an_edit_in_an_imported_file_is_noticed(tmp_path):
     source = Path(scas4d_core.__file__).parent
     copy = tmp_path / "scas4d_core"
     (copy / "kernels").mkdir(parents=True)
-    shutil.copy(source / "__init__.py", copy)
+    for name in ("__init__.py", "guards.py"):
+        shutil.copy(source / name, copy)
     for name in ("__init__", "jit", "cache"):
         shutil.copy(source / "kernels" / f"{name}.py", copy / "kernels")
     (tmp_path / "caller.py").write_text(CALLER)

@@ -12,7 +12,12 @@ from scas4d_core.rasterize.limits import DEFAULT, NEAR_SHARE, scene_limits
 
 @pytest.mark.parametrize(
     ("near", "rig_radius", "metres"),
-    [("auto", 4.0, NEAR_SHARE * 4.0), ("auto", 0.0, DEFAULT.near), (0.2, 4.0, 0.2)],
+    [
+        ("auto", 4.0, NEAR_SHARE * 4.0),
+        ("auto", 0.0, DEFAULT.near),
+        ("auto", 0.002, NEAR_SHARE * 0.002),
+        (0.2, 4.0, 0.2),
+    ],
 )
 def test_near_is_a_share_of_the_rig_or_what_the_scene_says(near: float | str, rig_radius: float, metres: float) -> None:
     assert scene_limits(near, rig_radius) == DEFAULT._replace(near=metres)

@@ -1,0 +1,280 @@
+"""Every clamp, floor and epsilon of the core's arithmetic: its name, its value, its unit and its reason, once.
+
+Two tables. A *guard* acts where the arithmetic would leave the finite numbers, and is counted each time it does, so
+that it cannot hide a fault. A *convention* is part of what is computed: it acts all the time, its count would say
+nothing, and its row says so. Kernels import the values; ``kernels.cache`` compiles anew when they change.
+
+``scas4d bench stability`` prints both tables with what they did in the catalogue of hard cases, and takes each one
+away to see which case then fails.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Guard:
+    """A number that the arithmetic needs beside the equations.
+
+    Attributes:
+        name: what it is counted under.
+        value: in ``unit``.
+        without: the value that takes its effect away; NaN where another than the value has to change for that.
+        where: the file under ``scas4d_core``.
+        reason: why it is there, and what happens where it acts.
+        counted: what one count is; of a convention, why there is none.
+    """
+
+    name: str
+    value: float
+    without: float
+    unit: str
+    where: str
+    reason: str
+    counted: str
+
+
+GUARDS: dict[str, Guard] = {}
+"""By name: counted."""
+CONVENTIONS: dict[str, Guard] = {}
+"""By name: part of the method, not counted."""
+
+
+def _guard(name: str, value: float, without: float, *, unit: str, where: str, reason: str, counted: str) -> float:
+    GUARDS[name] = Guard(name, value, without, unit, where, reason, counted)
+    return value
+
+
+def _convention(name: str, value: float, without: float, *, unit: str, where: str, reason: str, counted: str) -> float:
+    CONVENTIONS[name] = Guard(name, value, without, unit, where, reason, counted)
+    return value
+
+
+NAN = float("nan")
+INFINITY = float("inf")
+
+# Rendering.
+
+NOT_FINITE = _guard(
+    "not_finite", 1e15, NAN,
+    unit="m", where="kernels/projection.py, rasterize/twin.py",
+    reason="A Gaussian is left out whose mean, factor, opacity or features are NaN, infinite or beyond this: it would "
+    "turn every pixel that it reaches into NaN. Its gradients are 0.",
+    counted="Gaussians left out of a picture",
+)  # fmt: skip
+FEATURE_CEILING = _guard(
+    "feature_ceiling", 1e9, INFINITY,
+    unit="1", where="kernels/projection.py, rasterize/twin.py",
+    reason="The same for features beyond this: the fourth powers in SSIM would overflow. Colours are nominally 0…1.",
+    counted="under not_finite",
+)  # fmt: skip
+FOOTPRINT_CEILING = _guard(
+    "footprint_ceiling", 1e30, INFINITY,
+    unit="pixels⁴", where="kernels/projection.py",
+    reason="Determinant of the projected covariance from which on a Gaussian is left out (3e7 pixels wide): the conic "
+    "is a quotient of numbers that overflow. Also left out: a determinant that is not positive.",
+    counted="Gaussians left out of a picture",
+)  # fmt: skip
+GRADIENT_NOT_FINITE = _guard(
+    "gradient_not_finite", 1e30, NAN,
+    unit="loss per unit", where="kernels/projection.py",
+    reason="A Gaussian whose gradient overflowed on the way from the picture gets none: through the pivots and the "
+    "clusters' sums it would reach every other.",
+    counted="Gaussians without gradient in a backward pass",
+)  # fmt: skip
+
+# Deformation.
+
+HELD_BACK = _guard(
+    "held_back", 0.0, NAN,
+    unit="–", where="deformation_cpu.py",
+    reason="A Gaussian that is not finite as an update begins is left as it is: the pivot of its cluster, a mean, "
+    "would be NaN, and so all that the cluster holds. It weighs nothing in pivots and neighbour terms.",
+    counted="Gaussians held back in an update",
+)  # fmt: skip
+EMPTY_CLUSTER = _guard(
+    "empty_cluster", 1.0, 0.0,
+    unit="Gaussians", where="kernels/cascade.py, deformation.py",
+    reason="Least number that a pivot's sum is divided by: a cluster whose Gaussians are all held back has the pivot 0 "
+    "instead of NaN, which its gradient would carry on.",
+    counted="clusters without a Gaussian in an update",
+)  # fmt: skip
+EXPONENT = _guard(
+    "exponent", 125.5, 1e9,
+    unit="powers of 2", where="kernels/lanes.py, kernels/jit.py",
+    reason="Arguments of exponentials are clamped to ±87 (e^87 = 6e37): beyond, float32 overflows and the bits of the "
+    "result are garbage. In the cluster map a factor stays above 3e-38.",
+    counted="Gaussians in a layer whose factor, or in an update whose stretch (Δs), is clamped",
+)  # fmt: skip
+HALF_TURN = _guard(
+    "half_turn", 1e-12, 0.0,
+    unit="1", where="kernels/cascade.py, deformation.py",
+    reason="Floor of the polar rotation's cosine part, and of the radius it is divided by: a map that folds space "
+    "straight back has no rotation of its own; it counts as none instead of 0/0.",
+    counted="Gaussians in a layer, forward",
+)  # fmt: skip
+
+# Steps.
+
+GRADIENT_CEILING = _guard(
+    "gradient_ceiling", 1e18, INFINITY,
+    unit="loss per unit", where="kernels/adam.py",
+    reason="Gradients are clamped to ± this, NaN to 0: their squares would overflow, the second moment stay infinite, "
+    "and the parameter stand still for the rest of the update.",
+    counted="numbers of a gradient in a step",
+)  # fmt: skip
+MOMENT_FLOOR = _guard(
+    "moment_floor", 1e-19, 0.0,
+    unit="loss per unit", where="kernels/adam.py",
+    reason="Gradients and first moments below are 0, as are second moments below its square: they would be denormal "
+    "numbers, which cost tens of times as much as others, and be kept so for the rest of the update.",
+    counted="numbers of a gradient in a step",
+)  # fmt: skip
+
+# Frame 0.
+
+QUATERNION_FLOOR = _guard(
+    "quaternion_floor", 1e-30, -1.0,
+    unit="1", where="kernels/activation.py",
+    reason="A quaternion whose squared length is not above this has no direction: it counts as no rotation, and has no "
+    "gradient.",
+    counted="Gaussians in an activation",
+)  # fmt: skip
+LEFT_OUT = _guard(
+    "left_out_of_hierarchy", 0.0, NAN,
+    unit="–", where="hierarchy.py",
+    reason="A moving Gaussian that is not finite belongs to no cluster and stands: K-means would refuse all others.",
+    counted="Gaussians in a clustering",
+)  # fmt: skip
+
+# Conventions: acting all the time.
+
+ALPHA_FLOOR = _convention(
+    "alpha_floor", 1.0 / 255.0, 1e-8,
+    unit="1", where="rasterize/limits.py",
+    reason="A Gaussian covers exactly the pixels where its alpha is at least this; 8-bit pictures cannot show less.",
+    counted="ends the support of every Gaussian",
+)  # fmt: skip
+ALPHA_CAP = _convention(
+    "alpha_cap", 0.99, 1.0,
+    unit="1", where="rasterize/limits.py",
+    reason="No single Gaussian is opaque: 1/(1 − alpha) of the backward pass stays below 100.",
+    counted="meets every opaque Gaussian's middle, pixel by pixel",
+)  # fmt: skip
+TRANSMITTANCE_STOP = _convention(
+    "transmittance_stop", 1e-4, 0.0,
+    unit="1", where="rasterize/limits.py",
+    reason="A pixel is finished once less light than this would pass; what is left never gets denormal.",
+    counted="ends every opaque pixel",
+)  # fmt: skip
+LOW_PASS = _convention(
+    "low_pass", 0.3, 0.0,
+    unit="pixels²", where="rasterize/limits.py",
+    reason="Added to the diagonal of the projected covariance: a Gaussian is at least a pixel wide, and the covariance "
+    "definite whatever its factor.",
+    counted="added to every Gaussian",
+)  # fmt: skip
+NEAR = _convention(
+    "near", 0.01, -INFINITY,
+    unit="m", where="rasterize/limits.py",
+    reason="Nearer Gaussians are not drawn: the projection has its pole at depth 0.",
+    counted="culls in every picture, as the sides of the picture do",
+)  # fmt: skip
+TANGENT_MARGIN = _convention(
+    "tangent_margin", 0.3, 1e9,
+    unit="halves of the picture", where="rasterize/limits.py",
+    reason="How far beyond the border x/z may lie before the projection's Jacobian is taken at the clamped place: "
+    "89° off the axis the linear footprint would cover the picture.",
+    counted="holds every Gaussian beside the picture",
+)  # fmt: skip
+COVER_SLACK = _convention(
+    "cover_slack", 1e-4, -1e-2,
+    unit="1 and σ²", where="kernels/tiles.py",
+    reason="Relative and absolute widening of the support by which tiles and blocks are culled: rounding must not cull "
+    "what blending would draw. No pixel changes by it.",
+    counted="widens every support",
+)  # fmt: skip
+ROOT_FLOOR = _convention(
+    "root_floor", 1e-20, 0.0,
+    unit="m²", where="kernels/neighbour_terms.py, losses.py",
+    reason="Under the roots of the neighbour terms, as in Dynamic3DGaussians: where nothing has moved the gradient is "
+    "0, not NaN.",
+    counted="part of every pair's term",
+)  # fmt: skip
+ADAM_EPSILON = _convention(
+    "adam_epsilon", 1e-15, 0.0,
+    unit="loss per unit", where="kernels/adam.py",
+    reason="Adam's own, as in Dynamic3DGaussians: gradients of single Gaussians are far below the usual 1e-8.",
+    counted="part of every step",
+)  # fmt: skip
+SSIM_C1 = _convention(
+    "ssim_c1", 0.01**2, 0.0,
+    unit="1", where="kernels/image_loss.py, losses.py",
+    reason="SSIM's own (Wang et al. 2004): means that are both black compare as equal.",
+    counted="part of every window",
+)  # fmt: skip
+SSIM_C2 = _convention(
+    "ssim_c2", 0.03**2, 0.0,
+    unit="1", where="kernels/image_loss.py, losses.py",
+    reason="SSIM's own: windows that are both flat compare as equal.",
+    counted="part of every window",
+)  # fmt: skip
+SMALLEST_SQUARE = _convention(
+    "smallest_square", 1e-9, 0.0,
+    unit="1", where="losses.py, picture_loss.py",
+    reason="Sum of squared differences below which two pictures count as equal: PSNR stays finite.",
+    counted="acts on a figure that is told, not on the state",
+)  # fmt: skip
+
+
+class GuardCounts(Mapping[str, int]):
+    """How often guards acted since the last ``reset``, by name."""
+
+    def __init__(self, *names: str) -> None:
+        unknown = set(names) - set(GUARDS) - set(OBSERVED)
+        if unknown:
+            raise ValueError(f"guards {sorted(unknown)} are unknown; the table in scas4d_core/guards.py names all")
+        self._counts = dict.fromkeys(names, 0)
+
+    def add(self, names: Sequence[str], acted: NDArray[np.int64]) -> None:
+        """Count what a kernel's tasks counted under these names, [tasks, names] or [names]."""
+        counts = acted.reshape(-1, len(names)).sum(axis=0)
+        for name, count in zip(names, counts.tolist(), strict=True):
+            self._counts[name] += count
+
+    def reset(self) -> None:
+        """Begin again at 0."""
+        self._counts = dict.fromkeys(self._counts, 0)
+
+    def __getitem__(self, name: str) -> int:
+        return self._counts[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._counts)
+
+    def __len__(self) -> int:
+        return len(self._counts)
+
+    def __repr__(self) -> str:
+        return f"GuardCounts({self._counts})"
+
+
+OBSERVED = {
+    "folded": "Gaussians in a layer, forward, where the cluster map turns space inside out: det J ≤ 0. Nothing is "
+    "clamped; the state stays finite, and a fold can be undone by the next steps.",
+}
+"""What is counted beside the guards, and changes nothing."""
+
+
+def summed(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    """Counts of several holders, added up by name."""
+    total: dict[str, int] = {}
+    for each in counts:
+        for name, count in each.items():
+            total[name] = total.get(name, 0) + count
+    return total
