@@ -45,6 +45,7 @@ def status_of(scene: Scene) -> SceneStatus:
         last_committed=ledger.committed[-1] if ledger.committed else None,
         gaussians=scene.gaussians,
         paused=ledger.paused,
+        degraded=scene.trouble is not None and ledger.fatal is None,
         open_frames=sorted(ledger.open),
         set_aside=ledger.counts[FrameState.SET_ASIDE],
         missing=ledger.counts[FrameState.MISSING],

@@ -99,12 +99,13 @@ class SceneStatus(Model):
     id: str
     name: str
     state: SceneState = Field(
-        description="awaiting_first_frame: nothing to do yet. initialising: frame 0 is being reconstructed. ready: "
+        description="What the scene does; `paused` and `degraded` hold beside. "
+        "awaiting_first_frame: nothing to do yet. initialising: frame 0 is being reconstructed. ready: "
         "idle, the last frame was committed whole. updating: a later frame is being reconstructed. paused: it takes "
         "frames and reconstructs none. degraded: the scene goes on, but its last frame lost a camera or was set aside, "
         "or its worker is being restarted; `error` says why. failed: it takes no more frames."
     )
-    error: str | None = None
+    error: str | None = Field(default=None, description="Why the scene is failed or degraded.")
     progress: ProgressModel | None = Field(default=None, description="While initialising.")
     cameras: list[str]
     has_points: bool
@@ -115,7 +116,14 @@ class SceneStatus(Model):
     first_committed: int | None
     last_committed: int | None
     gaussians: int | None
-    paused: bool = False
+    paused: bool = Field(
+        default=False, description="It begins no further frame, whatever `state` says: one may still be at work."
+    )
+    degraded: bool = Field(
+        default=False,
+        description="Whatever `state` says: the last frame lost a camera or was set aside, the worker is being "
+        "restarted, or the disk is full. `error` says which.",
+    )
     open_frames: list[int] = Field(
         default_factory=list, description="Frames not closed yet, whose cameras send one by one."
     )

@@ -2,7 +2,7 @@
 
 import { Chart } from "./charts.js";
 import { TRACKS } from "./colours.js";
-import { node, showCameras, showFacts, showQueue, STATES } from "./panels.js";
+import { node, showCameras, showFacts, showQueue, stateWords } from "./panels.js";
 import { call, scenePath, token } from "./service.js";
 import { Stream } from "./stream.js";
 import { LiveView } from "./view.js";
@@ -46,7 +46,7 @@ async function listScenes() {
     scenes = (await call("GET", "/v1/scenes")).scenes;
   } catch (error) {
     if (error.status === 401 || error.status === 403) return askForToken(error.status === 401 && token.get());
-    if (!page.stream) curtain("No connection", error.message);
+    if (!page.stream) curtain(error.status === 503 ? "The service is starting" : "No connection", error.message);
     return;
   }
   const select = $("scenes");
@@ -54,13 +54,21 @@ async function listScenes() {
   select.replaceChildren(...scenes.map((scene) =>
     node("option", { value: scene.id }, scene.name ? `${scene.name} (${scene.id.slice(0, 6)})` : scene.id)));
   select.disabled = scenes.length === 0;
-  const there = scenes.find((scene) => scene.id === chosen) ?? (page.gone ? null : scenes.at(-1));
-  if (page.gone && scenes.length) select.prepend(node("option", { value: "", disabled: true, selected: true }, "choose a scene"));
+  const there = scenes.find((scene) => scene.id === chosen) ?? (page.gone || chosen ? null : scenes.at(-1));
+  if (!there && !page.gone && !page.stream && chosen) missing(chosen, scenes);
+  if (!there && scenes.length) select.prepend(node("option", { value: "", disabled: true, selected: true }, "choose a scene"));
   if (there) select.value = there.id;
-  if (!scenes.length && !page.stream && !page.gone) {
+  if (!scenes.length && !page.stream && !page.gone && !chosen) {
     curtain("No scene yet", "Send a capture and it appears here:", "scas4d push samples/robot --fps 5");
   }
   if (there && there.id !== page.scene) openScene(there.id);
+}
+
+/** The address names a scene that is not here: another one would be taken for it. */
+function missing(id, scenes) {
+  const box = curtain("There is no such scene", `The service has no scene ${id}. ${scenes.length ? "Choose one:" : "It has no others either."}`);
+  box.querySelector(".detail").replaceChildren(...scenes.map((scene) =>
+    node("button", { type: "button", class: "choice", onclick: () => openScene(scene.id) }, scene.name || scene.id)));
 }
 
 const wanted = () => Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
@@ -146,8 +154,8 @@ function showStatus(status) {
   page.status = status;
   const chip = $("state");
   chip.hidden = false;
-  chip.textContent = STATES[status.state] ?? status.state;
-  chip.dataset.state = status.state;
+  chip.textContent = stateWords(status);
+  chip.dataset.state = status.state === "failed" ? "failed" : status.degraded ? "degraded" : status.state;
   $("trouble").hidden = !status.error;
   $("trouble").textContent = status.error ? status.error[0].toUpperCase() + status.error.slice(1) + "." : "";
   showFacts($("facts"), status);
@@ -323,6 +331,7 @@ function curtain(title, words, detail = "", share) {
   bar.hidden = share === undefined;
   if (share === null) bar.removeAttribute("value");
   else if (share !== undefined) bar.value = share;
+  return box;
 }
 
 function note(words, id = null) {
@@ -463,7 +472,11 @@ document.addEventListener("keydown", (event) => {
 });
 window.addEventListener("hashchange", () => {
   const { scene, frame } = wanted();
-  if (scene && scene !== page.scene) openScene(scene);
+  if (scene && scene !== page.scene) {
+    closeScene();
+    page.gone = false;
+    listScenes();
+  }
   else if (scene && frame && Number(frame) !== page.frame) choose(Number(frame));
 });
 

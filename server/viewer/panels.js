@@ -10,6 +10,14 @@ export const STATES = {
   failed: "Failed",
 };
 
+/** What the scene does, and what holds beside it. */
+export function stateWords(status) {
+  const words = [STATES[status.state] ?? status.state];
+  if (status.paused && status.state !== "paused" && status.state !== "failed") words.push("pausing");
+  if (status.degraded && status.state !== "degraded") words.push("degraded");
+  return words.join(" · ");
+}
+
 const number = new Intl.NumberFormat("en");
 
 export function node(name, attributes = {}, ...children) {

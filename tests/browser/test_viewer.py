@@ -12,6 +12,7 @@ from running import Running, fake_settings
 from stage import FRAMES, push, start_scene
 
 from client.sdk import Client
+from client.wire import part_colour
 
 
 def opened(page, service, scene, frame=None):
@@ -134,7 +135,8 @@ def test_depth_parts_and_coverage(page, service, finished):
     page.select_option("#part-count select", "5")
     page.wait_for_timeout(300)
     five = rests(page, mode="parts")
-    assert len(np.unique(five[..., :3].reshape(-1, 3), axis=0)) == 1 + 5
+    shades = {tuple(shade) for shade in np.unique(five[..., :3].reshape(-1, 3), axis=0).tolist()}
+    assert shades == {(0, 0, 0), *map(part_colour, range(5))}  # as the service says, everywhere
     page.focus("#overlay")
     page.keyboard.press("4")
     alpha = rests(page, mode="alpha")
@@ -228,6 +230,21 @@ def test_it_connects_again_when_the_service_restarts(page, tmp_path):
         shown(page, frame="1")
     finally:
         service.stop()
+
+
+def test_an_address_of_no_scene_is_told_and_the_others_are_offered(page, service, finished):
+    opened(page, service, "nope")
+    until(page, "document.querySelector('#curtain').innerText.includes('There is no such scene')")
+    assert "nope" in page.locator("#curtain p").first.inner_text()
+    page.wait_for_timeout(300)
+    assert page.evaluate("document.getElementById('view').dataset.tag") is None  # nothing else in its place
+    page.locator("#curtain .choice").first.click()
+    shown(page)
+    assert finished in page.url
+    page.evaluate("location.hash = '#scene=gone'")  # by hand, in a page that shows a scene
+    until(page, "document.querySelector('#curtain').innerText.includes('There is no such scene')")
+    page.go_back()
+    assert page.faults == []
 
 
 def test_without_a_scene_it_says_what_to_do(page, tmp_path):

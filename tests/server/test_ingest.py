@@ -238,6 +238,23 @@ def test_a_paused_scene_takes_frames_and_reconstructs_none(http, make):
     assert finished(http, id, 0)["state"] == "committed"
 
 
+def test_what_a_scene_does_hides_neither_that_it_is_paused_nor_that_it_is_degraded(http, make):
+    id = make(queue_frames=3)
+    for index, red in enumerate((0, fakes.RAISES)):
+        put(http, id, index, pictures(red))
+        finished(http, id, index)
+    after = status(http, id)
+    assert (after["state"], after["paused"], after["degraded"]) == ("degraded", False, True)
+    put(http, id, 2, pictures(fakes.SLOW))
+    wait_for(lambda: status(http, id)["state"] == "updating")
+    during = http.post(f"/v1/scenes/{id}/pause").json()
+    assert (during["state"], during["paused"], during["degraded"]) == ("updating", True, True)
+    assert "told to raise" in during["error"]
+    finished(http, id, 2)
+    wait_for(lambda: status(http, id)["state"] == "paused")
+    assert (status(http, id)["degraded"], status(http, id)["error"]) == (False, None)
+
+
 def wait_for(condition):
     until = time.monotonic() + 20
     while not condition():
