@@ -253,12 +253,14 @@ def _outcome(experiment: Experiment, claim: Claim, ours: Measured) -> Outcome:
 
 
 def _agrees(own: float, paper: float, small: float) -> AgreementWord:
-    """Both small is the same size; one small and one not is neither."""
+    """Both small is the same size; no difference does not agree with one, even of the same sign."""
     if abs(own) < small and abs(paper) < small:
         return "sign and size"
     if own * paper <= 0:
         return "no"
-    return "sign and size" if 1 / FACTOR <= own / paper <= FACTOR else "sign"
+    if 1 / FACTOR <= own / paper <= FACTOR:
+        return "sign and size"
+    return "no" if min(abs(own), abs(paper)) < small else "sign"
 
 
 def _sign(value: float, small: float) -> int:

@@ -62,8 +62,8 @@ a frame 0 that all its rows share{_elsewhere(captures, there)}.
 
 The gain is the first setting's mean less the second's, over the captures that both the paper and we have. It agrees in
 size where the two gains lie within a factor of {FACTOR:g} of each other; gains that are small on both sides
-({", ".join(f"{name} {value:g}" for name, value in SMALL.items() if name in DIGITS)}) agree as well. Where the paper
-shows a picture only, its claim is the sign.
+({", ".join(f"{name} {value:g}" for name, value in SMALL.items() if name in DIGITS)}) agree as well, and a small gain
+does not agree with one that is not. Where the paper shows a picture only, its claim is the sign.
 
 {sections}
 

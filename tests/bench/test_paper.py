@@ -47,6 +47,7 @@ def gain(own: dict, paper: dict, expected=None):
         (12.0, "sign and size"),
         (12.1, "sign"),
         (2.9, "sign"),
+        (0.25, "no"),
         (-6.0, "no"),
         (0.0, "no"),
     ],
@@ -59,6 +60,8 @@ def test_agreement_is_of_sign_and_then_of_size(own, agrees):
 def test_no_difference_agrees_with_no_difference():
     assert gain({"robot": (20.0, 20.25)}, {"robot": (26.0, 25.9)}).agrees == "sign and size"
     assert gain({"robot": (20.0, 20.35)}, {"robot": (26.0, 25.9)}).agrees == "no"
+    assert gain({"robot": (20.5, 20.0)}, {"robot": (26.0, 25.9)}).agrees == "no"
+    assert gain({"robot": (20.35, 20.0)}, {"robot": (26.0, 25.8)}).agrees == "sign and size"
 
 
 def test_only_captures_that_both_have_are_compared():
