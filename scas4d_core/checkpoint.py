@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scas4d_core.captures.frame import Frame
 from scas4d_core.hierarchy import Hierarchy
 from scas4d_core.history import NEWEST_KEPT
+from scas4d_core.judge import Past
 from scas4d_core.neighbours import Neighbours
 from scas4d_core.npz import read_npz, write_npz
 from scas4d_core.views import TrainingView, ViewFactory
@@ -46,12 +47,14 @@ class Carried:
         labels: [N] what has been seen to move, in scenes without masks; None until something has.
         seen: the views of the frame, in scenes without masks: the next are compared with them.
         structure: digest of the clusters and neighbours that the motion belongs to.
+        past: what is usual for the scene and its cameras.
     """
 
     motion: Motion | None = None
     labels: NDArray[np.bool_] | None = None
     seen: Sequence[TrainingView] = field(default_factory=tuple)
     structure: int = 0
+    past: Past = field(default_factory=Past)
 
 
 def digest(hierarchy: Hierarchy, neighbours: Neighbours | None) -> int:
@@ -79,6 +82,7 @@ class Checkpoints:
         arrays: dict[str, Any] = {"format": np.int64(FORMAT), "structure": np.int64(carried.structure)}
         if carried.motion is not None:
             arrays |= _packed(carried.motion)
+        arrays |= {f"past.{name}": array for name, array in carried.past.arrays().items()}
         if carried.labels is not None:
             arrays["labels"] = carried.labels
         for view in carried.seen:
@@ -109,7 +113,8 @@ class Checkpoints:
             pictures = {name[5:]: array for name, array in arrays.items() if name.startswith("seen.")}
             seen = factory.views(Frame(index, 0.0, pictures, {}), {}, use_masks=False) if pictures else ()
             motion = _unpacked(arrays) if "motion.seconds" in arrays else None
-            return Carried(motion, arrays.get("labels"), seen, int(arrays["structure"]))
+            past = Past.of_arrays({name[5:]: array for name, array in arrays.items() if name.startswith("past.")})
+            return Carried(motion, arrays.get("labels"), seen, int(arrays["structure"]), past)
         except FileNotFoundError:
             raise CheckpointError(f"{file} is missing") from None
         except (ValueError, KeyError, TypeError) as error:

@@ -73,6 +73,20 @@ class PictureLoss:
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background)
         lap("render")
         g_image, g_alpha = self.rasterizer.gradient_buffers()
+        self._compare(view, g_image)
+        lap("picture loss")
+        gradients = self.rasterizer.backward(g_image, g_alpha, self._detached)
+        lap("render backward")
+        return gradients
+
+    def measure(self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView) -> None:
+        """Render the view and set ``image_part``, ``mask_part`` and ``psnr``, without gradients; see ``evaluate``."""
+        self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background)
+        g_image, _ = self.rasterizer.gradient_buffers()
+        self._compare(view, g_image)
+
+    def _compare(self, view: TrainingView, g_image: Array) -> None:
+        """Fill the losses of what was rendered, and its gradient."""
         channels, height, width = view.target.shape
         rows = np.empty((channels, height, 2), np.float32)
         g_exposure = np.empty((channels, height, 2), np.float32)
@@ -93,10 +107,6 @@ class PictureLoss:
         self.image_part, self.mask_part = float(sums[:3, 0].sum()), float(sums[3:, 0].sum())
         self.psnr = 10 * log10(3 * height * width / max(float(sums[:3, 1].sum()), SMALLEST_SQUARE))
         self.exposure_gradient[:channels] = g_exposure.sum(axis=1)
-        lap("picture loss")
-        gradients = self.rasterizer.backward(g_image, g_alpha, self._detached)
-        lap("render backward")
-        return gradients
 
     def colour_shift(self, view: TrainingView) -> tuple[float, float, float]:
         """Mean of the view's picture minus mean of what was rendered for it last, exposure included, RGB in 0…1."""

@@ -7,7 +7,7 @@ before (``checkpoint``), so that ``resume`` goes on after any end of the process
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from math import inf, isfinite, nan
 from time import perf_counter
 from typing import Any
@@ -16,6 +16,8 @@ import numpy as np
 from numba import get_num_threads
 from numpy.typing import NDArray
 
+from scas4d_core import judge
+from scas4d_core.budget import Budget
 from scas4d_core.cameras import Rig, WorldFrame, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.captures.images import resize_area
@@ -23,6 +25,7 @@ from scas4d_core.checkpoint import Carried, CheckpointError, Checkpoints, digest
 from scas4d_core.committed import Committed, View
 from scas4d_core.device import require_device
 from scas4d_core.floor import floor_inside
+from scas4d_core.frame_report import REPORTED_ITERATIONS, REPORTED_LOSSES, FrameReport, Progress, curve, means
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import build_hierarchy
 from scas4d_core.history import History, HistoryError
@@ -33,20 +36,16 @@ from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import Settings
 from scas4d_core.static_scene import StaticResult, fit_static_scene
-from scas4d_core.update import CameraFit, FrameUpdate, Updater
+from scas4d_core.trial import Given, Outcome, Trial
+from scas4d_core.update import FrameUpdate, Updater
+from scas4d_core.updated import Stopwatch
 from scas4d_core.views import TrainingView, ViewFactory, pictures_of
+from scas4d_core.witness import mean_error
 
 __all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "Resumed", "StepError", "View"]
 
 NEW_LABELS = 0.01
 """Share of all Gaussians that must be found moving anew before the hierarchy is built again."""
-
-REPORTED_ITERATIONS = 24
-"""The report's training loss is a mean over this many last iterations: about one round of a rig's cameras."""
-
-
-REPORTED_LOSSES = 100
-"""Of frame 0's thousands of losses the report keeps so many means at most."""
 
 
 class StepError(ValueError):
@@ -55,48 +54,6 @@ class StepError(ValueError):
 
 class ResumeError(ValueError):
     """A history that cannot be gone on from; the message says what is damaged."""
-
-
-@dataclass(frozen=True)
-class Progress:
-    """How far a long task is."""
-
-    stage: str
-    done: int
-    total: int
-    detail: dict[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class FrameReport:
-    """How frame 0, or the update of a frame, went.
-
-    Attributes:
-        seconds: by stage. loss: each iteration's weighted sum; of frame 0 at most ``REPORTED_LOSSES`` means.
-        psnr: dB, over the training views of the last iterations, each as it was rendered then; NaN where not measured.
-        moving, gaussians: how many Gaussians move, and are.
-        cameras: by name, how well each camera's picture was met when it was last rendered: a bumped camera shows.
-        used: cameras whose pictures were there. dropped: cameras left out, with the reason, as the caller gave them.
-    """
-
-    index: int
-    time: float
-    iterations: int
-    seconds: dict[str, float]
-    loss: list[float]
-    psnr: float
-    moving: int
-    gaussians: int
-    cameras: dict[str, CameraFit] = field(default_factory=dict)
-    used: list[str] = field(default_factory=list)
-    dropped: dict[str, str] = field(default_factory=dict)
-
-    def record(self) -> dict[str, Any]:
-        """The report as JSON: what is not finite is None."""
-        record = asdict(self)
-        record["psnr"] = self.psnr if isfinite(self.psnr) else None
-        record["loss"] = [loss if isfinite(loss) else None for loss in self.loss]
-        return record
 
 
 @dataclass(frozen=True)
@@ -141,6 +98,7 @@ class Reconstruction(Committed):
         limits = scene_limits(settings.scene.near, rig.radius)
         self._picture = PictureLoss(self._factory, settings.scene.background, 1.0, 0.0, limits=limits)
         self._updater: Updater | None = None
+        self._budget = Budget(settings.update.budget_ms)
 
     @classmethod
     def _of(cls, rig: Rig, settings: Settings, history: History) -> Reconstruction:
@@ -198,7 +156,7 @@ class Reconstruction(Committed):
             time=frame.time,
             iterations=len(result.losses),
             seconds={"fit": fitted - began, "prepare": perf_counter() - fitted},
-            loss=_means(result.losses, REPORTED_LOSSES),
+            loss=means(result.losses, REPORTED_LOSSES),
             psnr=float(np.mean(result.psnr[-REPORTED_ITERATIONS:])) if result.psnr else nan,
             moving=len(self._updater.hierarchy.rows),
             gaussians=len(result.gaussians),
@@ -210,7 +168,12 @@ class Reconstruction(Committed):
             "masked": self._masked,
             "exposures": {name: exposure.tolist() for name, exposure in result.exposures.items()},
         }
-        self._commit(report, result.gaussians, Carried(seen=seen, structure=structure), {**first, **(notes or {})})
+        past = judge.Past.of_first(
+            {name: fit.psnr for name, fit in result.cameras.items()},
+            judge.brightness(frame.images),
+        )
+        carried = Carried(seen=seen, structure=structure, past=replace(past, fitted=frame.time))
+        self._commit(report, result.gaussians, carried, {**first, **(notes or {})})
         return self
 
     @classmethod
@@ -313,18 +276,23 @@ class Reconstruction(Committed):
         )
 
     def step(
-        self, frame: Frame, *, dropped: Mapping[str, str] | None = None, notes: Mapping[str, Any] | None = None
+        self,
+        frame: Frame,
+        *,
+        dropped: Mapping[str, str] | None = None,
+        notes: Mapping[str, Any] | None = None,
+        started: float | None = None,
     ) -> FrameReport:
-        """Update to a frame and commit.
+        """Update to a frame and commit; a frame that does not fit is held or left out in part, and its report says so.
 
         Args:
             frame: later than the last; with the pictures of some cameras or all.
             dropped: cameras that the caller has left out, with the reason; committed with the report.
             notes: further facts to commit with the report, as JSON; they stand beside its own.
+            started: ``perf_counter`` when the work on the frame began, where that was before; a budget counts from it.
 
         Raises:
-            StepError: not later than the last frame, no picture of the rig, a picture of another size, or an update
-                that ended in numbers that are not finite.
+            StepError: not later than the last frame, no picture of the rig, or a picture of another size.
         """
         last = self.history.indices[-1]
         if frame.index <= last:
@@ -332,37 +300,75 @@ class Reconstruction(Committed):
         seconds = frame.time - self.history.time(last)
         if not 0 < seconds < inf:
             raise StepError(f"frame {frame.index}: time {frame.time} s is not after {self.history.time(last)} s")
-        started = perf_counter()
+        watch = Stopwatch() if started is None else Stopwatch(began=started, last=started)
+        past = self._carried.past
+        brightness = judge.brightness(frame.images)
+        look = judge.look(past, brightness) if self.settings.update.judge else judge.Look()
         try:
             views = self._factory.views(self._scaled(frame), self._exposures, self._uses_masks)
         except ValueError as error:
             raise StepError(str(error)) from error
-        decoded = perf_counter() - started
-        updater, carried = self._learn_what_moves(views)
-        updated = updater.run(
-            self._labelled(self._state(None), carried.labels), views, carried.motion, seconds, frame.index
+        watch.lap("decode")
+        updater, carried = self._learn_what_moves(views, look)
+        given = Given(
+            state=self._labelled(self._state(None), carried.labels),
+            motion=carried.motion,
+            seconds=frame.time - past.fitted if isfinite(past.fitted) else seconds,
+            views=[view for view in views if view.name not in look.left_out],
+            suspects=[view for view in views if past.of(view.name).out],
+            brightness=brightness,
+            seed=frame.index,
+            past=past,
+            look=look,
+            end=self._budget.end(watch.began),
+            each=self._budget.each,
         )
-        for name in ("means", "factors", "colours"):
-            if not np.isfinite(getattr(updated.gaussians, name)).all():
-                raise StepError(f"frame {frame.index}: the update left NaN or infinity in {name}; nothing is committed")
-        report = FrameReport(
+        trial = Trial(updater, self._factory, self._picture, self.settings.update)
+        outcome = trial.held(given, look.held) if look.held else trial.run(given)
+        watch.lap("update")
+        report = self._report(frame, outcome, look, watch, dropped or {})
+        how = {"cold": carried.motion is None, "relabelled": updater is not self._updater}
+        learnt = outcome.fresh and not outcome.stood
+        past = replace(outcome.past, fitted=frame.time) if learnt else outcome.past
+        seen = carried.seen if not outcome.fresh else () if self._masked else views
+        carried = replace(carried, motion=outcome.motion, past=past, seen=seen)
+        self._commit(report, outcome.gaussians, carried, {**how, **(notes or {})})
+        self._updater = updater
+        self._budget.learn(outcome.updated, perf_counter() - watch.began - watch.total)
+        return report
+
+    def _report(
+        self, frame: Frame, outcome: Outcome, look: judge.Look, watch: Stopwatch, dropped: Mapping[str, str]
+    ) -> FrameReport:
+        updated, gaussians = outcome.updated, outcome.gaussians
+        left_out = {**dropped, **look.left_out, **updated.left_out}
+        stages = {"decode": watch.seconds["decode"], **updated.seconds}
+        stages["other"] = max(0.0, watch.seconds["update"] - sum(updated.seconds.values()))
+        return FrameReport(
             index=frame.index,
             time=frame.time,
             iterations=len(updated.losses),
-            seconds={"decode": decoded, **updated.seconds},
+            seconds=stages,
             loss=updated.losses,
-            psnr=float(np.mean(updated.psnr[-REPORTED_ITERATIONS:])),
-            moving=len(updater.hierarchy.rows),
-            gaussians=len(updated.gaussians),
-            cameras=updated.cameras,
-            used=[view.name for view in views],
-            dropped=dict(dropped or {}),
+            psnr=float(np.mean(updated.psnr[-REPORTED_ITERATIONS:])) if updated.psnr else nan,
+            moving=int(gaussians.moving.sum()),
+            gaussians=len(gaussians),
+            cameras={
+                name: replace(fit, health=judge.health(outcome.fits.get(name))) for name, fit in updated.cameras.items()
+            },
+            used=[name for name in self.rig.names if name in frame.images and name not in left_out]
+            if outcome.fresh
+            else [],
+            dropped=left_out,
+            degraded=outcome.degraded,
+            attempts=outcome.attempts,
+            exposure=outcome.exposure,
+            held=outcome.held,
+            planned=updated.planned,
+            curve=curve(updated.losses, updated.moments),
+            errors={kind: mean_error(errors, list(errors)) for kind, errors in updated.errors.items()},
+            kept=updated.kept,
         )
-        how = {"cold": carried.motion is None, "relabelled": updater is not self._updater}
-        carried = replace(carried, motion=updated.motion, seen=() if self._masked else views)
-        self._commit(report, updated.gaussians, carried, {**how, **(notes or {})})
-        self._updater = updater
-        return report
 
     def _commit(self, report: FrameReport, gaussians: Gaussians, carried: Carried, more: Mapping[str, Any]) -> None:
         """The checkpoint first, then state and report in one rename."""
@@ -382,7 +388,7 @@ class Reconstruction(Committed):
         weights = self.settings.update.weights
         return self.settings.update.use_masks and max(weights.mask, weights.mask_alone) > 0
 
-    def _learn_what_moves(self, views: list[TrainingView]) -> tuple[Updater, Carried]:
+    def _learn_what_moves(self, views: list[TrainingView], look: judge.Look) -> tuple[Updater, Carried]:
         """Where frame 0 had no mask, the pictures tell what moves; what has moved once stays in the hierarchy.
 
         The labels become part of the state with the commit of this frame. A hierarchy of other Gaussians is a new one:
@@ -390,10 +396,11 @@ class Reconstruction(Committed):
         """
         assert self._updater is not None
         carried = self._carried
-        if self._masked or not carried.seen:
+        if self._masked or not carried.seen or look.held or look.exposure != 1.0:
             return self._updater, carried
         state = self._state(None)
-        found = moving_between(state, carried.seen, views, self._picture)
+        believed = [view for view in views if view.name not in look.left_out]
+        found = moving_between(state, carried.seen, believed, self._picture)
         known = np.zeros(len(state), np.bool_) if carried.labels is None else carried.labels
         if (found & ~known).sum() <= NEW_LABELS * len(state):
             return self._updater, carried
@@ -442,8 +449,3 @@ class Reconstruction(Committed):
                 if mask is not None:
                     masks[name] = (resize_area(255 * mask, size) >= 128).astype(np.uint8)
         return Frame(frame.index, frame.time, images, masks)
-
-
-def _means(values: list[float], most: int) -> list[float]:
-    """At most so many means of consecutive values."""
-    return [float(np.mean(part)) for part in np.array_split(values, max(1, min(len(values), most))) if len(part)]

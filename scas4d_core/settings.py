@@ -134,6 +134,32 @@ class UpdateSettings(Model):
     """One update: from Θ_{t−1} and the pictures of frame t to Θ_t."""
 
     iterations: int = Field(100, ge=1, description="Iterations a frame, one forward and backward render each.")
+    budget_ms: Positive | None = Field(
+        None,
+        description="Milliseconds that a frame may take, decoding and commit included; then there are as many "
+        "iterations as fit, whatever `iterations` says. None: no limit.",
+    )
+    stop_gain: float = Field(
+        0.0,
+        ge=0,
+        lt=1,
+        description="An update cools down and ends once a round over the training views lowers their mean loss by less "
+        "than this share, half its iterations over. 0: never.",
+    )
+    still: float = Field(
+        0.0,
+        ge=-1,
+        description="A frame needs no iteration where the state before shows it, on four training views, with at most "
+        "1 + this times the error that the last update ended with. -1: every frame is updated.",
+    )
+    judge: bool = Field(
+        True,
+        description="Leave out cameras and hold frames that do not fit what was before, commit no state that is worse "
+        "than not moving, and say so in the frame's report.",
+    )
+    patience: int = Field(
+        10, ge=1, description="Frames in a row that are held because they cannot be met, before the scene is another."
+    )
     clusters: tuple[int, ...] = Field(
         (64, 320, 1280), description="Clusters per layer, coarse to fine (the paper's); empty: each Gaussian alone."
     )

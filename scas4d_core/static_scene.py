@@ -15,7 +15,7 @@ from scas4d_core.kernels.adam import EVERY_ROW, adam
 from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import SceneSettings, StaticSettings
-from scas4d_core.update import CameraFit
+from scas4d_core.updated import CameraFit
 from scas4d_core.views import TrainingView, ViewFactory, view_order
 
 Array = NDArray[np.float32]

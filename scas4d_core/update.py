@@ -2,98 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from time import perf_counter
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.adam import Adam
+from scas4d_core.anytime import Anytime
+from scas4d_core.attempts import Course, Manner
 from scas4d_core.deformation_cpu import CpuDeformation
 from scas4d_core.floor import floor_term
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import Hierarchy
-from scas4d_core.kernels.adam import EVERY_ROW, adam
 from scas4d_core.neighbours import Neighbours
+from scas4d_core.pace import Counted
 from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import SceneSettings, UpdateSettings
-from scas4d_core.update_plan import Rates, first_lengths, mask_weight, plan_samples, plan_views
+from scas4d_core.update_plan import Rates, ViewPlan, first_lengths, mask_weight, plan_samples
+from scas4d_core.updated import Stopwatch, Story, Updated
 from scas4d_core.views import TrainingView, ViewFactory
-from scas4d_core.warm_start import Motion, quaternion_products, warm_start
+from scas4d_core.warm_start import Motion, quaternion_products
 
 Array = NDArray[np.float32]
-
-
-@dataclass
-class Stopwatch:
-    """Seconds by stage."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-    _last: float = field(default_factory=perf_counter)
-
-    def lap(self, stage: str) -> None:
-        """Book the time since the last lap to a stage."""
-        now = perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._last
-        self._last = now
-
-
-class Adam:
-    """Adam over one table of parameters, with a rate per column, times one per row where given.
-
-    It begins after a share ``start`` of the iterations and leaves the table alone before.
-    """
-
-    def __init__(
-        self, parameters: Array, columns: list[float], rates: Rates, start: float = 0.0, by_row: Array = EVERY_ROW
-    ) -> None:
-        self._parameters = parameters
-        self._by_row = by_row
-        self._first, self._second = np.zeros_like(parameters), np.zeros_like(parameters)
-        self._plan, self._start = rates, start
-        self._rates = np.array(columns, np.float32)
-        self._beta1, self._beta2 = np.float32(rates.beta1), np.float32(rates.beta2)
-        self._steps = 0
-
-    def step(self, gradients: Array, iteration: int, iterations: int) -> None:
-        """Take the step of an iteration, counted from 0."""
-        factor = self._plan.factor(iteration, iterations, self._start)
-        if factor == 0:
-            return
-        self._steps += 1
-        adam(
-            self._parameters, gradients, self._first, self._second, self._rates * np.float32(factor), self._by_row,
-            self._beta1, self._beta2, self._steps,
-        )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class CameraFit:
-    """How well one camera's picture was met, when it was last rendered.
-
-    Attributes:
-        psnr: dB. colour_shift: [3] mean of the picture minus mean of the render, RGB in 0…1; None where not measured.
-    """
-
-    psnr: float
-    colour_shift: tuple[float, float, float] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Updated:
-    """What an update leaves: Θ_t, the motion that warms the next start, and how it went.
-
-    ``losses`` holds each iteration's weighted sum, ``psnr`` the dB of the view it rendered; ``cameras`` how well each
-    camera was met, by name.
-    """
-
-    gaussians: Gaussians
-    motion: Motion
-    losses: list[float]
-    psnr: list[float]
-    seconds: dict[str, float]
-    cameras: dict[str, CameraFit] = field(default_factory=dict)
 
 
 class Updater(Protocol):
@@ -102,13 +33,20 @@ class Updater(Protocol):
     hierarchy: Hierarchy
 
     def run(
-        self, previous: Gaussians, views: list[TrainingView], motion: Motion | None, seconds: float, seed: int
+        self,
+        previous: Gaussians,
+        views: list[TrainingView],
+        motion: Motion | None,
+        seconds: float,
+        seed: int,
+        course: Course | None = None,
     ) -> Updated:
         """Find D_t and apply it.
 
         Args:
             previous: Θ_{t−1}. views: of frame t. motion: what the previous update left, or None.
             seconds: between the frames. seed: of the order of views and the sampled neighbourhoods.
+            course: how long and in which manner; None: the settings' iterations, as set.
         """
 
 
@@ -137,24 +75,32 @@ class FrameUpdate:
         self._deformation = CpuDeformation(hierarchy, neighbours, bounds, settings.cluster_map)
 
     def run(
-        self, previous: Gaussians, views: list[TrainingView], motion: Motion | None, seconds: float, seed: int
+        self,
+        previous: Gaussians,
+        views: list[TrainingView],
+        motion: Motion | None,
+        seconds: float,
+        seed: int,
+        course: Course | None = None,
     ) -> Updated:
         """Find D_t and apply it, see ``Updater.run``."""
         settings, deformation = self.settings, self._deformation
+        course = course or Course(Counted(settings.iterations))
         rng = np.random.default_rng([settings.seed, seed])
         watch = Stopwatch()
-        pictures = plan_views(self._factory, views, settings, rng)
+        plan = ViewPlan(self._factory, views, settings, course.pace.most, rng)
         samples = plan_samples(len(self.hierarchy.rows), settings.neighbour_sample, rng)
-        deformation.start(previous)
-        warm_start(deformation, motion, seconds, settings)
         features = np.concatenate([previous.colours, previous.foreground[:, None]], axis=1)
         colours = previous.colours.copy()
-        optimizers = self._optimizers(colours, cold=motion is None)
-        losses, psnr = [], []
-        cameras: dict[str, CameraFit] = {}
-        last = {view.name: iteration for iteration, view in enumerate(pictures)}
+        deformation.start(previous)
+        anytime = Anytime.of(self._factory, self._picture, deformation, previous, views if course.witness else [])
+        anytime.start(motion, seconds, settings)
+        optimizers = self._optimizers(colours, course.manner, cold=motion is None)
+        pace = Counted(0) if anytime.stands(course.enough) else course.pace
+        story = Story(len(views))
         watch.lap("start")
-        for iteration, view in enumerate(pictures):
+        while (iteration := story.iterations) < (planned := pace.planned(iteration, story.last_loss)):
+            view = plan.take(iteration, planned)
             deformation.forward()
             features[:, :3] = colours
             watch.lap("cascade")
@@ -162,9 +108,7 @@ class FrameUpdate:
                 deformation.means, deformation.factors, previous.opacities, features, view, watch.lap
             )
             loss = self._picture.image_part + self._picture.mask_part
-            psnr.append(self._picture.psnr)
-            if last[view.name] == iteration:
-                cameras[view.name] = CameraFit(self._picture.psnr, self._picture.colour_shift(view))
+            story.see(view, self._picture)
             loss += self._neighbour_terms(samples[iteration % len(samples)])
             if self._floor is not None:
                 loss += floor_term(
@@ -179,18 +123,23 @@ class FrameUpdate:
             g_colours = gradients.features[:, :3] + g_soft
             tables = [*deformation.cluster_gradients, deformation.delta_gradients, g_colours]
             for optimizer, table in zip(optimizers, tables, strict=True):
-                optimizer.step(table, iteration, settings.iterations)
-            losses.append(loss)
+                optimizer.step(table, iteration, planned)
             watch.lap("adam")
+            if story.end_iteration(loss, watch.total) and course.gate is not None:
+                plan.leave_out(story.leave_out(course.gate(story.first)))
         deformation.forward()
-        updated = Updated(self._commit(previous, colours), Motion.of(deformation, seconds), losses, psnr, {}, cameras)
+        kept = anytime.end(colours, story)
+        watch.lap("end")
+        state = previous if kept == "still" else self._commit(previous, colours if kept == "end" else previous.colours)
+        updated = story.updated(state, Motion.of(deformation, seconds), pace, anytime.errors, kept)
         watch.lap("commit")
         updated.seconds.update(watch.seconds)
         return updated
 
-    def _optimizers(self, colours: Array, cold: bool) -> list[Adam]:
+    def _optimizers(self, colours: Array, manner: Manner, cold: bool) -> list[Adam]:
         """One per table: each layer of clusters, the Gaussians' own deltas, the colours. Moments start at zero."""
-        rates, deformation = self._rates.hurried(self.settings.cold_start if cold else 1.0), self._deformation
+        rates = self._rates.tried(manner.rates, manner.rigid, manner.hold_colours)
+        rates, deformation = rates.hurried(self.settings.cold_start if cold else 1.0), self._deformation
         columns = [[r] * 3 + [t] * 3 + [scaling] * 4 for r, t, scaling in rates.layers]
         columns.append([rates.position] * 3 + [rates.rotation] * 3 + [rates.scale] * 3)
         starts = [rates.start_of(layer) for layer in range(len(rates.layers))] + [rates.start]

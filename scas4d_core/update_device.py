@@ -13,14 +13,16 @@ import torch
 from numpy.typing import NDArray
 
 from scas4d_core import update_torch
+from scas4d_core.attempts import Course
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import Hierarchy
 from scas4d_core.neighbours import Neighbours
+from scas4d_core.pace import Counted
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import SceneSettings, UpdateSettings
-from scas4d_core.update import CameraFit, Stopwatch, Updated
-from scas4d_core.update_plan import Rates, first_lengths, mask_weight, plan_samples, plan_views
+from scas4d_core.update_plan import Rates, ViewPlan, first_lengths, mask_weight, plan_samples
 from scas4d_core.update_torch import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchUpdate
+from scas4d_core.updated import CameraFit, Stopwatch, Updated
 from scas4d_core.views import LABEL, TrainingView, ViewFactory
 from scas4d_core.warm_start import Motion, warm_start
 
@@ -87,19 +89,28 @@ class DeviceUpdate:
         )
 
     def run(
-        self, previous: Gaussians, views: list[TrainingView], motion: Motion | None, seconds: float, seed: int
+        self,
+        previous: Gaussians,
+        views: list[TrainingView],
+        motion: Motion | None,
+        seconds: float,
+        seed: int,
+        course: Course | None = None,
     ) -> Updated:
-        """Find D_t and apply it, see ``update.Updater.run``."""
+        """Find D_t and apply it, see ``update.Updater.run``; start and end are not compared, and no gate is asked."""
         settings, hierarchy = self.settings, self.hierarchy
+        course = course or Course(Counted(settings.iterations))
         rng = np.random.default_rng([settings.seed, seed])
         watch = Stopwatch()
-        pictures = plan_views(self._factory, views, settings, rng)
+        most = course.pace.most
+        plan = ViewPlan(self._factory, views, settings, most, rng)
+        pictures = [plan.take(iteration, settings.iterations) for iteration in range(most)]
         samples = plan_samples(len(hierarchy.rows), settings.neighbour_sample, rng)
         tables = Tables.identity(hierarchy)
         warm_start(tables, motion, seconds, settings)
-        update = self._update
-        if motion is None:
-            update = replace(update, rates=update.rates.hurried(settings.cold_start))
+        manner = course.manner
+        rates = self._update.rates.tried(manner.rates, manner.rigid, manner.hold_colours)
+        update = replace(self._update, rates=rates.hurried(settings.cold_start) if motion is None else rates)
         start, deltas = tables.split()
         distinct = {id(view): view for view in pictures}
         place = {key: index for index, key in enumerate(distinct)}
@@ -110,13 +121,16 @@ class DeviceUpdate:
             [place[id(view)] for view in pictures],
             start=start,
             deltas=deltas,
-            rows=[samples[iteration % len(samples)] for iteration in range(settings.iterations)],
+            rows=[samples[iteration % len(samples)] for iteration in range(most)],
+            pace=course.pace,
         )
         watch.lap("iterations")
         motion = Motion.of(Tables.of(hierarchy, found), seconds)
         watch.lap("commit")
-        cameras = {view.name: CameraFit(psnr) for view, psnr in zip(pictures, found.psnr, strict=True)}
-        return Updated(found.gaussians, motion, found.losses, found.psnr, watch.seconds, cameras)
+        cameras = {view.name: CameraFit(psnr) for view, psnr in zip(pictures, found.psnr, strict=False)}
+        return Updated(
+            found.gaussians, motion, found.losses, found.psnr, watch.seconds, cameras, planned=course.pace.told
+        )
 
     def _on_device(self, view: TrainingView) -> update_torch.TrainingView:
         """The view as ``update_torch`` takes it; a picture smaller than its camera's is a coarse one."""

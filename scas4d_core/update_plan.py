@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from math import cos, pi
 
@@ -63,6 +64,21 @@ class Rates:
         """Layers that turn and shift faster: where there is no motion to start from there is further to go."""
         return replace(self, layers=tuple((factor * r, factor * t, scaling) for r, t, scaling in self.layers))
 
+    def tried(self, factor: float, rigid: bool, hold_colours: bool) -> Rates:
+        """All rates times a factor; ``rigid``: of clusters that turn and shift only; ``hold_colours``: colours stay."""
+        if (factor, rigid, hold_colours) == (1.0, False, False):
+            return self
+        own = 0.0 if rigid else factor
+        return replace(
+            self,
+            layers=tuple((factor * r, factor * t, own * scaling) for r, t, scaling in self.layers),
+            position=own * self.position,
+            rotation=own * self.rotation,
+            scale=own * self.scale,
+            colour=0.0 if hold_colours else factor * self.colour,
+            colour_standing=0.0 if hold_colours else factor * self.colour_standing,
+        )
+
     @classmethod
     def of(cls, settings: UpdateSettings, layers: int, radius: float) -> Rates:
         """The rates of a scene of ``radius`` metres whose hierarchy has so many layers."""
@@ -82,14 +98,47 @@ class Rates:
         )
 
 
-def plan_views(
-    factory: ViewFactory, views: list[TrainingView], settings: UpdateSettings, rng: np.random.Generator
-) -> list[TrainingView]:
-    """The view of each iteration, in random rounds: coarser pictures first, where the settings say so."""
-    order = view_order(len(views), settings.iterations, rng)
-    coarse = order[: round(settings.coarse_until * settings.iterations)]
-    small = {index: factory.coarser(views[index], settings.coarse_scale) for index in set(coarse)}
-    return [small[index] for index in coarse] + [views[index] for index in order[len(coarse) :]]
+class ViewPlan:
+    """Which view each iteration trains: random rounds over all, coarser pictures first where the settings say so.
+
+    Args:
+        most: iterations there can be at most; the order of more begins again.
+    """
+
+    def __init__(
+        self,
+        factory: ViewFactory,
+        views: Sequence[TrainingView],
+        settings: UpdateSettings,
+        most: int,
+        rng: np.random.Generator,
+    ) -> None:
+        self._factory = factory
+        self._views = views
+        self._order = view_order(len(views), most, rng)
+        self._until, self._scale = settings.coarse_until, settings.coarse_scale
+        self._small: dict[int, TrainingView] = {}
+        self._next = 0
+        self._left_out: set[str] = set()
+
+    def leave_out(self, names: Iterable[str]) -> None:
+        """These cameras have no turn any more; all of them cannot be left out."""
+        self._left_out |= set(names)
+        if all(view.name in self._left_out for view in self._views):
+            raise ValueError(f"all {len(self._views)} views are left out; an update needs one")
+
+    def take(self, iteration: int, iterations: int) -> TrainingView:
+        """The view of an iteration, counted from 0, of so many as are planned."""
+        while True:
+            index = self._order[self._next % len(self._order)]
+            self._next += 1
+            if self._views[index].name not in self._left_out:
+                break
+        if iteration >= round(self._until * iterations):
+            return self._views[index]
+        if index not in self._small:
+            self._small[index] = self._factory.coarser(self._views[index], self._scale)
+        return self._small[index]
 
 
 def plan_samples(count: int, size: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:

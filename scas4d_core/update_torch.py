@@ -19,6 +19,7 @@ from scas4d_core import losses
 from scas4d_core.cameras import Camera
 from scas4d_core.deformation import ClusterMap, ClusterParams, Deformed, Deltas, Layer, deform, material_rotations
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.pace import Pace, Timed
 from scas4d_core.rasterize import cuda, twin
 from scas4d_core.rasterize.limits import DEFAULT, GSPLAT, Limits
 from scas4d_core.rasterize.twin import CameraParams, Rendered
@@ -29,6 +30,9 @@ Render: TypeAlias = Callable[[Tensor, Tensor, Tensor, Tensor, CameraParams, Tens
 
 ADAM_EPSILON = 1e-15
 """As in 3D Gaussian Splatting: steps keep the size of the rate however small the gradients are."""
+
+TIMED_EVERY = 10
+"""Iterations after which an update by the clock waits for the device."""
 
 
 class Graph(NamedTuple):
@@ -169,6 +173,7 @@ class TorchUpdate:
         deltas: DeltaArrays | None = None,
         rows: Sequence[NDArray[np.int64]] | None = None,
         on_iteration: Callable[[int], None] | None = None,
+        pace: Pace | None = None,
     ) -> Updated:
         """Find the deformation from Θ_{t−1} to the pictures of frame t.
 
@@ -180,6 +185,7 @@ class TorchUpdate:
             deltas: per-Gaussian parameters to start from; None: the identity.
             rows: per iteration the rows among the moving whose neighbours are looked at; None: all.
             on_iteration: called with the number of iterations done.
+            pace: how many of the order's are taken; None: all.
 
         Raises:
             IndexError: the order names a view that is not there.
@@ -191,8 +197,13 @@ class TorchUpdate:
         base = [(group["lr"], group["begins"]) for group in optimizer.param_groups]
         history: list[tuple[Tensor, Tensor]] = []
         for iteration, view in enumerate(order):
+            if self.on_cuda and isinstance(pace, Timed) and iteration % TIMED_EVERY == 0:
+                torch.cuda.synchronize()  # the host runs ahead: its clock would not see the device's work
+            planned = len(order) if pace is None else pace.planned(iteration, None)
+            if iteration >= planned:
+                break
             for group, (rate, begins) in zip(optimizer.param_groups, base, strict=True):
-                group["lr"] = rate * self.rates.factor(iteration, len(order), begins)
+                group["lr"] = rate * self.rates.factor(iteration, planned, begins)
             sampled = None if rows is None else scene.indices(rows[iteration])
             optimizer.zero_grad(set_to_none=True)
             loss = scene.loss(view, sampled)

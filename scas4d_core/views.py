@@ -96,6 +96,10 @@ class ViewFactory:
         planes = np.ascontiguousarray(np.moveaxis(small, -1, 0))
         return self._view(view.name, CameraArrays.of(camera), planes, view.exposure)
 
+    def retouched(self, view: TrainingView, target: Array) -> TrainingView:
+        """The view with other planes [C, H, W] of the same size."""
+        return self._view(view.name, view.camera, target, view.exposure)
+
     def _view(self, name: str, camera: CameraArrays, target: Array, exposure: Array) -> TrainingView:
         means, squares = np.empty_like(target), np.empty_like(target)
         image_loss.target_moments(target, self.scratch(*target.shape), means, squares)

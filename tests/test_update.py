@@ -20,7 +20,9 @@ from scas4d_core.kernels import neighbour_terms
 from scas4d_core.neighbours import Neighbours, build_neighbours
 from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.settings import SceneSettings, UpdateSettings
-from scas4d_core.update import Adam, FrameUpdate, Updated
+from scas4d_core.adam import Adam
+from scas4d_core.update import FrameUpdate
+from scas4d_core.updated import Updated
 from scas4d_core.update_plan import Rates, plan_samples
 from scas4d_core.views import TrainingView, ViewFactory
 

@@ -20,8 +20,11 @@ CAPTURES = (*OBJECT_CAPTURES, "stage", "basketball")
 CAPTURE_CHANGES: Mapping[str, tuple[str, ...]] = {}
 """What a scene itself asks for in every run of it (its budget of Gaussians, its floor), never what tunes a method."""
 
-LATER: Mapping[str, Mapping[str, Any]] = {"static": {"stop_gain": 0.0}}
+LATER: Mapping[str, Mapping[str, Any]] = {"static": {"stop_gain": 0.0}, "update": {"budget_ms": None, "stop_gain": 0.0}}
 """Settings that rows measured before do not name, by group, with the value that they had in effect."""
+
+IDLE = {"update": ("still", "judge", "patience")}
+"""Settings that rows measured before do not name and that change nothing on captures without faults: taken as today."""
 
 OTHER_MAP = "published" if preset("scas4d").update.cluster_map == "centred" else "centred"
 """The cluster map that is not the default."""
@@ -124,10 +127,12 @@ def measure_runs(
     return run_jobs(jobs, out, again=again, report=report)
 
 
-def completed(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """A row's settings with what came later, at the value that leaves all as it was."""
+def completed(settings: Mapping[str, Any], today: Mapping[str, Any]) -> dict[str, Any]:
+    """A row's settings with what came later, at the value that leaves all as it was. ``today``: those of its run."""
     return {
-        group: {**LATER.get(group, {}), **given} if isinstance(given, dict) else given
+        group: {**LATER.get(group, {}), **{name: today[group][name] for name in IDLE.get(group, ())}, **given}
+        if isinstance(given, dict)
+        else given
         for group, given in settings.items()
     }
 
@@ -147,7 +152,7 @@ def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
             for row in rows:
                 given = row["given"]
                 withheld = (given["masks"], given["points"])
-                told = completed(row["settings"])
+                told = completed(row["settings"], settings)
                 same = all(told.get(group) == settings[group] for group in groups)
                 if row["capture"] != capture or not same or withheld != (run.masks, run.points):
                     continue

@@ -1,0 +1,68 @@
+"""A frame that is exposed otherwise than those before: its gain is taken out of its pictures, and colours are held.
+
+Lights flicker, and cameras that choose their own exposure do it together. Learnt as colours, that would be unlearnt a
+frame later. How much brighter the pictures are is read against the scene as it stood: the median over the
+pixels is that of the many in which nothing but the light changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.judge import EXPOSURE
+from scas4d_core.picture_loss import PictureLoss
+from scas4d_core.views import LABEL, TrainingView, ViewFactory
+
+Array = NDArray[np.float32]
+
+DARK = 0.05
+"""Mean of the channels, 0…1, from which a pixel tells how bright the light is."""
+PIXELS = 100
+"""Of every other row and column that a camera needs to have a say."""
+SATURATED = 0.99
+"""Of a channel, 0…1, from which a pixel says only that it is at least so bright."""
+
+
+def evened(
+    factory: ViewFactory, picture: PictureLoss, state: Gaussians, views: Sequence[TrainingView]
+) -> tuple[float, list[TrainingView]]:
+    """How many times brighter than usual a frame is, and its views as they would be without that.
+
+    Args:
+        state: Θ_{t−1}, as the frame before shows it. views: of the frame.
+
+    Returns:
+        1 and the views as they are, where they turn out not to differ.
+    """
+    features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
+    shown: list[Array] = []
+    ratios = []
+    for view in views:
+        picture.measure(state.means, state.factors, state.opacities, features, view)
+        planes = picture.rasterizer.planes[:LABEL, : view.camera.height, : view.camera.width]
+        shown.append(view.exposure[:LABEL, 0, None, None] * planes + view.exposure[:LABEL, 1, None, None])
+        ratios += _ratio(view.target[:LABEL], shown[-1])
+    gain = float(np.median(ratios)) if ratios else 1.0
+    if 1 / EXPOSURE <= gain <= EXPOSURE:
+        return 1.0, list(views)
+    return gain, [factory.retouched(view, _without(view, gain, now)) for view, now in zip(views, shown, strict=True)]
+
+
+def _ratio(picture: Array, shown: Array) -> list[float]:
+    """Median over the pixels of how much brighter a picture is than what was shown; none where both are dark."""
+    here, there = picture[:, ::2, ::2].mean(axis=0), shown[:, ::2, ::2].mean(axis=0)
+    says = (there > DARK) & (there < SATURATED) & (here > DARK / 2) & (here < SATURATED)
+    return [float(np.median(here[says] / there[says]))] if says.sum() >= PIXELS else []
+
+
+def _without(view: TrainingView, gain: float, shown: Array) -> Array:
+    """The view's planes over the gain; what is saturated is taken to be as bright as the scene says, or more."""
+    target = view.target.copy()
+    saturated = target[:LABEL] >= SATURATED
+    target[:LABEL] /= np.float32(gain)
+    np.copyto(target[:LABEL], np.maximum(target[:LABEL], shown), where=saturated)
+    return target

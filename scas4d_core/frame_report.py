@@ -1,0 +1,104 @@
+"""How frame 0, or the update of a frame, went: what is committed beside its state."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from itertools import pairwise
+from math import isfinite
+from typing import Any
+
+import numpy as np
+
+from scas4d_core.updated import CameraFit
+
+REPORTED_ITERATIONS = 24
+"""The report's training loss is a mean over this many last iterations: about one round of a rig's cameras."""
+REPORTED_LOSSES = 100
+"""Of frame 0's thousands of losses the report keeps so many means at most."""
+CHECKPOINTS = 10
+"""Points of the curve of an update at most."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a long task is."""
+
+    stage: str
+    done: int
+    total: int
+    detail: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """How far an update was: mean training loss of the iterations since the point before.
+
+    Attributes:
+        milliseconds: since the update began; decoding is before it.
+    """
+
+    iterations: int
+    milliseconds: float
+    loss: float
+
+
+@dataclass(frozen=True)
+class FrameReport:
+    """How frame 0, or the update of a frame, went.
+
+    Attributes:
+        seconds: by stage. loss: each iteration's weighted sum; of frame 0 at most ``REPORTED_LOSSES`` means.
+        psnr: dB, over the training views of the last iterations, each as it was rendered then; NaN where not measured.
+        moving, gaussians: how many Gaussians move, and are.
+        cameras: by name, how well each camera's picture was met when it was last rendered: a bumped camera shows.
+        used: cameras whose pictures were learnt from. dropped: cameras left out, with the reason.
+        degraded: why the state is not the frame's, or only by half; None for a frame that went as it should.
+        attempts: how often and in which manner the update was tried, with what came of each.
+        exposure: times that the frame was seen to be brighter than frame 0.
+        held: Gaussians held one by one as they were before. guards: by name, how often each guard acted.
+        planned: (iteration, iterations in all) whenever the pace planned otherwise. curve: of the last attempt.
+        errors: mean image loss of the witnesses for the frame before ("still"), going on as before ("warm"), and the
+            end of the update ("end"). kept: which of them the state is.
+    """
+
+    index: int
+    time: float
+    iterations: int
+    seconds: dict[str, float]
+    loss: list[float]
+    psnr: float
+    moving: int
+    gaussians: int
+    cameras: dict[str, CameraFit] = field(default_factory=dict)
+    used: list[str] = field(default_factory=list)
+    dropped: dict[str, str] = field(default_factory=dict)
+    degraded: str | None = None
+    attempts: list[str] = field(default_factory=list)
+    exposure: float = 1.0
+    held: int = 0
+    guards: dict[str, int] = field(default_factory=dict)
+    planned: list[tuple[int, int]] = field(default_factory=list)
+    curve: list[CurvePoint] = field(default_factory=list)
+    errors: dict[str, float] = field(default_factory=dict)
+    kept: str = "end"
+
+    def record(self) -> dict[str, Any]:
+        """The report as JSON: what is not finite is None."""
+        record = asdict(self)
+        record["psnr"] = self.psnr if isfinite(self.psnr) else None
+        record["loss"] = [loss if isfinite(loss) else None for loss in self.loss]
+        return record
+
+
+def means(values: list[float], most: int) -> list[float]:
+    """At most so many means of consecutive values."""
+    return [float(np.mean(part)) for part in np.array_split(values, max(1, min(len(values), most))) if len(part)]
+
+
+def curve(losses: list[float], moments: list[float]) -> list[CurvePoint]:
+    """The curve of an update from the loss of each iteration and the seconds at its end."""
+    ends = np.unique(np.linspace(0, len(moments), CHECKPOINTS + 1).round().astype(int))
+    return [
+        CurvePoint(int(end), 1000 * moments[end - 1], float(np.mean(losses[begin:end])))
+        for begin, end in pairwise(ends)
+    ]

@@ -1,0 +1,246 @@
+"""Which pictures of a frame can be believed: a black frame is finite, and 100 iterations would paint the scene black.
+
+Each camera is held against its own past and against the others of the frame, with figures that an update has anyway:
+the mean brightness of its picture, and how well it was met when it was rendered first and last. One camera that fits
+much worse than the others did is left out; what all of them say is believed as long as the frame as a whole can be met.
+The thresholds were read off the captures: docs/stability.md has the distributions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from math import nan
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+EXPOSURE = 1.08
+"""Times brighter or darker, median over the cameras, from which a frame is exposed otherwise; clean captures: 1.04."""
+ENOUGH = 8
+"""Cameras that the exposure needs: an object that turns changes the brightness of one picture by a third."""
+UNUSABLE = 2.0
+"""Times brighter or darker, as above, from which the light is another and nothing is learnt from the frame."""
+BLIND = 0.05
+"""Share of its usual brightness, against the other cameras, below which a camera shows nothing."""
+
+FIRST_DB = -9.0
+"""Against its usual place among the cameras when first rendered: such a camera is left out at once; clean: -6.1."""
+LAST_DB = -5.0
+"""The same when last rendered: left out from the next frame on. Clean: -3.7; moved by one or two pixels: -6 to -15."""
+FITS_DB = -3.0
+"""From which a camera that was left out is believed again."""
+NEW_DB = -4.0
+"""More is allowed for in the first update, when a camera's place is known from frame 0 alone."""
+DROP_DB = 6.0
+"""Of the cameras' median below its usual, from which an update has not met its frame."""
+FIRST_DROP_DB = 14.0
+"""The same in the first update, which starts without a motion."""
+MOST_OUT = 0.5
+"""Share of the cameras that are left out at most; where more do not fit, it is the frame that changed."""
+
+PLACE_RATE, LEVEL_RATE = 0.2, 0.3
+"""How fast a camera's usual place and the usual level follow."""
+
+DARKEST = 1e-3
+"""Mean of a picture, 0…1, below which its brightness says nothing."""
+
+
+@dataclass(frozen=True)
+class CameraPast:
+    """What is usual for one camera.
+
+    Attributes:
+        place: dB of its last rendering, less the median over the cameras; NaN where not known.
+        brightness: mean of its picture, 0…1, in the exposure of frame 0; NaN where not known.
+        out: frames in a row that it has been left out, 0 when it is believed.
+    """
+
+    place: float = nan
+    brightness: float = nan
+    out: int = 0
+
+
+@dataclass(frozen=True)
+class Past:
+    """What is usual for a scene; carried from commit to commit.
+
+    Attributes:
+        cameras: by name. level: dB, median over the cameras at the end of an update; NaN where not known.
+        updates: that went into it. held: frames in a row that were held. fitted: seconds, time of the last frame that
+            was not. error: of the last update, by witness view.
+    """
+
+    cameras: Mapping[str, CameraPast] = field(default_factory=dict)
+    level: float = nan
+    updates: int = 0
+    held: int = 0
+    fitted: float = nan
+    error: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of_first(cls, psnr: Mapping[str, float], bright: Mapping[str, float]) -> Past:
+        """After frame 0: how well its fit met each camera, dB, and how bright the pictures are."""
+        level = float(np.median(list(psnr.values()))) if psnr else nan
+        cameras = {name: CameraPast(psnr.get(name, nan) - level, value) for name, value in bright.items()}
+        return cls(cameras, level)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """As arrays, for a checkpoint."""
+        rows = [(past.place, past.brightness, past.out) for past in self.cameras.values()]
+        return {
+            "names": np.array(list(self.cameras), np.str_),
+            "cameras": np.array(rows, np.float64).reshape(-1, 3),
+            "scene": np.array([self.level, self.updates, self.held, self.fitted], np.float64),
+            "witnesses": np.array(list(self.error), np.str_),
+            "error": np.array(list(self.error.values()), np.float64),
+        }
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Past:
+        """From ``arrays``; from none, where nothing is known.
+
+        Raises:
+            KeyError, ValueError: some are missing, or do not fit.
+        """
+        if not arrays:
+            return cls()
+        rows = zip(arrays["names"].tolist(), arrays["cameras"].tolist(), strict=True)
+        cameras = {name: CameraPast(place, bright, int(out)) for name, (place, bright, out) in rows}
+        level, updates, held, fitted = arrays["scene"].tolist()
+        error = dict(zip(arrays["witnesses"].tolist(), arrays["error"].tolist(), strict=True))
+        return cls(cameras, level, int(updates), int(held), fitted, error)
+
+    def of(self, name: str) -> CameraPast:
+        """What is usual for a camera; nothing for one that is new."""
+        return self.cameras.get(name, CameraPast())
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the pictures themselves say, before anything is rendered.
+
+    Attributes:
+        exposure: times that the frame is brighter than the one before; 1 where it is not seen to differ.
+        left_out: by camera, why. held: why nothing can be learnt from the frame, or None.
+    """
+
+    exposure: float = 1.0
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    held: str | None = None
+
+
+def brightness_of(picture: NDArray[np.uint8]) -> float:
+    """Mean of every fourth pixel of every fourth row of a picture [H, W, 3], 0…1."""
+    return float(picture[::4, ::4].mean()) / 255
+
+
+def brightness(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, float]:
+    """Of each camera's picture."""
+    return {name: brightness_of(picture) for name, picture in pictures.items()}
+
+
+def look(past: Past, bright: Mapping[str, float]) -> Look:
+    """Judge the pictures of a frame by their brightness; cameras that were left out before stay so (``settle``)."""
+    left_out = {
+        name: "it has not fitted the other cameras since it was left out" for name in bright if past.of(name).out
+    }
+    ratios = {
+        name: value / past.of(name).brightness for name, value in bright.items() if past.of(name).brightness > DARKEST
+    }
+    if not ratios:
+        return Look(left_out=left_out)
+    common = float(np.median(list(ratios.values())))
+    enough = len(ratios) >= ENOUGH
+    if not 1 / UNUSABLE <= common <= UNUSABLE and (enough or common < BLIND or common > 1 / BLIND):
+        return Look(common, left_out, f"the pictures are {common:.2g} times as bright as they were")
+    for name, ratio in ratios.items():
+        if ratio < BLIND * common:
+            left_out[name] = f"it shows nothing: {ratio:.2g} times as bright as it was"
+    if not enough or 1 / EXPOSURE <= common <= EXPOSURE:
+        common = 1.0
+    return Look(common, _few(left_out, len(bright)))
+
+
+def place(past: Past, psnr: Mapping[str, float]) -> dict[str, float]:
+    """DB by camera, above (+) or below where it usually is among the cameras."""
+    known = {name: value for name, value in psnr.items() if past.of(name).place == past.of(name).place}
+    if not known:
+        return {}
+    shift = float(np.median([value - past.of(name).place for name, value in known.items()]))
+    return {name: value - past.of(name).place - shift for name, value in known.items()}
+
+
+def misfits(past: Past, psnr: Mapping[str, float], limit: float) -> dict[str, str]:
+    """Cameras whose rendering fits so much worse than usual, of all that were rendered, with the reason.
+
+    Args:
+        psnr: dB by camera. limit: ``FIRST_DB`` or ``LAST_DB``.
+    """
+    if past.updates == 0:
+        limit += NEW_DB
+    found = {
+        name: f"its picture fits {-off:.1f} dB worse than usual beside the others"
+        for name, off in place(past, psnr).items()
+        if off < limit
+    }
+    return _few(found, len(psnr))
+
+
+def unmet(past: Past, psnr: Mapping[str, float]) -> str | None:
+    """Why an update has not met its frame, or None. ``psnr``: dB by camera when last rendered."""
+    if not psnr or past.level != past.level:
+        return None
+    level = float(np.median(list(psnr.values())))
+    drop = FIRST_DROP_DB if past.updates == 0 else DROP_DB
+    if level > past.level - drop:
+        return None
+    return f"the pictures are met at {level:.1f} dB, {past.level - level:.1f} dB less than usual"
+
+
+def health(off: float | None) -> float:
+    """0…1: 1 where a camera fits as usual or better, 0 from ``LAST_DB`` on. ``off``: see ``place``; None: not known."""
+    return 1.0 if off is None else float(np.clip(1 - off / LAST_DB, 0, 1))
+
+
+def settle(past: Past, psnr: Mapping[str, float], bright: Mapping[str, float], exposure: float) -> Past:
+    """What is usual after an update was committed.
+
+    Args:
+        psnr: dB by camera, of those learnt from when last rendered, of those left out as the update ended.
+        bright: of every picture of the frame. exposure: of the frame.
+    """
+    off = place(past, psnr)
+    out = misfits(past, psnr, LAST_DB)
+    believed = {n: v for n, v in psnr.items() if n not in out and not past.of(n).out}
+    level = float(np.median(list(believed.values()))) if believed else past.level
+    cameras = dict(past.cameras)
+    for name, value in bright.items():
+        before = past.of(name)
+        now = replace(before, brightness=value / exposure)
+        if before.out:
+            fits = off.get(name, -np.inf) > FITS_DB
+            now = replace(before, out=0) if fits else replace(before, out=before.out + 1)
+        elif name in out:
+            now = replace(before, out=1)
+        elif name in psnr:
+            here = psnr[name] - level
+            known = before.place == before.place and past.updates > 0
+            now = replace(now, place=before.place + PLACE_RATE * (here - before.place) if known else here)
+        cameras[name] = now
+    known = past.updates > 0
+    return replace(
+        past,
+        cameras=cameras,
+        level=past.level + LEVEL_RATE * (level - past.level) if known else level,
+        updates=past.updates + 1,
+        held=0,
+    )
+
+
+def _few(found: dict[str, str], count: int) -> dict[str, str]:
+    """What was found against cameras, unless it is found against most of them."""
+    return found if len(found) <= MOST_OUT * count else {}

@@ -1,0 +1,142 @@
+"""How many iterations an update takes: a number, as many as fit into a time, or fewer once the pictures are met.
+
+The schedule of an update (when layers begin, how the rates fall) follows the share of the iterations that is done, so a
+pace says before each iteration how many there will be in all. What it said is recorded with the commit: ``Replayed``
+takes the same decisions again, whatever the clock says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Protocol
+
+COOLING = 0.15
+"""Share of the iterations that follows the decision to stop: the rates fall to their end first."""
+
+PROBE = 4
+"""Iterations after which an update's own speed is worth more than what the updates before took."""
+
+MOST_TIMED = 4000
+"""Iterations that an update by the clock has at most."""
+
+
+class Pace(Protocol):
+    """Decides how long one update goes on.
+
+    Attributes:
+        most: iterations there can be at most.
+        told: (iteration, planned) whenever what is planned changed.
+    """
+
+    told: list[tuple[int, int]]
+
+    @property
+    def most(self) -> int:
+        """See above."""
+
+    def planned(self, done: int, loss: float | None) -> int:
+        """Iterations in all, as seen before iteration ``done``, counted from 0; the update ends at ``done`` or less.
+
+        Args:
+            loss: of the iteration before, None before the first.
+        """
+
+
+@dataclass
+class Counted:
+    """So many iterations."""
+
+    most: int
+    told: list[tuple[int, int]] = field(default_factory=list)
+
+    def planned(self, done: int, loss: float | None) -> int:
+        """See ``Pace.planned``."""
+        return _tell(self, done, self.most)
+
+
+@dataclass
+class Replayed:
+    """The decisions of an update that was."""
+
+    decisions: Sequence[tuple[int, int]]
+    told: list[tuple[int, int]] = field(default_factory=list)
+
+    @property
+    def most(self) -> int:
+        """See ``Pace``."""
+        return max(total for _, total in self.decisions)
+
+    def planned(self, done: int, loss: float | None) -> int:
+        """See ``Pace.planned``."""
+        return _tell(self, done, [total for first, total in self.decisions if first <= done][-1])
+
+
+@dataclass
+class Timed:
+    """As many iterations as fit before a moment of ``clock``; at least one.
+
+    Attributes:
+        end: the moment by which the last iteration has to be over, seconds.
+        each: seconds of an iteration in the updates before, or None where there was none.
+    """
+
+    end: float
+    each: float | None
+    most: int = MOST_TIMED
+    clock: Callable[[], float] = perf_counter
+    told: list[tuple[int, int]] = field(default_factory=list)
+    _began: float = 0.0
+
+    def planned(self, done: int, loss: float | None) -> int:
+        """See ``Pace.planned``."""
+        now = self.clock()
+        if done == 0:
+            self._began = now
+        each = self.each
+        if done >= PROBE or (each is None and done > 0):
+            each = (now - self._began) / done
+        if each is None:
+            return _tell(self, done, min(self.most, 100))
+        left = int((self.end - now) / max(each, 1e-9))
+        return _tell(self, done, min(self.most, max(1, done + left)))
+
+
+@dataclass
+class UntilMet:
+    """Fewer than ``pace`` plans, once a round of training views brings less than a share of its loss.
+
+    The mean loss of each ``window`` iterations is compared with the window before. Where it fell by less than ``gain``,
+    the update cools down and ends. Held-out cameras have no part in it.
+    """
+
+    pace: Pace
+    gain: float
+    window: int
+    first: int = 0
+    told: list[tuple[int, int]] = field(default_factory=list)
+    _losses: list[float] = field(default_factory=list)
+    _end: int | None = None
+
+    @property
+    def most(self) -> int:
+        """See ``Pace``."""
+        return self.pace.most
+
+    def planned(self, done: int, loss: float | None) -> int:
+        """See ``Pace.planned``."""
+        total = self.pace.planned(done, loss)
+        if loss is not None:
+            self._losses.append(loss)
+        if self._end is None and done >= max(self.first, 2 * self.window) and done % self.window == 0:
+            before, now = sum(self._losses[-2 * self.window : -self.window]), sum(self._losses[-self.window :])
+            if now > (1 - self.gain) * before:
+                self._end = done + max(1, round(COOLING * total))
+        return _tell(self, done, total if self._end is None else min(total, self._end))
+
+
+def _tell(pace: Pace, done: int, total: int) -> int:
+    if not pace.told or pace.told[-1][1] != total:
+        pace.told.append((done, total))
+    return total

@@ -1,0 +1,208 @@
+"""A frame tried until it can be committed: the update as set, the ladder, the search for what jumped, or held."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from scas4d_core import judge
+from scas4d_core.attempts import AS_SET, LADDER, SOUGHT, Checked, Course, Manner, checked
+from scas4d_core.exposure import evened
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.judge import Look, Past
+from scas4d_core.pace import Counted, Pace, Timed, UntilMet
+from scas4d_core.picture_loss import PictureLoss
+from scas4d_core.reacquire import reacquire, shifted
+from scas4d_core.settings import UpdateSettings
+from scas4d_core.update import Updater
+from scas4d_core.updated import Updated
+from scas4d_core.views import TrainingView, ViewFactory
+from scas4d_core.warm_start import Motion
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """What a frame starts from.
+
+    Attributes:
+        state: Θ_{t−1}. motion: that was found last, or None. seconds: since then. views: of the frame, to learn from.
+        suspects: views of cameras that are left out. brightness: mean of each camera's picture. seed: of the update.
+        past: what is usual. look: what the pictures say. end: moment by which the last iteration has to be over.
+        each: seconds of an iteration in the updates before, or None.
+    """
+
+    state: Gaussians
+    motion: Motion | None
+    seconds: float
+    views: list[TrainingView]
+    suspects: list[TrainingView]
+    brightness: Mapping[str, float]
+    seed: int
+    past: Past
+    look: Look
+    end: float | None = None
+    each: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What is committed.
+
+    Attributes:
+        updated: of the attempt that is committed, or of the last one where the frame is held.
+        gaussians: Θ_t. motion: for the next update. past: what is usual now. fits: dB by camera above or below its
+            usual place. held: Gaussians held one by one. degraded, attempts: see ``FrameReport``.
+        exposure: of the frame. fresh: whether the frame was believed. stood: whether Θ_{t−1} showed it already.
+    """
+
+    updated: Updated
+    gaussians: Gaussians
+    motion: Motion | None
+    past: Past
+    fits: Mapping[str, float]
+    held: int = 0
+    degraded: str | None = None
+    attempts: list[str] = field(default_factory=list)
+    exposure: float = 1.0
+    fresh: bool = True
+    stood: bool = False
+
+
+class Trial:
+    """Tries the frames of a scene.
+
+    Args:
+        updater: of the scene. factory: of its views. picture: renders, with the settings' background and limits.
+    """
+
+    def __init__(self, updater: Updater, factory: ViewFactory, picture: PictureLoss, settings: UpdateSettings) -> None:
+        self._updater = updater
+        self._picture = picture
+        self._factory, self._rig = factory, factory.rig
+        self._settings = settings
+
+    def run(self, given: Given) -> Outcome:
+        """Try a frame. ``given.look.held`` is None."""
+        settings, attempts = self._settings, list[str]()
+        exposure, first = 1.0, AS_SET
+        if given.look.exposure != 1.0:
+            exposure, views = evened(self._factory, self._picture, given.state, given.views)
+            given = replace(given, views=views)
+        updated, check = self._attempt(given, given.state, first, attempts)
+        for manner in LADDER:
+            if check.fault is None:
+                break
+            updated, check = self._attempt(given, given.state, manner, attempts)
+        if check.fault is not None:
+            return self._held(given, updated, attempts, check.fault)
+        degraded = attempts[-2] if len(attempts) > 1 else None
+        why = self._unmet(given, updated)
+        if why is not None:
+            attempts[-1] += f": {why}"
+            again = self._sought(given, updated, attempts)
+            if again is not None:
+                updated, check = again
+                degraded = f"{why}; {attempts[-1]}"
+            elif given.past.held + 1 < settings.patience:
+                return self._held(given, updated, attempts, why)
+            else:
+                degraded = f"{why}, for {settings.patience} frames: taken as it is from here on"
+        return self._committed(given, updated, check, degraded, attempts, exposure)
+
+    def held(self, given: Given, why: str) -> Outcome:
+        """A frame whose pictures say nothing: the state stays, nothing is tried."""
+        nothing = Updated(given.state, given.motion, [], [], {}, kept="still")  # type: ignore[arg-type]
+        return self._held(given, nothing, [], why)
+
+    def _attempt(self, given: Given, start: Gaussians, manner: Manner, told: list[str]) -> tuple[Updated, Checked]:
+        motion = None if manner.cold else given.motion
+        updated = self._updater.run(start, given.views, motion, given.seconds, given.seed, self._course(given, manner))
+        check = checked(given.state, updated.gaussians, self._updater.hierarchy.rows, self._rig.radius)
+        told.append(manner.name if check.fault is None else f"{manner.name}: {check.fault}")
+        return updated, check
+
+    def _course(self, given: Given, manner: Manner) -> Course:
+        settings, past = self._settings, given.past
+        iterations = round(manner.longer * settings.iterations)
+        pace: Pace = Counted(iterations)
+        if given.end is not None:
+            pace = Timed(given.end, given.each)
+        if settings.stop_gain > 0:
+            pace = UntilMet(pace, settings.stop_gain, len(given.views), iterations // 2)
+        enough = {name: (1 + settings.still) * error for name, error in past.error.items()}
+        return Course(
+            pace, manner,
+            gate=self._gate(given) if settings.judge else None,
+            witness=settings.judge,
+            enough=enough if settings.still > -1 and manner is AS_SET else None,
+        )  # fmt: skip
+
+    def _gate(self, given: Given) -> Callable[[Mapping[str, float]], Mapping[str, str]]:
+        return lambda first: judge.misfits(given.past, first, judge.FIRST_DB)
+
+    def _unmet(self, given: Given, updated: Updated) -> str | None:
+        if not self._settings.judge:
+            return None
+        return judge.unmet(given.past, self._met(updated))
+
+    def _met(self, updated: Updated) -> dict[str, float]:
+        """DB of the cameras that were learnt from to the end."""
+        return {name: fit.psnr for name, fit in updated.cameras.items() if name not in updated.left_out}
+
+    def _sought(self, given: Given, tried: Updated, attempts: list[str]) -> tuple[Updated, Checked] | None:
+        """Longer, from where the silhouettes say that the object is, and from where the update ended; None: in vain."""
+        found = reacquire(given.state, given.views, self._picture, self._rig)
+        starts = [("sought from where the update ended", tried.gaussians)]
+        if found is not None:
+            length = float(np.linalg.norm(found.shift))
+            starts.insert(0, (f"sought {length:.2f} m away", shifted(given.state, found.shift)))
+        for name, start in starts:
+            course = self._course(given, replace(SOUGHT, name=name))
+            updated = self._updater.run(start, given.views, None, given.seconds, given.seed, course)
+            check = checked(start, updated.gaussians, self._updater.hierarchy.rows, self._rig.radius)
+            why = check.fault or judge.unmet(given.past, self._met(updated))
+            attempts.append(name if why is None else f"{name}: {why}")
+            if why is None:
+                return updated, check
+        return None
+
+    def _held(self, given: Given, updated: Updated, attempts: list[str], why: str) -> Outcome:
+        past = replace(given.past, held=given.past.held + 1)
+        fits = judge.place(past, {name: fit.psnr for name, fit in updated.cameras.items()})
+        return Outcome(
+            updated, given.state, given.motion, past, fits, 0, f"held as it was: {why}", attempts, fresh=False
+        )
+
+    def _committed(
+        self,
+        given: Given,
+        updated: Updated,
+        check: Checked,
+        degraded: str | None,
+        attempts: list[str],
+        exposure: float,
+    ) -> Outcome:
+        psnr = {name: fit.psnr for name, fit in updated.cameras.items()}
+        psnr |= self._suspects(given, check.gaussians)
+        past = given.past
+        if degraded is not None and past.held + 1 >= self._settings.patience:  # this is how it looks from now on
+            past = replace(past, level=float("nan"), updates=0)
+        fits = judge.place(past, psnr)
+        past = judge.settle(past, psnr, given.brightness, exposure)
+        if updated.errors.get("end"):
+            past = replace(past, error=updated.errors[updated.kept])
+        motion = None if check.held and not np.isfinite(updated.gaussians.means).all() else updated.motion
+        if not updated.losses:  # it stands, or its frame was sent twice: it may go on as it went
+            return Outcome(updated, given.state, given.motion, past, fits, attempts=["not moved"], stood=True)
+        return Outcome(updated, check.gaussians, motion, past, fits, check.held, degraded, attempts, exposure)
+
+    def _suspects(self, given: Given, state: Gaussians) -> dict[str, float]:
+        """DB of cameras that are left out: so they come back once they fit."""
+        features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
+        found = {}
+        for view in given.suspects:
+            self._picture.measure(state.means, state.factors, state.opacities, features, view)
+            found[view.name] = self._picture.psnr
+        return found
