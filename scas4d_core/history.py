@@ -8,11 +8,12 @@ appends and deletes; others read, and see what it did with ``refresh``.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,10 +75,14 @@ class History:
                 raise HistoryError(f"{self.directory} already holds a history; open it with History.load or empty it")
 
     @classmethod
-    def load(cls, directory: Path | str) -> History:
+    def load(cls, directory: Path | str, only: Iterable[int] | None = None) -> History:
         """Opens the history in a directory; ``append`` goes on behind its last frame.
 
         A frame that cannot be read is left out and named in ``damaged``.
+
+        Args:
+            directory: of the history.
+            only: frames to know of, for who reads those alone; every file of the directory is looked at without.
 
         Raises:
             HistoryError: no history there, or the file that all frames need is damaged.
@@ -87,7 +92,7 @@ class History:
             raise HistoryError(f"{folder} holds no history: fixed.npz is missing")
         history = cls()
         history.directory = folder
-        history.refresh()
+        history.refresh(only)
         if history._stamps:
             history._fixed = _read(folder / "fixed.npz", FIXED)
         return history
@@ -123,8 +128,8 @@ class History:
             HistoryError: index not above the last, another number of Gaussians, other ids or opacities, or a report
                 that is no JSON.
         """
-        if self._times and index <= self.indices[-1]:
-            raise HistoryError(f"frame {index} comes after frame {self.indices[-1]}; append frames in rising order")
+        if index <= self._newest():
+            raise HistoryError(f"frame {index} comes after frame {self._newest()}; append frames in rising order")
         try:
             said = json.dumps(dict(report or {}), allow_nan=False)
         except (TypeError, ValueError) as error:
@@ -158,20 +163,26 @@ class History:
         self.damaged.pop(index, None)
         self._keep(index, frame)
 
-    def refresh(self) -> tuple[list[int], list[int]]:
+    def refresh(self, only: Iterable[int] | None = None) -> tuple[list[int], list[int]]:
         """Picks up what the process that writes this directory has done since; frames that are known stay unopened.
+
+        Args:
+            only: frames that may have changed, where that is known: a directory of a day takes a while to look through.
 
         Returns:
             The indices that are new (or written anew), and those that are gone.
         """
         if self.directory is None:
             return [], []
-        listed = self._listed()
-        gone = [index for index in self._times if index not in listed]
+        looked_at = {*self._times, *self.damaged} if only is None else set(only)
+        listed = self._listed() if only is None else self._stamped(looked_at)
+        gone = sorted(index for index in looked_at if index in self._times and index not in listed)
         changed = [index for index, stamp in listed.items() if self._stamps.get(index) != stamp]
         for index in [*gone, *changed]:
             self._forget(index)
-        self.damaged = {index: reason for index, reason in self.damaged.items() if index in listed}
+        for index in looked_at - listed.keys():
+            self.damaged.pop(index, None)
+        newest = self._newest()
         added = []
         for index in changed:
             try:
@@ -184,7 +195,8 @@ class History:
                 self.damaged.pop(index, None)
                 added.append(index)
             self._stamps[index] = listed[index]
-        self._times = dict(sorted(self._times.items()))
+        if added and added[0] < newest:
+            self._times = dict(sorted(self._times.items()))
         if added and not self._fixed:
             self._fixed = _read(self.directory / "fixed.npz", FIXED)
         return added, gone
@@ -328,8 +340,12 @@ class History:
             return
         if index in self.damaged:
             raise UnreadableFrameError(f"frame {index} cannot be read: {self.damaged[index]}")
-        held = f"{self.indices[0]} to {self.indices[-1]}" if self._times else "none yet"
+        held = f"{next(iter(self._times))} to {self._newest()}" if self._times else "none yet"
         raise UnreadableFrameError(f"frame {index} is not in the history; committed frames: {held}")
+
+    def _newest(self) -> int:
+        """Index of the last frame, -1 without one; ``indices`` copies all of them."""
+        return next(reversed(self._times), -1)
 
     def _file(self, index: int) -> Path:
         assert self.directory is not None
@@ -348,6 +364,14 @@ class History:
                         continue
         return dict(sorted(found.items()))
 
+    def _stamped(self, indices: Iterable[int]) -> dict[int, Stamp]:
+        """The same of some frames, without looking at the others."""
+        found: dict[int, Stamp] = {}
+        for index in sorted(indices):
+            with contextlib.suppress(FileNotFoundError):
+                found[index] = _stamp(self._file(index).stat())
+        return found
+
     def _from_file(self, index: int, names: Sequence[str]) -> Arrays:
         try:
             return _read(self._file(index), names)
@@ -365,7 +389,7 @@ class History:
     def _keep(self, index: int, frame: Arrays) -> None:
         self._frames[index] = frame
         if self.directory is not None:
-            newest = self.indices[-1]
+            newest = self._newest()
             for old in [i for i in self._frames if i != newest][: max(0, len(self._frames) - FRAMES_KEPT)]:
                 del self._frames[old]
 

@@ -136,7 +136,9 @@ class SetAside:
 
 @dataclass(frozen=True)
 class Refresh:
-    """Frames were committed, deleted or taken back."""
+    """Frames were committed, deleted or taken back: these, or None where every file has to be looked at."""
+
+    frames: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -123,10 +123,10 @@ class Line:
             if turn is self._at_work:  # the asker has gone
                 asyncio.get_running_loop().call_later(self._grace, self._give_up, turn)
 
-    def refresh(self) -> None:
+    def refresh(self, frames: tuple[int, ...] | None) -> None:
         """There is more to read, or less."""
         if self.process is not None:
-            self.process.send(Refresh())
+            self.process.send(Refresh(frames))
 
     async def stop(self, seconds: float) -> None:
         """Ends the process, at once where it is busy; whoever waits is refused, and whoever asks later."""
@@ -248,11 +248,11 @@ class Readers:
         answer = _checked(await self.views.ask(replace(query, labels=labels.labels)), query)
         return replace(answer, headers={**answer.headers, "X-Parts-Frame": labels.frame})
 
-    def refresh(self) -> None:
-        """Frames were committed, deleted or taken back."""
+    def refresh(self, frames: tuple[int, ...] | None = None) -> None:
+        """Frames were committed, deleted or taken back: these, or any where not told."""
         self._commits += 1
-        self.views.refresh()
-        self.bulk.refresh()
+        self.views.refresh(frames)
+        self.bulk.refresh(frames)
 
     async def stop(self, seconds: float) -> None:
         """Ends the processes; whoever waits is refused."""

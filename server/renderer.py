@@ -62,7 +62,7 @@ def _serve(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
         if isinstance(message, Stop):
             break
         if isinstance(message, Refresh):
-            renderer.stale = True
+            renderer.changed(message.frames)
         elif isinstance(message, Ask):
             connection.send(renderer.answer(message))
     logging.shutdown()
@@ -75,7 +75,7 @@ class Renderer:
     def __init__(self, spec: SceneSpec) -> None:
         self.spec = spec
         self.engine = load_engine(spec.engine)
-        self.stale = False
+        self._stale: set[int] | None = set()
         self._history: History | None = None
         self._reader: Reader | None = None
         self._parts = PartLabels(spec.folder / "parts")
@@ -85,10 +85,14 @@ class Renderer:
         """What is committed now: opened once, then kept up to date by what is new in its folder."""
         if self._history is None:
             self._history = History.load(self.spec.states)
-        elif self.stale:
-            self._history.refresh()
-        self.stale = False
+        elif self._stale is None or self._stale:
+            self._history.refresh(self._stale)
+        self._stale = set()
         return self._history
+
+    def changed(self, frames: tuple[int, ...] | None) -> None:
+        """These frames were committed, deleted or taken back since; None: any may have been."""
+        self._stale = None if frames is None or self._stale is None else self._stale | set(frames)
 
     @property
     def reader(self) -> Reader:

@@ -45,9 +45,9 @@ class ReportFiles:
         with self._turn:
             try:
                 if self._history is None:
-                    self._history = History.load(self._states)
-                elif index not in self._history:  # a look at every file of the folder, which may hold a day
-                    self._history.refresh()
+                    self._history = History.load(self._states, only=(index,))
+                else:
+                    self._history.refresh(only=(index,))
                 return self._history.report(index)
             except HistoryError:
                 return {}

@@ -270,7 +270,7 @@ class Scene:
         self.trouble = (
             f"frame {message.index} was committed without " + "; ".join(dropped.values()) if dropped else None
         )
-        self._questions.refresh()
+        self._questions.refresh((message.index, *message.deleted))
         self._tell(FrameFinished(report))
         self.work()
         if message.deleted:

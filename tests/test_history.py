@@ -162,6 +162,29 @@ def test_a_reader_sees_what_the_writer_did_and_opens_only_what_is_new(tmp_path, 
     assert same(reader.gaussians(9), state(10))
 
 
+def test_a_reader_that_is_told_what_changed_looks_at_nothing_else(tmp_path, monkeypatch):
+    writer = filled(History(tmp_path), 4)
+    reader = History.load(tmp_path)
+    alone = History.load(tmp_path, only=(2, 5))
+    assert alone.indices == [2]
+    assert same(alone.gaussians(2), state(1))
+    monkeypatch.setattr(History, "_listed", None)  # the directory is not looked through
+    writer.append(8, 1.0, state(8))
+    assert writer.retain(last=2) == [2, 4]
+    assert reader.refresh((8, 2)) == ([8], [2])
+    assert reader.indices == [0, 4, 6, 8]
+    assert reader.refresh((4, 8, 99)) == ([], [4])
+    assert reader.indices == writer.indices
+    writer.cut(6)
+    writer.append(7, 0.9, state(7))
+    assert reader.refresh((7, 8)) == ([7], [8])
+    assert reader.indices == [0, 6, 7]
+    # A frame between known ones comes to its place.
+    between = History.load(tmp_path, only=(0, 7))
+    assert between.refresh((6,)) == ([6], [])
+    assert between.indices == [0, 6, 7]
+
+
 def test_a_reader_that_asks_for_what_was_just_deleted_is_told(tmp_path):
     writer = filled(History(tmp_path), 6)
     reader = History.load(tmp_path)
