@@ -25,6 +25,8 @@ from pydantic_settings import (
 PREFIX = "SCAS4D_"
 CONFIG = "SCAS4D_CONFIG"
 """Names the TOML file; no setting itself."""
+URL = "SCAS4D_URL"
+"""Where clients find the service; it may be set for both."""
 
 TOKEN = re.compile(r"[A-Za-z0-9._~+/=-]{16,512}")
 """What can stand behind `Authorization: Bearer` (RFC 6750), and is long enough not to be guessed."""
@@ -232,7 +234,7 @@ class ServerSettings(BaseSettings):
 
 def unknown(environment: Mapping[str, str]) -> list[str]:
     """Names that look like settings and are none: misspelt, most likely."""
-    known = {f"{PREFIX}{name.upper()}" for name in ServerSettings.model_fields} | {CONFIG}
+    known = {f"{PREFIX}{name.upper()}" for name in ServerSettings.model_fields} | {CONFIG, URL}
     return sorted(name for name in environment if name.upper().startswith(PREFIX) and name.upper() not in known)
 
 

@@ -58,7 +58,7 @@ def test_a_file_that_is_not_there_is_refused():
 
 
 def test_a_misspelt_variable_is_noticed():
-    environment = {"SCAS4D_PORT": "1", "SCAS4D_PROT": "1", "SCAS4D_CONFIG": "x", "PATH": "/bin"}
+    environment = {"SCAS4D_PORT": "1", "SCAS4D_PROT": "1", "SCAS4D_CONFIG": "x", "SCAS4D_URL": "y", "PATH": "/bin"}
     assert unknown(environment) == ["SCAS4D_PROT"]
 
 
