@@ -34,7 +34,7 @@ from scas4d_core.motion_labels import moving_between, settled
 from scas4d_core.neighbours import build_neighbours
 from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.rasterize.limits import scene_limits
-from scas4d_core.settings import Settings
+from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.static_scene import StaticResult, fit_static_scene
 from scas4d_core.trial import Given, Outcome, Trial
 from scas4d_core.update import FrameUpdate, Updater
@@ -98,6 +98,7 @@ class Reconstruction(Committed):
         limits = scene_limits(settings.scene.near, rig.radius)
         self._picture = PictureLoss(self._factory, settings.scene.background, 1.0, 0.0, limits=limits)
         self._updater: Updater | None = None
+        self._effort = settings.update
         self._budget = Budget(settings.update.budget_ms)
 
     @classmethod
@@ -323,7 +324,7 @@ class Reconstruction(Committed):
             end=self._budget.end(watch.began),
             each=self._budget.each,
         )
-        trial = Trial(updater, self._factory, self._picture, self.settings.update)
+        trial = Trial(updater, self._factory, self._picture, self._effort)
         outcome = trial.held(given, look.held) if look.held else trial.run(given)
         watch.lap("update")
         report = self._report(frame, outcome, look, watch, dropped or {})
@@ -336,6 +337,24 @@ class Reconstruction(Committed):
         self._updater = updater
         self._budget.learn(outcome.updated, perf_counter() - watch.began - watch.total)
         return report
+
+    def spend(
+        self,
+        *,
+        iterations: int | None = None,
+        budget_ms: float | None = None,
+        stop_gain: float | None = None,
+        still: float | None = None,
+    ) -> None:
+        """Give the updates from here on another budget, see ``UpdateSettings``; what is None is as the scene was made.
+
+        Raises:
+            ValueError: a value out of range.
+        """
+        told = {"iterations": iterations, "budget_ms": budget_ms, "stop_gain": stop_gain, "still": still}
+        changes = {name: value for name, value in told.items() if value is not None}
+        self._effort = UpdateSettings.model_validate({**self.settings.update.model_dump(), **changes})
+        self._budget.milliseconds = self._effort.budget_ms
 
     def _report(
         self, frame: Frame, outcome: Outcome, look: judge.Look, watch: Stopwatch, dropped: Mapping[str, str]

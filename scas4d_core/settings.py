@@ -225,7 +225,7 @@ class UpdateSettings(Model):
     def _ascend(cls, clusters: tuple[int, ...]) -> tuple[int, ...]:
         if any(size < 1 for size in clusters) or list(clusters) != sorted(set(clusters)):
             raise ValueError(
-                f"clusters {clusters} do not ascend; give numbers from 1, the coarsest layer's first and the finest's last"
+                f"clusters {clusters} do not ascend; give numbers from 1, the coarsest layer's first, the finest's last"
             )
         return clusters
 

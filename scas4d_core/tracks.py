@@ -231,7 +231,8 @@ def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indice
     unknown = wanted[held[order[place]] != wanted] if len(held) else wanted
     if len(unknown):
         raise ValueError(
-            f"ids {unknown[:5].tolist()} are no Gaussians of this scene; take ids out of an answer, or of its {len(held)} Gaussians"
+            f"ids {unknown[:5].tolist()} are no Gaussians of this scene; take ids out of an answer, or of its "
+            f"{len(held)} Gaussians"
         )
     positions = world.to_user(history.stacked("means", indices, order[place]))
     return Tracks(positions, np.ones(positions.shape[:2]), wanted, np.asarray(indices, dtype=np.int64))

@@ -13,6 +13,7 @@ from box_scene import MOVING, SHIFT, TURN, make_box, make_rig, moved, take_frame
 
 from scas4d_core import update as update_module
 from scas4d_core import update_torch
+from scas4d_core.adam import Adam
 from scas4d_core.deformation_cpu import CpuDeformation
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import Hierarchy, build_hierarchy
@@ -20,10 +21,9 @@ from scas4d_core.kernels import neighbour_terms
 from scas4d_core.neighbours import Neighbours, build_neighbours
 from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.settings import SceneSettings, UpdateSettings
-from scas4d_core.adam import Adam
 from scas4d_core.update import FrameUpdate
-from scas4d_core.updated import Updated
 from scas4d_core.update_plan import Rates, plan_samples
+from scas4d_core.updated import Updated
 from scas4d_core.views import TrainingView, ViewFactory
 
 BEFORE = make_box()

@@ -19,8 +19,8 @@ from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import LayerRates, SceneSettings, Settings, UpdateSettings, Weights
 from scas4d_core.static_scene import StaticResult
 from scas4d_core.update import FrameUpdate
-from scas4d_core.updated import Updated
 from scas4d_core.update_device import DeviceUpdate
+from scas4d_core.updated import Updated
 from scas4d_core.views import ViewFactory
 from scas4d_core.warm_start import Motion
 

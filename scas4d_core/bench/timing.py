@@ -119,9 +119,9 @@ def read_times(out: Path, capture: str) -> Row | None:
 
 def time_of(times: Row | None, settings: Settings) -> Row | None:
     """The entry of a setting, whatever its seeds; None where it was not timed."""
-    wanted = _unseeded(settings.model_dump(mode="json"))
+    today = settings.model_dump(mode="json")
     for entry in times["settings"] if times else ():
-        if _unseeded(completed(entry["settings"])) == wanted:
+        if _unseeded(completed(entry["settings"], today)) == _unseeded(today):
             found: Row = entry
             return found
     return None
