@@ -190,12 +190,13 @@ def faults(
     from client.overrides import overrides
     from scas4d_core.captures import open_capture
     from server.bench import faults as of_faults
+    from server.bench.study import Study, encoded_frames
 
     opened = open_capture(capture)
-    study = of_faults.Study(
+    study = Study(
         work.resolve(),
         opened,
-        of_faults.encoded_frames(opened, frames),
+        encoded_frames(opened, frames),
         overrides(changes or []),
         {} if engine is None else {"SCAS4D_ENGINE": engine},
     )

@@ -26,8 +26,8 @@ import numpy as np
 from client.wire import FrameState
 from scas4d_core.bench.machine import in_words, machine
 from scas4d_core.captures import Capture
-from server.bench.faults import encoded_frames
 from server.bench.service import Service, StudyError
+from server.bench.study import encoded_frames
 
 BAR_RATE, BAR_LATENCY, BAR_SLOWER = 5.0, 2.0, 0.25
 IDLE_S = 6.0

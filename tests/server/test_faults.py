@@ -8,6 +8,7 @@ import pytest
 
 from scas4d_core.captures import open_capture
 from server.bench import faults
+from server.bench import study as of
 
 HERE = Path(__file__).parent
 CAPTURE = HERE.parents[1] / "samples" / "robot"
@@ -22,13 +23,13 @@ SHORT = {
 def study(tmp_path_factory):
     capture = open_capture(CAPTURE)
     fake = {"SCAS4D_ENGINE": "fakes:engine", "PYTHONPATH": f"{HERE}:{HERE.parents[1]}", "FAKE_UPDATE_S": "0.1"}
-    frames = faults.encoded_frames(capture, 8)
-    return faults.Study(tmp_path_factory.mktemp("faults"), capture, frames, {}, fake)
+    frames = of.encoded_frames(capture, 8)
+    return of.Study(tmp_path_factory.mktemp("faults"), capture, frames, {}, fake)
 
 
 @pytest.fixture(scope="module")
 def expected(study):
-    return faults.undisturbed(study)
+    return of.undisturbed(study)
 
 
 def test_states_of_the_fake_depend_on_every_frame(expected):
@@ -51,13 +52,13 @@ def test_a_full_disk(study, expected):
 
 def test_kills_with_the_method_itself(tmp_path):
     capture = open_capture(CAPTURE)
-    study = faults.Study(tmp_path, capture, faults.encoded_frames(capture, 4), SHORT, {})
-    expected, seconds = faults.undisturbed(study)
+    study = of.Study(tmp_path, capture, of.encoded_frames(capture, 4), SHORT, {})
+    expected, seconds = of.undisturbed(study)
     assert faults.kills(study, expected, seconds, count=2, seed=3, told=lambda said: None).faults == []
 
 
 def test_a_lost_frame_and_another_state_are_noticed():
-    assert faults.compare({0: "a", 1: "b"}, {0: "a", 1: "c", 2: "d"}) == [
+    assert of.compare({0: "a", 1: "b"}, {0: "a", 1: "c", 2: "d"}) == [
         "frames [2] are not committed",
         "states [1] are not bit-identical",
     ]
