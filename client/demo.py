@@ -49,6 +49,7 @@ def running_service(data: Path, log: Path, port: int = 8000) -> Iterator[str]:
                     raise RuntimeError(f"the service has ended: {_last_words(log)}; its log is {log}")
                 bars("making the kernels ready", 0, 1)
                 time.sleep(POLL_S)
+            bars("making the kernels ready", 1, 1)
         yield url
     finally:
         process.terminate()

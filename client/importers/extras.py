@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-INSTALL = "pip install 'scas4d[importers]'"
+INSTALL = "in the project's folder: pip install -e '.[importers]'"
 
 
 class MissingExtra(RuntimeError):

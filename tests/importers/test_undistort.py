@@ -173,5 +173,5 @@ def test_what_cannot_be_a_camera_is_named(model, changes, said):
 
 
 def test_a_missing_package_names_the_extra():
-    with pytest.raises(MissingExtra, match=r"opening boxes needs no_such_box.*pip install 'scas4d\[importers\]'"):
+    with pytest.raises(MissingExtra, match=r"opening boxes needs no_such_box.*pip install -e '\.\[importers\]'"):
         load("no_such_box", needed="opening boxes")
