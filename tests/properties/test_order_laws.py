@@ -12,14 +12,14 @@ from hypothesis import given
 from properties.cases import law, seeds
 from properties.dyadic import RIG
 
-from scas4d_core import update as update_module
 from scas4d_core.cameras import Rig
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.neighbours import build_neighbours
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.update import FrameUpdate, Updated
-from scas4d_core.views import ViewFactory
+from scas4d_core.update_plan import ViewPlan
+from scas4d_core.views import TrainingView, ViewFactory
 
 MADE = make_box()
 JITTER = np.random.default_rng(1).normal(0, 0.003, MADE.means.shape).astype(np.float32)
@@ -38,10 +38,10 @@ SEQUENCE = ["0a", "2b", "1b", "3a", "0b", "1a"]
 def updated(state: Gaussians, hierarchy: Hierarchy, rig: Rig, monkeypatch: pytest.MonkeyPatch) -> Updated:
     """An update that looks at the views of SEQUENCE, whatever the order of the rig's cameras."""
 
-    def plan_views(factory, views, settings, rng):  # type: ignore[no-untyped-def]
-        return [next(view for view in views if view.name == name) for name in SEQUENCE]
+    def take(plan: ViewPlan, iteration: int, iterations: int) -> TrainingView:
+        return next(view for view in plan._views if view.name == SEQUENCE[iteration])
 
-    monkeypatch.setattr(update_module, "plan_views", plan_views)
+    monkeypatch.setattr(ViewPlan, "take", take)
     factory = ViewFactory(rig)
     made = FrameUpdate(factory, SceneSettings(), SETTINGS, hierarchy, NEIGHBOURS, state)
     return made.run(state, factory.views(FRAME, {}), None, 1.0, seed=1)
