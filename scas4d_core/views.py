@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,16 +30,22 @@ class TrainingView:
     Attributes:
         name: the camera's. camera: as kernels read it.
         target: [C, H, W] float32, RGB in 0…1 and, where the frame has a mask, the mask; C is 3 or 4.
-        means, squares: [C, H, W], SSIM's windowed moments of the target.
         exposure: [C, 2] gain and offset of the camera; the label's are 1 and 0.
+        scratch: of the image loss, for pictures of this size.
     """
 
     name: str
     camera: CameraArrays
     target: Array
-    means: Array
-    squares: Array
     exposure: Array
+    scratch: Array
+
+    @cached_property
+    def moments(self) -> tuple[Array, Array]:
+        """[C, H, W] twice: SSIM's windowed means of the target and of its square; made when first asked for."""
+        means, squares = np.empty_like(self.target), np.empty_like(self.target)
+        image_loss.target_moments(self.target, self.scratch, means, squares)
+        return means, squares
 
 
 class ViewFactory:
@@ -101,9 +108,7 @@ class ViewFactory:
         return self._view(view.name, view.camera, target, view.exposure)
 
     def _view(self, name: str, camera: CameraArrays, target: Array, exposure: Array) -> TrainingView:
-        means, squares = np.empty_like(target), np.empty_like(target)
-        image_loss.target_moments(target, self.scratch(*target.shape), means, squares)
-        return TrainingView(name, camera, target, means, squares, exposure)
+        return TrainingView(name, camera, target, exposure, self.scratch(*target.shape))
 
 
 def pictures_of(
