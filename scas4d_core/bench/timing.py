@@ -138,15 +138,23 @@ def _unseeded(settings: Row) -> Row:
     return settings | {"update": {**settings["update"], "seed": 0}}
 
 
-def started(capture: Capture, settings: Settings, out: Path) -> Any:
-    """A reconstruction after frame 0, which is read from the study or, the first time, fitted and kept there."""
+def started(capture: Capture, settings: Settings, out: Path, states: Path | None = None) -> Any:
+    """A reconstruction after frame 0, which is read from the study or, the first time, fitted and kept there.
+
+    Args:
+        states: empty folder to commit to; None: in memory.
+    """
     from scas4d_core.bench.first_frame import first_frame_key, load_first_frame, save_first_frame
+    from scas4d_core.history import History
     from scas4d_core.reconstruction import Reconstruction
 
     file = out / "first" / f"{first_frame_key(capture, settings)}.npz"
     static, _ = load_first_frame(file) or (None, 0.0)
     began = time.perf_counter()
-    reconstruction = Reconstruction.start(capture.rig, capture.frame(0), settings, points=capture.points, static=static)
+    history = History() if states is None else History(states)
+    reconstruction = Reconstruction.start(
+        capture.rig, capture.frame(0), settings, points=capture.points, static=static, history=history
+    )
     if static is None and reconstruction.static is not None:
         save_first_frame(file, reconstruction.static, time.perf_counter() - began)
     return reconstruction
