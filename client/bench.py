@@ -187,11 +187,13 @@ def faults(
 
     Example: scas4d bench faults samples/robot --set static.iterations=300 --set update.iterations=20
     """
+    from client.extras import need_server
     from client.overrides import overrides
     from scas4d_core.captures import open_capture
     from server.bench import faults as of_faults
     from server.bench.study import Study, encoded_frames
 
+    need_server()
     opened = open_capture(capture)
     study = Study(
         work.resolve(),
@@ -258,10 +260,12 @@ def views(
 
     Example: scas4d bench views captures/robot
     """
+    from client.extras import need_server
     from client.overrides import overrides
     from scas4d_core.captures import open_capture
     from server.bench import views as of_views
 
+    need_server()
     rows = of_views.measure(
         open_capture(capture),
         work.resolve(),
