@@ -79,4 +79,4 @@ def test_every_limit_that_a_remedy_names_is_a_setting():
     for path in (ROOT / "server").rglob("*.py"):
         named |= set(re.findall(r"SCAS4D_([A-Z_]+[A-Z])", path.read_text()))
     assert "MAX_BODY_MB" in named
-    assert {name.lower() for name in named} - {"config"} <= set(ServerSettings.model_fields)
+    assert {name.lower() for name in named} - {"config", "url"} <= set(ServerSettings.model_fields)
