@@ -221,7 +221,7 @@ the baseline's). {equal_words(compared)}
 
 ## One setting at a time
 
-Around 100 iterations of `scas4d` (the line "{DEFAULT.label}" above).
+Around the default, 100 iterations of `scas4d`.
 
 {others}
 
@@ -274,12 +274,13 @@ def _choice(means: Sequence[Point], default: Point) -> str:
 
 
 def _axis_means(points: Sequence[Point], axis: str, captures: Sequence[str]) -> tuple[list[Point], Point | None]:
-    """The means of an axis over the captures that have it, and the default's over the same."""
+    """The default's means over the captures that have an axis, and behind them the axis's; the default's alone."""
     on = _captures_of(points, axis, captures)
     if not on:
         return [], None
     means = mean_points(points, on)
-    return of_axis(means, axis), next(point for point in means if point.variant == DEFAULT)
+    default = next(point for point in means if point.variant == DEFAULT)
+    return [default, *of_axis(means, axis)], default
 
 
 def _captures_of(points: Sequence[Point], axis: str, captures: Sequence[str]) -> list[str]:
