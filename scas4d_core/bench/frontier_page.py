@@ -191,8 +191,8 @@ def _text(
 
 An iteration is one forward and backward render of one training view. Each row covers the first {updates} updates of a
 capture, from a frame 0 that all its rows share; accuracy is the mean over these updates and the test cameras.
-Definitions: [quality.md](quality.md), `scas4d_core/bench/measure.py`. Seconds are medians of one update, pictures decoded
-and state committed. A setting is dominated where another one is at least as fast and more accurate.
+Definitions: [quality.md](quality.md), `scas4d_core/bench/measure.py`. Seconds are medians of one update, pictures
+decoded and state committed. A setting is dominated where another one is at least as fast and more accurate.
 
 ## What to choose
 
@@ -246,8 +246,8 @@ scas4d bench frontier {" ".join(f"CAPTURES/{name}" for name in captures)} --page
 ```
 
 Accuracy does not depend on what else a machine does; seconds do. They come from a pass of their own in which all
-settings take turns (`--only times`) where it was made, and are CPU seconds of rows on one thread otherwise. A budget of Gaussians has a frame 0 of its own, and only "through a whole capture"
-covers more than the first updates.
+settings take turns (`--only times`) where it was made, and are CPU seconds of rows on one thread otherwise. A budget of
+Gaussians has a frame 0 of its own, and only "through a whole capture" covers more than the first updates.
 There is no setting of views per iteration, so there is no such axis.
 """
 
