@@ -24,7 +24,7 @@ def require_device(device: str) -> None:
     for package in ("torch", "gsplat"):
         if importlib.util.find_spec(package) is None:
             raise DeviceError(
-                f"device {device!r}: {package} is not installed; run pip install 'scas4d[cuda]', {otherwise}"
+                f"device {device!r}: {package} is not installed; run pip install -e '.[cuda]', {otherwise}"
             )
     import torch
 

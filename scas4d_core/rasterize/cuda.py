@@ -1,4 +1,4 @@
-"""The rasterizer on a CUDA device, through gsplat 1.5.3 (``pip install 'scas4d[cuda]'``).
+"""The rasterizer on a CUDA device, through gsplat 1.5.3 (``pip install -e '.[cuda]'``).
 
 Not yet run on a GPU: written against gsplat's sources. There, as here, the centre of pixel (column i, row j) is
 (i + 0.5, j + 0.5); order is by depth, ties by row; the cap (0.999), the floor (1/255), the transmittance stop (1e-4)
@@ -27,7 +27,7 @@ def _gsplat() -> ModuleType:
         import gsplat
     except ImportError as error:
         raise ImportError(
-            "device 'cuda' rasterizes with gsplat, which is not installed; run: pip install 'scas4d[cuda]', "
+            "device 'cuda' rasterizes with gsplat, which is not installed; run: pip install -e '.[cuda]', "
             "or choose device 'cpu'"
         ) from error
     module: ModuleType = gsplat

@@ -136,7 +136,7 @@ def test_a_device_that_is_not_there_is_refused_before_the_scene_is_made(http):
     before = http.get("/v1/scenes").json()
     document = problem(http.post("/v1/scenes", json=body(settings={"device": "cuda"})), 422)
     assert (document["field"], document["value"]) == ("settings.device", "cuda")
-    assert "pip install 'scas4d[cuda]'" in document["remedy"]
+    assert "pip install -e '.[cuda]'" in document["remedy"]
     assert http.get("/v1/scenes").json() == before
 
 
