@@ -84,10 +84,17 @@ class FrameReport:
 
     def record(self) -> dict[str, Any]:
         """The report as JSON: what is not finite is None."""
-        record = asdict(self)
-        record["psnr"] = self.psnr if isfinite(self.psnr) else None
-        record["loss"] = [loss if isfinite(loss) else None for loss in self.loss]
+        record: dict[str, Any] = _finite(asdict(self))
         return record
+
+
+def _finite(value: Any) -> Any:
+    """The same, with None for numbers that JSON does not have."""
+    if isinstance(value, dict):
+        return {name: _finite(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not isfinite(value) else value
 
 
 def means(values: list[float], most: int) -> list[float]:

@@ -27,9 +27,27 @@ class Reconstruction(Protocol):
     resumed: Resumed | None
 
     def step(
-        self, frame: Frame, *, dropped: Mapping[str, str] | None = None, notes: Mapping[str, Any] | None = None
+        self,
+        frame: Frame,
+        *,
+        dropped: Mapping[str, str] | None = None,
+        notes: Mapping[str, Any] | None = None,
+        started: float | None = None,
     ) -> FrameReport:
-        """Finds the state of the next frame and commits it to the history, with the report and what is given here."""
+        """Finds the state of the next frame and commits it to the history, with the report and what is given here.
+
+        `started`: `perf_counter` when the work on the frame began, from where a budget counts.
+        """
+
+    def spend(
+        self,
+        *,
+        iterations: int | None = None,
+        budget_ms: float | None = None,
+        stop_gain: float | None = None,
+        still: float | None = None,
+    ) -> None:
+        """Another budget from the next step on; what is None is as the scene was made."""
 
 
 class Reader(Protocol):

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from client.wire import FileKind
+from client.wire import Budget, FileKind
 
 Hashes = dict[str, dict[FileKind, str]]
 """BLAKE3 of each file, by camera and kind."""
@@ -103,8 +103,26 @@ class Paused(_Fact):
     paused: bool
 
 
+class Budgeted(_Fact):
+    """Another budget holds from frame `index` on: a frame that is done again gets the one that held for it."""
+
+    fact: Literal["budget"] = "budget"
+    index: int
+    budget: Budget
+
+
 Fact = Annotated[
-    Created | Taken | PartTaken | Missing | Skipped | SetAside | Died | FramesDeleted | StatesDeleted | Paused,
+    Created
+    | Taken
+    | PartTaken
+    | Missing
+    | Skipped
+    | SetAside
+    | Died
+    | FramesDeleted
+    | StatesDeleted
+    | Paused
+    | Budgeted,
     Field(discriminator="fact"),
 ]
 _adapter: TypeAdapter[Fact] = TypeAdapter(Fact)

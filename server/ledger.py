@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from blake3 import blake3
 
-from client.wire import FileKind, FrameState
+from client.wire import Budget, FileKind, FrameState
 from server.facts import (
+    Budgeted,
     Died,
     Fact,
     FramesDeleted,
@@ -66,7 +67,7 @@ class Ledger:
 
     Attributes:
         frames: every index below `next_frame`. open: frames that cameras send one by one. fatal: why the scene cannot
-            go on, or None.
+            go on, or None. budgets: the first frame that each holds for, rising.
     """
 
     def __init__(self, scene: str) -> None:
@@ -76,6 +77,7 @@ class Ledger:
         self.paused = False
         self.fatal: str | None = None
         self.states_deleted = 0
+        self.budgets: list[tuple[int, Budget]] = [(0, Budget())]
 
     @property
     def committed(self) -> Sequence[int]:
@@ -134,8 +136,19 @@ class Ledger:
                 self.states_deleted += self.frames.delete_states(fact.frames)
             case Paused():
                 self.paused = fact.paused
+            case Budgeted():
+                self.budgets = [one for one in self.budgets if one[0] < fact.index] or [(0, Budget())]
+                self.budgets.append((fact.index, fact.budget))
             case _:  # created: the scene's own; a part of a frame that is closed
                 pass
+
+    def budget_of(self, index: int) -> Budget:
+        """The budget that holds for a frame."""
+        return next(budget for first, budget in reversed(self.budgets) if first <= index)
+
+    def begins_next(self) -> int:
+        """The first frame that is not begun: what changes now holds from there on."""
+        return next(iter(self.waiting()), self.next_frame)
 
     def move(self, index: int, state: FrameState) -> None:
         """A frame is in another state."""
@@ -193,6 +206,12 @@ class Ledger:
         if self.fatal is None:
             return []
         return [SetAside(index=index, reason=f"{HOPELESS}: {self.fatal}") for index in self.waiting()]
+
+    def last_tried(self) -> int | None:
+        """The newest frame that the worker has finished, well or not."""
+        states = self.frames.states()
+        tried = np.flatnonzero((states == CODES[FrameState.COMMITTED]) | (states == CODES[FrameState.SET_ASIDE]))
+        return int(tried[-1]) if len(tried) else None
 
     def last_time(self) -> float | None:
         """Seconds of the newest closed frame that has a time."""

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from client.wire import Retention
+from client.wire import Budget, Retention
 from scas4d_core.cameras import Camera, Rig
 
 
@@ -53,12 +53,14 @@ class FrameReady:
     """The pictures of a frame lie in records of the frame log (`server.frame_store`).
 
     `identity` is checked where one record holds the whole frame; of several, one a camera, a damaged one is left out.
+    `budget` is the one that holds for this frame, whenever it is reconstructed.
     """
 
     index: int
     time: float
     files: tuple[str, ...]
     identity: str
+    budget: Budget = field(default_factory=Budget)
 
 
 @dataclass(frozen=True)

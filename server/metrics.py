@@ -11,7 +11,7 @@ from typing import Protocol
 from prometheus_client import CollectorRegistry, Counter, Histogram
 from prometheus_client.core import GaugeMetricFamily, Metric
 
-from client.wire import FrameReportModel, SceneState, SceneStatus
+from client.wire import FrameReportModel, FrameState, SceneState, SceneStatus
 from server.hub import Hub
 from server.messages import Query
 from server.settings import ServerSettings
@@ -28,6 +28,17 @@ FRAMES = Counter(
     registry=registry,
 )
 INGEST_BYTES = Counter("scas4d_ingest_bytes", "Encoded pictures and masks of acknowledged frames.", registry=registry)
+DEGRADED = Counter(
+    "scas4d_degraded_frames",
+    "Committed frames whose state is not theirs: held (the state before stands) or in part.",
+    ["how"],
+    registry=registry,
+)
+LEFT_OUT = Counter(
+    "scas4d_cameras_left_out",
+    "Cameras of committed frames that were not learnt from: nothing came, or it did not fit.",
+    registry=registry,
+)
 UPDATE_SECONDS = Histogram(
     "scas4d_update_seconds", "A committed frame, by stage.", ["stage"], buckets=SECONDS, registry=registry
 )
@@ -51,11 +62,17 @@ RESTARTS = Counter(
 )
 for state in ("acknowledged", "committed", "set_aside", "skipped", "missing"):
     FRAMES.labels(state)
+for how in ("held", "in_part"):
+    DEGRADED.labels(how)
 
 
 def finished(report: FrameReportModel) -> None:
     """Counts a frame that ended, and what its update took."""
     FRAMES.labels(report.state.value).inc()
+    if report.state == FrameState.COMMITTED:
+        LEFT_OUT.inc(len(report.dropped_cameras))
+        if report.degraded is not None:
+            DEGRADED.labels("held" if report.degraded.startswith("held") else "in_part").inc()
     for stage, seconds in report.seconds.items():
         UPDATE_SECONDS.labels(stage).observe(seconds)
 

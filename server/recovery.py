@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from client.wire import FrameState
 from scas4d_core.history import History, HistoryError
@@ -48,8 +50,10 @@ def recover(folder: Path, scene: str) -> Recovered:
     debris = _unnamed(ledger, sizes)
     remove(frames, debris)
     sizes = {name: size for name, size in sizes.items() if name not in debris}
-    indices, damaged = _states(folder / "states", damage)
+    indices, damaged, newest = _states(folder / "states", damage)
     facts += ledger.reconcile(indices, damaged)
+    if newest:
+        ledger.frames.set_numbers(indices[-1], newest)
     for fact in ledger.hopeless():  # its scene failed, and the service ended before it could say so of this one
         ledger.apply(fact)
         facts.append(fact)
@@ -124,13 +128,17 @@ def _part(index: int, name: str, pictures: Pictures) -> PartTaken | None:
     return PartTaken(index=index, time=pictures.time, camera=camera, file=name, hashes=kinds)
 
 
-def _states(folder: Path, damage: list[str]) -> tuple[list[int], dict[int, str]]:
-    """Committed states that can be read, and those that cannot."""
+def _states(folder: Path, damage: list[str]) -> tuple[list[int], dict[int, str], dict[str, Any]]:
+    """Committed states that can be read, those that cannot, and what was committed with the newest."""
     try:
         history = History.load(folder)
     except HistoryError as error:
         if (folder / "fixed.npz").exists():
             damage.append(f"the committed states cannot be read: {error}")
-        return [], {}
+        return [], {}, {}
     damage.extend(f"frame {index}: its state is damaged: {reason}" for index, reason in history.damaged.items())
-    return history.indices, dict(history.damaged)
+    report: dict[str, Any] = {}
+    if history.indices:
+        with contextlib.suppress(HistoryError):  # the worker takes the state up, or says what is wrong with it
+            report = history.report(history.indices[-1])
+    return history.indices, dict(history.damaged), report

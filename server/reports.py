@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from client.wire import CameraFitModel, FrameReportModel
+from client.wire import Budget, CameraFitModel, CurvePointModel, FrameReportModel, FrameState
 from scas4d_core.history import History, HistoryError
 
 KEPT = 512
@@ -27,9 +27,35 @@ def fill(report: FrameReportModel, committed: Mapping[str, Any]) -> None:
     report.used_cameras = list(committed.get("used", []))
     report.dropped_cameras = dict(committed.get("dropped", {}))
     report.cameras = {
-        name: CameraFitModel(psnr=fit.get("psnr"), colour_shift=fit.get("colour_shift"))
+        name: CameraFitModel(psnr=fit.get("psnr"), colour_shift=fit.get("colour_shift"), health=fit.get("health"))
         for name, fit in committed.get("cameras", {}).items()
     }
+    report.degraded = committed.get("degraded")
+    report.kept = committed.get("kept")
+    report.tries = list(committed.get("attempts", []))
+    report.exposure = committed.get("exposure")
+    report.held_gaussians = committed.get("held")
+    report.guards = dict(committed.get("guards", {}))
+    report.planned = [(int(first), int(total)) for first, total in committed.get("planned", [])]
+    report.curve = [CurvePointModel(**point) for point in committed.get("curve", [])]
+    report.errors = dict(committed.get("errors", {}))
+    report.threads = committed.get("threads")
+    report.write_seconds = committed.get("write_seconds")
+    budget = committed.get("budget")
+    report.budget = None if budget is None else Budget.model_validate(budget)
+
+
+def trouble(report: FrameReportModel) -> str | None:
+    """What is wrong with a scene whose newest finished frame is this; None: nothing."""
+    if report.state == FrameState.SET_ASIDE:
+        return f"frame {report.index} was set aside: {report.error}"
+    if report.degraded is not None:
+        verb = "" if report.degraded.startswith("held") else "committed in part: "
+        return f"frame {report.index} was {verb}{report.degraded}"
+    if report.dropped_cameras:
+        left_out = "; ".join(f"{name}: {reason}" for name, reason in report.dropped_cameras.items())
+        return f"frame {report.index} was committed without camera {left_out}"
+    return None
 
 
 class ReportFiles:

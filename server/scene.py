@@ -76,7 +76,7 @@ class Scene:
         self.gaussians: int | None = None
         self.last_seconds = 1.0
         self.door = asyncio.Lock()
-        self.trouble: str | None = None
+        self.trouble = self._last_trouble()
         """Why the scene is degraded: the last frame's, or that of the worker or the disk."""
         self._at_work: int | None = None
         self._ready = False
@@ -216,7 +216,7 @@ class Scene:
         assert receipt is not None
         ledger.move(index, FrameState.UPDATING)
         self._at_work = index
-        self._worker.send(FrameReady(index, receipt.time, entry.files, receipt.identity))
+        self._worker.send(FrameReady(index, receipt.time, entry.files, receipt.identity, ledger.budget_of(index)))
         self._tell(SceneChanged())
 
     def _from_worker(self, message: Any) -> None:
@@ -257,8 +257,14 @@ class Scene:
             self._questions.refresh()
             if ready.indices[-1] > newest:  # committed, and its worker was gone before it could say so
                 self._tell(FrameFinished(self.frames[ready.indices[-1]].report))
+        self.trouble = self._last_trouble()
         self._ready = True
         self.work()
+
+    def _last_trouble(self) -> str | None:
+        """What was wrong with the newest frame that was tried."""
+        last = self.ledger.last_tried()
+        return None if last is None else reports.trouble(self.frames[last].report)
 
     async def _commit(self, message: Committed) -> None:
         self.supervision.committed()
@@ -266,10 +272,7 @@ class Scene:
         self.ledger.move(message.index, FrameState.COMMITTED)
         self._fill(message.index, message.report)
         report = self.frames[message.index].report
-        dropped = report.dropped_cameras
-        self.trouble = (
-            f"frame {message.index} was committed without " + "; ".join(dropped.values()) if dropped else None
-        )
+        self.trouble = reports.trouble(report)
         self._questions.refresh((message.index, *message.deleted))
         self._tell(FrameFinished(report))
         self.work()
@@ -285,7 +288,7 @@ class Scene:
         await self._write(fact)
         self.ledger.apply(fact)
         self._at_work, self.progress = None, None
-        self.trouble = f"frame {fact.index} was set aside: {fact.reason}"
+        self.trouble = reports.trouble(self.frames[fact.index].report)
         if fact.fatal:
             async with self.door:  # from here on none is taken; the one that is just being taken waits like the others
                 pass

@@ -58,4 +58,5 @@ def status_of(scene: Scene) -> SceneStatus:
         created=scene.created.isoformat(),
         ingest=scene.rules,
         settings=scene.spec.settings.model_dump(mode="json"),
+        budget=ledger.budgets[-1][1],
     )

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from client.wire import Budget
 from scas4d_core.captures import Frame, InitialPoints
 from scas4d_core.captures.images import ImageError, decode_image, decode_mask
 from scas4d_core.history import History, HistoryError
@@ -76,6 +77,8 @@ class Worker:
         self.states: History | None = None
         self.reconstruction: Reconstruction | None = None
         self._progress_at = 0.0
+        self._budget = Budget()
+        self._write_seconds: float | None = None
 
     def open(self) -> bool:
         """Takes up what is committed and says so; False where it cannot be gone on from."""
@@ -121,13 +124,14 @@ class Worker:
             OSError: the disk is full; nothing is committed.
         """
         dropped: dict[str, str] = {}
+        began = time.perf_counter()
         try:
             frame, dropped = self.decode(message)
             least = self.spec.minimum_cameras
             if len(frame.images) < least:
                 reason = f"{len(frame.images)} cameras' pictures are left, the scene's minimum is {least}"
                 return SetAside(message.index, reason, dropped)
-            return self.reconstruct(frame, dropped)
+            return self.reconstruct(frame, dropped, message.budget, began)
         except FrameDamage as error:
             return SetAside(message.index, f"its record in the frame log is damaged: {error}", dropped)
         except Exception as error:  # whatever the engine raises, the service goes on and says so
@@ -176,8 +180,8 @@ class Worker:
                 dropped[name] = str(error)
         return Frame(message.index, message.time, images, masks), dropped
 
-    def reconstruct(self, frame: Frame, dropped: dict[str, str]) -> Committed:
-        """Runs the first frame or an update, and commits."""
+    def reconstruct(self, frame: Frame, dropped: dict[str, str], budget: Budget, began: float) -> Committed:
+        """Runs the first frame or an update, and commits. `began`: `perf_counter` before decoding."""
         assert self.states is not None
         if self.reconstruction is None:
             self.reconstruction = self.engine.start(
@@ -190,7 +194,12 @@ class Worker:
                 dropped=dropped,
             )
         else:
-            self.reconstruction.step(frame, dropped=dropped)
+            if budget != self._budget:
+                self.reconstruction.spend(**budget.model_dump())
+                self._budget = budget
+            notes = {"budget": budget.model_dump(), "write_seconds": self._write_seconds}
+            report = self.reconstruction.step(frame, dropped=dropped, notes=notes, started=began)
+            self._write_seconds = max(0.0, time.perf_counter() - began - sum(report.seconds.values()))
         return Committed(frame.index, self.states.report(frame.index), tuple(self.retain()))
 
     def retain(self) -> list[int]:

@@ -1,9 +1,11 @@
 """What crosses the wire, once: the service imports these models, the SDK returns them. One file a resource."""
 
 from client.wire.base import MAX_CAMERAS, MAX_PIXELS_A_SIDE, CameraName, Model, Pixel, Row3, Row4
+from client.wire.budgets import Budget, EffectiveBudget, SceneBudget
 from client.wire.frames import (
     FINISHED,
     CameraFitModel,
+    CurvePointModel,
     FrameReceipt,
     FrameReportModel,
     FrameState,
@@ -36,6 +38,16 @@ from client.wire.scenes import (
 )
 from client.wire.service import Health, ProblemDetails, Ticket
 from client.wire.tracks import TracksModel, TracksRequest, tracks_model
+from client.wire.tradeoff import (
+    CurveMean,
+    PointKind,
+    ReplayRequest,
+    ReplayState,
+    ReplayStatus,
+    TimeModel,
+    TradeoffModel,
+    TradeoffPoint,
+)
 from client.wire.views import RenderFormat, RenderKind, RenderRequest, Unit
 
 __all__ = [
@@ -43,9 +55,13 @@ __all__ = [
     "FRAME_MEDIA_TYPE",
     "MAX_CAMERAS",
     "MAX_PIXELS_A_SIDE",
+    "Budget",
     "CameraFitModel",
     "CameraModel",
     "CameraName",
+    "CurveMean",
+    "CurvePointModel",
+    "EffectiveBudget",
     "FileKind",
     "FrameFile",
     "FrameHead",
@@ -61,23 +77,31 @@ __all__ = [
     "PartReceipt",
     "PartsModel",
     "Pixel",
+    "PointKind",
     "PointsReceipt",
     "ProblemDetails",
     "ProgressModel",
     "RenderFormat",
     "RenderKind",
     "RenderRequest",
+    "ReplayRequest",
+    "ReplayState",
+    "ReplayStatus",
     "Retention",
     "RigModel",
     "Row3",
     "Row4",
+    "SceneBudget",
     "SceneCreate",
     "SceneList",
     "SceneState",
     "SceneStatus",
     "Ticket",
+    "TimeModel",
     "TracksModel",
     "TracksRequest",
+    "TradeoffModel",
+    "TradeoffPoint",
     "Unit",
     "frame_chunks",
     "head_length",

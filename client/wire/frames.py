@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from typing import Literal
 
 from pydantic import Field
 
 from client.wire.base import Model
+from client.wire.budgets import Budget
 
 
 class FrameReceipt(Model):
@@ -58,6 +60,19 @@ class CameraFitModel(Model):
     colour_shift: tuple[float, float, float] | None = Field(
         default=None, description="Mean of the picture minus mean of the render, RGB in 0…1; null where not measured."
     )
+    health: float | None = Field(
+        default=None,
+        description="0…1: 1 where it fits as usual beside the other cameras, 0 where it would be left out; null where "
+        "not judged.",
+    )
+
+
+class CurvePointModel(Model):
+    """How far an update was."""
+
+    iterations: int
+    milliseconds: float = Field(description="Since the update began, after decoding.")
+    loss: float | None = Field(description="Mean training loss of the iterations since the point before.")
 
 
 class FrameReportModel(Model):
@@ -78,10 +93,41 @@ class FrameReportModel(Model):
     deleted: bool = Field(default=False, description="It was committed, and retention has deleted its state since.")
     received: list[str] | None = Field(default=None, description="While open: cameras whose picture is here.")
     used_cameras: list[str] = Field(default_factory=list, description="Cameras that the update saw.")
-    dropped_cameras: dict[str, str] = Field(default_factory=dict, description="Camera left out → reason.")
+    dropped_cameras: dict[str, str] = Field(
+        default_factory=dict,
+        description="Camera left out → reason: it sent nothing that can be decoded, or its picture did not fit.",
+    )
+    degraded: str | None = Field(
+        default=None, description="Why the committed state is not the frame's, or only by half; null where it is."
+    )
+    kept: Literal["end", "still", "warm"] | None = Field(
+        default=None,
+        description="What was committed: the end of the update, the state before (still), or that going on as it moved "
+        "(warm): whichever shows the frame best.",
+    )
+    tries: list[str] = Field(
+        default_factory=list, description="In which manner the update was tried, and what came of each."
+    )
+    exposure: float | None = Field(default=None, description="Times brighter than frame 0, as far as it was seen.")
+    held_gaussians: int | None = Field(default=None, description="That stayed as they were before, one by one.")
+    guards: dict[str, int] = Field(default_factory=dict, description="How often each guard acted.")
+    budget: Budget | None = Field(default=None, description="What the update was told; nulls: as the scene was made.")
     iterations: int | None = None
+    planned: list[tuple[int, int]] = Field(
+        default_factory=list, description="(iteration, iterations in all) whenever that was planned otherwise."
+    )
     seconds: dict[str, float] = Field(default_factory=dict, description="By stage.")
+    write_seconds: float | None = Field(
+        default=None, description="What writing the commit before took; its own is not known when it is written."
+    )
+    threads: int | None = Field(default=None, description="That the update ran on.")
     loss: list[float] = Field(default_factory=list)
+    curve: list[CurvePointModel] = Field(default_factory=list, description="Of the last attempt.")
+    errors: dict[str, float | None] = Field(
+        default_factory=dict,
+        description="Mean image loss on at most four training views, the witnesses: of the state before (still), "
+        "that going on as it moved (warm), and the end of the update (end).",
+    )
     psnr: float | None = Field(default=None, description="dB, training views of the last iterations.")
     cameras: dict[str, CameraFitModel] = Field(default_factory=dict, description="By camera that the update saw.")
     moving: int | None = None

@@ -8,6 +8,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from client.wire.base import MAX_CAMERAS, Model
+from client.wire.budgets import Budget
 from client.wire.rigs import RigModel
 
 
@@ -102,8 +103,8 @@ class SceneStatus(Model):
         description="What the scene does; `paused` and `degraded` hold beside. "
         "awaiting_first_frame: nothing to do yet. initialising: frame 0 is being reconstructed. ready: "
         "idle, the last frame was committed whole. updating: a later frame is being reconstructed. paused: it takes "
-        "frames and reconstructs none. degraded: the scene goes on, but its last frame lost a camera or was set aside, "
-        "or its worker is being restarted; `error` says why. failed: it takes no more frames."
+        "frames and reconstructs none. degraded: the scene goes on, but its last frame lost a camera, was held or "
+        "was set aside, or its worker is being restarted; `error` says why. failed: it takes no more frames."
     )
     error: str | None = Field(default=None, description="Why the scene is failed or degraded.")
     progress: ProgressModel | None = Field(default=None, description="While initialising.")
@@ -121,8 +122,8 @@ class SceneStatus(Model):
     )
     degraded: bool = Field(
         default=False,
-        description="Whatever `state` says: the last frame lost a camera or was set aside, the worker is being "
-        "restarted, or the disk is full. `error` says which.",
+        description="Whatever `state` says: the last frame lost a camera, was held or met only by half, or was set "
+        "aside; the worker is being restarted, or the disk is full. `error` says which.",
     )
     open_frames: list[int] = Field(
         default_factory=list, description="Frames not closed yet, whose cameras send one by one."
@@ -138,6 +139,7 @@ class SceneStatus(Model):
     created: str = Field(description="UTC, ISO 8601.")
     ingest: IngestSettings = IngestSettings()
     settings: dict[str, Any]
+    budget: Budget = Field(default=Budget(), description="As it was put last; nulls: as `settings` say.")
 
 
 class SceneList(Model):

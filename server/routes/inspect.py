@@ -31,5 +31,5 @@ async def frames(
     """What became of many frames, from `first` on; `next` says where to go on."""
     after = min(first + limit, scene.next_frame)  # frames are numbered without gaps
     reports = [await scene.report(index) for index in range(first, after)]
-    without_loss = [report.model_copy(update={"loss": []}) for report in reports if report is not None]
-    return FrameList(frames=without_loss, next=after if first <= after < scene.next_frame else None)
+    short = [report.model_copy(update={"loss": [], "curve": []}) for report in reports if report is not None]
+    return FrameList(frames=short, next=after if first <= after < scene.next_frame else None)

@@ -12,7 +12,8 @@ import numpy as np
 from scas4d_core import tracks
 from scas4d_core.gaussians import Gaussians
 
-SLOW, SLOW_RAISES, RAISES, DIES = 200, 201, 250, 251
+SLOW, SLOW_RAISES, RAISES, DIES, HELD, LEAVES_OUT = 200, 201, 250, 251, 240, 241
+ITERATIONS = 100
 SLOW_S = 2.0
 STEP_M = 0.125
 HANGS, KILLS = 777_001, 777_002
@@ -80,20 +81,36 @@ class FakeReconstruction:
         self.points = points
         self.history = history
         self.resumed = resumed
+        self.iterations = ITERATIONS
 
     def commit(self, frame, dropped, notes):
         count = len(self.points)
-        report = Report(frame.index, frame.time, 100, {"update": 0.01}, [0.5, 0.25], 31.5, count, count)
+        report = Report(frame.index, frame.time, self.iterations, {"update": 0.01}, [0.5, 0.25], 31.5, count, count)
         known = self.history.indices
         before = self.history.gaussians(known[-1]).colours[0, 0] if known else None
         red = int(next(iter(frame.images.values()))[0, 0, 0])
         record = {**asdict(report), "used": list(frame.images), "dropped": dropped or {}, **(notes or {})}
+        if red == HELD:
+            record |= {"degraded": "held as it was: the fake was told so", "kept": "still", "used": []}
+        if red == LEAVES_OUT:
+            record["dropped"] = {**record["dropped"], "c1": "it shows nothing"}
+        first = self.iterations // 2
+        record["curve"] = [
+            {"iterations": first, "milliseconds": 2.0 * first, "loss": 0.5},
+            {"iterations": self.iterations, "milliseconds": 2.0 * self.iterations, "loss": 0.25},
+        ]
+        record["errors"] = {"still": 0.5, "end": 1 / self.iterations}
+        record |= {"kept": record.get("kept", "end"), "attempts": ["as set"], "threads": 2}
         self.history.append(frame.index, frame.time, state(self.points, frame.index, before, red), record)
         return report
 
-    def step(self, frame, *, dropped=None, notes=None):
+    def step(self, frame, *, dropped=None, notes=None, started=None):
+        assert started is None or started <= time.perf_counter()
         obey(frame)
         return self.commit(frame, dropped, notes)
+
+    def spend(self, *, iterations=None, budget_ms=None, stop_gain=None, still=None):
+        self.iterations = iterations or ITERATIONS
 
 
 class FakeReader:
