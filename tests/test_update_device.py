@@ -197,7 +197,7 @@ def test_a_device_that_is_not_there_says_what_to_do(monkeypatch: pytest.MonkeyPa
     require_device("cpu")
     found: dict[str, object] = dict.fromkeys(("torch", "gsplat"))
     monkeypatch.setattr(device.importlib.util, "find_spec", found.get)
-    with pytest.raises(DeviceError, match=r"torch is not installed; run pip install 'scas4d\[cuda\]', or choose"):
+    with pytest.raises(DeviceError, match=r"torch is not installed; run pip install -e '.\[cuda\]', or choose"):
         require_device("cuda")
     found["torch"] = object()
     with pytest.raises(DeviceError, match="gsplat is not installed"):
