@@ -158,6 +158,8 @@ class Client(_Settings):
     tracks = _sends(calls.tracks)
     tracks_arrays = _sends(calls.tracks_arrays)
     parts = _sends(calls.parts)
+    budget = _sends(calls.budget)
+    set_budget = _sends(calls.set_budget)
 
     def watch(self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2) -> Iterator[SceneStatus]:
         """The scene's status again and again, until the frame is finished or the scene failed.
@@ -253,6 +255,8 @@ class AsyncClient(_Settings):
     tracks = _sends_async(calls.tracks)
     tracks_arrays = _sends_async(calls.tracks_arrays)
     parts = _sends_async(calls.parts)
+    budget = _sends_async(calls.budget)
+    set_budget = _sends_async(calls.set_budget)
 
     async def watch(
         self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2

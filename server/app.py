@@ -24,6 +24,7 @@ from server.placement.local import LocalPlacement
 from server.problems import Problem
 from server.readiness import Readiness
 from server.routes import (
+    budget,
     estimate,
     frames,
     health,
@@ -84,7 +85,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     app.add_middleware(Door, settings=settings, tickets=app.state.tickets)
     app.add_middleware(AccessLog)
     resources = (
-        *(scenes, inspect, points, frames, ingest, render, tracks, parts, stream),
+        *(scenes, inspect, points, frames, ingest, render, tracks, parts, stream, budget),
         *(estimate, tickets, health, metrics, viewer),
     )
     for resource in resources:

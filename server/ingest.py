@@ -6,11 +6,11 @@ import asyncio
 from collections.abc import Coroutine
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from client.wire import FrameHead, FrameReceipt, FrameReportModel, FrameState, PartReceipt
+from client.wire import Budget, FrameHead, FrameReceipt, FrameReportModel, FrameState, PartReceipt
 from server import metrics
 from server.admission import Admission
 from server.disk import full_disk, no_room
-from server.facts import Fact, Missing, Paused, Skipped, Taken
+from server.facts import Budgeted, Fact, Missing, Paused, Skipped, Taken
 from server.frame_store import remove
 from server.ledger import frame_identity
 from server.open_frames import OpenFrames
@@ -203,6 +203,24 @@ class Ingest:
             async with self._scene.door:
                 if self._scene.ledger.paused != paused:
                     await self._append(Paused(paused=paused))
+
+        await whole(change())
+
+    async def budget(self, budget: Budget) -> None:
+        """Another budget from the first frame on that is not begun; none begins while that is written down.
+
+        Raises:
+            Problem: 409 for a failed scene, 507 when the disk is full.
+        """
+
+        async def change() -> None:
+            scene = self._scene
+            async with scene.door:
+                self.rules.refuse_if_failed()
+                if scene.ledger.budgets[-1][1] == budget:
+                    return
+                with scene.no_frame_begins():
+                    await self._append(Budgeted(index=scene.ledger.begins_next(), budget=budget))
 
         await whole(change())
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Coroutine, Sequence
+from collections.abc import Coroutine, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,7 @@ class Scene:
         """Why the scene is degraded: the last frame's, or that of the worker or the disk."""
         self._at_work: int | None = None
         self._ready = False
+        self._holding = 0
         self._stopping = False
         self._again: asyncio.TimerHandle | None = None
         self._tasks: set[asyncio.Task[None]] = set()
@@ -205,7 +207,7 @@ class Scene:
         """Gives the worker its next frame, if it can take one and one waits; called whenever that may have changed."""
         self._tell(SceneChanged())
         ledger = self.ledger
-        if not self._ready or self._at_work is not None or ledger.paused or ledger.fatal is not None:
+        if not self._ready or self._at_work is not None or self._holding or ledger.paused or ledger.fatal is not None:
             return
         waiting = ledger.waiting()
         if not waiting:
@@ -371,6 +373,16 @@ class Scene:
 
     def _is_committed(self, index: int) -> bool:
         return bool(self._files.read(index))
+
+    @contextmanager
+    def no_frame_begins(self) -> Iterator[None]:
+        """The worker is given no frame inside; the one at work goes on."""
+        self._holding += 1
+        try:
+            yield
+        finally:
+            self._holding -= 1
+            self.work()
 
     async def pause(self, paused: bool) -> None:
         """Reconstructs nothing more after the frame at work; or goes on."""

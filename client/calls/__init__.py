@@ -1,5 +1,6 @@
 """The requests of the service as values, one file a noun: the sync and the async client send the same ones."""
 
+from client.calls.budgets import budget, set_budget
 from client.calls.call import Call
 from client.calls.frames import close_frame, declare_missing, frame, frames, ply, put_camera, put_frame
 from client.calls.parts import parts
@@ -10,6 +11,7 @@ from client.calls.views import render, render_arrays, render_file
 
 __all__ = [
     "Call",
+    "budget",
     "close_frame",
     "create_scene",
     "declare_missing",
@@ -33,6 +35,7 @@ __all__ = [
     "rig",
     "scene",
     "scenes",
+    "set_budget",
     "ticket",
     "tracks",
     "tracks_arrays",

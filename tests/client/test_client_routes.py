@@ -40,6 +40,8 @@ CALLS = [
     calls.tracks("s", ids=[0]),
     calls.tracks_arrays("s", ids=[0]),
     calls.parts("s"),
+    calls.budget("s"),
+    calls.set_budget("s", iterations=50),
 ]
 AS_AN_ADDRESS = {("GET", "/v1/scenes/{id}/render"), ("GET", "/v1/scenes/{id}/tracks")}
 """The same as a POST beside them, for a browser's address line."""

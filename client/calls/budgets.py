@@ -1,0 +1,53 @@
+"""Budgets: what an update may cost, and what it brings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from client.calls.call import Call, body, path, reads
+from client.wire import Budget, ReplayRequest, SceneBudget, TradeoffModel
+
+
+def budget(id: str) -> Call[SceneBudget]:
+    """What the updates of a scene may cost."""
+    return Call("GET", path(id, "budget"), reads(SceneBudget))
+
+
+def set_budget(
+    id: str,
+    *,
+    iterations: int | None = None,
+    budget_ms: float | None = None,
+    stop_gain: float | None = None,
+    still: float | None = None,
+) -> Call[SceneBudget]:
+    """Another budget, from the first frame on that is not begun. What is None is as the scene was made.
+
+    Args:
+        id: of the scene.
+        iterations: a frame.
+        budget_ms: milliseconds a frame, decoding and commit included; then as many iterations as fit.
+        stop_gain: a round over the cameras that brings less than this share ends the update.
+        still: a frame needs no iteration where the one before shows it with at most 1 + this times the usual error.
+    """
+    request = Budget(iterations=iterations, budget_ms=budget_ms, stop_gain=stop_gain, still=still)
+    return Call("PUT", path(id, "budget"), reads(SceneBudget), arguments=body(request))
+
+
+def tradeoff(id: str) -> Call[TradeoffModel]:
+    """What accuracy costs in time, for this scene on its machine."""
+    return Call("GET", path(id, "tradeoff"), reads(TradeoffModel))
+
+
+def replay(id: str, iterations: Sequence[int] = (25, 50, 200), frames: int = 4) -> Call[TradeoffModel]:
+    """Measures other numbers of iterations: the newest frames are updated again, in the background and in memory.
+
+    `tradeoff` tells how far it is, and has the points when it is done.
+
+    Args:
+        id: of the scene.
+        iterations: a frame, each a replay; the scene's own number is always measured too.
+        frames: that are replayed; their pictures must still be held.
+    """
+    request = ReplayRequest(iterations=list(iterations), frames=frames)
+    return Call("POST", path(id, "tradeoff"), reads(TradeoffModel), repeatable=False, arguments=body(request))

@@ -1,0 +1,27 @@
+"""What the updates of a scene may cost."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+
+from client.wire import Budget, SceneBudget
+from server.budgets import scene_budget
+from server.routes.access import TheScene
+
+router = APIRouter(prefix="/v1/scenes", tags=["budget"])
+
+
+@router.get("/{id}/budget")
+async def get(scene: TheScene) -> SceneBudget:
+    """The budget of frames that are not begun."""
+    return scene_budget(scene)
+
+
+@router.put("/{id}/budget")
+async def put(scene: TheScene, budget: Budget) -> SceneBudget:
+    """Another budget from the first frame on that is not begun; what is null is as the scene was made.
+
+    It is on disk when this answers: after any end of the service each frame gets the budget that held for it.
+    """
+    await scene.ingest.budget(budget)
+    return scene_budget(scene)
