@@ -7,18 +7,21 @@ from __future__ import annotations
 import json
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scas4d_core.bench.machine import core_version, machine
+from scas4d_core.bench.sequences import Shown, as_it_is, back_and_forth, repeated, slowed
 from scas4d_core.bench.store import Row
 from scas4d_core.bench.timing import started
-from scas4d_core.captures import Capture, Frame, open_capture
+from scas4d_core.captures import Capture, open_capture
+from scas4d_core.metrics import psnr as image_psnr
 from scas4d_core.presets import preset
 from scas4d_core.settings import Settings
 
@@ -30,17 +33,6 @@ FRAMES = 50
 """Of a capture played back and forth."""
 COUNTED_FROM = 2
 """Updates before are not counted: the first has no motion to start from and knows no speed."""
-
-
-def back_and_forth(capture: Capture, frames: int) -> Iterator[Frame]:
-    """So many frames after the first, played to the end, back to the start and so on; time goes on."""
-    count = capture.frame_count
-    first, second = capture.frame(0), capture.frame(1)
-    step = second.time - first.time
-    for index in range(1, frames + 1):
-        place = index % (2 * count - 2)
-        shown = capture.frame(min(place, 2 * count - 2 - place))
-        yield Frame(index, first.time + index * step, shown.images, shown.masks)
 
 
 @dataclass
@@ -109,6 +101,66 @@ def measure_budgets(
             f"over; {row['iterations'][1]:.0f} iterations; worst {row['worst_off_ms']:+.0f} ms"
         )
     return _leave(out, f"{capture.name}-budgets", capture, {"budgets": [one.row() for one in kept]})
+
+
+def measure_adaptive(
+    folder: Path, out: Path, *, name: str = "adaptive", updates: int = 10, report: Report = print
+) -> Row:
+    """A preset that spares effort against ``scas4d``, frame by frame in turns, on a capture as it is, with frames
+    repeated, and slowed; leaves ``out/effort/<capture>-<name>.json``.
+
+    Args:
+        folder: of a capture with test cameras. out: folder of a study, with its frames 0. updates: of the capture.
+    """
+    capture = open_capture(folder)
+    sequences: dict[str, Callable[[], Iterator[Shown]]] = {
+        "as it is": lambda: as_it_is(capture, updates),
+        "repeated": lambda: repeated(capture, updates),
+        "slowed": lambda: slowed(capture, updates, out),
+    }
+    answers = []
+    for what, frames in sequences.items():
+        fixed = _changed(preset("scas4d"), still=-1.0)
+        pair = {"scas4d": started(capture, fixed, out), name: started(capture, preset(name), out)}
+        seconds: dict[str, list[float]] = {key: [] for key in pair}
+        psnr: dict[str, list[float]] = {key: [] for key in pair}
+        iterations: list[int] = []
+        repeats: list[bool] = []
+        for number, shown in enumerate(frames()):
+            for key in list(pair) if number % 2 else list(pair)[::-1]:
+                began = time.perf_counter()
+                done = pair[key].step(shown.frame, started=began)
+                seconds[key].append(time.perf_counter() - began)
+                psnr[key].append(_score(pair[key], capture, shown.truth))
+                if key == name:
+                    iterations.append(done.iterations)
+            repeats.append(shown.repeats)
+        taken = {key: np.array(values) for key, values in seconds.items()}
+        again = np.array(repeats)
+        answer = {
+            "sequence": what,
+            "frames": len(again),
+            "psnr": {key: float(np.mean(values)) for key, values in psnr.items()},
+            "seconds": {key: float(np.median(values)) for key, values in taken.items()},
+            "time": float(taken[name].sum() / taken["scas4d"].sum()),
+            "time_repeats": float(
+                taken[name][again].sum() / taken["scas4d"][~again].sum() * (~again).sum() / again.sum()
+            )
+            if again.any()
+            else None,
+            "iterations": np.percentile(iterations, (0, 50, 100)).tolist(),
+        }
+        answers.append(answer)
+        difference = answer["psnr"][name] - answer["psnr"]["scas4d"]
+        told = "" if answer["time_repeats"] is None else f", repeats {100 * answer['time_repeats']:.0f} %"
+        report(f"    {capture.name}, {what}: {100 * answer['time']:.0f} % of the time{told}, {difference:+.2f} dB")
+    return _leave(out, f"{capture.name}-{name}", capture, {"name": name, "sequences": answers})
+
+
+def _score(reconstruction: Any, capture: Capture, truth: Mapping[str, NDArray[np.float32]]) -> float:
+    """dB, mean over the test cameras."""
+    cameras = capture.test_rig.cameras if capture.test_rig is not None else ()
+    return float(np.mean([image_psnr(reconstruction.render(c).colour, truth[c.name]) for c in cameras]))
 
 
 def _each(report: Any) -> float:
