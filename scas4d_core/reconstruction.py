@@ -209,6 +209,31 @@ class Reconstruction(Committed):
         self._take_up(held)
         return self
 
+    @classmethod
+    def aside(cls, rig: Rig, settings: Settings, history: History, index: int) -> Reconstruction:
+        """A copy in memory that goes on from a committed frame with a cold start; ``history`` is read, not changed.
+
+        Args:
+            rig: training cameras, user's world, as given to ``start``. settings: as given to ``start``, or with other
+                ones of the update.
+            history: of the scene. index: a committed frame.
+
+        Raises:
+            HistoryError: the frame or the first one cannot be read.
+        """
+        first = history.indices[0]
+        copy = History()
+        for one in sorted({first, index}):
+            copy.append(one, history.time(one), history.gaussians(one), history.report(one))
+        self = cls._of(rig, settings, copy)
+        report = copy.report(first)
+        self._masked = bool(report["masked"])
+        self._exposures = {name: np.array(exposure, np.float32) for name, exposure in report["exposures"].items()}
+        labels = self._labels_of(index)
+        self._updater, structure = self._prepared(self._labelled(copy.gaussians(first), labels))
+        self._carried = Carried(labels=labels, structure=structure)
+        return self
+
     def _take_up(self, held: Callable[[int], bool]) -> None:
         """Find the commit to go on from, and cut the history after it."""
         history = self.history
