@@ -282,3 +282,32 @@ def views(
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text)
+
+
+@app.command()
+def stability(
+    cases: Annotated[
+        list[str] | None, typer.Option(help="Only cases whose name holds this. May be repeated.", show_default=False)
+    ] = None,
+    fast: Annotated[bool, typer.Option("--fast", help="Leave out what takes long, as a million to cluster.")] = False,
+    mutate: Annotated[
+        bool, typer.Option("--mutate", help="Take away each guard in turn; goes on where it was interrupted.")
+    ] = False,
+    store: Annotated[Path, typer.Option(help="Folder of the mutations' results.")] = Path("out/stability"),
+    out: Annotated[Path | None, typer.Option(help="Write the tables here, between their marks.")] = None,
+) -> None:
+    """Runs the catalogue of hard cases on every backend that is here, and counts what the guards did.
+
+    Example: scas4d bench stability --cases NaN --cases fold
+    """
+    from scas4d_core.stability import mutate as mutations
+    from scas4d_core.stability import run
+
+    lines = run.run(cases, slow=not fast, told=typer.echo)
+    failing = mutations.study(store, typer.echo) if mutate else mutations.known(store)
+    if out is not None:
+        if cases or fast:
+            raise typer.BadParameter("a page has all cases; leave out --cases and --fast, or --out")
+        run.write_page(out, run.page(lines, failing, *run.here()))
+    if any(line.violations for line in lines) or (mutate and not all((failing or {}).values())):
+        raise typer.Exit(1)

@@ -9,12 +9,16 @@ Quaternions are (w, x, y, z). Lengths are metres in the inside world.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import e, log2
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from scas4d_core.guards import EMPTY_CLUSTER, HALF_TURN
+from scas4d_core.guards import EMPTY_CLUSTER, EXPONENT, HALF_TURN
+
+LARGEST = EXPONENT / log2(e)
+"""Of an exponential's argument."""
 
 ClusterMap = Literal["centred", "published"]
 """Which form of equation (6): scaling about the cluster's pivot, or about the world's origin as published."""
@@ -245,7 +249,7 @@ def deform(
     """
     points, jacobians, rotations = cascade(means, layers, kind)
     dq = rotation_quaternions(deltas.dr)
-    moved = quaternion_matrices(dq) @ jacobians @ factors * torch.exp(deltas.ds)[:, None, :]
+    moved = quaternion_matrices(dq) @ jacobians @ factors * torch.exp(deltas.ds.clamp(-LARGEST, LARGEST))[:, None, :]
     turns = quaternion_product(dq, rotations)
     turns = torch.where(turns[:, :1] < 0, -turns, turns)
     return Deformed(points + deltas.dp, moved, turns)

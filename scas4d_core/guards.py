@@ -193,7 +193,7 @@ TANGENT_MARGIN = _convention(
     counted="holds every Gaussian beside the picture",
 )  # fmt: skip
 COVER_SLACK = _convention(
-    "cover_slack", 1e-4, -1e-2,
+    "cover_slack", 1e-4, 0.0,
     unit="1 and σ²", where="kernels/tiles.py",
     reason="Relative and absolute widening of the support by which tiles and blocks are culled: rounding must not cull "
     "what blending would draw. No pixel changes by it.",

@@ -108,7 +108,7 @@ def activate_backward(parameters, factors, opacities, features, g_means, g_facto
                 total = ZERO
                 for row in range(3):
                     total += g[row, column] * factors[i, row, column]
-                gradients[i, 7 + column] = total
+                gradients[i, 7 + column] = total if abs(p[7 + column]) <= LARGEST else ZERO
                 gradients[i, 11 + column] = g_features[i, column]
             gradients[i, 10] = g_opacities[i] * opacities[i] * (ONE - opacities[i])
             gradients[i, 14] = g_features[i, 3] * features[i, 3] * (ONE - features[i, 3])

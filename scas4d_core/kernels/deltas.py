@@ -107,7 +107,8 @@ def apply_own_backward(
     g0 = g1 = g2 = g3 = g4 = g5 = g6 = g7 = g8 = nothing
     excess = nothing
     for column in range(3):
-        stretch = lanes.exp(lanes.pick(deltas, entries, place, COLUMNS, 6 + column))
+        exponent = lanes.pick(deltas, entries, place, COLUMNS, 6 + column)
+        stretch = lanes.exp(exponent)
         e0 = stretch * lanes.load(v, leaving + n * column)
         e1 = stretch * lanes.load(v, leaving + n * (3 + column))
         e2 = stretch * lanes.load(v, leaving + n * (6 + column))
@@ -132,7 +133,9 @@ def apply_own_backward(
         p0 = r0 * h0 + r3 * h1 + r6 * h2 + pull * e0
         p1 = r1 * h0 + r4 * h1 + r7 * h2 + pull * e1
         p2 = r2 * h0 + r5 * h1 + r8 * h2 + pull * e2
-        lanes.put(g_deltas, entries, place, COLUMNS, 6 + column, p0 * e0 + p1 * e1 + p2 * e2)
+        g_exponent = p0 * e0 + p1 * e1 + p2 * e2
+        free = lanes.magnitude(exponent) <= LARGEST
+        lanes.put(g_deltas, entries, place, COLUMNS, 6 + column, lanes.choose(free, g_exponent, nothing))
         lanes.store(g, n * (3 + column), lanes.choose(counts, stretch * p0, nothing))
         lanes.store(g, n * (6 + column), lanes.choose(counts, stretch * p1, nothing))
         lanes.store(g, n * (9 + column), lanes.choose(counts, stretch * p2, nothing))

@@ -1,0 +1,101 @@
+"""What a hard case is, and the laws that all of them share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Values = dict[str, NDArray[Any]]
+
+REFERENCE = "float64"
+"""The backend that the others are held against: the torch twins in float64."""
+CPU, TORCH, CUDA = "cpu", "torch float32", "cuda"
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What one backend made of a case.
+
+    Attributes:
+        values, gradients: arrays by name.
+        guards: how often each acted.
+    """
+
+    values: Values
+    gradients: Values = field(default_factory=dict)
+    guards: Mapping[str, int] = field(default_factory=dict)
+
+
+class Problem(Protocol):
+    """A case made in one size."""
+
+    def run(self, backend: str) -> Outcome | None:
+        """Compute it; None where the backend has no such computation."""
+
+    def violations(self, outcomes: Mapping[str, Outcome]) -> list[str]:
+        """What does not hold, in words."""
+
+
+def _nothing_more(problem: Any, outcomes: Mapping[str, Outcome]) -> list[str]:
+    return []
+
+
+@dataclass(frozen=True, eq=False)
+class HardCase:
+    """One line of the catalogue.
+
+    Attributes:
+        name: of the case.
+        what: is hard about it, and what must hold beside the laws that every case has.
+        source: where it comes from: the literature, users' reports (repository#thread), or the equations.
+        sizes: in which it is tried; what a size is, ``what`` says.
+        make: the problem in a size.
+        holds: violations of what must hold beside the problem's own laws.
+        slow: left out where only the fast ones are run.
+    """
+
+    name: str
+    what: str
+    source: str
+    sizes: tuple[Any, ...]
+    make: Callable[[Any], Problem]
+    holds: Callable[[Any, Mapping[str, Outcome]], list[str]] = _nothing_more
+    slow: bool = False
+
+
+def not_finite(outcome: Outcome, backend: str) -> list[str]:
+    """A line for each array that holds NaN or infinity."""
+    arrays = [*outcome.values.items(), *((f"gradient of {name}", a) for name, a in outcome.gradients.items())]
+    return [
+        f"{backend}: {name} holds {np.count_nonzero(~np.isfinite(array))} numbers that are not finite"
+        for name, array in arrays
+        if not np.isfinite(array).all()
+    ]
+
+
+def beyond(outcome: Outcome, backend: str, bound: float) -> list[str]:
+    """A line for each gradient with a number larger than a bound."""
+    return [
+        f"{backend}: gradient of {name} reaches {np.abs(array).max():.3g}, beyond {bound:.3g}"
+        for name, array in outcome.gradients.items()
+        if array.size and float(np.abs(array).max()) > bound
+    ]
+
+
+def apart(found: NDArray[Any], truth: NDArray[Any], least: float = 1e-30) -> float:
+    """Norm of the difference over the norm of the truth; 0 where both are 0."""
+    difference = np.linalg.norm((found - truth).astype(np.float64))
+    return float(difference / max(float(np.linalg.norm(truth.astype(np.float64))), least)) if difference > 0 else 0.0
+
+
+def unexpected_counts(outcome: Outcome, expected: Mapping[str, int] | None, silent: Sequence[str] = ()) -> list[str]:
+    """A line where the CPU's guards acted otherwise than expected; None: anything goes."""
+    if expected is None:
+        return []
+    found = {name: count for name, count in outcome.guards.items() if count and name not in silent}
+    wanted = {name: count for name, count in expected.items() if count}
+    return [] if found == wanted else [f"guards acted {found}, expected {wanted}"]
