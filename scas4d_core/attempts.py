@@ -16,10 +16,15 @@ from numpy.typing import NDArray
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.pace import Pace
 
+Array = NDArray[np.float32]
+
 FARTHEST = 1.0
 """Radii of the rig that a Gaussian may move in one update."""
 LONGEST = 1.0
 """Radii of the rig that an axis may become long."""
+SHRUNK, STRETCHED = 0.1, 10.0
+"""Times its length in frame 0 that an axis may become short or long: thousands of updates add up what each leaves, and
+the axes would wander without end (docs/stability.md, Time). Such an axis is set to the bound, and counted."""
 BRIGHTEST = 8.0
 """Size that a colour may have; 0…1 is what a camera shows, a gain of a camera stretches it."""
 FEW = 0.01
@@ -76,36 +81,68 @@ class Checked:
 
     Attributes:
         gaussians: with what is implausible held. held: how many Gaussians are. fault: None where it may be committed.
+        bounded: axes that were set to the shortest or longest that they may be.
     """
 
     gaussians: Gaussians
     held: int
     fault: str | None
+    bounded: int = 0
 
 
-def checked(before: Gaussians, after: Gaussians, rows: NDArray[np.int64], radius: float) -> Checked:
+def axis_lengths(gaussians: Gaussians) -> Array:
+    """[N, 3] metres."""
+    lengths: Array = np.sqrt(np.square(gaussians.factors).sum(axis=1))
+    return lengths
+
+
+def checked(
+    before: Gaussians, after: Gaussians, rows: NDArray[np.int64], radius: float, first: Array | None = None
+) -> Checked:
     """Hold what is not finite, bounded and plausible as it was before.
 
     Args:
         before, after: Θ_{t−1} and what an update makes of it. rows: [M] what moves. radius: of the rig, metres.
+        first: [N, 3] ``axis_lengths`` of frame 0; None: axes may have any length up to ``LONGEST``.
     """
     bad = np.zeros(len(after), np.bool_)
     with np.errstate(over="ignore", invalid="ignore"):
         colours = np.abs(after.colours).max(axis=1, initial=0)
         bad |= ~(colours <= BRIGHTEST)  # NaN is not at most anything
         moved = np.square(after.means[rows] - before.means[rows]).sum(axis=1)
-        lengths = np.square(after.factors[rows]).sum(axis=1).max(axis=1, initial=0)
+        squares = np.square(after.factors[rows]).sum(axis=1)
+        lengths = squares.max(axis=1, initial=0)
         turned = np.square(after.rotations[rows]).sum(axis=1)
         fine = (moved <= (FARTHEST * radius) ** 2) & (lengths <= (LONGEST * radius) ** 2) & (np.abs(turned - 1) < 0.01)
         fine &= _oriented(before.factors[rows], after.factors[rows])
     bad[rows] |= ~fine
     count = int(bad.sum())
+    bounded = 0
+    if first is not None:
+        after, bounded = _bounded(after, rows, squares, first)
     if count == 0:
-        return Checked(after, 0, None)
+        return Checked(after, 0, None, bounded)
     if count > max(1, FEW * len(rows)):
         return Checked(before, count, f"{count} of {len(rows)} Gaussians are not finite, or moved or grew too far")
     arrays = {name: np.where(_like(bad, now), then, now) for name, then, now in _pairs(before, after)}
-    return Checked(after.replace(**arrays), count, None)
+    return Checked(after.replace(**arrays), count, None, bounded)
+
+
+def _bounded(after: Gaussians, rows: NDArray[np.int64], squares: Array, first: Array) -> tuple[Gaussians, int]:
+    """Axes set to the bounds of their length, and how many were.
+
+    Args:
+        squares: [M, 3] of the axes' lengths. first: [N, 3] lengths in frame 0.
+    """
+    least, most = np.square(SHRUNK * first[rows]), np.square(STRETCHED * first[rows])
+    which, axis = np.nonzero((squares < least) | (squares > most))
+    if not len(which):
+        return after, 0
+    there = squares[which, axis]
+    bound = np.where(there < least[which, axis], least[which, axis], most[which, axis])
+    factors = after.factors.copy()
+    factors[rows[which], :, axis] *= np.sqrt(bound / np.maximum(there, np.finfo(np.float32).tiny))[:, None]
+    return after.replace(factors=factors), len(which)
 
 
 def _oriented(before: NDArray[np.float32], after: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -17,6 +17,7 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 
 from scas4d_core import judge
+from scas4d_core.attempts import axis_lengths
 from scas4d_core.budget import Budget
 from scas4d_core.cameras import Rig, WorldFrame, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
@@ -98,6 +99,7 @@ class Reconstruction(Committed):
         limits = scene_limits(settings.scene.near, rig.radius)
         self._picture = PictureLoss(self._factory, settings.scene.background, 1.0, 0.0, limits=limits)
         self._updater: Updater | None = None
+        self._lengths: NDArray[np.float32] | None = None
         self._effort = settings.update
         self._budget = Budget(settings.update.budget_ms)
 
@@ -149,6 +151,7 @@ class Reconstruction(Committed):
         fitted = perf_counter()
         self.static = result
         self._exposures = result.exposures
+        self._lengths = axis_lengths(result.gaussians)
         self._masked = len(frame.masks) > 0
         self._updater, structure = self._prepared(result.gaussians)
         seen = () if self._masked else self._factory.views(self._scaled(frame), {}, use_masks=False)
@@ -203,7 +206,7 @@ class Reconstruction(Committed):
             report = history.report(first)
             self._masked = bool(report["masked"])
             self._exposures = {name: np.array(e, np.float32) for name, e in report["exposures"].items()}
-            history.gaussians(first)
+            self._lengths = axis_lengths(history.gaussians(first))
         except (HistoryError, KeyError) as error:
             raise ResumeError(f"the first frame, which every update needs, cannot be read ({error})") from error
         self._take_up(held)
@@ -348,6 +351,7 @@ class Reconstruction(Committed):
             look=look,
             end=self._budget.end(watch.began),
             each=self._budget.each,
+            lengths=self._lengths,
         )
         trial = Trial(updater, self._factory, self._picture, self._effort)
         outcome = trial.held(given, look.held) if look.held else trial.run(given)
@@ -408,6 +412,7 @@ class Reconstruction(Committed):
             attempts=outcome.attempts,
             exposure=outcome.exposure,
             held=outcome.held,
+            guards={"axis_bounds": outcome.bounded},
             planned=updated.planned,
             curve=curve(updated.losses, updated.moments),
             errors={kind: mean_error(errors, list(errors)) for kind, errors in updated.errors.items()},

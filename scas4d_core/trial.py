@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scas4d_core import judge
 from scas4d_core.attempts import AS_SET, LADDER, SOUGHT, Checked, Course, Manner, checked
@@ -30,7 +31,7 @@ class Given:
         state: Θ_{t−1}. motion: that was found last, or None. seconds: since then. views: of the frame, to learn from.
         suspects: views of cameras that are left out. brightness: mean of each camera's picture. seed: of the update.
         past: what is usual. look: what the pictures say. end: moment by which the last iteration has to be over.
-        each: seconds of an iteration in the updates before, or None.
+        each: seconds of an iteration in the updates before, or None. lengths: [N, 3] metres, of the axes in frame 0.
     """
 
     state: Gaussians
@@ -44,6 +45,7 @@ class Given:
     look: Look
     end: float | None = None
     each: float | None = None
+    lengths: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +55,8 @@ class Outcome:
     Attributes:
         updated: of the attempt that is committed, or of the last one where the frame is held.
         gaussians: Θ_t. motion: for the next update. past: what is usual now. fits: dB by camera above or below its
-            usual place. held: Gaussians held one by one. degraded, attempts: see ``FrameReport``.
+            usual place. held: Gaussians held one by one. degraded, attempts: see ``FrameReport``. bounded: axes set to
+            the shortest or longest that they may be.
         exposure: of the frame. fresh: whether the frame was believed. stood: whether Θ_{t−1} showed it already.
     """
 
@@ -68,6 +71,7 @@ class Outcome:
     exposure: float = 1.0
     fresh: bool = True
     stood: bool = False
+    bounded: int = 0
 
 
 class Trial:
@@ -119,9 +123,12 @@ class Trial:
     def _attempt(self, given: Given, start: Gaussians, manner: Manner, told: list[str]) -> tuple[Updated, Checked]:
         motion = None if manner.cold else given.motion
         updated = self._updater.run(start, given.views, motion, given.seconds, given.seed, self._course(given, manner))
-        check = checked(given.state, updated.gaussians, self._updater.hierarchy.rows, self._rig.radius)
+        check = self._checked(given, given.state, updated)
         told.append(manner.name if check.fault is None else f"{manner.name}: {check.fault}")
         return updated, check
+
+    def _checked(self, given: Given, start: Gaussians, updated: Updated) -> Checked:
+        return checked(start, updated.gaussians, self._updater.hierarchy.rows, self._rig.radius, given.lengths)
 
     def _course(self, given: Given, manner: Manner) -> Course:
         settings, past = self._settings, given.past
@@ -161,7 +168,7 @@ class Trial:
         for name, start in starts:
             course = self._course(given, replace(SOUGHT, name=name))
             updated = self._updater.run(start, given.views, None, given.seconds, given.seed, course)
-            check = checked(start, updated.gaussians, self._updater.hierarchy.rows, self._rig.radius)
+            check = self._checked(given, start, updated)
             why = check.fault or judge.unmet(given.past, self._met(updated))
             attempts.append(name if why is None else f"{name}: {why}")
             if why is None:
@@ -196,7 +203,18 @@ class Trial:
         motion = None if check.held and not np.isfinite(updated.gaussians.means).all() else updated.motion
         if not updated.losses:  # it stands, or its frame was sent twice: it may go on as it went
             return Outcome(updated, given.state, given.motion, past, fits, attempts=["not moved"], stood=True)
-        return Outcome(updated, check.gaussians, motion, past, fits, check.held, degraded, attempts, exposure)
+        return Outcome(
+            updated,
+            check.gaussians,
+            motion,
+            past,
+            fits,
+            check.held,
+            degraded,
+            attempts,
+            exposure,
+            bounded=check.bounded,
+        )
 
     def _suspects(self, given: Given, state: Gaussians) -> dict[str, float]:
         """DB of cameras that are left out: so they come back once they fit."""

@@ -1,0 +1,88 @@
+"""The small scene of the frame cases and of the soak: a ball goes around over a floor, another lies there."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Camera, Rig
+from scas4d_core.gaussians import Gaussians
+
+ORBIT = 0.14
+"""Metres, radius of the way of the ball that goes."""
+BALL = 0.15
+"""Metres, its radius."""
+GOES, RESTS, STANDS = 220, 160, 64
+"""Gaussians of the ball that goes, of the one that lies, and of the floor; in this order."""
+
+
+def cameras(count: int, size: int, *, turned: float = 0.0, names: str = "c") -> Rig:
+    """Square cameras of ``size`` pixels around the origin, by turns above and below; y is down.
+
+    Args:
+        count: even, so that their mean is the origin. turned: radians, of all of them about the vertical.
+    """
+    lens = np.array([[1.25 * size, 0, size / 2], [0, 1.25 * size, size / 2], [0, 0, 1]])
+    found = []
+    for k in range(count):
+        angle = turned + 2 * np.pi * k / count
+        eye = np.array([1.3 * np.sin(angle), 0.45 * (-1) ** k, 1.3 * np.cos(angle)])
+        z = -eye / np.linalg.norm(eye)
+        x = np.cross([0, 1, 0], z) / np.linalg.norm(np.cross([0, 1, 0], z))
+        pose = np.eye(4)
+        pose[:3, :3] = [x, np.cross(z, x), z]
+        pose[:3, 3] = -pose[:3, :3] @ eye
+        found.append(Camera(f"{names}{k}", lens, pose, size, size))
+    return Rig(tuple(found))
+
+
+def first_state(*, resting_may_move: bool) -> Gaussians:
+    """Θ_0, in metres of the inside world.
+
+    Args:
+        resting_may_move: whether the ball that lies there is labelled as moving.
+    """
+    rng = np.random.default_rng(0)
+    positions, widths = [], []
+    for count, centre, radius in ((GOES, (ORBIT, -0.1, 0.0), BALL), (RESTS, (-0.1, 0.2, -0.25), 0.12)):
+        normals = rng.normal(size=(count, 3))
+        positions.append(np.array(centre) + radius * normals / np.linalg.norm(normals, axis=1, keepdims=True))
+        widths.append(np.full(count, 1.6 * radius / np.sqrt(count)))
+    line = 1.2 * ((np.arange(8) + 0.5) / 8 - 0.5)
+    x, z = (array.ravel() for array in np.meshgrid(line, line))
+    positions.append(np.stack([x, np.full(STANDS, 0.35), z], axis=1))
+    total = GOES + RESTS + STANDS
+    axes = np.linalg.qr(rng.normal(size=(total, 3, 3)))[0]
+    lengths = np.exp(rng.normal(0, 0.2, (total, 3)))
+    lengths[:-STANDS] *= np.concatenate(widths)[:, None]
+    factors = axes * lengths[:, None, :]
+    factors[-STANDS:] = np.diag([0.08, 0.01, 0.08])
+    return Gaussians(
+        means=np.concatenate(positions).astype(np.float32),
+        factors=factors.astype(np.float32),
+        rotations=np.tile(np.array([1, 0, 0, 0], np.float32), (total, 1)),
+        opacities=np.full(total, 0.9, np.float32),
+        colours=rng.uniform(0.05, 0.95, (total, 3)).astype(np.float32),
+        foreground=np.repeat(
+            np.array([0.98, 0.98 if resting_may_move else 0.02, 0.02], np.float32), [GOES, RESTS, STANDS]
+        ),
+        ids=np.arange(total),
+    )
+
+
+def gone(state: Gaussians, angle: float, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Gaussians:
+    """The ball that goes, turned by ``angle`` radians about the vertical axis through the origin, then shifted."""
+    means, factors = state.means.copy(), state.factors.copy()
+    turn = np.eye(3)
+    if angle != 0:
+        c, s = np.cos(angle), np.sin(angle)
+        turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    means[:GOES] = (state.means[:GOES] @ turn.T + shift).astype(np.float32)
+    factors[:GOES] = (turn @ state.factors[:GOES]).astype(np.float32)
+    return state.replace(means=means, factors=factors)
+
+
+def rows() -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """[N] which Gaussians are of the ball that goes, and which of the one that lies."""
+    index = np.arange(GOES + RESTS + STANDS)
+    return index < GOES, (index >= GOES) & (index < GOES + RESTS)
