@@ -42,6 +42,9 @@ FIRST_DROP_DB = 14.0
 MOST_OUT = 0.5
 """Share of the cameras that are left out at most; where more do not fit, it is the frame that changed."""
 
+CLEAN_DB = 40.0
+"""All that is met better counts as this: beyond, 5 dB are a thousandth of the range, and no sign of a fault."""
+
 PLACE_RATE, LEVEL_RATE = 0.2, 0.3
 """How fast a camera's usual place and the usual level follow."""
 
@@ -71,7 +74,7 @@ class Past:
     Attributes:
         cameras: by name. level: dB, median over the cameras at the end of an update; NaN where not known.
         updates: that went into it. held: frames in a row that were held. fitted: seconds, time of the last frame that
-            was not. error: of the last update, by witness view.
+            was not. error: usual at the end of an update, by witness view.
     """
 
     cameras: Mapping[str, CameraPast] = field(default_factory=dict)
@@ -84,6 +87,7 @@ class Past:
     @classmethod
     def of_first(cls, psnr: Mapping[str, float], bright: Mapping[str, float]) -> Past:
         """After frame 0: how well its fit met each camera, dB, and how bright the pictures are."""
+        psnr = _capped(psnr)
         level = float(np.median(list(psnr.values()))) if psnr else nan
         cameras = {name: CameraPast(psnr.get(name, nan) - level, value) for name, value in bright.items()}
         return cls(cameras, level)
@@ -167,7 +171,7 @@ def look(past: Past, bright: Mapping[str, float]) -> Look:
 
 def place(past: Past, psnr: Mapping[str, float]) -> dict[str, float]:
     """DB by camera, above (+) or below where it usually is among the cameras."""
-    known = {name: value for name, value in psnr.items() if past.of(name).place == past.of(name).place}
+    known = {name: value for name, value in _capped(psnr).items() if past.of(name).place == past.of(name).place}
     if not known:
         return {}
     shift = float(np.median([value - past.of(name).place for name, value in known.items()]))
@@ -194,7 +198,7 @@ def unmet(past: Past, psnr: Mapping[str, float]) -> str | None:
     """Why an update has not met its frame, or None. ``psnr``: dB by camera when last rendered."""
     if not psnr or past.level != past.level:
         return None
-    level = float(np.median(list(psnr.values())))
+    level = float(np.median(list(_capped(psnr).values())))
     drop = FIRST_DROP_DB if past.updates == 0 else DROP_DB
     if level > past.level - drop:
         return None
@@ -213,6 +217,7 @@ def settle(past: Past, psnr: Mapping[str, float], bright: Mapping[str, float], e
         psnr: dB by camera, of those learnt from when last rendered, of those left out as the update ended.
         bright: of every picture of the frame. exposure: of the frame.
     """
+    psnr = _capped(psnr)
     off = place(past, psnr)
     out = misfits(past, psnr, LAST_DB)
     believed = {n: v for n, v in psnr.items() if n not in out and not past.of(n).out}
@@ -239,6 +244,11 @@ def settle(past: Past, psnr: Mapping[str, float], bright: Mapping[str, float], e
         updates=past.updates + 1,
         held=0,
     )
+
+
+def _capped(psnr: Mapping[str, float]) -> dict[str, float]:
+    """No more than ``CLEAN_DB`` each; what is not a number stays none."""
+    return {name: CLEAN_DB if value > CLEAN_DB else value for name, value in psnr.items()}
 
 
 def _few(found: dict[str, str], count: int) -> dict[str, str]:

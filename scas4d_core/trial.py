@@ -22,6 +22,9 @@ from scas4d_core.updated import Updated
 from scas4d_core.views import TrainingView, ViewFactory
 from scas4d_core.warm_start import Motion
 
+ERROR_RISE = 1.02
+"""Times that the usual error of a witness rises at most in an update."""
+
 
 @dataclass(frozen=True, eq=False)
 class Given:
@@ -199,7 +202,7 @@ class Trial:
         fits = judge.place(past, psnr)
         past = judge.settle(past, psnr, given.brightness, exposure)
         if updated.errors.get("end"):
-            past = replace(past, error=updated.errors[updated.kept])
+            past = replace(past, error=_usual(given.past.error, updated.errors[updated.kept]))
         motion = None if check.held and not np.isfinite(updated.gaussians.means).all() else updated.motion
         if not updated.losses:  # it stands, or its frame was sent twice: it may go on as it went
             return Outcome(updated, given.state, given.motion, past, fits, attempts=["not moved"], stood=True)
@@ -224,3 +227,11 @@ class Trial:
             self._picture.measure(state.means, state.factors, state.opacities, features, view)
             found[view.name] = self._picture.psnr
         return found
+
+
+def _usual(before: Mapping[str, float], now: Mapping[str, float]) -> dict[str, float]:
+    """The errors by view that are usual: they fall at once and rise slowly.
+
+    What a noisy frame was met with would else be enough for the next good one, which moved.
+    """
+    return {name: min(value, ERROR_RISE * before.get(name, value)) for name, value in now.items()}

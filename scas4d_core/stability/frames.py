@@ -1,0 +1,383 @@
+"""Frames that are not what they should be: what each case sends, and what must come of it.
+
+A case takes a footage that goes as it should, and says what is sent in place of its frames from one on: first the
+faulty ones, then good ones. What must hold in every case: all is finite, what is not as it should be is explained in
+the report, and the third good frame is as good as if nothing had been.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.captures.frame import Frame
+from scas4d_core.frame_report import FrameReport
+
+Picture = NDArray[np.uint8]
+Pictures = Mapping[str, Picture]
+
+AFTER = 3
+"""Good frames after the faulty ones; the last of them is held against the undisturbed run."""
+WITHIN_DB = 0.5
+"""Of the undisturbed run, the last good frame."""
+NEAR_DB = 1.0
+"""Of the undisturbed run, a faulty frame that can be followed all the same."""
+JUMPED_DB = 3.0
+"""Of the undisturbed run, an object that jumped, three frames later: it is seen from other sides, with turned light."""
+
+
+class Footage(Protocol):
+    """A sequence that goes as it should, with cameras held out."""
+
+    def frame(self, index: int) -> Frame:
+        """The training pictures."""
+
+    def truth(self, index: int) -> Pictures:
+        """What the held-out cameras see."""
+
+    def jumped(self, index: int, sizes: float) -> tuple[Frame, Pictures] | None:
+        """The same with the object moved by so many times its own size; None where that cannot be had."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sent:
+    """One frame as it is sent.
+
+    Attributes:
+        frame: its index and time are set when it is sent. like: frame of the footage that it should look like, which
+            the undisturbed run is asked for. truth: what held-out cameras see at that moment.
+        good: whether it is as it should be.
+    """
+
+    frame: Frame
+    like: int
+    truth: Pictures
+    good: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What came of one.
+
+    Attributes:
+        sent: what was sent. report: of the frame. kept: whether the state is that before, bit by bit. sound: whether
+            it is finite and its rotations have unit norm. psnr, usual: dB of the held-out cameras, here and in the
+            undisturbed run.
+    """
+
+    sent: Sent
+    report: FrameReport
+    kept: bool
+    sound: bool
+    psnr: float
+    usual: float
+
+
+Make = Callable[[Footage, int, Any], "list[Sent] | None"]
+Holds = Callable[[Sequence[Step], Any], list[str]]
+
+
+@dataclass(frozen=True)
+class FrameCase:
+    """One line of the catalogue.
+
+    Attributes:
+        name, what, source: of the case; where in the literature or in users' reports it comes from. sizes: in which it
+            is tried. make: what is sent from a frame on, in a size; None where the footage cannot show it. holds: what
+            must hold beside what always must, of the faulty frames.
+    """
+
+    name: str
+    what: str
+    source: str
+    sizes: tuple[Any, ...]
+    make: Make
+    holds: Holds
+
+
+def violations(case: FrameCase, steps: Sequence[Step], size: Any) -> list[str]:
+    """What does not hold, a sentence each."""
+    found = [f"frame {step.report.index}: not finite, or a rotation is no unit" for step in steps if not step.sound]
+    faulty = [step for step in steps if not step.sent.good]
+    found += case.holds(faulty, size)
+    last = steps[-1]
+    if last.sent.good:
+        if not last.psnr >= last.usual - WITHIN_DB:
+            found.append(f"{AFTER} good frames later {last.psnr - last.usual:+.2f} dB against the undisturbed run")
+        if last.report.degraded is not None:
+            found.append(f"{AFTER} good frames later it is still degraded: {last.report.degraded}")
+    return found
+
+
+# What must hold of the faulty frames
+
+
+def held(steps: Sequence[Step], size: Any) -> list[str]:
+    """The state stays as it was, and the report says why."""
+    found = [f"frame {step.report.index}: the state has changed" for step in steps if not step.kept]
+    return found + [f"frame {s.report.index}: not said to be held" for s in steps if not _says(s, "held as it was")]
+
+
+def left_out(names: Callable[[Any], Sequence[str]], first: int = 0) -> Holds:
+    """These cameras are left out, no others, from the frame ``first`` of the faulty ones on; and no damage is done."""
+
+    def holds(steps: Sequence[Step], size: Any) -> list[str]:
+        found = []
+        for number, step in enumerate(steps):
+            missing, others = set(names(size)) - set(step.report.dropped), set(step.report.dropped) - set(names(size))
+            if missing and number >= first:
+                found.append(f"frame {step.report.index}: {', '.join(sorted(missing))} is not left out")
+            if others:
+                found.append(f"frame {step.report.index}: {', '.join(sorted(others))} is left out as well")
+        return found + near(steps, size)
+
+    return holds
+
+
+def near(steps: Sequence[Step], size: Any) -> list[str]:
+    """The frames are followed nearly as well as usual."""
+    return [
+        f"frame {step.report.index}: {step.psnr - step.usual:+.2f} dB against the undisturbed run"
+        for step in steps
+        if not step.psnr >= step.usual - NEAR_DB
+    ]
+
+
+def stood(steps: Sequence[Step], size: Any) -> list[str]:
+    """Nothing is moved, and the report says so."""
+    found = [f"frame {step.report.index}: the state has changed" for step in steps if not step.kept]
+    return found + [f"frame {s.report.index}: not said to stand" for s in steps if s.report.attempts != ["not moved"]]
+
+
+def jumped(steps: Sequence[Step], size: Any) -> list[str]:
+    """Degraded at first, and explained; then found again."""
+    found = [] if steps[0].report.degraded else [f"frame {steps[0].report.index}: not degraded"]
+    last = steps[-1]
+    if not last.psnr >= last.usual - JUMPED_DB:
+        found.append(f"not found again: {last.psnr - last.usual:+.2f} dB after {len(steps)} frames")
+    return found
+
+
+def explained(steps: Sequence[Step], size: Any) -> list[str]:
+    """Each is degraded, or left cameras out, and says why."""
+    return [f"frame {s.report.index}: not explained" for s in steps if not (s.report.degraded or s.report.dropped)]
+
+
+def _says(step: Step, words: str) -> bool:
+    return (step.report.degraded or "").startswith(words)
+
+
+# What is sent
+
+
+def good(footage: Footage, index: int) -> Sent:
+    """A frame as it should be."""
+    return Sent(footage.frame(index), index, footage.truth(index), True)
+
+
+def replaced(footage: Footage, at: int, count: int, change: Callable[[int, Frame], Frame]) -> list[Sent]:
+    """So many frames from ``at`` on changed, the truth going on behind them; then good ones."""
+    faulty = [
+        Sent(change(number, footage.frame(at + number)), at + number, footage.truth(at + number), False)
+        for number in range(count)
+    ]
+    return faulty + [good(footage, at + count + number) for number in range(AFTER)]
+
+
+def each(frame: Frame, change: Callable[[str, Picture], Picture]) -> Frame:
+    """All pictures changed; the masks stay."""
+    images = {name: change(name, np.asarray(frame.images[name])) for name in frame.images}
+    return Frame(frame.index, frame.time, images, frame.masks)
+
+
+def filled(value: int) -> Make:
+    """Pictures of one value, for as many frames as the size says."""
+    return lambda footage, at, size: replaced(
+        footage, at, size, lambda number, frame: each(frame, lambda name, picture: np.full_like(picture, value))
+    )
+
+
+def noise(footage: Footage, at: int, size: Any) -> list[Sent]:
+    """Pixels of 0 or 255 at random."""
+    rng = np.random.default_rng(0)
+
+    def saturated(name: str, picture: Picture) -> Picture:
+        return (255 * rng.integers(0, 2, picture.shape)).astype(np.uint8)
+
+    return replaced(footage, at, size, lambda number, frame: each(frame, saturated))
+
+
+def brighter(factors: Callable[[Any, int], float], count: Callable[[Any], int]) -> Make:
+    """Pictures times a factor, saturated at 255."""
+
+    def make(footage: Footage, at: int, size: Any) -> list[Sent]:
+        def changed(number: int, frame: Frame) -> Frame:
+            factor = factors(size, number)
+            return each(frame, lambda name, picture: (factor * picture).round().clip(0, 255).astype(np.uint8))
+
+        return replaced(footage, at, count(size), changed)
+
+    return make
+
+
+def swapped(footage: Footage, at: int, size: Any) -> list[Sent]:
+    """The pictures of two cameras, each in the other's place."""
+    one, two = _two(footage)
+
+    def change(number: int, frame: Frame) -> Frame:
+        images, masks = dict(frame.images), dict(frame.masks)
+        images[one], images[two] = images[two], images[one]
+        if masks:
+            masks[one], masks[two] = masks[two], masks[one]
+        return Frame(frame.index, frame.time, images, masks)
+
+    return replaced(footage, at, size, change)
+
+
+def bumped(footage: Footage, at: int, size: Any) -> list[Sent]:
+    """One camera's pictures shifted by so many pixels, for good: four frames are sent."""
+    name = _two(footage)[0]
+
+    def change(number: int, frame: Frame) -> Frame:
+        images = {**frame.images, name: np.roll(np.asarray(frame.images[name]), size, axis=1)}
+        masks = {**frame.masks, name: np.roll(np.asarray(frame.masks[name]), size, axis=1)} if frame.masks else {}
+        return Frame(frame.index, frame.time, images, masks)
+
+    return replaced(footage, at, 4, change)[:4]
+
+
+def capped(footage: Footage, at: int, size: Any) -> list[Sent]:
+    """So many cameras show nothing, for two frames."""
+    names = capped_names(footage, size)
+    return replaced(
+        footage, at, 2,
+        lambda number, frame: each(frame, lambda name, picture: 0 * picture if name in names else picture),
+    )  # fmt: skip
+
+
+def capped_names(footage: Footage, size: int) -> list[str]:
+    """The first of the rig."""
+    return sorted(footage.frame(0).images)[:size]
+
+
+def still(footage: Footage, at: int, size: Any) -> list[Sent]:
+    """The frame before again, so many times; then it goes on."""
+    return _again(footage, at, size, lambda frame: frame)
+
+
+def still_noisy(footage: Footage, at: int, size: Any) -> list[Sent]:
+    """The frame before again, twice, with noise of so many levels."""
+    rng = np.random.default_rng(0)
+
+    def change(name: str, picture: Picture) -> Picture:
+        return (picture + rng.normal(0, size, picture.shape)).round().clip(0, 255).astype(np.uint8)
+
+    return _again(footage, at, 2, lambda frame: each(frame, change))
+
+
+def _again(footage: Footage, at: int, count: int, change: Callable[[Frame], Frame]) -> list[Sent]:
+    sent = [Sent(change(footage.frame(at - 1)), at - 1, footage.truth(at - 1), False) for _ in range(count)]
+    return sent + [good(footage, at + number) for number in range(AFTER)]
+
+
+def dropping(footage: Footage, at: int, size: Any) -> list[Sent]:
+    """One camera less in each frame, until so many are left; then all are back."""
+    names = sorted(footage.frame(0).images)
+    count = min(len(names) - size, 7)
+    steps = np.linspace(1, len(names) - size, count).round().astype(int)
+
+    def change(number: int, frame: Frame) -> Frame:
+        kept = names[steps[number] :]
+        return Frame(
+            frame.index,
+            frame.time,
+            {name: frame.images[name] for name in kept},
+            {name: frame.masks[name] for name in kept if name in frame.masks},
+        )
+
+    return replaced(footage, at, count, change)
+
+
+def elsewhen(footage: Footage, at: int, size: Any) -> list[Sent]:
+    """One frame shows what is so many frames later."""
+    wrong = footage.frame(at + size)
+    faulty = Sent(Frame(at, 0.0, wrong.images, wrong.masks), at + size, footage.truth(at + size), False)
+    return [faulty, *(good(footage, at + 1 + number) for number in range(AFTER))]
+
+
+def teleported(footage: Footage, at: int, size: Any) -> list[Sent] | None:
+    """The object is moved by so many times its own size, and goes on from there: four frames are sent."""
+    sent = []
+    for number in range(4):
+        found = footage.jumped(at + number, size)
+        if found is None:
+            return None
+        sent.append(Sent(found[0], at + number, found[1], False))
+    return sent
+
+
+def _two(footage: Footage) -> tuple[str, str]:
+    """A camera, and one that sees the object from elsewhere."""
+    names = sorted(footage.frame(0).images)
+    return names[1], names[len(names) // 2 + 1]
+
+
+FIELD = "issue 4; field.md section 4"
+CASES = (
+    FrameCase(
+        "all black", "lens caps, or a lost trigger: finite, and learnt it would paint the scene black; size: frames",
+        FIELD, (1, 3, 5), filled(0), held,
+    ),
+    FrameCase("all white", "over-exposed; size: frames", FIELD, (1, 3), filled(255), held),
+    FrameCase("saturated noise", "pixels of 0 and 255 at random; size: frames", FIELD, (1, 3), noise, held),
+    FrameCase(
+        "lights off and on", "2 % of the light for so many frames, then as before", FIELD, (1, 5),
+        brighter(lambda size, number: 0.02, lambda size: int(size)), held,
+    ),
+    FrameCase(
+        "exposure flickers", "all pictures times the size and its inverse by turns, four frames", FIELD,
+        (1.1, 1.3, 1.6),
+        brighter(lambda size, number: size if number % 2 == 0 else 1 / size, lambda size: 4), near,
+    ),
+)  # fmt: skip
+
+
+def named(footage: Footage) -> tuple[FrameCase, ...]:
+    """All cases; some name cameras of the footage."""
+    one, two = _two(footage)
+    return (
+        *CASES,
+        FrameCase(
+            "two cameras swapped", "cables changed over, for so many frames", FIELD, (1, 3), swapped,
+            left_out(lambda size: (one, two)),
+        ),
+        FrameCase(
+            "a camera is bumped", "its pictures are shifted by so many pixels, for good", FIELD, (1, 2, 4, 8), bumped,
+            left_out(lambda size: (one,), first=1),
+        ),
+        FrameCase(
+            "cameras show nothing", "so many are black, two frames", FIELD, (1, 3), capped,
+            left_out(lambda size: capped_names(footage, size)),
+        ),
+        FrameCase("everything stands", "the same pictures so many times", FIELD, (1, 5), still, stood),
+        FrameCase(
+            "a frame again, with noise", "the last pictures twice more, with noise of so many levels of 255", FIELD,
+            (1, 3), still_noisy, near,
+        ),
+        FrameCase(
+            "cameras drop out one by one", "until so many are left, then all are back", FIELD, (4, 2), dropping,
+            lambda steps, size: [],
+        ),
+        FrameCase(
+            "a frame of another time", "one frame shows what is so many frames later", FIELD, (2, 4), elsewhen,
+            lambda steps, size: [],
+        ),
+        FrameCase(
+            "the object jumps", "by so many times its own size, and goes on from there", FIELD, (1.0, 2.0), teleported,
+            jumped,
+        ),
+    )  # fmt: skip
