@@ -132,7 +132,7 @@ MOMENT_FLOOR = _guard(
     "moment_floor", 1e-19, 0.0,
     unit="loss per unit", where="kernels/adam.py",
     reason="Gradients and first moments below are 0, as are second moments below its square: they would be denormal "
-    "numbers, which cost tens of times as much as others, and be kept so for the rest of the update.",
+    "numbers, with which a step takes 3.5 times as long (docs/stability.md), for the rest of the update.",
     counted="numbers of a gradient in a step",
 )  # fmt: skip
 

@@ -59,7 +59,6 @@ def adam(
 @kernel
 def hold(gradients, first, last, acted):
     """Bring the numbers from flat index ``first`` to before ``last`` within the guards; add to ``acted`` [2]."""
-    columns = gradients.shape[1]
     # First whether there is anything to do: NaN and infinity stay in a sum.
     total, least = lanes.fill(ZERO), lanes.fill(ONE)
     for place in range(first, last, lanes.COUNT):
@@ -68,16 +67,21 @@ def hold(gradients, first, last, acted):
         least = lanes.choose(size > ZERO, lanes.minimum(size, least), least)
     if lanes.sum_of(total) <= LARGEST and not lanes.any_of(least <= SMALLEST):
         return
-    for k in range(first, last):
-        given = gradients[k // columns, k % columns]
-        size = abs(given)
-        if not size <= LARGEST:
-            # NaN is neither above nor below 0: it becomes 0.
-            gradients[k // columns, k % columns] = LARGEST if given > ZERO else (-LARGEST if given < ZERO else ZERO)
-            acted[0] += 1
-        elif ZERO < size <= SMALLEST:
-            gradients[k // columns, k % columns] = ZERO
-            acted[1] += 1
+    held = flushed = lanes.fill(ZERO)
+    one, most = lanes.fill(ONE), lanes.fill(LARGEST)
+    for place in range(first, last, lanes.COUNT):
+        given = lanes.load_first(gradients, place, last - place)
+        size = lanes.magnitude(given)
+        tiny = (size > ZERO) & (size <= SMALLEST)
+        fits = size <= LARGEST
+        # NaN is neither above nor below 0: it becomes 0.
+        bound = lanes.choose(given > ZERO, most, lanes.choose(given < ZERO, -most, lanes.fill(ZERO)))
+        taken = lanes.choose(fits, lanes.choose(tiny, lanes.fill(ZERO), given), bound)
+        lanes.store_first(gradients, place, last - place, taken)
+        held += lanes.choose(fits, lanes.fill(ZERO), one)
+        flushed += lanes.choose(tiny, one, lanes.fill(ZERO))
+    acted[0] += np.int64(lanes.sum_of(held))
+    acted[1] += np.int64(lanes.sum_of(flushed))
 
 
 @parallel_kernel
