@@ -160,6 +160,8 @@ class Client(_Settings):
     parts = _sends(calls.parts)
     budget = _sends(calls.budget)
     set_budget = _sends(calls.set_budget)
+    tradeoff = _sends(calls.tradeoff)
+    replay = _sends(calls.replay)
 
     def watch(self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2) -> Iterator[SceneStatus]:
         """The scene's status again and again, until the frame is finished or the scene failed.
@@ -257,6 +259,8 @@ class AsyncClient(_Settings):
     parts = _sends_async(calls.parts)
     budget = _sends_async(calls.budget)
     set_budget = _sends_async(calls.set_budget)
+    tradeoff = _sends_async(calls.tradeoff)
+    replay = _sends_async(calls.replay)
 
     async def watch(
         self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2

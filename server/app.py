@@ -38,6 +38,7 @@ from server.routes import (
     stream,
     tickets,
     tracks,
+    tradeoff,
     viewer,
 )
 from server.scenes import Scenes
@@ -85,7 +86,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     app.add_middleware(Door, settings=settings, tickets=app.state.tickets)
     app.add_middleware(AccessLog)
     resources = (
-        *(scenes, inspect, points, frames, ingest, render, tracks, parts, stream, budget),
+        *(scenes, inspect, points, frames, ingest, render, tracks, parts, stream, budget, tradeoff),
         *(estimate, tickets, health, metrics, viewer),
     )
     for resource in resources:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from scas4d_core.committed import View
     from scas4d_core.reconstruction import FrameReport, Progress, Resumed
     from scas4d_core.tracks import Tracks
+    from scas4d_core.tradeoff import Decode, Replayed
 
 
 class Reconstruction(Protocol):
@@ -105,6 +106,18 @@ class Engine(Protocol):
     def reader(self, rig: Rig, settings: Any, history: History) -> Reader:
         """Reads what was committed to a history; made anew when the history has grown."""
 
+    def replay(
+        self,
+        rig: Rig,
+        settings: Any,
+        history: History,
+        base: int,
+        frames: Sequence[Decode],
+        iterations: int,
+        over: Callable[[], None],
+    ) -> Replayed:
+        """Updates the frames after a committed one again, in memory, with another number of iterations."""
+
     def warm_up(self) -> None:
         """Compiles or loads what the first frames would wait for; called once, in a process of its own."""
 
@@ -151,19 +164,41 @@ class CoreEngine:
 
         warm_up()
 
+    def replay(
+        self,
+        rig: Rig,
+        settings: Any,
+        history: History,
+        base: int,
+        frames: Sequence[Decode],
+        iterations: int,
+        over: Callable[[], None],
+    ) -> Replayed:
+        """`scas4d_core.tradeoff.replay`, on one thread: the others belong to the update."""
+        from scas4d_core.tradeoff import replay
+        from scas4d_core.warm_up import warm_up_elsewhere
+
+        warm_up_elsewhere()
+        _one_thread()
+        return replay(rig, settings, history, base, frames, iterations, over)
+
     def reader(self, rig: Rig, settings: Any, history: History) -> Reader:
         """`Committed`, on one thread: the others belong to the update."""
-        import numba
-        from threadpoolctl import threadpool_limits
-
         from scas4d_core.committed import Committed
         from scas4d_core.rasterize.limits import scene_limits
 
-        numba.set_num_threads(1)
-        threadpool_limits(1)  # of OpenMP and BLAS: scikit-learn's spin while they wait, 16 s for parts on busy cores
+        _one_thread()
         world = rig.world_frame(settings.scene.metres_per_unit)
         limits = scene_limits(settings.scene.near, rig.radius * world.metres_per_unit)
         return Committed(history, world, limits)
+
+
+def _one_thread() -> None:
+    import numba
+    from threadpoolctl import threadpool_limits
+
+    numba.set_num_threads(1)
+    threadpool_limits(1)  # of OpenMP and BLAS: scikit-learn's spin while they wait, 16 s for parts on busy cores
 
 
 def core_engine() -> Engine:

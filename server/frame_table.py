@@ -183,6 +183,12 @@ class FrameTable:
         while len(self._numbers) > reports.KEPT:
             self._numbers.popitem(last=False)
 
+    def remember(self, index: int, committed: Mapping[str, Any]) -> None:
+        """The same of a frame that is not new, where there is room: the newest stay."""
+        if committed and index not in self._numbers and len(self._numbers) < reports.KEPT:
+            self._numbers[index] = committed
+            self._numbers.move_to_end(index, last=False)
+
     def _list_all(self) -> None:
         readable = (self.states() == CODES[FrameState.COMMITTED]) & ~self.flagged(DELETED)
         self.committed = array("q", np.flatnonzero(readable).astype(np.int64).tobytes())

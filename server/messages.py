@@ -133,6 +133,46 @@ class SetAside:
     fatal: bool = False
 
 
+# Of the replayer, which has a process for each replay.
+
+
+@dataclass(frozen=True)
+class ReplaySpec:
+    """Frames to be updated again in memory, with each of `iterations`; `base` is the commit before them.
+
+    `first`: the scene's first frame, which every update needs.
+    """
+
+    scene: SceneSpec
+    first: int
+    base: int
+    frames: tuple[FrameReady, ...]
+    iterations: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class ReplayUpdated:
+    """One update is over."""
+
+
+@dataclass(frozen=True)
+class ReplayPoint:
+    """What one number of iterations costs and brings (`scas4d_core.tradeoff.Replayed`)."""
+
+    iterations: int
+    milliseconds: float
+    error: float | None
+    psnr: float | None
+    frames: int
+
+
+@dataclass(frozen=True)
+class ReplayEnded:
+    """Nothing more comes; `fault` is None where all were measured."""
+
+    fault: str | None = None
+
+
 # To the readers.
 
 

@@ -26,6 +26,7 @@ from server.placement import Ended, Placement, Process
 from server.problems import Problem
 from server.readers import Readers
 from server.recovery import Recovered
+from server.replays import Replays
 from server.retention import Held, deletable
 from server.scene_status import state_of, status_of
 from server.settings import ServerSettings
@@ -90,6 +91,7 @@ class Scene:
         self._files = reports.ReportFiles(self.spec.states)
         self.ingest = Ingest(self)
         self._questions = Readers(self.spec, server, placement)
+        self.replays = Replays(self, placement)
         self._worker: Process
         self._start_worker()
         if found.facts:
@@ -189,7 +191,9 @@ class Scene:
             )
         found = entry.report
         if found.state == FrameState.COMMITTED and not found.deleted and not entry.measured:
-            reports.fill(found, await asyncio.to_thread(self._files.read, index))
+            numbers = await asyncio.to_thread(self._files.read, index)
+            reports.fill(found, numbers)
+            self.frames.remember(index, numbers)
         return found
 
     async def ask(self, query: Query) -> Answer:
@@ -411,5 +415,5 @@ class Scene:
         for task in tuple(self._tasks):
             task.cancel()
         seconds = self.server.stop_seconds
-        await asyncio.gather(self._worker.stop(seconds), self._questions.stop(seconds))
+        await asyncio.gather(self._worker.stop(seconds), self._questions.stop(seconds), self.replays.stop())
         await self.journal.close()

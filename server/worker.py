@@ -15,12 +15,11 @@ import numpy as np
 
 from client.wire import Budget
 from scas4d_core.captures import Frame, InitialPoints
-from scas4d_core.captures.images import ImageError, decode_image, decode_mask
 from scas4d_core.history import History, HistoryError
+from server.decoding import decode, read
 from server.disk import FolderLock, no_room
 from server.engine import Reconstruction, load_engine
-from server.frame_store import FrameDamage, holds, read_pictures
-from server.ledger import frame_identity
+from server.frame_store import FrameDamage, holds
 from server.messages import Broken, Committed, FrameReady, Progressed, Ready, SceneSpec, SetAside, Stalled, Stop
 
 PROGRESS_EVERY_S = 0.2
@@ -36,7 +35,7 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     """Runs until told to stop, or until the service is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the service says when to stop
     os.nice(NICE)
-    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
+    end_with_parent()
     # A service that was killed leaves a worker in the middle of an update: two must not commit to one history.
     lock = FolderLock(spec.folder / "worker.lock", wait=True)
     with contextlib.suppress(OSError):  # a full disk is no reason not to work
@@ -57,10 +56,16 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     os._exit(0)
 
 
-def _end_with_parent(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(PARENT_EVERY_S)
-    os._exit(0)
+def end_with_parent() -> None:
+    """The process ends soon after the one that started it: for those that may be busy for long."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(PARENT_EVERY_S)
+        os._exit(0)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 class _Stopped(Exception):
@@ -126,7 +131,7 @@ class Worker:
         dropped: dict[str, str] = {}
         began = time.perf_counter()
         try:
-            frame, dropped = self.decode(message)
+            frame, dropped = decode(self.spec.rig, message, read(self.spec.frames, message))
             least = self.spec.minimum_cameras
             if len(frame.images) < least:
                 reason = f"{len(frame.images)} cameras' pictures are left, the scene's minimum is {least}"
@@ -141,44 +146,6 @@ class Worker:
             # Without a first frame there is nothing to go on from.
             first = self.reconstruction is None
             return SetAside(message.index, f"{type(error).__name__}: {error}", dropped, fatal=first)
-
-    def decode(self, message: FrameReady) -> tuple[Frame, dict[str, str]]:
-        """The frame, and the cameras left out of it with the reason.
-
-        Raises:
-            FrameDamage: the record that holds the whole frame cannot be used.
-        """
-        images, masks, dropped = {}, {}, {}
-        faults: list[str] = []
-        encoded: dict[str, memoryview] = {}
-        encoded_masks: dict[str, memoryview] = {}
-        for name in message.files:
-            try:
-                pictures = read_pictures(self.spec.frames, name)
-            except FrameDamage as error:
-                if len(message.files) == 1:
-                    raise
-                faults.append(f"a record in the frame log is damaged: {error}")
-                continue
-            if len(message.files) == 1 and frame_identity(pictures.hashes, message.time) != message.identity:
-                raise FrameDamage(f"{name}: it holds other pictures than were acknowledged")
-            encoded.update(pictures.images)
-            encoded_masks.update(pictures.masks)
-        # In the order of the rig, whatever the order in which they came: the same pictures give the same bits.
-        for camera in self.spec.rig.cameras:
-            name, size = camera.name, (camera.width, camera.height)
-            if name not in encoded:
-                dropped[name] = "; ".join(faults) or f"camera {name!r} had sent nothing when the frame was closed"
-                continue
-            try:
-                image = decode_image(bytes(encoded[name]), size=size, name=f"image of camera {name!r}")
-                if name in encoded_masks:
-                    mask = bytes(encoded_masks[name])
-                    masks[name] = decode_mask(mask, size=size, name=f"mask of camera {name!r}")
-                images[name] = image
-            except ImageError as error:
-                dropped[name] = str(error)
-        return Frame(message.index, message.time, images, masks), dropped
 
     def reconstruct(self, frame: Frame, dropped: dict[str, str], budget: Budget, began: float) -> Committed:
         """Runs the first frame or an update, and commits. `began`: `perf_counter` before decoding."""

@@ -1,6 +1,6 @@
 """The requests of the service as values, one file a noun: the sync and the async client send the same ones."""
 
-from client.calls.budgets import budget, set_budget
+from client.calls.budgets import budget, replay, set_budget, tradeoff
 from client.calls.call import Call
 from client.calls.frames import close_frame, declare_missing, frame, frames, ply, put_camera, put_frame
 from client.calls.parts import parts
@@ -31,6 +31,7 @@ __all__ = [
     "render",
     "render_arrays",
     "render_file",
+    "replay",
     "resume",
     "rig",
     "scene",
@@ -39,4 +40,5 @@ __all__ = [
     "ticket",
     "tracks",
     "tracks_arrays",
+    "tradeoff",
 ]

@@ -14,6 +14,7 @@ from scas4d_core.gaussians import Gaussians
 
 SLOW, SLOW_RAISES, RAISES, DIES, HELD, LEAVES_OUT = 200, 201, 250, 251, 240, 241
 ITERATIONS = 100
+RAISES_IN_REPLAY, DIES_IN_REPLAY = 666, 667
 SLOW_S = 2.0
 STEP_M = 0.125
 HANGS, KILLS = 777_001, 777_002
@@ -168,6 +169,23 @@ class FakeEngine:
         offset = np.array([STEP_M * first, 0, 0])
         points = history.gaussians(first).means - offset
         return FakeReconstruction(points, history, Resumed(last, [], [], False))
+
+    def replay(self, rig, settings, history, base, frames, iterations, over):
+        history.gaussians(base)
+        indices = []
+        for decode in frames:
+            frame, _ = decode()
+            obey(frame)
+            indices.append(frame.index)
+            over()
+        if iterations == RAISES_IN_REPLAY:
+            raise FloatingPointError("the fake was told to raise")
+        if iterations == DIES_IN_REPLAY:
+            os._exit(7)
+        return SimpleNamespace(
+            iterations=iterations, milliseconds=3.0 * iterations, error=1 / iterations, psnr=30.0,
+            frames=len(indices) - 1,
+        )  # fmt: skip
 
     def reader(self, rig, settings, history):
         return FakeReader(rig, history)

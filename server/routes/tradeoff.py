@@ -1,0 +1,54 @@
+"""What accuracy costs in time, for a scene on its machine."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+
+from client.wire import ReplayRequest, TradeoffModel
+from server import tradeoff
+from server.budgets import scene_budget
+from server.routes.access import TheScene
+from server.scenes import Scene
+
+router = APIRouter(prefix="/v1/scenes", tags=["budget"])
+
+
+@router.get("/{id}/tradeoff")
+async def get(scene: TheScene) -> TradeoffModel:
+    """Measured: what the newest 64 frames ran. Replayed: what was asked for. Extrapolated: the times of the rest."""
+    return await answer(scene)
+
+
+@router.post("/{id}/tradeoff", status_code=202)
+async def replay(scene: TheScene, request: ReplayRequest | None = None) -> TradeoffModel:
+    """Measures other numbers of iterations: the newest frames are updated again in the background, in memory.
+
+    One replay of a scene at a time, on one thread and at a low priority; the scene's own number of iterations is
+    measured with the others, so that their ratios hold. `replay` tells how far it is.
+    """
+    scene.replays.start(request or ReplayRequest())
+    return await answer(scene)
+
+
+async def answer(scene: Scene) -> TradeoffModel:
+    """All that is known now."""
+    newest = scene.committed[-tradeoff.NEWEST :]
+    found = [await scene.report(index) for index in newest]
+    first = scene.committed[0] if newest else 0
+    reports = tradeoff.telling([report for report in found if report is not None], first)
+    write = tradeoff.writing(reports)
+    replayed = [
+        point.model_copy(update={"milliseconds": point.milliseconds + write})
+        for _, point in sorted(scene.replays.points.items())
+    ]
+    points = [*tradeoff.measured(reports), *replayed]
+    model = tradeoff.time_model(reports)
+    threads = reports[-1].threads if reports else None
+    return TradeoffModel(
+        scene=scene.id,
+        points=[*points, *tradeoff.extrapolated(model, points, threads)],
+        curve=tradeoff.curve(reports),
+        model=model,
+        budget=scene_budget(scene).effective,
+        replay=scene.replays.status,
+    )

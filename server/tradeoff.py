@@ -1,0 +1,131 @@
+"""Accuracy against time, from the reports of a scene's newest frames and from its replays. No disk, no processes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from itertools import groupby
+from math import floor, log10
+from statistics import fmean, median
+from typing import Any
+
+from client.wire import CurveMean, FrameReportModel, FrameState, PointKind, TimeModel, TradeoffPoint
+
+NEWEST = 64
+"""Frames that are looked at."""
+LADDER = (10, 25, 50, 100, 200, 300, 500)
+"""Iterations that are extrapolated where they were not measured."""
+NEAR = 0.1
+"""Iterations that differ by no more than this share are not extrapolated beside measured ones."""
+
+
+def telling(reports: Iterable[FrameReportModel], first: int) -> list[FrameReportModel]:
+    """Updates that tell what their iterations cost and bring: committed, not frame 0, in one go, and met."""
+    return [
+        report
+        for report in reports
+        if report.state == FrameState.COMMITTED
+        and report.index != first
+        and report.iterations is not None
+        and report.degraded is None
+        and len(report.tries) <= 1
+        and "total" in report.seconds
+    ]
+
+
+def writing(reports: Iterable[FrameReportModel]) -> float:
+    """Milliseconds that writing a commit takes, the median; 0 where it is not known."""
+    known = [report.write_seconds for report in reports if report.write_seconds is not None]
+    return 1000 * median(known) if known else 0.0
+
+
+def measured(reports: Sequence[FrameReportModel]) -> list[TradeoffPoint]:
+    """A point for each number of iterations that frames ran, to two digits, and threads."""
+    write = writing(reports)
+    points = []
+    for (iterations, threads), group in _groups(reports, lambda report: (_rounded(report.iterations), report.threads)):
+        errors = [report.errors.get(report.kept or "end") for report in group]
+        points.append(
+            TradeoffPoint(
+                kind=PointKind.MEASURED,
+                iterations=iterations,
+                milliseconds=median(1000 * report.seconds["total"] for report in group) + write,
+                error=_mean(errors),
+                psnr=_mean(report.psnr for report in group),
+                frames=len(group),
+                threads=threads,
+            )
+        )
+    return points
+
+
+def curve(reports: Sequence[FrameReportModel]) -> list[CurveMean]:
+    """How far updates were on their way, mean over those that had as many iterations."""
+    steps = [
+        (_rounded(report.iterations), _rounded(point.iterations), point)
+        for report in reports
+        for point in report.curve
+        if point.loss is not None
+    ]
+    return [
+        CurveMean(
+            planned=planned,
+            iterations=iterations,
+            milliseconds=median(point.milliseconds for *_, point in group),
+            loss=fmean(point.loss for *_, point in group),
+            frames=len(group),
+        )
+        for (planned, iterations), group in _groups(steps, lambda step: step[:2])
+    ]
+
+
+def time_model(reports: Sequence[FrameReportModel]) -> TimeModel | None:
+    """Time linear in the iterations: their slope from within the updates, the rest is fixed."""
+    slopes = []
+    for report in reports:
+        if len(report.curve) > 1:
+            begin, end = report.curve[0], report.curve[-1]
+            slopes.append((end.milliseconds - begin.milliseconds) / (end.iterations - begin.iterations))
+    if not slopes:
+        return None
+    each = median(slopes)
+    rest = [1000 * report.seconds["total"] - each * (report.iterations or 0) for report in reports if report.curve]
+    return TimeModel(fixed=max(0.0, median(rest)) + writing(reports), per_iteration=each, frames=len(slopes))
+
+
+def extrapolated(model: TimeModel | None, known: Sequence[TradeoffPoint], threads: int | None) -> list[TradeoffPoint]:
+    """What was not measured on as many threads, by the model: its time, and nothing about its accuracy."""
+    if model is None:
+        return []
+    there = [point.iterations for point in known if point.threads == threads]
+    return [
+        TradeoffPoint(
+            kind=PointKind.EXTRAPOLATED,
+            iterations=iterations,
+            milliseconds=model.fixed + model.per_iteration * iterations,
+            error=None,
+            psnr=None,
+            frames=0,
+            threads=threads,
+        )
+        for iterations in LADDER
+        if all(abs(iterations - one) > NEAR * iterations for one in there)
+    ]
+
+
+def _groups(items: Sequence[Any], key: Any) -> list[tuple[Any, list[Any]]]:
+    def order(item: Any) -> Any:
+        return tuple(-1 if part is None else part for part in key(item))
+
+    return [(key(group[0]), group) for _, found in groupby(sorted(items, key=order), order) if (group := list(found))]
+
+
+def _rounded(iterations: int | None) -> int:
+    """To two significant digits: a budget of milliseconds gives a frame 97 and the next 98."""
+    if not iterations:
+        return 0
+    return round(iterations, min(0, 1 - floor(log10(iterations))))
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return fmean(known) if known else None
