@@ -40,5 +40,8 @@ class Budget:
         before = updated.seconds.get("start", 0.0)
         each = max(0.0, updated.moments[-1] - before) / len(updated.moments)
         after = commit + sum(updated.seconds.get(stage, 0.0) for stage in ("end", "commit"))
-        self.each = each if self.each is None else self.each + RATE * (each - self.each)
-        self.after += RATE * (after - self.after) if self.after != AFTER_S else after - self.after
+        if self.each is None:
+            self.each, self.after = each, after
+        else:
+            self.each += RATE * (each - self.each)
+            self.after += RATE * (after - self.after)
