@@ -68,6 +68,14 @@ class Anytime:
         names = sorted(still.keys() & enough.keys())
         return bool(names) and mean_error(still, names) <= mean_error(enough, names)
 
+    def error(self, colours: Array) -> float:
+        """Mean error of the witnesses for the deformation as it is set, with its cascade brought up to date."""
+        self.deformation.forward()
+        features = np.concatenate([colours, self.previous.foreground[:, None]], axis=1)
+        deformation = self.deformation
+        found = self.witness.errors(deformation.means, deformation.factors, self.previous.opacities, features)
+        return mean_error(found, list(found))
+
     def end(self, colours: Array, story: Story) -> str:
         """Which state is best of "still", "warm" and "end"; the deformation is set to it.
 

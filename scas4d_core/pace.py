@@ -15,6 +15,9 @@ from typing import Protocol
 COOLING = 0.15
 """Share of the iterations that follows the decision to stop: the rates fall to their end first."""
 
+LOOK_EVERY = 10
+"""Iterations between two looks at the witnesses, where a pace looks."""
+
 PROBE = 4
 """Iterations after which an update's own speed is worth more than what the updates before took."""
 
@@ -36,28 +39,41 @@ class Pace(Protocol):
     def most(self) -> int:
         """See above."""
 
-    def planned(self, done: int, loss: float | None) -> int:
-        """Iterations in all, as seen before iteration ``done``, counted from 0; the update ends at ``done`` or less.
+    def planned(self, done: int) -> int:
+        """Iterations in all, as seen before iteration ``done``, counted from 0; the update ends at ``done`` or less."""
 
-        Args:
-            loss: of the iteration before, None before the first.
-        """
+    def looks(self, done: int) -> bool:
+        """Whether it wants to know the witnesses' error after ``done`` iterations."""
+
+    def saw(self, done: int, error: float) -> None:
+        """The witnesses' error after ``done`` iterations, where ``looks`` said so."""
+
+
+class Blind:
+    """A pace that does not look."""
+
+    def looks(self, done: int) -> bool:
+        """See ``Pace.looks``."""
+        return False
+
+    def saw(self, done: int, error: float) -> None:
+        """See ``Pace.saw``."""
 
 
 @dataclass
-class Counted:
+class Counted(Blind):
     """So many iterations."""
 
     most: int
     told: list[tuple[int, int]] = field(default_factory=list)
 
-    def planned(self, done: int, loss: float | None) -> int:
+    def planned(self, done: int) -> int:
         """See ``Pace.planned``."""
         return _tell(self, done, self.most)
 
 
 @dataclass
-class Replayed:
+class Replayed(Blind):
     """The decisions of an update that was."""
 
     decisions: Sequence[tuple[int, int]]
@@ -68,13 +84,13 @@ class Replayed:
         """See ``Pace``."""
         return max(total for _, total in self.decisions)
 
-    def planned(self, done: int, loss: float | None) -> int:
+    def planned(self, done: int) -> int:
         """See ``Pace.planned``."""
         return _tell(self, done, [total for first, total in self.decisions if first <= done][-1])
 
 
 @dataclass
-class Timed:
+class Timed(Blind):
     """As many iterations as fit before a moment of ``clock``; at least one.
 
     Attributes:
@@ -89,7 +105,7 @@ class Timed:
     told: list[tuple[int, int]] = field(default_factory=list)
     _began: float = 0.0
 
-    def planned(self, done: int, loss: float | None) -> int:
+    def planned(self, done: int) -> int:
         """See ``Pace.planned``."""
         now = self.clock()
         if done == 0:
@@ -105,18 +121,20 @@ class Timed:
 
 @dataclass
 class UntilMet:
-    """Fewer than ``pace`` plans, once a round of training views brings less than a share of its loss.
+    """Fewer than ``pace`` plans, once going on brings next to nothing.
 
-    The mean loss of each ``window`` iterations is compared with the window before. Where it fell by less than ``gain``,
-    the update cools down and ends. Held-out cameras have no part in it.
+    Every ``LOOK_EVERY`` iterations the witnesses (``witness``: training views, never those held out) are looked at.
+    Where their error fell by less than a share ``gain`` since the look before, the update cools down and ends.
+
+    Attributes:
+        first: share of the iterations before which it does not end: what begins late has to have begun.
     """
 
     pace: Pace
     gain: float
-    window: int
-    first: int = 0
+    first: float = 0.0
     told: list[tuple[int, int]] = field(default_factory=list)
-    _losses: list[float] = field(default_factory=list)
+    _error: float | None = None
     _end: int | None = None
 
     @property
@@ -124,15 +142,20 @@ class UntilMet:
         """See ``Pace``."""
         return self.pace.most
 
-    def planned(self, done: int, loss: float | None) -> int:
+    def looks(self, done: int) -> bool:
+        """See ``Pace.looks``."""
+        return self._end is None and done % LOOK_EVERY == 0
+
+    def saw(self, done: int, error: float) -> None:
+        """See ``Pace.saw``."""
+        total = self.pace.planned(done)
+        if self._error is not None and done >= self.first * total and error > (1 - self.gain) * self._error:
+            self._end = done + max(1, round(COOLING * total))
+        self._error = error
+
+    def planned(self, done: int) -> int:
         """See ``Pace.planned``."""
-        total = self.pace.planned(done, loss)
-        if loss is not None:
-            self._losses.append(loss)
-        if self._end is None and done >= max(self.first, 2 * self.window) and done % self.window == 0:
-            before, now = sum(self._losses[-2 * self.window : -self.window]), sum(self._losses[-self.window :])
-            if now > (1 - self.gain) * before:
-                self._end = done + max(1, round(COOLING * total))
+        total = self.pace.planned(done)
         return _tell(self, done, total if self._end is None else min(total, self._end))
 
 

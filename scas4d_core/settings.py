@@ -143,8 +143,8 @@ class UpdateSettings(Model):
         0.0,
         ge=0,
         lt=1,
-        description="An update cools down and ends once a round over the training views lowers their mean loss by less "
-        "than this share, half its iterations over. 0: never.",
+        description="An update cools down and ends once ten iterations lower its error on four training views by less "
+        "than this share, after all layers have begun. 0: never.",
     )
     still: float = Field(
         0.0,
@@ -185,6 +185,9 @@ class UpdateSettings(Model):
     )
     own_start: float = Field(
         0.4, ge=0, lt=1, description="The same for what each Gaussian adds to its clusters: Δp, ΔR, Δs."
+    )
+    cold_longer: float = Field(
+        1.0, gt=0, description="Factor on the iterations where there is no motion to start from."
     )
     cold_start: float = Field(
         2.0, ge=1, description="Factor on the layers' rates where there is no motion to start from: further to go."

@@ -135,17 +135,18 @@ class Trial:
 
     def _course(self, given: Given, manner: Manner) -> Course:
         settings, past = self._settings, given.past
-        iterations = round(manner.longer * settings.iterations)
+        longer = manner.longer * (settings.cold_longer if manner.cold or given.motion is None else 1.0)
+        iterations = round(longer * settings.iterations)
         pace: Pace = Counted(iterations)
         if given.end is not None:
             pace = Timed(given.end, given.each)
         if settings.stop_gain > 0:
-            pace = UntilMet(pace, settings.stop_gain, len(given.views), iterations // 2)
+            pace = UntilMet(pace, settings.stop_gain, max(settings.own_start, *settings.layer_starts))
         enough = {name: (1 + settings.still) * error for name, error in past.error.items()}
         return Course(
             pace, manner,
             gate=self._gate(given) if settings.judge else None,
-            witness=settings.judge,
+            witness=settings.judge or settings.stop_gain > 0,
             enough=enough if settings.still > -1 and manner is AS_SET else None,
         )  # fmt: skip
 

@@ -99,7 +99,7 @@ class FrameUpdate:
         pace = Counted(0) if anytime.stands(course.enough) else course.pace
         story = Story(len(views))
         watch.lap("start")
-        while (iteration := story.iterations) < (planned := pace.planned(iteration, story.last_loss)):
+        while (iteration := story.iterations) < (planned := pace.planned(iteration)):
             view = plan.take(iteration, planned)
             deformation.forward()
             features[:, :3] = colours
@@ -127,6 +127,9 @@ class FrameUpdate:
             watch.lap("adam")
             if story.end_iteration(loss, watch.total) and course.gate is not None:
                 plan.leave_out(story.leave_out(course.gate(story.first)))
+            if pace.looks(story.iterations):
+                pace.saw(story.iterations, anytime.error(colours))
+                watch.lap("looks")
         deformation.forward()
         kept = anytime.end(colours, story)
         watch.lap("end")

@@ -199,7 +199,7 @@ class TorchUpdate:
         for iteration, view in enumerate(order):
             if self.on_cuda and isinstance(pace, Timed) and iteration % TIMED_EVERY == 0:
                 torch.cuda.synchronize()  # the host runs ahead: its clock would not see the device's work
-            planned = len(order) if pace is None else pace.planned(iteration, None)
+            planned = len(order) if pace is None else pace.planned(iteration)
             if iteration >= planned:
                 break
             for group, (rate, begins) in zip(optimizer.param_groups, base, strict=True):

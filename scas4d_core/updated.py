@@ -97,11 +97,6 @@ class Story:
         """That are over."""
         return len(self.losses)
 
-    @property
-    def last_loss(self) -> float | None:
-        """Of the iteration before; None before the first."""
-        return self.losses[-1] if self.losses else None
-
     def see(self, view: TrainingView, picture: PictureLoss) -> None:
         """A view was rendered and compared."""
         self.psnr.append(picture.psnr)

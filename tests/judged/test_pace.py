@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from scas4d_core.budget import AFTER_S, RATE, Budget
-from scas4d_core.pace import COOLING, MOST_TIMED, PROBE, Counted, Pace, Replayed, Timed, UntilMet
+from scas4d_core.pace import COOLING, LOOK_EVERY, MOST_TIMED, PROBE, Counted, Pace, Replayed, Timed, UntilMet
 from scas4d_core.updated import Updated
 
 
@@ -19,12 +19,15 @@ class Clock:
         return self.now
 
 
-def iterate(pace: Pace, clock: Clock, each: float, loss: float = 1.0) -> int:
-    """The loop of an update whose iterations take so long; how many there were."""
-    done = 0
-    while done < pace.planned(done, loss if done else None):
+def iterate(pace: Pace, clock: Clock, each: float, falls: float = 1.0) -> int:
+    """The loop of an update whose iterations take so long, its error falling by a factor each; how many there were."""
+    done, error = 0, 1.0
+    while done < pace.planned(done):
         clock.now += each
         done += 1
+        error *= falls
+        if pace.looks(done):
+            pace.saw(done, error)
     return done
 
 
@@ -49,7 +52,7 @@ def test_timed_ends_in_time_whatever_was_believed(each: float, believed: float |
 def test_timed_slows_down_with_the_machine() -> None:
     clock = Clock()
     pace, end, done = Timed(clock.now + 1.0, 0.01, clock=clock), clock.now + 1.0, 0
-    while done < pace.planned(done, None):
+    while done < pace.planned(done):
         clock.now += 0.01 if done < 30 else 0.04
         done += 1
     assert clock.now <= end + 0.04
@@ -60,32 +63,29 @@ def test_timed_slows_down_with_the_machine() -> None:
 def test_timed_takes_one_iteration_even_without_time_and_never_too_many() -> None:
     clock = Clock()
     assert iterate(Timed(clock.now - 5, 0.01, clock=clock), clock, 0.01) == 1
-    assert Timed(clock.now + 1e9, 1e-6, clock=clock).planned(0, None) == MOST_TIMED
+    assert Timed(clock.now + 1e9, 1e-6, clock=clock).planned(0) == MOST_TIMED
     assert PROBE >= 1
 
 
 def test_until_met_cools_down_and_ends_where_nothing_is_gained() -> None:
-    flat = UntilMet(Counted(100), 0.05, window=10, first=20)
-    assert iterate(flat, Clock(), 1.0, loss=1.0) == 20 + round(COOLING * 100)
-    falling, done, losses = UntilMet(Counted(100), 0.05, window=10), 0, 1.0
-    while done < falling.planned(done, losses if done else None):
-        losses *= 0.98
-        done += 1
-    assert done == 100
+    flat = UntilMet(Counted(100), 0.05)
+    assert iterate(flat, Clock(), 1.0) == 2 * LOOK_EVERY + round(COOLING * 100)
+    falling = UntilMet(Counted(100), 0.05)
+    assert iterate(falling, Clock(), 1.0, falls=0.98) == 100
     assert flat.most == falling.most == 100
 
 
-def test_until_met_waits_for_its_first_iterations() -> None:
-    assert iterate(UntilMet(Counted(100), 0.05, window=10, first=50), Clock(), 1.0) == 50 + round(COOLING * 100)
-    assert iterate(UntilMet(Counted(30), 0.05, window=10, first=50), Clock(), 1.0) == 30
+def test_until_met_waits_for_what_begins_late() -> None:
+    assert iterate(UntilMet(Counted(100), 0.05, first=0.5), Clock(), 1.0) == 50 + round(COOLING * 100)
+    assert iterate(UntilMet(Counted(30), 0.05, first=0.9), Clock(), 1.0) == 30
 
 
 def test_what_was_decided_is_decided_again() -> None:
     clock = Clock()
-    pace = UntilMet(Timed(clock.now + 1.0, 0.02, clock=clock), 0.05, window=8)
+    pace = UntilMet(Timed(clock.now + 1.0, 0.02, clock=clock), 0.05)
     count = iterate(pace, clock, 0.013)
     again = Replayed(pace.told)
-    assert [again.planned(done, None) for done in range(count + 1)][-1] == count
+    assert [again.planned(done) for done in range(count + 1)][-1] == count
     assert again.most == max(total for _, total in pace.told)
     assert again.told == pace.told
 
