@@ -232,6 +232,7 @@ class Reconstruction(Committed):
         report = copy.report(first)
         self._masked = bool(report["masked"])
         self._exposures = {name: np.array(exposure, np.float32) for name, exposure in report["exposures"].items()}
+        self._lengths = axis_lengths(copy.gaussians(first))
         labels = self._labels_of(index)
         self._updater, structure = self._prepared(self._labelled(copy.gaussians(first), labels))
         self._carried = Carried(labels=labels, structure=structure)
