@@ -3,7 +3,7 @@
 const NS = "http://www.w3.org/2000/svg";
 const [LEFT, RIGHT, TOP, BOTTOM] = [38, 8, 8, 16];
 
-function element(name, attributes, parent) {
+export function element(name, attributes, parent) {
   const made = document.createElementNS(NS, name);
   for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
   parent?.append(made);
@@ -11,7 +11,7 @@ function element(name, attributes, parent) {
 }
 
 /** 1, 2 or 5 times a power of ten: about `count` steps over a span. */
-function step(span, count) {
+export function step(span, count) {
   const rough = span / count;
   const power = 10 ** Math.floor(Math.log10(rough));
   return power * ([1, 2, 5].find((k) => k * power >= rough) ?? 10);
@@ -33,7 +33,8 @@ export class Chart {
     this.note = element("title", {});
     svg.addEventListener("pointermove", (event) => {
       const point = this.nearest(event);
-      this.note.textContent = point ? `frame ${point.index}: ${this.text(point.value)}` : "";
+      const why = point && [point.fault, point.held, point.change].filter((one) => one).join("; ");
+      this.note.textContent = point ? `frame ${point.index}: ${this.text(point.value)}${why ? `; ${why}` : ""}` : "";
     });
     new ResizeObserver(() => this.draw()).observe(svg);
   }
@@ -42,7 +43,7 @@ export class Chart {
     return value === null ? "not measured" : `${value.toFixed(value < 10 ? 2 : 1)} ${this.unit}`;
   }
 
-  /** @param points [{index, value or null, fault}] by index */
+  /** @param points [{index, value or null, fault, held, change}] by index: why it is marked, or nothing */
   set(points) {
     this.points = points;
     this.draw();
@@ -125,6 +126,13 @@ export class Chart {
       if (known.length < 60) {
         for (const point of known) element("circle", { cx: this.x(point), cy: y(point.value), r: 2.4, class: "dot" }, this.svg);
       }
+    }
+    for (const point of this.points.filter((one) => one.change)) {
+      const x = this.x({ index: point.index - 0.5 });
+      element("line", { x1: x, x2: x, y1: TOP - 4, y2: TOP + height, class: "change" }, this.svg);
+    }
+    for (const point of this.points.filter((one) => one.held)) {
+      element("path", { d: `M${this.x(point)} ${TOP + height - 8}l4.5 4l-4.5 4l-4.5 -4z`, class: "held" }, this.svg);
     }
     for (const point of this.points.filter((one) => one.fault)) {
       element("path", { d: `M${this.x(point)} ${TOP + height - 7}l4.5 7h-9z`, class: "fault" }, this.svg);

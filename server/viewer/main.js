@@ -2,9 +2,10 @@
 
 import { Chart } from "./charts.js";
 import { TRACKS } from "./colours.js";
-import { node, showCameras, showFacts, showQueue, stateWords } from "./panels.js";
+import { isHeld, node, reasonOf, showCameras, showFacts, showQueue, stateWords } from "./panels.js";
 import { call, scenePath, token } from "./service.js";
 import { Stream } from "./stream.js";
+import { Tradeoff } from "./tradeoff.js";
 import { LiveView } from "./view.js";
 
 const LIST_EVERY_MS = 4000;
@@ -37,6 +38,7 @@ const view = new LiveView($("picture"), $("overlay"), {
 });
 const psnr = new Chart($("psnr"), "line", "dB", choose);
 const seconds = new Chart($("seconds"), "bars", "s", choose);
+const tradeoff = new Tradeoff($);
 
 // Scenes.
 
@@ -105,12 +107,14 @@ async function openScene(id) {
   page.stream.subscribe("frames", "frames");
   view.open(page.stream, rig);
   view.setFrame(page.frame);
+  tradeoff.open(id);
   await loadReports();
 }
 
 function closeScene() {
   page.stream?.close();
   view.close();
+  tradeoff.close();
   stopPlaying();
   Object.assign(page, { stream: null, status: null, rig: null, scene: null, tracks: [], failed: null });
   page.reports.clear();
@@ -140,7 +144,7 @@ function connection(state, wait) {
   $("connection").classList.toggle("good", live);
   $("banner").hidden = live;
   if (live) {
-    if (page.lost) loadReports();
+    if (page.lost) loadReports(), tradeoff.refresh();
     page.lost = false;
   } else {
     page.lost = true;
@@ -199,6 +203,7 @@ function finished(report, missed) {
   keep(report);
   if (missed) loadReports();
   else redraw();
+  tradeoff.refresh();
 }
 
 const inOrder = () => [...page.reports.values()].sort((a, b) => a.index - b.index);
@@ -206,11 +211,14 @@ const readable = () => inOrder().filter((report) => report.state === "committed"
 
 function redraw() {
   const reports = inOrder();
-  psnr.set(reports.map((one) => ({ index: one.index, value: one.psnr ?? null, fault: one.state !== "committed" })));
+  const fault = (one) => (one.state === "committed" ? "" : one.error ?? one.state);
+  psnr.set(reports.map((one) => ({ index: one.index, value: one.psnr ?? null, fault: fault(one), held: reasonOf(one) })));
   // The first frame takes minutes and would flatten all others; it is told in words.
   const first = reports.find((one) => one.state === "committed");
   const updates = reports.filter((one) => one !== first);
-  seconds.set(reports.map((one) => ({ index: one.index, fault: one.state !== "committed",
+  const budgets = updates.filter((one) => one.budget);
+  const changes = new Map(budgets.slice(1).map((one, i) => [one.index, change(budgets[i].budget, one.budget)]));
+  seconds.set(reports.map((one) => ({ index: one.index, fault: fault(one), held: reasonOf(one), change: changes.get(one.index),
     value: one === first ? null : one.seconds?.total ?? null })));
   const times = updates.map((one) => one.seconds?.total).filter((value) => value !== undefined).sort((a, b) => a - b);
   $("figures").textContent = first
@@ -218,6 +226,13 @@ function redraw() {
     : "";
   showTimeline();
   showHealth();
+}
+
+/** Another budget than the frame before had, in words. */
+function change(before, now) {
+  if (JSON.stringify(before) === JSON.stringify(now)) return "";
+  if (now.budget_ms !== null) return `from here on ${now.budget_ms} ms`;
+  return now.iterations !== null ? `from here on ${now.iterations} iterations` : "from here on another budget";
 }
 
 // Time.
@@ -248,11 +263,26 @@ function showTimeline() {
   slider.value = Math.max(at, 0);
   const report = reports[at];
   slider.setAttribute("aria-valuetext", report ? `frame ${report.index}` : "no frame");
-  $("moment").textContent = report ? `frame ${report.index} · ${report.time.toFixed(2)} s` : "no frame";
+  const how = isHeld(report) ? " · held" : report?.degraded ? " · in part" : "";
+  $("moment").textContent = report ? `frame ${report.index} · ${report.time.toFixed(2)} s${how}` : "no frame";
+  $("reason").hidden = !report?.degraded;
+  $("reason").textContent = report?.degraded ? `Frame ${report.index}: ${report.degraded}.` : "";
+  showMarks(reports);
   $("live").setAttribute("aria-pressed", String(page.frame === null));
   for (const id of ["play", "back", "forth"]) $(id).disabled = reports.length < 2;
   psnr.choose(report?.index ?? null);
   seconds.choose(report?.index ?? null);
+}
+
+/** Where on the slider frames are that are not what their pictures show. */
+function showMarks(reports) {
+  const last = Math.max(reports.length - 1, 1);
+  $("marks").replaceChildren(...reports.flatMap((report, at) => {
+    if (!report.degraded) return [];
+    const mark = node("span", { title: `frame ${report.index}: ${report.degraded}`, onclick: () => choose(report.index) });
+    mark.style.left = `${100 * at / last}%`;
+    return [mark];
+  }));
 }
 
 function showHealth() {

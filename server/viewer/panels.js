@@ -30,6 +30,14 @@ export function node(name, attributes = {}, ...children) {
   return made;
 }
 
+/** Why a committed frame is not what its pictures show, or only by half; empty where it is. */
+export function reasonOf(report) {
+  if (!report?.degraded) return "";
+  return report.degraded[0].toUpperCase() + report.degraded.slice(1);
+}
+
+export const isHeld = (report) => Boolean(report?.degraded?.startsWith("held"));
+
 export function showFacts(list, status) {
   const facts = [
     ["Frames", `${number.format(status.committed)} committed`],
@@ -62,12 +70,16 @@ const median = (values) => {
 
 const BELOW_DB = 4;
 const SHIFT = 0.02;
+const UNWELL = 0.4;
 
 /** What looks wrong with a camera beside the others and beside itself before; empty where nothing does. */
 export function complaints(name, report, reports) {
   const fit = report.cameras?.[name];
-  if (!fit) return name in (report.dropped_cameras ?? {}) ? [`left out of this frame: ${report.dropped_cameras[name]}`] : [];
-  const found = [];
+  const found = name in (report.dropped_cameras ?? {}) ? [`left out of this frame: ${report.dropped_cameras[name]}`] : [];
+  if (!fit || found.length) return found;
+  if (fit.health != null && fit.health < UNWELL) {
+    found.push(`its health is ${Math.round(100 * fit.health)} %: it fits worse than usual beside the others, and is left out at 0`);
+  }
   const others = Object.entries(report.cameras).filter(([other]) => other !== name).map(([, one]) => one.psnr);
   const middle = median(others.filter((value) => value !== null));
   const before = reports.filter((one) => one.index < report.index).slice(-20).map((one) => one.cameras?.[name]);
@@ -110,10 +122,12 @@ export function showCameras(body, summary, names, report, reports, lookFrom) {
       node("td", { class: "figure" }, fit && fit.psnr !== null ? fit.psnr.toFixed(1) : "–"),
       node("td", {}, swatch),
       node("td", { class: "figure" }, shift ? `${(100 * Math.max(...shift.map(Math.abs))).toFixed(1)} %` : "–"),
-      node("td", { class: "words", title: words }, found.length ? "⚠ look" : fit ? "good" : "no figures"));
+      node("td", { class: "words", title: words },
+        (found.length ? "⚠ " : "") + (name in (report?.dropped_cameras ?? {}) ? "left out" : fit?.health != null ? `${Math.round(100 * fit.health)} %`
+          : found.length ? "look" : fit ? "good" : "no figures")));
   });
   body.replaceChildren(...rows);
-  const complaint = report && names.flatMap((name) => complaints(name, report, reports).map((one) => `Camera ${name}: ${one}`));
+  const complaint = report && names.flatMap((name) => complaints(name, report, reports).map((one) => `Camera ${name}: ${one}${one.endsWith("?") ? "" : "."}`));
   summary.textContent = !report || !known.length ? "Figures come with the first update."
     : troubled ? complaint.slice(0, 3).join(" ") + (complaint.length > 3 ? ` … and ${complaint.length - 3} more.` : "")
     : `All ${names.length} cameras look as they did before.`;

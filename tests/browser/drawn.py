@@ -43,11 +43,12 @@ def colours():
 class DrawnReconstruction(fakes.FakeReconstruction):
     def commit(self, frame, dropped, notes):
         fits = {
-            name: {"psnr": 32.0 + number, "colour_shift": [0.001, 0, 0]} for number, name in enumerate(frame.images)
+            name: {"psnr": 32.0 + number, "colour_shift": [0.001, 0, 0], "health": 0.95}
+            for number, name in enumerate(frame.images)
         }
         if frame.index >= BUMPED_FROM:
-            fits["c2"] = {"psnr": 21.0, "colour_shift": [0.06, 0.01, -0.02]}
-        seconds = {"total": 0.8 + 0.1 * (frame.index % 3)}
+            fits["c2"] = {"psnr": 21.0, "colour_shift": [0.06, 0.01, -0.02], "health": 0.2}
+        seconds = {"total": (0.8 + 0.1 * (frame.index % 3)) * self.iterations / fakes.ITERATIONS}
         more = {"cameras": fits, "psnr": 31.0 + np.sin(frame.index), "seconds": seconds}
         return super().commit(frame, dropped, {**(notes or {}), **more})
 

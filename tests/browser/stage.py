@@ -1,8 +1,13 @@
-"""What the tests of the page look at."""
+"""What the tests of the page look at, and how."""
 
 from __future__ import annotations
 
+import base64
+import io
+
+import numpy as np
 from drawn import colours, make_rig, positions
+from PIL import Image
 from running import picture
 
 from scas4d_core.captures import InitialPoints
@@ -20,3 +25,25 @@ def start_scene(sdk, name="ring"):
 def push(sdk, id, index, red=0):
     """One frame; `red` tells the fake engine what to do."""
     sdk.put_frame(id, index, {name: picture(red, (32, 24)) for name in make_rig().names})
+
+
+def opened(page, service, scene, frame=None):
+    page.goto(f"{service.url}/#scene={scene}" + ("" if frame is None else f"&frame={frame}"))
+    return page
+
+
+def shown(page, **wanted):
+    """Waits until the picture that is shown has these properties; the picture."""
+    tests = " && ".join(f"d.{name} === {value!r}" for name, value in wanted.items()) or "true"
+    page.wait_for_function(f"() => {{ const d = document.getElementById('view').dataset; return d.tag && ({tests}); }}")
+    return canvas(page)
+
+
+def until(page, condition):
+    """Waits until an expression is true; as a function, because the page's policy forbids to evaluate text."""
+    page.wait_for_function(f"() => {condition}")
+
+
+def canvas(page, id="picture"):
+    data = page.evaluate(f"document.getElementById({id!r}).toDataURL('image/png').split(',')[1]")
+    return np.array(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGBA")).astype(int)

@@ -2,39 +2,13 @@
 
 from __future__ import annotations
 
-import base64
-import io
-
 import numpy as np
 import pytest
-from PIL import Image
 from running import Running, fake_settings
-from stage import FRAMES, push, start_scene
+from stage import FRAMES, canvas, opened, push, shown, start_scene, until
 
 from client.sdk import Client
 from client.wire import part_colour
-
-
-def opened(page, service, scene, frame=None):
-    page.goto(f"{service.url}/#scene={scene}" + ("" if frame is None else f"&frame={frame}"))
-    return page
-
-
-def shown(page, **wanted):
-    """Waits until the picture that is shown has these properties; the picture."""
-    tests = " && ".join(f"d.{name} === {value!r}" for name, value in wanted.items()) or "true"
-    page.wait_for_function(f"() => {{ const d = document.getElementById('view').dataset; return d.tag && ({tests}); }}")
-    return canvas(page)
-
-
-def until(page, condition):
-    """Waits until an expression is true; as a function, because the page's policy forbids to evaluate text."""
-    page.wait_for_function(f"() => {condition}")
-
-
-def canvas(page, id="picture"):
-    data = page.evaluate(f"document.getElementById({id!r}).toDataURL('image/png').split(',')[1]")
-    return np.array(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGBA")).astype(int)
 
 
 def rests(page, **wanted):

@@ -1,0 +1,248 @@
+// What accuracy costs in time: error over milliseconds a frame, and the budget that is chosen by it.
+
+import { element, step } from "./charts.js";
+import { call, scenePath } from "./service.js";
+
+const [LEFT, RIGHT, TOP, BOTTOM] = [44, 14, 16, 26];
+const EVERY_MS = 3000;
+const REPLAY_EVERY_MS = 700;
+const REPLAYED = [25, 50, 200];
+const STEPS = 1000;
+// From and to of the slider, which is logarithmic.
+const RANGES = { iterations: [5, 1000], budget_ms: [20, 20000] };
+const UNITS = { iterations: "iterations", budget_ms: "ms" };
+const HOW = { measured: "measured on frames of the scene", replayed: "replayed", extrapolated: "extrapolated: its time alone" };
+
+/** Three digits that mean something are enough to choose by. */
+const short = (value) => Number(value.toPrecision(value < 100 ? 2 : 3));
+
+export class Tradeoff {
+  /** @param $ finds an element by its id */
+  constructor($) {
+    Object.assign(this, { $, scene: null, model: null, asked: null, effective: null, timer: null, due: 0, moving: false });
+    $("budget-kind").addEventListener("change", () => this.place(true));
+    $("budget").addEventListener("input", () => {
+      this.moving = true;
+      this.tell();
+      this.draw();
+    });
+    $("budget").addEventListener("change", () => this.put());
+    $("measure").addEventListener("click", () => this.measure());
+    new ResizeObserver(() => this.draw()).observe($("tradeoff"));
+  }
+
+  open(scene) {
+    this.close();
+    this.scene = scene;
+    this.refresh();
+  }
+
+  close() {
+    clearTimeout(this.timer);
+    Object.assign(this, { scene: null, model: null, asked: null, effective: null, timer: null, moving: false });
+    this.say("");
+    this.draw();
+    this.place();
+  }
+
+  /** A frame is finished, or something else may have changed: soon, but not for every frame of a fast rig. */
+  refresh(soonest = 0) {
+    if (!this.scene || this.timer) return;
+    this.timer = setTimeout(() => this.load(), Math.max(soonest, this.due - performance.now(), 0));
+  }
+
+  async load() {
+    const scene = this.scene;
+    this.due = performance.now() + EVERY_MS;
+    try {
+      const model = await call("GET", `${scenePath(scene)}/tradeoff`);
+      const budget = await call("GET", `${scenePath(scene)}/budget`);
+      if (this.scene !== scene) return;
+      this.timer = null;
+      this.show(model, budget);
+    } catch {
+      if (this.scene === scene) this.timer = null; // the page says elsewhere that the service does not answer
+    }
+  }
+
+  show(model, budget) {
+    this.model = model;
+    Object.assign(this, { asked: budget.asked, effective: budget.effective, since: budget.since });
+    if (!this.moving) this.place();
+    this.draw();
+    const replay = model.replay;
+    this.$("measure").disabled = replay.state === "running" || !model.points.length;
+    if (replay.state === "running") {
+      this.say(`Replaying ${replay.frames.length} of the newest frames in the background: ${replay.done} of ${replay.total} updates.`);
+      this.due = 0;
+      this.refresh(REPLAY_EVERY_MS);
+    } else if (replay.state === "failed") this.say(`The replay failed: ${replay.error}.`, true);
+    else if (replay.state === "done") {
+      const which = replay.frames.length > 1 ? `frames ${replay.frames[0]} to ${replay.frames.at(-1)}` : `frame ${replay.frames[0]}`;
+      this.say(`Replayed ${which} on ${replay.threads === 1 ? "one thread" : `${replay.threads} threads`}: compare replayed times with each other.`);
+    } else this.say("");
+  }
+
+  // The budget.
+
+  get kind() {
+    return this.$("budget-kind").value;
+  }
+
+  get value() {
+    const [from, to] = RANGES[this.kind];
+    const value = from * (to / from) ** (Number(this.$("budget").value) / STEPS);
+    return this.kind === "iterations" ? Math.round(short(value)) : short(value);
+  }
+
+  /** Sets the control to the budget that holds; `chosen`: by the kind that was just chosen. */
+  place(chosen = false) {
+    const slider = this.$("budget");
+    const [kind, effective] = [this.$("budget-kind"), this.effective];
+    slider.disabled = kind.disabled = !effective;
+    if (effective && !chosen) {
+      kind.value = effective.budget_ms !== null ? "budget_ms" : this.asked.iterations !== null ? "iterations" : "";
+    }
+    slider.hidden = !kind.value;
+    if (effective && kind.value) {
+      const known = this.effective[kind.value] ?? this.milliseconds(this.effective.iterations) ?? 1000;
+      const [from, to] = RANGES[kind.value];
+      slider.value = Math.round(STEPS * Math.log(known / from) / Math.log(to / from));
+    }
+    this.tell();
+    if (chosen && !kind.value) this.put();
+  }
+
+  milliseconds(iterations) {
+    const model = this.model?.model;
+    return model ? model.fixed + model.per_iteration * iterations : null;
+  }
+
+  /** What the control says, and what that would cost or bring. */
+  tell() {
+    const words = this.$("budget-words");
+    const effective = this.effective;
+    this.$("budget-value").textContent = effective && this.kind ? `${this.value} ${UNITS[this.kind]}` : "";
+    if (!effective) return words.textContent = "";
+    const own = effective.budget_ms === null ? `${effective.iterations} iterations a frame` : `as many iterations as fit into ${short(effective.budget_ms)} ms`;
+    const now = `Now: ${own}${this.asked.iterations === null && this.asked.budget_ms === null ? ", as the scene was made" : `, from frame ${this.since} on`}.`;
+    const model = this.model?.model;
+    let then = "";
+    if (this.moving && model) {
+      then = this.kind === "iterations" ? ` Then: about ${short(this.milliseconds(this.value))} ms a frame.`
+        : ` Then: about ${Math.max(1, Math.round((this.value - model.fixed) / model.per_iteration))} iterations a frame.`;
+    }
+    words.textContent = now + then;
+  }
+
+  async put() {
+    const scene = this.scene;
+    const body = { ...this.asked, iterations: null, budget_ms: null };
+    if (this.kind) body[this.kind] = this.value;
+    try {
+      const budget = await call("PUT", `${scenePath(scene)}/budget`, body);
+      if (this.scene !== scene) return;
+      Object.assign(this, { asked: budget.asked, effective: budget.effective, since: budget.since, moving: false });
+      this.place();
+      this.draw();
+    } catch (error) {
+      this.moving = false;
+      this.say(error.message, true);
+    }
+  }
+
+  async measure() {
+    try {
+      const model = await call("POST", `${scenePath(this.scene)}/tradeoff`, { iterations: REPLAYED });
+      this.show(model, { asked: this.asked, effective: this.effective, since: this.since });
+    } catch (error) {
+      this.say(error.message, true);
+    }
+  }
+
+  say(words, bad = false) {
+    this.$("replay-words").textContent = words;
+    this.$("replay-words").classList.toggle("warning", bad);
+  }
+
+  // The plot.
+
+  draw() {
+    const svg = this.$("tradeoff");
+    const { clientWidth, clientHeight } = svg;
+    svg.replaceChildren();
+    const points = this.model?.points.filter((point) => point.iterations > 0) ?? [];
+    // Settings that judge nothing have no witnesses: then the PSNR stands for the accuracy.
+    const by = points.some((point) => point.error !== null) ? "error" : "psnr";
+    const known = points.filter((point) => point[by] !== null);
+    this.$("tradeoff-unit").textContent = by === "error" ? "error over ms a frame" : "PSNR, dB, over ms a frame";
+    this.$("tradeoff-key").hidden = !known.length;
+    if (!clientWidth) return;
+    svg.setAttribute("viewBox", `0 0 ${clientWidth} ${clientHeight}`);
+    if (!known.length) {
+      element("text", { x: clientWidth / 2, y: clientHeight / 2 + 4, class: "empty" }, svg).textContent = "after the first update";
+      return;
+    }
+    const width = clientWidth - LEFT - RIGHT;
+    const height = clientHeight - TOP - BOTTOM;
+    const times = points.map((point) => point.milliseconds);
+    const [first, last] = [Math.min(...times) / 1.15, Math.max(...times) * 1.15];
+    const x = (time) => LEFT + Math.log(time / first) / Math.log(last / first) * width;
+    const values = known.map((point) => point[by]);
+    const pad = Math.max(0.15 * (Math.max(...values) - Math.min(...values)), 0.05 * Math.max(...values), 1e-9);
+    const [low, high] = [Math.max(0, Math.min(...values) - pad), Math.max(...values) + pad];
+    const y = (value) => TOP + (high - value) / (high - low) * height;
+    const tick = step(high - low, 3);
+    for (let value = Math.ceil(low / tick) * tick; value <= high; value += tick) {
+      element("line", { x1: LEFT, x2: clientWidth - RIGHT, y1: y(value), y2: y(value), class: "grid" }, svg);
+      element("text", { x: LEFT - 5, y: y(value) + 3.5, class: "label end" }, svg).textContent =
+        value.toFixed(Math.max(0, -Math.floor(Math.log10(tick) + 1e-9)));
+    }
+    for (let power = 10 ** Math.floor(Math.log10(first)); power < last; power *= 10) {
+      for (const time of [power, 2 * power, 5 * power].filter((one) => one > first && one < last)) {
+        element("line", { x1: x(time), x2: x(time), y1: TOP + height, y2: TOP + height + 3, class: "grid" }, svg);
+        element("text", { x: x(time), y: clientHeight - 4, class: "label" }, svg).textContent = time;
+      }
+    }
+    const chosen = this.chosen();
+    if (chosen && chosen > first && chosen < last) {
+      element("line", { x1: x(chosen), x2: x(chosen), y1: TOP, y2: TOP + height, class: "chosen" }, svg);
+    }
+    const replayed = known.filter((point) => point.kind === "replayed");
+    if (replayed.length > 1) {
+      const way = [...replayed].sort((a, b) => a.iterations - b.iterations);
+      element("path", { d: way.map((one, i) => `${i ? "L" : "M"}${x(one.milliseconds)} ${y(one[by])}`).join(""), class: "way" }, svg);
+    }
+    for (const point of points) {
+      const [px, py] = [x(point.milliseconds), point[by] === null ? TOP + height : y(point[by])];
+      if (point.kind !== "extrapolated" && point[by] === null) continue;
+      const shapes = {
+        measured: ["circle", { cx: px, cy: py, r: 4.2 }],
+        replayed: ["path", { d: `M${px} ${py - 5.2}l5.2 5.2l-5.2 5.2l-5.2 -5.2z` }],
+        extrapolated: ["path", { d: `M${px} ${py - 8}l4 7.5h-8z` }],
+      };
+      const made = element(shapes[point.kind][0], { ...shapes[point.kind][1], class: `point ${point.kind}` }, svg);
+      element("title", {}, made).textContent = this.words(point);
+      // Below what was measured, above the others: the same number of iterations is often in both.
+      const below = point.kind === "measured" ? 16 : -10;
+      element("text", { x: px, y: py + below, class: "label" }, svg).textContent = point.iterations;
+    }
+  }
+
+  chosen() {
+    if (!this.effective) return null;
+    const kind = this.moving ? this.kind : null;
+    if (kind === "budget_ms") return this.value;
+    if (kind === "iterations") return this.milliseconds(this.value);
+    return this.effective.budget_ms ?? this.milliseconds(this.effective.iterations);
+  }
+
+  words(point) {
+    const figures = [`${point.iterations} iterations`, `${short(point.milliseconds)} ms a frame`];
+    if (point.error !== null) figures.push(`error ${point.error.toFixed(4)}`);
+    if (point.psnr !== null) figures.push(`${point.psnr.toFixed(1)} dB`);
+    const from = point.frames ? `, ${point.frames} ${point.frames === 1 ? "frame" : "frames"}` : "";
+    const threads = point.threads ? `, ${point.threads} ${point.threads === 1 ? "thread" : "threads"}` : "";
+    return `${figures.join(", ")} (${HOW[point.kind]}${from}${threads})`;
+  }
+}

@@ -1,0 +1,99 @@
+"""The panel of accuracy and time, and frames that were held: what a person sees and changes."""
+
+from __future__ import annotations
+
+import fakes
+import pytest
+from stage import opened, push, shown, start_scene, until
+
+from client.sdk import Client
+from client.wire import Budget
+
+
+@pytest.fixture
+def ran(service):
+    """Frames with 100 and 40 iterations; frame 6 is held, of frame 7 a camera is left out."""
+    with Client(service.url, patience=30) as sdk:
+        id = start_scene(sdk, "budgets")
+        for index in range(9):
+            if index == 4:
+                sdk.set_budget(id, iterations=40)
+            push(sdk, id, index, red={6: fakes.HELD, 7: fakes.LEAVES_OUT}.get(index, 0))
+            sdk.wait(id, index)
+        yield sdk, id
+        sdk.delete_scene(id)
+
+
+def text(page, id):
+    return page.locator(f"#{id}").inner_text()
+
+
+def test_what_was_measured_and_what_is_extrapolated_are_told_apart(page, service, ran):
+    _, id = ran
+    opened(page, service, id)
+    until(page, "document.querySelectorAll('#tradeoff .point.measured').length === 2")
+    assert page.locator("#tradeoff .point.extrapolated").count() == 6
+    assert page.locator("#tradeoff .point.replayed").count() == 0
+    said = page.locator("#tradeoff .point.measured title").first.text_content()
+    assert said.startswith("40 iterations")
+    assert "error 0.0250" in said
+    assert "measured" in said
+    assert "its time alone" in page.locator("#tradeoff .point.extrapolated title").first.text_content()
+    assert text(page, "tradeoff-unit").startswith("error")
+    assert "40 iterations a frame, from frame 4 on" in text(page, "budget-words")
+    assert page.locator("#seconds .change").count() == 1  # where the budget changed
+    assert page.faults == []
+
+
+def test_a_budget_that_is_moved_holds_from_the_next_frame_on(page, service, ran):
+    sdk, id = ran
+    opened(page, service, id)
+    until(page, "document.getElementById('budget-value').innerText === '40 iterations'")
+    page.focus("#budget")
+    page.keyboard.press("End")
+    until(page, "document.getElementById('budget-words').innerText.includes('1000 iterations a frame, from frame 9')")
+    assert sdk.budget(id).asked == Budget(iterations=1000)
+    push(sdk, id, 9)
+    until(page, "document.querySelectorAll('#seconds .change').length === 2")
+    page.select_option("#budget-kind", "budget_ms")
+    page.focus("#budget")
+    page.keyboard.press("Home")
+    until(page, "document.getElementById('budget-words').innerText.includes('as fit into 20 ms')")
+    assert sdk.budget(id).asked == Budget(budget_ms=20)
+    page.select_option("#budget-kind", "")
+    until(page, "document.getElementById('budget-words').innerText.includes('as the scene was made')")
+    assert sdk.budget(id).asked == Budget()
+    assert page.faults == []
+
+
+def test_other_budgets_are_measured_on_request(page, service, ran):
+    _, id = ran
+    opened(page, service, id)
+    until(page, "!document.getElementById('measure').disabled")
+    page.click("#measure")
+    until(page, "document.querySelectorAll('#tradeoff .point.replayed').length === 4")  # 25, 50, 200 and its own 40
+    assert "compare replayed times with each other" in text(page, "replay-words")
+    assert page.locator("#measure").is_enabled()
+    assert page.faults == []
+
+
+def test_held_frames_are_marked_with_their_reason_and_cameras_have_their_health(page, service, ran):
+    _, id = ran
+    opened(page, service, id, frame=6)
+    shown(page, frame="6")
+    assert page.locator("#marks span").count() == 1
+    assert "the fake was told so" in page.locator("#marks span").get_attribute("title")
+    assert text(page, "moment").endswith("held")
+    assert text(page, "reason") == "Frame 6: held as it was: the fake was told so."
+    assert page.locator("#psnr .held").count() == 1
+    page.locator("#time").fill("7")
+    shown(page, frame="7")
+    assert page.locator("#reason").is_hidden()
+    rows = page.locator("#cameras tr").all_inner_texts()
+    assert "left out" in rows[1]
+    assert "20 %" in rows[2]
+    assert "95 %" in rows[0]
+    assert "camera c1" in text(page, "camera-summary").lower()
+    page.locator("#marks span").click()
+    shown(page, frame="6")
+    assert page.faults == []
