@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 
 from scas4d_core.cameras import Camera
+from scas4d_core.kernels.blend import blend
+from scas4d_core.kernels.projection import DEPTH, TILE
+from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
 from scas4d_core.stability.case import CPU, HardCase, Outcome
 from scas4d_core.stability.rendering import Rendering
 
@@ -117,6 +120,81 @@ def _at_one_pixel(count: int) -> Rendering:
     means = np.stack([0.02 * depths, 0.01 * depths, depths], -1)
     # Thousands of factors 1 − alpha in a row: float32 adds up.
     return among(count, means=means, factors=0.01 * np.eye(3), opacities=0.02, value=2e-3, gradient=2e-2, bound=1e8)
+
+
+def _opaque(problem: Rendering, outcomes: Mapping[str, Outcome]) -> list[str]:
+    """Behind the middle of an opaque Gaussian little is seen: the cap keeps it drawn, at alpha 1 the stop would not."""
+    rows = np.flatnonzero(problem.opacities >= 0.98)
+    places, _ = problem.camera.project(problem.means[rows])
+    columns, lines = np.floor(places).astype(int).T
+    inside = (columns >= 0) & (columns < problem.camera.width) & (lines >= 0) & (lines < problem.camera.height)
+    found = []
+    for backend, outcome in outcomes.items():
+        least = outcome.values["alpha"][lines[inside], columns[inside]].min()
+        if least < 0.75:
+            found.append(f"{backend}: alpha is {least:.2g} in the middle of an opaque Gaussian")
+    return found
+
+
+def _on_a_pixel(seed: int) -> Culled:
+    """Supports that end, to a rounding, on the one pixel that they have in a block."""
+    rng = np.random.default_rng(seed)
+    count, depth, focal, low_pass = 2000, 2.0, 64.0, float(np.float32(Rendering.limits.low_pass))
+    reach = rng.integers(2, 20, count)
+    column, row = rng.integers(20, 236, count), 4 * rng.integers(8, 56, count) + 3 + reach
+    wished = np.square(reach) / (2 * np.log(255 * rng.uniform(0.05, 0.9, count)))
+    width = np.sqrt(np.maximum(wished - 0.3, 1e-3))
+    variance = np.square(width) + low_pass
+    opacity = np.exp(np.square(reach) / (2 * variance)) / 255 * (1 + 6e-8 * rng.integers(-6, 7, count))
+    kept = opacity < 0.95
+    means = np.stack([(column + 0.5) * depth / focal, (row + 0.5) * depth / focal, np.full(count, depth)], -1)
+    return Culled(
+        means[kept].astype(np.float32),
+        (width[kept, None, None] * depth / focal * np.eye(3)).astype(np.float32),
+        opacity[kept].astype(np.float32),
+        np.ones((int(kept.sum()), 4), np.float32),
+        Camera("c", np.array([[focal, 0, 0], [0, focal, 0], [0, 0, 1]]), np.eye(4), 256, 256),
+        bad=np.zeros(int(kept.sum()), bool),
+    )
+
+
+ARRAYS = ("means", "factors", "opacities", "features")
+TOGETHER = 100
+"""Gaussians of which each is seen: more would end pixels before."""
+
+
+def _culling_is_exact(problem: Rendering) -> list[str]:
+    """The same bits as from tile lists that hold every Gaussian in every block."""
+    changed = 0
+    for first in range(0, len(problem.means), TOGETHER):
+        rows = slice(first, first + TOGETHER)
+        means, factors, opacities, features = (np.ascontiguousarray(getattr(problem, name)[rows]) for name in ARRAYS)
+        rasterizer = CpuRasterizer(problem.limits)
+        view, black = CameraArrays.of(problem.camera), np.zeros(4, np.float32)
+        picture = rasterizer.forward(means, factors, opacities, features, view, black).features.copy()
+        splats = rasterizer.splats
+        order = np.argsort(splats[:, DEPTH], kind="stable").astype(np.int32)
+        tiles = -(-view.width // TILE) * -(-view.height // TILE)
+        image, rest = np.empty_like(rasterizer.planes), np.empty(rasterizer.planes.shape[1:], np.float32)
+        blend(
+            splats, features, (0,), np.arange(tiles + 1) * len(order), np.tile(order, tiles),
+            np.full(tiles * len(order), 2**64 - 1, np.uint64), np.arange(tiles), 1, (view.width, view.height), black,
+            rasterizer.limits, image, rest,
+        )  # fmt: skip
+        changed += int((image[:, : view.height, : view.width] != picture).any(axis=0).sum())
+    return [f"culling changes {changed} pixels"] if changed else []
+
+
+class Culled(Rendering):
+    """Of which only the culling is looked at, on the CPU."""
+
+    def run(self, backend: str) -> Outcome | None:
+        """See ``Problem``."""
+        return self._cpu() if backend == CPU else None
+
+    def violations(self, outcomes: Mapping[str, Outcome]) -> list[str]:
+        """See ``Problem``."""
+        return _culling_is_exact(self)
 
 
 def _equal_depths(count: int) -> Rendering:
@@ -302,11 +380,19 @@ CASES = (
         lambda o: among(9, opacities=np.float32(1 / 255) * np.float32(o)),
     ),
     HardCase(
+        "support that ends on a pixel",
+        "seed of 2000 Gaussians: culling by blocks and tiles changes no bit",
+        "exact culling",
+        (37, 56, 65),
+        _on_a_pixel,
+    ),
+    HardCase(
         "opacity at one",
         "capped, no gradient through the cap; two capped ones leave exactly the stop's light, and either is right then",
         "gsplat, alpha cap",
         (0.98, 0.99, 1.0, 2.0),
         lambda o: among(9, opacities=o, value=1.1e-2),
+        _opaque,
     ),
     HardCase(
         "axes of length 0",

@@ -15,6 +15,8 @@ from scas4d_core.stability.case import CPU, CUDA, REFERENCE, Outcome, apart, bey
 
 Array = NDArray[np.float32]
 
+LEAST_LIGHT = 9e-5
+"""What passes the densest pixel: transmittances stay far above denormal numbers."""
 KINK_SHARE = 0.005
 """Of the pixels: so many may lie on the other side of the alpha floor or of the stop in float32."""
 
@@ -146,6 +148,8 @@ class Rendering:
             found.append(f"{backend}: picture in {picture.min():.4g}…{picture.max():.4g}, colours {low:.4g}…{high:.4g}")
         if alpha.min() < -1e-5 or alpha.max() > 1 + 1e-5:
             found.append(f"{backend}: alpha in {alpha.min():.4g}…{alpha.max():.4g}")
+        if alpha.size and 1 - alpha.max() < LEAST_LIGHT:
+            found.append(f"{backend}: {1 - alpha.max():.2g} of the light is left, less than {LEAST_LIGHT:g}")
         return found
 
     def _touched(self, outcome: Outcome, backend: str) -> list[str]:
