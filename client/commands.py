@@ -1,4 +1,4 @@
-"""`scas4d push`, `import`, `scenes`, `watch`: what talks to a service, or makes a capture ready for it."""
+"""`scas4d push`, `import`, `scenes`, `watch`, `budget`: what talks to a service, or makes a capture ready for it."""
 
 from __future__ import annotations
 
@@ -156,6 +156,47 @@ def watch(scene: Scene, url: Url = DEFAULT_URL, token: Token = None) -> None:
         return
 
 
+def budget(
+    scene: Scene,
+    iterations: Annotated[int | None, typer.Option(min=1, help="A frame.")] = None,
+    milliseconds: Annotated[
+        float | None, typer.Option(min=0.001, help="A frame, decoding and commit included: as many iterations as fit.")
+    ] = None,
+    stop_gain: Annotated[
+        float | None,
+        typer.Option(min=0, max=0.999, help="Ten iterations that bring less than this share end an update."),
+    ] = None,
+    still: Annotated[
+        float | None,
+        typer.Option(
+            min=-1, help="No iteration where the frame before shows it within 1 + this times the usual error."
+        ),
+    ] = None,
+    as_made: Annotated[bool, typer.Option("--as-made", help="As the scene was made.")] = False,
+    url: Url = DEFAULT_URL,
+    token: Token = None,
+) -> None:
+    """Tells what a scene's updates may cost; with options, sets it from the next frame on."""
+    given = (iterations, milliseconds, stop_gain, still)
+    if as_made and any(value is not None for value in given):
+        raise ValueError("--as-made stands for no other budget; leave it out, or the others")
+    with Client(url, token=token, outage=0) as client:
+        if as_made or any(value is not None for value in given):
+            found = client.set_budget(
+                scene, iterations=iterations, budget_ms=milliseconds, stop_gain=stop_gain, still=still
+            )
+        else:
+            found = client.budget(scene)
+    now = found.effective
+    many = (
+        f"{now.iterations} iterations"
+        if now.budget_ms is None
+        else f"as many iterations as fit into {now.budget_ms:g} ms"
+    )
+    stops = f", or fewer: stop gain {now.stop_gain:g}" if now.stop_gain else ""
+    console.print(f"{many} a frame{stops}; still {now.still:g}; from frame {found.since} on", highlight=False)
+
+
 def import_(
     capture: CaptureFolder,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="New folder.")],
@@ -183,6 +224,8 @@ def frame_line(report: FrameReportModel, missed: int = 0) -> str:
         parts.append(f"{report.psnr:.1f} dB")
     if "total" in report.seconds:
         parts.append(f"{report.seconds['total']:.2f} s")
+    if report.degraded:
+        parts.append(report.degraded)
     if report.dropped_cameras:
         parts.append(f"without {', '.join(report.dropped_cameras)}")
     if report.error:
@@ -219,3 +262,4 @@ def register(app: typer.Typer) -> None:
     app.command(name="import")(import_)
     app.command()(scenes)
     app.command()(watch)
+    app.command()(budget)

@@ -27,7 +27,7 @@ def set_budget(
         id: of the scene.
         iterations: a frame.
         budget_ms: milliseconds a frame, decoding and commit included; then as many iterations as fit.
-        stop_gain: a round over the cameras that brings less than this share ends the update.
+        stop_gain: ten iterations that lower the error by less than this share end the update.
         still: a frame needs no iteration where the one before shows it with at most 1 + this times the usual error.
     """
     request = Budget(iterations=iterations, budget_ms=budget_ms, stop_gain=stop_gain, still=still)

@@ -30,8 +30,8 @@ class Budget(Model):
         default=None,
         ge=0,
         lt=1,
-        description="An update ends once a round over the cameras lowers their mean loss by less than this share; 0: "
-        "never.",
+        description="An update ends once ten iterations lower its error on four training views by less than this "
+        "share; 0: never.",
     )
     still: float | None = Field(
         default=None,

@@ -126,6 +126,29 @@ def test_scenes_are_listed_whole_in_a_narrow_terminal(service):
     assert lines[0].index("state") == lines[1].index("awaiting_first_frame")
 
 
+def test_a_budget_is_told_set_and_taken_back(service):
+    def said(*arguments):
+        done = scas4d("budget", scene, *arguments, "--url", service.url, COLUMNS="200")
+        assert done.returncode == 0, done.stderr
+        return done.stdout.strip()
+
+    with Client(service.url) as client:
+        scene = client.create_scene(make_rig(2)).id
+        try:
+            made = said()
+            assert made.startswith("100 iterations a frame")
+            assert "fit into 500 ms a frame, or fewer: stop gain 0.02" in said(
+                "--milliseconds", "500", "--stop-gain", "0.02"
+            )
+            assert client.budget(scene).asked.budget_ms == 500
+            assert said("--iterations", "50").startswith("50 iterations a frame")
+            assert said("--as-made") == made
+            refused = scas4d("budget", scene, "--as-made", "--iterations", "5", "--url", service.url)
+            assert (refused.returncode, "leave it out" in refused.stderr) == (1, True)
+        finally:
+            client.delete_scene(scene)
+
+
 def test_serve_refuses_to_listen_beyond_this_machine():
     done = scas4d("serve", "--host", "0.0.0.0")
     assert done.returncode == 1
