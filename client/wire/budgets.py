@@ -11,7 +11,7 @@ from client.wire.base import Model
 MOST_ITERATIONS = 100_000
 LONGEST_MS = 3_600_000.0
 
-Iterations = Annotated[int, Field(ge=1, le=MOST_ITERATIONS)]
+Iterations = Annotated[int, Field(strict=True, ge=1, le=MOST_ITERATIONS)]
 
 
 class Budget(Model):
@@ -20,6 +20,7 @@ class Budget(Model):
     iterations: Iterations | None = Field(default=None, description="A frame; of `update.iterations`.")
     budget_ms: float | None = Field(
         default=None,
+        strict=True,
         gt=0,
         le=LONGEST_MS,
         allow_inf_nan=False,
@@ -28,6 +29,7 @@ class Budget(Model):
     )
     stop_gain: float | None = Field(
         default=None,
+        strict=True,
         ge=0,
         lt=1,
         description="An update ends once ten iterations lower its error on four training views by less than this "
@@ -35,6 +37,7 @@ class Budget(Model):
     )
     still: float | None = Field(
         default=None,
+        strict=True,
         ge=-1,
         le=1000,
         allow_inf_nan=False,

@@ -99,6 +99,7 @@ class ReplayRequest(Model):
     )
     frames: int = Field(
         default=4,
+        strict=True,
         ge=1,
         le=MOST_REPLAYED,
         description="The newest so many; one more before them warms up. Their pictures must still be held.",
