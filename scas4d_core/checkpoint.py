@@ -10,7 +10,7 @@ first frame; clusters and neighbours are built again from the first frame, and a
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from scas4d_core.npz import read_npz, write_npz
 from scas4d_core.views import TrainingView, ViewFactory
 from scas4d_core.warm_start import Motion
 
-FORMAT = 1
+FORMAT = 2
 """Of a checkpoint's file; another one is refused."""
 
 _FILE = re.compile(r"checkpoint_(\d{6,})\.npz")
@@ -48,6 +48,7 @@ class Carried:
         seen: the views of the frame, in scenes without masks: the next are compared with them.
         structure: digest of the clusters and neighbours that the motion belongs to.
         past: what is usual for the scene and its cameras.
+        shown: fingerprint of each picture of the frame (``repeats``).
     """
 
     motion: Motion | None = None
@@ -55,6 +56,7 @@ class Carried:
     seen: Sequence[TrainingView] = field(default_factory=tuple)
     structure: int = 0
     past: Past = field(default_factory=Past)
+    shown: Mapping[str, int] = field(default_factory=dict)
 
 
 def digest(hierarchy: Hierarchy, neighbours: Neighbours | None) -> int:
@@ -83,6 +85,10 @@ class Checkpoints:
         if carried.motion is not None:
             arrays |= _packed(carried.motion)
         arrays |= {f"past.{name}": array for name, array in carried.past.arrays().items()}
+        arrays |= {
+            "shown.names": np.array(list(carried.shown), np.str_),
+            "shown.prints": np.array(list(carried.shown.values()), np.int64),
+        }
         if carried.labels is not None:
             arrays["labels"] = carried.labels
         for view in carried.seen:
@@ -114,7 +120,8 @@ class Checkpoints:
             seen = factory.views(Frame(index, 0.0, pictures, {}), {}, use_masks=False) if pictures else ()
             motion = _unpacked(arrays) if "motion.seconds" in arrays else None
             past = Past.of_arrays({name[5:]: array for name, array in arrays.items() if name.startswith("past.")})
-            return Carried(motion, arrays.get("labels"), seen, int(arrays["structure"]), past)
+            shown = dict(zip(arrays["shown.names"].tolist(), arrays["shown.prints"].tolist(), strict=True))
+            return Carried(motion, arrays.get("labels"), seen, int(arrays["structure"]), past, shown)
         except FileNotFoundError:
             raise CheckpointError(f"{file} is missing") from None
         except (ValueError, KeyError, TypeError) as error:

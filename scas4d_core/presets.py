@@ -2,10 +2,31 @@
 
 from __future__ import annotations
 
-from scas4d_core.settings import Settings, UpdateSettings, Weights
+from scas4d_core.settings import LayerRates, Settings, UpdateSettings, Weights
 
 PRESETS: dict[str, Settings] = {
     "scas4d": Settings(),
+    # Effort where it is needed (docs/accuracy-and-time.md): the first motion is looked for longer, what follows takes
+    # fewer and bolder iterations, none where nothing moved; silhouettes are left to the pictures.
+    "adaptive": Settings(
+        update=UpdateSettings(
+            iterations=50,
+            cold_longer=4.0,
+            stop_gain=0.02,
+            still=0.02,
+            layer_rates=(
+                LayerRates(rotation=0.044, translation=0.0088, scaling=0.002),
+                LayerRates(rotation=0.011, translation=0.0022, scaling=0.002),
+                LayerRates(rotation=0.0022, translation=0.00044, scaling=0.002),
+            ),
+            rate_position=2e-4,
+            rate_rotation=0.0025,
+            rate_colour=0.00375,
+            beta1=0.7,
+            beta2=0.9,
+            weights=Weights(mask_alone=0.0),
+        )
+    ),
     # Per-Gaussian updates with the authors' terms, weights and rates (Dynamic3DGaussians, train.py).
     "dynamic3dgs": Settings(
         update=UpdateSettings(

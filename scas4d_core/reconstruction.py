@@ -35,10 +35,12 @@ from scas4d_core.motion_labels import moving_between, settled
 from scas4d_core.neighbours import build_neighbours
 from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.rasterize.limits import scene_limits
+from scas4d_core.repeats import fingerprints, same_again
 from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.static_scene import StaticResult, fit_static_scene
 from scas4d_core.trial import Given, Outcome, Trial
 from scas4d_core.update import FrameUpdate, Updater
+from scas4d_core.update_plan import mask_weight
 from scas4d_core.updated import Stopwatch
 from scas4d_core.views import TrainingView, ViewFactory, pictures_of
 from scas4d_core.witness import mean_error
@@ -176,7 +178,9 @@ class Reconstruction(Committed):
             {name: fit.psnr for name, fit in result.cameras.items()},
             judge.brightness(frame.images),
         )
-        carried = Carried(seen=seen, structure=structure, past=replace(past, fitted=frame.time))
+        carried = Carried(
+            seen=seen, structure=structure, past=replace(past, fitted=frame.time), shown=fingerprints(frame.images)
+        )
         self._commit(report, result.gaussians, carried, {**first, **(notes or {})})
         return self
 
@@ -355,14 +359,20 @@ class Reconstruction(Committed):
             lengths=self._lengths,
         )
         trial = Trial(updater, self._factory, self._picture, self._effort)
-        outcome = trial.held(given, look.held) if look.held else trial.run(given)
+        shown = fingerprints(frame.images)
+        if look.held:
+            outcome = trial.held(given, look.held)
+        elif shown == carried.shown and self._effort.still > -1:
+            outcome = same_again(given)
+        else:
+            outcome = trial.run(given)
         watch.lap("update")
         report = self._report(frame, outcome, look, watch, dropped or {})
         how = {"cold": carried.motion is None, "relabelled": updater is not self._updater}
         learnt = outcome.fresh and not outcome.stood
         past = replace(outcome.past, fitted=frame.time) if learnt else outcome.past
         seen = carried.seen if not outcome.fresh else () if self._masked else views
-        carried = replace(carried, motion=outcome.motion, past=past, seen=seen)
+        carried = replace(carried, motion=outcome.motion, past=past, seen=seen, shown=shown)
         self._commit(report, outcome.gaussians, carried, {**how, **(notes or {})})
         self._updater = updater
         self._budget.learn(outcome.updated, perf_counter() - watch.began - watch.total)
@@ -434,9 +444,10 @@ class Reconstruction(Committed):
 
     @property
     def _uses_masks(self) -> bool:
-        """Whether updates look at masks."""
-        weights = self.settings.update.weights
-        return self.settings.update.use_masks and max(weights.mask, weights.mask_alone) > 0
+        """Whether updates look at masks: where no term asks for them they are not even read."""
+        assert self._updater is not None
+        settings, moving = self.settings.update, len(self._updater.hierarchy.rows)
+        return settings.use_masks and mask_weight(settings, moving, len(self._state(None))) > 0
 
     def _learn_what_moves(self, views: list[TrainingView], look: judge.Look) -> tuple[Updater, Carried]:
         """Where frame 0 had no mask, the pictures tell what moves; what has moved once stays in the hierarchy.
