@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
-EXPOSURE = 1.08
+EXPOSURE = 1.05
 """Times brighter or darker, median over the cameras, from which a frame is exposed otherwise; clean captures: 1.04."""
 ENOUGH = 8
 """Cameras that the exposure needs: an object that turns changes the brightness of one picture by a third."""
@@ -39,6 +39,10 @@ DROP_DB = 6.0
 """Of the cameras' median below its usual, from which an update has not met its frame."""
 FIRST_DROP_DB = 14.0
 """The same in the first update, which starts without a motion."""
+BEHIND_DB = 1.5
+"""The same, from which the first frames after held ones are sought longer: what moved on unseen is further away."""
+CATCH_UP = 3
+"""Frames that are, at most."""
 MOST_OUT = 0.5
 """Share of the cameras that are left out at most; where more do not fit, it is the frame that changed."""
 
@@ -74,7 +78,8 @@ class Past:
     Attributes:
         cameras: by name. level: dB, median over the cameras at the end of an update; NaN where not known.
         updates: that went into it. held: frames in a row that were held. fitted: seconds, time of the last frame that
-            was not. error: usual at the end of an update, by witness view.
+            was not. behind: frames since some were held, 0 once they are met as usual again. error: usual at the end
+            of an update, by witness view.
     """
 
     cameras: Mapping[str, CameraPast] = field(default_factory=dict)
@@ -82,6 +87,7 @@ class Past:
     updates: int = 0
     held: int = 0
     fitted: float = nan
+    behind: int = 0
     error: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
@@ -98,7 +104,7 @@ class Past:
         return {
             "names": np.array(list(self.cameras), np.str_),
             "cameras": np.array(rows, np.float64).reshape(-1, 3),
-            "scene": np.array([self.level, self.updates, self.held, self.fitted], np.float64),
+            "scene": np.array([self.level, self.updates, self.held, self.fitted, self.behind], np.float64),
             "witnesses": np.array(list(self.error), np.str_),
             "error": np.array(list(self.error.values()), np.float64),
         }
@@ -114,9 +120,9 @@ class Past:
             return cls()
         rows = zip(arrays["names"].tolist(), arrays["cameras"].tolist(), strict=True)
         cameras = {name: CameraPast(place, bright, int(out)) for name, (place, bright, out) in rows}
-        level, updates, held, fitted = arrays["scene"].tolist()
+        level, updates, held, fitted, behind = arrays["scene"].tolist()
         error = dict(zip(arrays["witnesses"].tolist(), arrays["error"].tolist(), strict=True))
-        return cls(cameras, level, int(updates), int(held), fitted, error)
+        return cls(cameras, level, int(updates), int(held), fitted, int(behind), error)
 
     def of(self, name: str) -> CameraPast:
         """What is usual for a camera; nothing for one that is new."""
@@ -198,11 +204,24 @@ def unmet(past: Past, psnr: Mapping[str, float]) -> str | None:
     """Why an update has not met its frame, or None. ``psnr``: dB by camera when last rendered."""
     if not psnr or past.level != past.level:
         return None
-    level = float(np.median(list(_capped(psnr).values())))
+    level = level_of(psnr)
     drop = FIRST_DROP_DB if past.updates == 0 else DROP_DB
     if level > past.level - drop:
         return None
     return f"the pictures are met at {level:.1f} dB, {past.level - level:.1f} dB less than usual"
+
+
+def behind(past: Past, psnr: Mapping[str, float]) -> str | None:
+    """Why an update after held frames should be sought longer, or None. ``psnr``: dB by camera when last rendered."""
+    if not (past.held or past.behind) or not psnr or past.level != past.level:
+        return None
+    off = past.level - level_of(psnr)
+    return f"{off:.1f} dB less than before frames were held" if off > BEHIND_DB else None
+
+
+def level_of(psnr: Mapping[str, float]) -> float:
+    """DB, median over the cameras; NaN of none."""
+    return float(np.median(list(_capped(psnr).values()))) if psnr else nan
 
 
 def health(off: float | None) -> float:
@@ -237,12 +256,15 @@ def settle(past: Past, psnr: Mapping[str, float], bright: Mapping[str, float], e
             now = replace(now, place=before.place + PLACE_RATE * (here - before.place) if known else here)
         cameras[name] = now
     known = past.updates > 0
+    later = past.behind + 1 if behind(past, believed) and past.behind < CATCH_UP else 0
+    follows = LEVEL_RATE if later == 0 else 0.0
     return replace(
         past,
         cameras=cameras,
-        level=past.level + LEVEL_RATE * (level - past.level) if known else level,
+        level=past.level + follows * (level - past.level) if known else level,
         updates=past.updates + 1,
         held=0,
+        behind=later,
     )
 
 

@@ -116,6 +116,9 @@ class Trial:
                 return self._held(given, updated, attempts, why)
             else:
                 degraded = f"{why}, for {settings.patience} frames: taken as it is from here on"
+        elif degraded is None and (why := self._behind(given, updated)) is not None:
+            attempts[-1] += f": {why}"
+            updated, check = self._longer(given, updated, check, attempts)
         return self._committed(given, updated, check, degraded, attempts, exposure)
 
     def held(self, given: Given, why: str) -> Outcome:
@@ -158,6 +161,11 @@ class Trial:
             return None
         return judge.unmet(given.past, self._met(updated))
 
+    def _behind(self, given: Given, updated: Updated) -> str | None:
+        if not self._settings.judge:
+            return None
+        return judge.behind(given.past, self._met(updated))
+
     def _met(self, updated: Updated) -> dict[str, float]:
         """DB of the cameras that were learnt from to the end."""
         return {name: fit.psnr for name, fit in updated.cameras.items() if name not in updated.left_out}
@@ -176,8 +184,19 @@ class Trial:
             why = check.fault or judge.unmet(given.past, self._met(updated))
             attempts.append(name if why is None else f"{name}: {why}")
             if why is None:
-                return updated, check
+                return (updated if start is not tried.gaussians else _after(updated, tried)), check
         return None
+
+    def _longer(self, given: Given, tried: Updated, check: Checked, attempts: list[str]) -> tuple[Updated, Checked]:
+        """On from where an update ended; the better of both."""
+        manner = replace(SOUGHT, name="on from where the update ended")
+        updated = self._updater.run(
+            tried.gaussians, given.views, None, given.seconds, given.seed, self._course(given, manner)
+        )
+        again = self._checked(given, given.state, updated)
+        better = judge.level_of(self._met(updated)) > judge.level_of(self._met(tried))
+        attempts.append(manner.name if again.fault is None else f"{manner.name}: {again.fault}")
+        return (_after(updated, tried), again) if again.fault is None and better else (tried, check)
 
     def _held(self, given: Given, updated: Updated, attempts: list[str], why: str) -> Outcome:
         past = replace(given.past, held=given.past.held + 1)
@@ -228,6 +247,11 @@ class Trial:
             self._picture.measure(state.means, state.factors, state.opacities, features, view)
             found[view.name] = self._picture.psnr
         return found
+
+
+def _after(updated: Updated, first: Updated) -> Updated:
+    """An update that went on from where another ended: its motion is that of both."""
+    return replace(updated, motion=updated.motion.after(first.motion))
 
 
 def _usual(before: Mapping[str, float], now: Mapping[str, float]) -> dict[str, float]:

@@ -6,7 +6,7 @@ a point on a circle goes on along the circle, and so do the clusters of finer la
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -68,6 +68,16 @@ class Motion:
     rest: Float
     own_turns: Float
     seconds: float
+
+    def after(self, first: Motion) -> Motion:
+        """Both, one after the other in the same interval; small turns add up."""
+        return replace(
+            self,
+            turns=[a + b for a, b in zip(first.turns, self.turns, strict=True)],
+            shifts=[a + b for a, b in zip(first.shifts, self.shifts, strict=True)],
+            rest=first.rest + self.rest,
+            own_turns=first.own_turns + self.own_turns,
+        )
 
     @classmethod
     def of(cls, deformation: Parameters, seconds: float) -> Motion:
