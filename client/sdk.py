@@ -162,6 +162,7 @@ class Client(_Settings):
     set_budget = _sends(calls.set_budget)
     tradeoff = _sends(calls.tradeoff)
     replay = _sends(calls.replay)
+    end_replay = _sends(calls.end_replay)
 
     def watch(self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2) -> Iterator[SceneStatus]:
         """The scene's status again and again, until the frame is finished or the scene failed.
@@ -261,6 +262,7 @@ class AsyncClient(_Settings):
     set_budget = _sends_async(calls.set_budget)
     tradeoff = _sends_async(calls.tradeoff)
     replay = _sends_async(calls.replay)
+    end_replay = _sends_async(calls.end_replay)
 
     async def watch(
         self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2

@@ -15,6 +15,9 @@ from server.problems import Problem, counted
 if TYPE_CHECKING:
     from server.scene import Scene
 
+KEPT = 32
+"""Points: those measured last."""
+
 log = logging.getLogger("scas4d.server")
 
 
@@ -62,6 +65,13 @@ class Replays:
         iterations = tuple(dict.fromkeys([own, *request.iterations]))
         messages = tuple(self._message(index) for index in indices)
         spec = ReplaySpec(scene.spec, scene.committed[0], base, messages, iterations)
+        self._life = life = object()
+        self._process = self._placement.start(
+            replayer.main,
+            spec,
+            lambda message: self._told(life, message),
+            lambda reason: self._ended(life, reason),
+        )
         self.status = ReplayStatus(
             state=ReplayState.RUNNING,
             iterations=list(iterations),
@@ -69,13 +79,6 @@ class Replays:
             warm_up=indices[0],
             threads=replayer.THREADS,
             total=len(iterations) * len(indices),
-        )
-        self._life = life = object()
-        self._process = self._placement.start(
-            replayer.main,
-            spec,
-            lambda message: self._told(life, message),
-            lambda reason: self._ended(life, reason),
         )
 
     def _chosen(self, count: int) -> tuple[int, list[int]]:
@@ -135,6 +138,9 @@ class Replays:
             case ReplayUpdated():
                 self.status.done += 1
             case ReplayPoint():
+                self.points.pop(message.iterations, None)
+                while len(self.points) >= KEPT:
+                    del self.points[next(iter(self.points))]
                 self.points[message.iterations] = TradeoffPoint(
                     kind=PointKind.REPLAYED,
                     iterations=message.iterations,
@@ -161,6 +167,13 @@ class Replays:
         process, self._process = self._process, None
         if process is not None:
             self._scene.background(process.stop(1.0))
+
+    async def end(self) -> None:
+        """Ends the replay that is running, if one is; its points so far stay."""
+        if self._process is None:
+            return
+        await self.stop()
+        self.status.state, self.status.error = ReplayState.FAILED, "it was ended on request"
 
     async def stop(self) -> None:
         """Ends what is running: nobody will ask."""

@@ -1,6 +1,6 @@
 """The requests of the service as values, one file a noun: the sync and the async client send the same ones."""
 
-from client.calls.budgets import budget, replay, set_budget, tradeoff
+from client.calls.budgets import budget, end_replay, replay, set_budget, tradeoff
 from client.calls.call import Call
 from client.calls.frames import close_frame, declare_missing, frame, frames, ply, put_camera, put_frame
 from client.calls.parts import parts
@@ -16,6 +16,7 @@ __all__ = [
     "create_scene",
     "declare_missing",
     "delete_scene",
+    "end_replay",
     "estimate",
     "frame",
     "frames",

@@ -51,3 +51,8 @@ def replay(id: str, iterations: Sequence[int] = (25, 50, 200), frames: int = 4) 
     """
     request = ReplayRequest(iterations=list(iterations), frames=frames)
     return Call("POST", path(id, "tradeoff"), reads(TradeoffModel), repeatable=False, arguments=body(request))
+
+
+def end_replay(id: str) -> Call[TradeoffModel]:
+    """Ends the replay that is running, if one is; what it has measured stays."""
+    return Call("DELETE", path(id, "tradeoff"), reads(TradeoffModel))

@@ -30,6 +30,13 @@ async def replay(scene: TheScene, request: ReplayRequest | None = None) -> Trade
     return await answer(scene)
 
 
+@router.delete("/{id}/tradeoff")
+async def end(scene: TheScene) -> TradeoffModel:
+    """Ends the replay that is running, if one is; what it has measured stays."""
+    await scene.replays.end()
+    return await answer(scene)
+
+
 async def answer(scene: Scene) -> TradeoffModel:
     """All that is known now."""
     newest = scene.committed[-tradeoff.NEWEST :]

@@ -44,6 +44,7 @@ CALLS = [
     calls.set_budget("s", iterations=50),
     calls.tradeoff("s"),
     calls.replay("s"),
+    calls.end_replay("s"),
 ]
 AS_AN_ADDRESS = {("GET", "/v1/scenes/{id}/render"), ("GET", "/v1/scenes/{id}/tracks")}
 """The same as a POST beside them, for a browser's address line."""

@@ -112,6 +112,11 @@ def test_one_replay_at_a_time_and_the_scene_goes_on_beside_it(sdk, http):
     assert time.monotonic() - began < 2 * fakes.SLOW_S
     assert replayed(sdk, id).replay.state == "done"
     sdk.replay(id, [50], frames=1)
+    ended = sdk.end_replay(id).replay
+    assert (ended.state, ended.error) == ("failed", "it was ended on request")
+    assert sdk.end_replay(id).replay == ended
+    assert not sdk.scene(id).degraded
+    sdk.replay(id, [50], frames=1)
     sdk.delete_scene(id)  # in the middle of it
     problem(http.get(f"/v1/scenes/{id}/tradeoff"), 404)
 
