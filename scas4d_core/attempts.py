@@ -52,8 +52,8 @@ AS_SET = Manner()
 SMALLER = Manner("smaller steps", rates=0.3, cold=True)
 RIGID = Manner("rigid layers only", rates=0.3, rigid=True, hold_colours=True, cold=True)
 SOUGHT = Manner("sought again", cold=True, longer=5.0)
-"""After ``reacquire``: from where the silhouettes say that the object is, or from where an update ended. Robot with two of
-three frames lost is met at 33.5 dB with five times the iterations, at 32.1 dB with twice, the next at 30.8 and 27.9."""
+"""After ``reacquire``: from where the silhouettes say that the object is, or from where an update ended. Two of three
+frames of robot lost, the next is met at 33.5 dB with five times the iterations, at 32.1 dB with twice."""
 
 LADDER = (SMALLER, RIGID)
 """What follows an attempt that is not finite or not plausible."""

@@ -336,13 +336,15 @@ class Reconstruction(Committed):
             raise StepError(f"frame {frame.index}: time {frame.time} s is not after {self.history.time(last)} s")
         watch = Stopwatch() if started is None else Stopwatch(began=started, last=started)
         past = self._carried.past
-        brightness = judge.brightness(frame.images)
-        look = judge.look(past, brightness) if self.settings.update.judge else judge.Look()
+        frame = replace(frame, images=dict(frame.images))  # decoded once: a capture's pictures are, whenever looked at
         try:
             views = self._factory.views(self._scaled(frame), self._exposures, self._uses_masks)
         except ValueError as error:
             raise StepError(str(error)) from error
         watch.lap("decode")
+        brightness = judge.brightness(frame.images)
+        look = judge.look(past, brightness) if self.settings.update.judge else judge.Look()
+        watch.lap("judge")
         updater, carried = self._learn_what_moves(views, look)
         given = Given(
             state=self._labelled(self._state(None), carried.labels),
@@ -367,6 +369,7 @@ class Reconstruction(Committed):
         else:
             outcome = trial.run(given)
         watch.lap("update")
+        watch.move("update", "judge", trial.judging)
         report = self._report(frame, outcome, look, watch, dropped or {})
         how = {"cold": carried.motion is None, "relabelled": updater is not self._updater}
         learnt = outcome.fresh and not outcome.stood
@@ -402,6 +405,7 @@ class Reconstruction(Committed):
         updated, gaussians = outcome.updated, outcome.gaussians
         left_out = {**dropped, **look.left_out, **updated.left_out}
         stages = {"decode": watch.seconds["decode"], **updated.seconds}
+        stages["judge"] = watch.seconds["judge"] + updated.seconds.get("judge", 0.0)
         stages["other"] = max(0.0, watch.seconds["update"] - sum(updated.seconds.values()))
         return FrameReport(
             index=frame.index,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +84,9 @@ class Trial:
 
     Args:
         updater: of the scene. factory: of its views. picture: renders, with the settings' background and limits.
+
+    Attributes:
+        judging: seconds that checks took beside the updates.
     """
 
     def __init__(self, updater: Updater, factory: ViewFactory, picture: PictureLoss, settings: UpdateSettings) -> None:
@@ -89,6 +94,7 @@ class Trial:
         self._picture = picture
         self._factory, self._rig = factory, factory.rig
         self._settings = settings
+        self.judging = 0.0
 
     def run(self, given: Given) -> Outcome:
         """Try a frame. ``given.look.held`` is None."""
@@ -134,7 +140,14 @@ class Trial:
         return updated, check
 
     def _checked(self, given: Given, start: Gaussians, updated: Updated) -> Checked:
-        return checked(start, updated.gaussians, self._updater.hierarchy.rows, self._rig.radius, given.lengths)
+        with self._timed():
+            return checked(start, updated.gaussians, self._updater.hierarchy.rows, self._rig.radius, given.lengths)
+
+    @contextmanager
+    def _timed(self) -> Iterator[None]:
+        began = perf_counter()
+        yield
+        self.judging += perf_counter() - began
 
     def _course(self, given: Given, manner: Manner) -> Course:
         settings, past = self._settings, given.past
@@ -159,7 +172,8 @@ class Trial:
     def _unmet(self, given: Given, updated: Updated) -> str | None:
         if not self._settings.judge:
             return None
-        return judge.unmet(given.past, self._met(updated))
+        with self._timed():
+            return judge.unmet(given.past, self._met(updated))
 
     def _behind(self, given: Given, updated: Updated) -> str | None:
         if not self._settings.judge:
@@ -215,7 +229,8 @@ class Trial:
         exposure: float,
     ) -> Outcome:
         psnr = {name: fit.psnr for name, fit in updated.cameras.items()}
-        psnr |= self._suspects(given, check.gaussians)
+        with self._timed():
+            psnr |= self._suspects(given, check.gaussians)
         past = given.past
         if degraded is not None and past.held + 1 >= self._settings.patience:  # this is how it looks from now on
             past = replace(past, level=float("nan"), updates=0)

@@ -127,6 +127,7 @@ class FrameUpdate:
             watch.lap("adam")
             if story.end_iteration(loss, watch.total) and course.gate is not None:
                 plan.leave_out(story.leave_out(course.gate(story.first)))
+                watch.lap("judge")
             if pace.looks(story.iterations):
                 pace.saw(story.iterations, anytime.error(colours))
                 watch.lap("looks")

@@ -32,6 +32,11 @@ class Stopwatch:
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
         self.last = now
 
+    def move(self, stage: str, other: str, seconds: float) -> None:
+        """Book a part of a stage to another."""
+        self.seconds[stage] -= seconds
+        self.seconds[other] = self.seconds.get(other, 0.0) + seconds
+
 
 @dataclass(frozen=True)
 class CameraFit:
