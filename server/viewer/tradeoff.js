@@ -71,12 +71,14 @@ export class Tradeoff {
     if (!this.moving) this.place();
     this.draw();
     const replay = model.replay;
-    this.$("measure").disabled = replay.state === "running" || !model.points.length;
-    if (replay.state === "running") {
+    const running = replay.state === "running";
+    this.$("measure").disabled = !running && !model.points.length;
+    this.$("measure").textContent = running ? "Stop" : `Measure ${REPLAYED.slice(0, -1).join(", ")} and ${REPLAYED.at(-1)} iterations`;
+    if (running) {
       this.say(`Replaying ${replay.frames.length} of the newest frames in the background: ${replay.done} of ${replay.total} updates.`);
       this.due = 0;
       this.refresh(REPLAY_EVERY_MS);
-    } else if (replay.state === "failed") this.say(`The replay failed: ${replay.error}.`, true);
+    } else if (replay.state === "failed") this.say(`The replay is incomplete: ${replay.error}.`, true);
     else if (replay.state === "done") {
       const which = replay.frames.length > 1 ? `frames ${replay.frames[0]} to ${replay.frames.at(-1)}` : `frame ${replay.frames[0]}`;
       this.say(`Replayed ${which} on ${replay.threads === 1 ? "one thread" : `${replay.threads} threads`}: compare replayed times with each other.`);
@@ -151,9 +153,12 @@ export class Tradeoff {
     }
   }
 
+  /** Begins a replay, or ends the one that is running. */
   async measure() {
+    const running = this.model?.replay.state === "running";
+    const path = `${scenePath(this.scene)}/tradeoff`;
     try {
-      const model = await call("POST", `${scenePath(this.scene)}/tradeoff`, { iterations: REPLAYED });
+      const model = await (running ? call("DELETE", path) : call("POST", path, { iterations: REPLAYED }));
       this.show(model, { asked: this.asked, effective: this.effective, since: this.since });
     } catch (error) {
       this.say(error.message, true);

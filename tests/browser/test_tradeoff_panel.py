@@ -66,14 +66,21 @@ def test_a_budget_that_is_moved_holds_from_the_next_frame_on(page, service, ran)
     assert page.faults == []
 
 
-def test_other_budgets_are_measured_on_request(page, service, ran):
-    _, id = ran
+def test_other_budgets_are_measured_on_request_until_told_to_stop(page, service, ran):
+    sdk, id = ran
     opened(page, service, id)
     until(page, "!document.getElementById('measure').disabled")
     page.click("#measure")
     until(page, "document.querySelectorAll('#tradeoff .point.replayed').length === 4")  # 25, 50, 200 and its own 40
     assert "compare replayed times with each other" in text(page, "replay-words")
-    assert page.locator("#measure").is_enabled()
+    assert text(page, "measure").startswith("Measure 25")
+    push(sdk, id, 9, red=fakes.SLOW)  # two seconds in a replay, too
+    sdk.wait(id, 9)
+    page.click("#measure")
+    until(page, "document.getElementById('measure').innerText === 'Stop'")
+    page.click("#measure")
+    until(page, "document.getElementById('replay-words').innerText.includes('ended on request')")
+    assert sdk.tradeoff(id).replay.state == "failed"
     assert page.faults == []
 
 
