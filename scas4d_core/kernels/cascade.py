@@ -154,7 +154,7 @@ def carry(table, about_origin, points, place, v, present, lane, acted):
         table: [23] of its cluster. points: x, y, z of the block from flat index ``place`` on, as they enter.
         v: [13, 16] factors 0–8 and turns 9–12.
         present: flat; from ``lane`` on, 0 for a Gaussian that is not counted, else 1.
-        acted: [3 or more] int64, added to: for how many of them the guards in ``ACTED`` acted.
+        acted: [3 or more] int64, added to: for how many of them the guards in ``ACTED`` acted; None: not counted.
     """
     x, y, z = (
         lanes.load(points, place), lanes.load(points, place + lanes.COUNT), lanes.load(points, place + 2 * lanes.COUNT)
@@ -181,15 +181,16 @@ def carry(table, about_origin, points, place, v, present, lane, acted):
     lanes.store(v, 10 * lanes.COUNT, ox)
     lanes.store(v, 11 * lanes.COUNT, oy)
     lanes.store(v, 12 * lanes.COUNT, oz)
-    clamped = lanes.magnitude(exponent) > LARGEST
-    # det J = f³ (1 + (2 − f) e·c), and the cosine is 1 more than its second factor. Half turns are among the folds.
-    folded = a[11] <= ONE
-    if lanes.any_of(clamped):
-        acted[0] += lanes.count_of(clamped & (lanes.load(present, lane) > ZERO))
-    if lanes.any_of(folded):
-        counts = lanes.load(present, lane) > ZERO
-        acted[1] += lanes.count_of((a[17] < LEAST) & counts)
-        acted[2] += lanes.count_of(folded & counts)
+    if acted is not None:  # known as the kernel is compiled
+        clamped = lanes.magnitude(exponent) > LARGEST
+        # det J = f³ (1 + (2 − f) e·c), and the cosine is 1 more than its second factor. Half turns are among the folds.
+        folded = a[11] <= ONE
+        if lanes.any_of(clamped):
+            acted[0] += lanes.count_of(clamped & (lanes.load(present, lane) > ZERO))
+        if lanes.any_of(folded):
+            counts = lanes.load(present, lane) > ZERO
+            acted[1] += lanes.count_of((a[17] < LEAST) & counts)
+            acted[2] += lanes.count_of(folded & counts)
 
 
 @kernel

@@ -144,7 +144,6 @@ def deform_backward(
     """
     blocks, layers = clusters.shape
     for task in prange((blocks + BLOCKS - 1) // BLOCKS):
-        counted = np.zeros(3, np.int64)  # by the forward already
         v = np.empty((layers + 1) * CARRIED, np.float32)
         g = np.empty(16 * lanes.COUNT, np.float32)
         for block in range(task * BLOCKS, min(blocks, (task + 1) * BLOCKS)):
@@ -156,7 +155,7 @@ def deform_backward(
                 place = (layer * blocks + block) * 3 * lanes.COUNT
                 carry(
                     tables[clusters[block, layer]], about_origin, points, place, leaving, present, block * lanes.COUNT,
-                    counted,
+                    None,
                 )  # fmt: skip
             losses[block] = apply_own_backward(
                 deltas, entries, rows, block * lanes.COUNT, present, v, layers * CARRIED, scale_weight, bounds,

@@ -225,6 +225,9 @@ def project_backward_group(
         sums: [16, columns], each Gaussian's record summed over its pairs, and 1 behind it if there was one, else 0;
             0 is written there of a Gaussian whose gradient overflows.
         g_means, g_factors, g_opacities, g_screen: out, from row ``first`` on.
+
+    Returns:
+        Whether a gradient overflowed here.
     """
     margin = limits[5]
     fx, fy = lens[0], lens[1]
@@ -301,6 +304,20 @@ def project_backward_group(
                 g_means[first + lane] = ZERO
                 g_screen[first + lane] = ZERO
                 g_opacities[first + lane] = ZERO
+        return True
+    return False
+
+
+@kernel
+def give_up_steep(sums, counts, first, some, used):
+    """Clear the sums of those of sixteen Gaussians whose pairs add up to more than ``STEEPEST``, and their mark."""
+    sums.shape[1] - 1
+    for k in range(some):
+        steep = ZERO
+        for column in range(used):
+            steep += abs(sums[k, column])
+        if counts[first + k] > 0 and not steep <= STEEPEST:
+            sums[k] = ZERO
 
 
 @parallel_kernel
@@ -341,6 +358,7 @@ def project_backward(
         for first in range(task * CHUNK, min(count, (task + 1) * CHUNK), lanes.COUNT):
             some = min(lanes.COUNT, count - first)
             sums[:, columns] = ZERO
+            worst = lanes.fill(ZERO)
             for k in range(some):
                 i = first + k
                 sums[k, columns] = ONE if counts[i] > 0 else ZERO
@@ -352,15 +370,14 @@ def project_backward(
                     for pair in range(firsts[i], firsts[i] + counts[i]):
                         total += lanes.load(records, pair * columns + column)
                     lanes.store(sums, k * (columns + 1) + column, total)
-                    used = lanes.magnitude(lanes.only_first(total, 6 + channels - column))
-                    if lanes.any_of(lanes.choose(used <= STEEPEST, lanes.fill(ZERO), lanes.fill(ONE)) > ZERO):
-                        sums[k, columns] = ZERO
-                if counts[i] > 0 and sums[k, columns] == ZERO:
-                    sums[k, :columns] = ZERO
+                    worst += lanes.magnitude(lanes.only_first(total, 6 + channels - column))
                 for channel in range(channels):
                     g_features[i, channel] = sums[k, 6 + channel]
+            steep = not lanes.sum_of(worst) <= STEEPEST
+            if steep:
+                give_up_steep(sums, counts, first, some, 6 + channels)
             if some == lanes.COUNT:
-                project_backward_group(
+                lost = project_backward_group(
                     first, first, means, factors, pose, lens, limits, splats, sums, columns + 1, depth_channel,
                     g_means, g_factors, g_opacities, g_screen,
                 )  # fmt: skip
@@ -369,7 +386,7 @@ def project_backward(
                     padded(g_means[first:]), padded(g_factors[first:]),
                     padded(g_opacities[first:]), padded(g_screen[first:]),
                 )  # fmt: skip
-                project_backward_group(
+                lost = project_backward_group(
                     0, first, padded(means[first:]), padded(factors[first:]), pose, lens, limits, splats, sums,
                     columns + 1, depth_channel, last[0], last[1], last[2], last[3],
                 )  # fmt: skip
@@ -377,7 +394,8 @@ def project_backward(
                 g_factors[first:] = last[1][:some]
                 g_opacities[first:] = last[2][:some]
                 g_screen[first:] = last[3][:some]
-            for k in range(some):
-                if counts[first + k] > 0 and sums[k, columns] == ZERO:
-                    g_features[first + k] = ZERO
-                    acted[task, 0] += 1
+            if steep or lost:
+                for k in range(some):
+                    if counts[first + k] > 0 and sums[k, columns] == ZERO:
+                        g_features[first + k] = ZERO
+                        acted[task, 0] += 1

@@ -38,10 +38,10 @@ PATCHES: dict[str, tuple[tuple[str, str, str], ...]] = {
     "gradient_not_finite": (
         (
             "kernels/projection.py",
-            "if lanes.any_of(lanes.choose(used <= STEEPEST, lanes.fill(ZERO), lanes.fill(ONE)) > ZERO):",
-            "if lanes.any_of(used < ZERO):",
+            "steep = not lanes.sum_of(worst) <= STEEPEST",
+            "steep = lanes.sum_of(worst) < ZERO",
         ),
-        ("kernels/projection.py", "if not steep <= STEEPEST:", "if steep < ZERO:"),
+        ("kernels/projection.py", "if not steep <= STEEPEST:", "if False:"),
     ),
     "held_back": (
         (
