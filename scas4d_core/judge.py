@@ -38,7 +38,9 @@ NEW_DB = -4.0
 DROP_DB = 6.0
 """Of the cameras' median below its usual, from which an update has not met its frame."""
 FIRST_DROP_DB = 14.0
-"""The same in the first update, which starts without a motion."""
+"""The same in the first updates, the first of which starts without a motion and may take longer than others."""
+SETTLED = 3
+"""Updates from which the usual level is known."""
 BEHIND_DB = 1.5
 """The same, from which the first frames after held ones are sought longer: what moved on unseen is further away."""
 CATCH_UP = 3
@@ -78,8 +80,8 @@ class Past:
     Attributes:
         cameras: by name. level: dB, median over the cameras at the end of an update; NaN where not known.
         updates: that went into it. held: frames in a row that were held. fitted: seconds, time of the last frame that
-            was not. behind: frames since some were held, 0 once they are met as usual again. error: usual at the end
-            of an update, by witness view.
+            was not. behind: frames since some were held or not moved, 0 once they are met as usual again. error: usual
+            at the end of an update, by witness view.
     """
 
     cameras: Mapping[str, CameraPast] = field(default_factory=dict)
@@ -205,18 +207,22 @@ def unmet(past: Past, psnr: Mapping[str, float]) -> str | None:
     if not psnr or past.level != past.level:
         return None
     level = level_of(psnr)
-    drop = FIRST_DROP_DB if past.updates == 0 else DROP_DB
+    drop = FIRST_DROP_DB if past.updates < SETTLED else DROP_DB
     if level > past.level - drop:
         return None
     return f"the pictures are met at {level:.1f} dB, {past.level - level:.1f} dB less than usual"
 
 
 def behind(past: Past, psnr: Mapping[str, float]) -> str | None:
-    """Why an update after held frames should be sought longer, or None. ``psnr``: dB by camera when last rendered."""
+    """Why an update after frames that were held or not moved should be sought longer, or None.
+
+    Args:
+        psnr: dB by camera when last rendered.
+    """
     if not (past.held or past.behind) or not psnr or past.level != past.level:
         return None
     off = past.level - level_of(psnr)
-    return f"{off:.1f} dB less than before frames were held" if off > BEHIND_DB else None
+    return f"{off:.1f} dB less than before" if off > BEHIND_DB else None
 
 
 def level_of(psnr: Mapping[str, float]) -> float:

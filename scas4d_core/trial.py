@@ -151,7 +151,7 @@ class Trial:
 
     def _course(self, given: Given, manner: Manner) -> Course:
         settings, past = self._settings, given.past
-        longer = manner.longer * (settings.cold_longer if manner.cold or given.motion is None else 1.0)
+        longer = max(manner.longer, settings.cold_longer if given.motion is None else 1.0)
         iterations = round(longer * settings.iterations)
         pace: Pace = Counted(iterations)
         if given.end is not None:
@@ -240,6 +240,7 @@ class Trial:
             past = replace(past, error=_usual(given.past.error, updated.errors[updated.kept]))
         motion = None if check.held and not np.isfinite(updated.gaussians.means).all() else updated.motion
         if not updated.losses:  # it stands, or its frame was sent twice: it may go on as it went
+            past = replace(past, behind=max(1, past.behind))  # it may not go on as it went, or from further away
             return Outcome(updated, given.state, given.motion, past, fits, attempts=["not moved"], stood=True)
         return Outcome(
             updated,
