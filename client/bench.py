@@ -295,11 +295,30 @@ def stability(
     ] = False,
     store: Annotated[Path, typer.Option(help="Folder of the mutations' results.")] = Path("out/stability"),
     out: Annotated[Path | None, typer.Option(help="Write the tables here, between their marks.")] = None,
+    frames: Annotated[
+        bool,
+        typer.Option("--frames", help="The frame cases instead, and what the checks cost; made up, or --captures."),
+    ] = False,
+    captures: Annotated[
+        list[Path] | None, typer.Option(help="Frame cases on this capture with test cameras. May be repeated.")
+    ] = None,
+    service: Annotated[
+        bool, typer.Option("--service", help="The frame cases through a running service instead.")
+    ] = False,
+    soak: Annotated[
+        int | None, typer.Option(min=1, help="So many frames of a small scene instead; goes on where it was.")
+    ] = None,
 ) -> None:
     """Runs the catalogue of hard cases on every backend that is here, and counts what the guards did.
 
-    Example: scas4d bench stability --cases NaN --cases fold
+    Examples: scas4d bench stability --cases NaN --cases fold; scas4d bench stability --captures captures/robot; scas4d
+    bench stability --service; scas4d bench stability --soak 10000
     """
+    if frames or captures or service or soak is not None:
+        from client.bench_stability import frame_studies
+
+        frame_studies(captures or [], store, cases or [], service=service, soak=soak)
+        return
     from scas4d_core.stability import mutate as mutations
     from scas4d_core.stability import run
 

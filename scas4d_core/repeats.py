@@ -7,6 +7,7 @@ motion before them leads.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from zlib import crc32
 
 import numpy as np
@@ -27,4 +28,5 @@ def fingerprints(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, int]:
 def same_again(given: Given) -> Outcome:
     """The outcome of a frame that shows what the one before showed."""
     nothing = Updated(given.state, given.motion, [], [], {}, kept="still")  # type: ignore[arg-type]
-    return Outcome(nothing, given.state, given.motion, given.past, {}, attempts=["the same pictures again"], stood=True)
+    past = replace(given.past, behind=max(1, given.past.behind))  # the scene may have stood, or gone further
+    return Outcome(nothing, given.state, given.motion, past, {}, attempts=["the same pictures again"], stood=True)

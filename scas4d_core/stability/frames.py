@@ -369,7 +369,8 @@ def named(footage: Footage) -> tuple[FrameCase, ...]:
             left_out(lambda size: (one, two)),
         ),
         FrameCase(
-            "a camera is bumped", "shifted by so many pixels, for good; one may pass unseen", FIELD, (1, 2, 4, 8), bumped,
+            "a camera is bumped", "shifted by so many pixels for good; one may pass unseen", FIELD,
+            (1, 2, 4, 8), bumped,
             left_out(lambda size: (one,) if size > 1 else (), first=1, may=(one,)),
         ),
         FrameCase(

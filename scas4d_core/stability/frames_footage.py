@@ -13,7 +13,7 @@ from scas4d_core.bench.first_frame import first_frame_key, load_first_frame, sav
 from scas4d_core.bench.made_up import photograph
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import Capture
-from scas4d_core.captures.frame import Frame
+from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.history import History
 from scas4d_core.reconstruction import Reconstruction
@@ -46,7 +46,7 @@ class MadeUp:
     def __init__(self, settings: Settings | None = None) -> None:
         self.settings = settings or Settings(
             scene=SceneSettings(metres_per_unit=1.0),
-            static=StaticSettings(iterations=1),
+            static=StaticSettings(iterations=600, max_gaussians=1200),
             update=UpdateSettings(iterations=60, clusters=(2, 12, 48), neighbour_falloff=200.0),
         )
         self.rig = cameras(CAMERAS, SIZE)
@@ -71,6 +71,12 @@ class MadeUp:
     def jumped(self, index: int, sizes: float) -> tuple[Frame, Pictures]:
         """See ``frames.Footage``; it jumps to where it is seen by all cameras."""
         return self._shown(index, (-0.8 * sizes * 2 * BALL, 0.0, -0.6 * sizes * 2 * BALL))
+
+    @property
+    def points(self) -> InitialPoints:
+        """For who fits frame 0."""
+        true = self._true
+        return InitialPoints(true.means.astype(np.float64), true.colours.copy(), true.foreground.copy())
 
     def start(self, folder: Path) -> Reconstruction:
         """Frame 0 committed."""
@@ -108,6 +114,7 @@ class Filmed:
 
     def __init__(self, capture: Capture, settings: Settings, kept: Path) -> None:
         self._capture = capture
+        self.points = capture.points
         self.name, self.count, self.settings = capture.name, capture.frame_count, settings
         self.rig: Rig = capture.full_rig
         self._kept = kept / f"{first_frame_key(capture, settings)}.npz"

@@ -88,7 +88,7 @@ class FrameStudy:
             after = scene.history.gaussians(index)
             steps.append(
                 Step(
-                    one, report, _same(before, after), _sound(after), self._measured(scene, index, one.truth),
+                    one, report, _same(before, after), sound(after), self._measured(scene, index, one.truth),
                     self.undisturbed(one.like),
                 )
             )  # fmt: skip
@@ -162,7 +162,8 @@ def _same(before: Gaussians, after: Gaussians) -> bool:
     return all(np.array_equal(array, there[name]) for name, array in before.arrays().items())
 
 
-def _sound(state: Gaussians) -> bool:
+def sound(state: Gaussians) -> bool:
+    """Whether a state is finite and its rotations are units."""
     finite = all(bool(np.isfinite(array).all()) for array in state.arrays().values())
     norms = np.linalg.norm(state.rotations.astype(np.float64), axis=1)
     return finite and bool(np.abs(norms - 1).max() <= UNIT)
