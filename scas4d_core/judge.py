@@ -37,10 +37,8 @@ NEW_DB = -4.0
 """More is allowed for in the first update, when a camera's place is known from frame 0 alone."""
 DROP_DB = 6.0
 """Of the cameras' median below its usual, from which an update has not met its frame."""
-FIRST_DROP_DB = 14.0
-"""The same in the first updates, the first of which starts without a motion and may take longer than others."""
-SETTLED = 3
-"""Updates from which the usual level is known."""
+DROPS_DB = (14.0, 9.0, 9.0)
+"""The same in the first updates: what is usual is known from frame 0 alone, or from an update that took longer."""
 BEHIND_DB = 1.5
 """The same, from which the first frames after held ones are sought longer: what moved on unseen is further away."""
 CATCH_UP = 3
@@ -207,7 +205,7 @@ def unmet(past: Past, psnr: Mapping[str, float]) -> str | None:
     if not psnr or past.level != past.level:
         return None
     level = level_of(psnr)
-    drop = FIRST_DROP_DB if past.updates < SETTLED else DROP_DB
+    drop = DROPS_DB[past.updates] if past.updates < len(DROPS_DB) else DROP_DB
     if level > past.level - drop:
         return None
     return f"the pictures are met at {level:.1f} dB, {past.level - level:.1f} dB less than usual"
