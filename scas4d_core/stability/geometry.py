@@ -327,7 +327,7 @@ CASES = (
         (60.0, 80.0, 89.0, 89.9),
         _off_axis,
     ),
-    HardCase("needle", "1:1000, of this length in metres", "gsplat#613; PhysGaussian", (0.01, 0.1, 1.0), _needle),
+    HardCase("needle", "1:1000, of this length in metres", "gsplat#613", (0.01, 0.1, 1.0), _needle),
     HardCase(
         "needle along the ray",
         "1 mm thick, of this length in metres; the longest reach behind the camera",
@@ -404,7 +404,7 @@ CASES = (
     HardCase(
         "axes of 1e-12",
         "in metres, times this",
-        "issue list of gsplat",
+        "edge of float32",
         (1.0, 1e-20),
         lambda s: among(9, factors=1e-12 * s * np.eye(3)),
     ),

@@ -454,7 +454,7 @@ CASES = (
     HardCase(
         "fewer Gaussians than clusters",
         "so many, for layers of 64, 320 and 1280",
-        "issue list of POGS",
+        "edge of K-means",
         (1, 2, 9, 63),
         lambda n: _clustering(lambda rng: rng.normal(size=(n, 3)), (64, 320, 1280)),
     ),
