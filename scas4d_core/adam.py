@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.kernels.adam import EVERY_ROW, adam
+from scas4d_core.guards import GuardCounts
+from scas4d_core.kernels.adam import ACTED, EVERY_ROW, adam
 from scas4d_core.update_plan import Rates
 
 Array = NDArray[np.float32]
@@ -14,7 +15,8 @@ Array = NDArray[np.float32]
 class Adam:
     """Adam over one table of parameters, with a rate per column, times one per row where given.
 
-    It begins after a share ``start`` of the iterations and leaves the table alone before.
+    It begins after a share ``start`` of the iterations and leaves the table alone before. ``guards`` counts how often
+    each guard of the step acted.
     """
 
     def __init__(
@@ -27,6 +29,7 @@ class Adam:
         self._rates = np.array(columns, np.float32)
         self._beta1, self._beta2 = np.float32(rates.beta1), np.float32(rates.beta2)
         self._steps = 0
+        self.guards = GuardCounts(*ACTED)
 
     def step(self, gradients: Array, iteration: int, iterations: int) -> None:
         """Take the step of an iteration, counted from 0."""
@@ -34,7 +37,8 @@ class Adam:
         if factor == 0:
             return
         self._steps += 1
-        adam(
+        acted = adam(
             self._parameters, gradients, self._first, self._second, self._rates * np.float32(factor), self._by_row,
             self._beta1, self._beta2, self._steps,
         )  # fmt: skip
+        self.guards.add(ACTED, acted)

@@ -427,7 +427,7 @@ class Reconstruction(Committed):
             attempts=outcome.attempts,
             exposure=outcome.exposure,
             held=outcome.held,
-            guards={"axis_bounds": outcome.bounded},
+            guards={**updated.guards, "axis_bounds": outcome.bounded},
             planned=updated.planned,
             curve=curve(updated.losses, updated.moments),
             errors={kind: mean_error(errors, list(errors)) for kind, errors in updated.errors.items()},

@@ -13,6 +13,7 @@ from scas4d_core.attempts import Course, Manner
 from scas4d_core.deformation_cpu import CpuDeformation
 from scas4d_core.floor import floor_term
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.guards import summed
 from scas4d_core.hierarchy import Hierarchy
 from scas4d_core.neighbours import Neighbours
 from scas4d_core.pace import Counted
@@ -92,6 +93,9 @@ class FrameUpdate:
         samples = plan_samples(len(self.hierarchy.rows), settings.neighbour_sample, rng)
         features = np.concatenate([previous.colours, previous.foreground[:, None]], axis=1)
         colours = previous.colours.copy()
+        counts = (deformation.guards, self._picture.rasterizer.guards)
+        for guards in counts:
+            guards.reset()
         deformation.start(previous)
         anytime = Anytime.of(self._factory, self._picture, deformation, previous, views if course.witness else [])
         anytime.start(motion, seconds, settings)
@@ -136,6 +140,8 @@ class FrameUpdate:
         watch.lap("end")
         state = previous if kept == "still" else self._commit(previous, colours if kept == "end" else previous.colours)
         updated = story.updated(state, Motion.of(deformation, seconds), pace, anytime.errors, kept)
+        acted = summed([*counts, *(optimizer.guards for optimizer in optimizers)])
+        updated.guards.update({name: count for name, count in acted.items() if count})
         watch.lap("commit")
         updated.seconds.update(watch.seconds)
         return updated

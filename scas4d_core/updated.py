@@ -62,7 +62,7 @@ class Updated:
         cameras: how well each camera was met, by name. left_out: cameras that the gate left out, with the reason.
         planned: what the pace planned, see ``pace.Pace.told``.
         errors: image loss by witness view, of the frame before ("still"), the warm start ("warm") and the end ("end");
-            empty where nothing was compared. kept: which of them became Θ_t.
+            empty where nothing was compared. kept: which of them became Θ_t. guards: those that acted, how often.
     """
 
     gaussians: Gaussians
@@ -76,6 +76,7 @@ class Updated:
     planned: list[tuple[int, int]] = field(default_factory=list)
     errors: dict[str, dict[str, float]] = field(default_factory=dict)
     kept: str = "end"
+    guards: dict[str, int] = field(default_factory=dict)
 
 
 class Story:
