@@ -8,6 +8,7 @@ from pathlib import Path
 
 from scas4d_core.bench import frontier_plots as plots
 from scas4d_core.bench.convergence import read_convergence
+from scas4d_core.bench.effort_page import effort_text
 from scas4d_core.bench.frontier import AXES, DEFAULT, METHODS, UPDATES, Variant
 from scas4d_core.bench.machine import in_words
 from scas4d_core.bench.store import Store
@@ -212,6 +213,7 @@ the baseline's). {equal_words(compared)}
 
 {images["captures"]}
 
+{effort_text(out, captures)}
 ## Iterations
 
 {score_table(iterations, default)}

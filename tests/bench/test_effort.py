@@ -1,0 +1,63 @@
+"""How budgets and adaptive effort are told: within, over, reached and missed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scas4d_core.bench.effort import Kept
+from scas4d_core.bench.effort_page import effort_text
+from scas4d_core.bench.sequences import as_it_is, back_and_forth, repeated
+from scas4d_core.captures import open_capture
+
+SAMPLE = Path(__file__).parents[2] / "samples" / "robot"
+
+
+def test_what_is_within_is_measured_both_ways() -> None:
+    kept = Kept(500.0, [0.5, 0.520, 0.530, 0.470, 0.400], [9] * 5, [0.01] * 5)
+    row = kept.row()
+    assert row["within"] == pytest.approx(2 / 5)  # 25 ms: 5 % is more than one iteration
+    assert row["not_over"] == pytest.approx(4 / 5)
+    assert row["worst_off_ms"] == pytest.approx(30)
+    assert Kept(100.0, [0.118], [1], [0.02]).row()["within"] == 1.0
+
+
+def test_a_capture_goes_back_and_forth_and_time_goes_on() -> None:
+    capture = open_capture(SAMPLE)
+    count = capture.frame_count
+    frames = list(back_and_forth(capture, 2 * count))
+    assert [frame.index for frame in frames] == list(range(1, 2 * count + 1))
+    assert np.diff([frame.time for frame in frames]).min() > 0
+    name = capture.rig.names[0]
+    np.testing.assert_array_equal(frames[0].images[name], frames[2 * count - 4].images[name])
+    assert (frames[0].images[name] != frames[1].images[name]).any()
+
+
+def test_repeats_are_said() -> None:
+    capture = open_capture(SAMPLE)
+    assert [shown.repeats for shown in repeated(capture, 3)] == [False, True] * 2 + [False, True, True, True]
+    assert not any(shown.repeats for shown in as_it_is(capture, 3))
+
+
+def test_the_page_judges(tmp_path: Path) -> None:
+    assert effort_text(tmp_path, ["robot"]) == ""
+    folder = tmp_path / "effort"
+    folder.mkdir()
+    kept = [Kept(500.0, [0.5] * 20, [9] * 20, [0.01] * 20).row(), Kept(100.0, [0.2] * 20, [9] * 20, [0.01] * 20).row()]
+    (folder / "robot-budgets.json").write_text(json.dumps({"capture": "robot", "budgets": kept}))
+
+    def adaptive(time: float) -> None:
+        one = {"frames": 9, "psnr": {"scas4d": 30.0, "adaptive": 29.95}, "time": time, "time_repeats": 0.05}
+        rows = [{**one, "sequence": name} for name in ("as it is", "repeated", "slowed")]
+        (folder / "robot-adaptive.json").write_text(json.dumps({"capture": "robot", "sequences": rows}))
+
+    adaptive(0.5)
+    text = effort_text(tmp_path, ["robot"])
+    assert "| robot | 500 | 100 % | 100 % | +0.0 | +0.0 | 9 | reached |" in text
+    assert "**missed** |" in text
+    assert "reached on every capture" in text
+    adaptive(0.7)
+    assert "**missed** on some captures" in effort_text(tmp_path, ["robot"])
