@@ -82,7 +82,8 @@ def _adaptive(rows: Sequence[Row]) -> list[str]:
         "",
         f"Mean: {100 * np.mean(times):.0f} % of the time, {np.mean(losses):+.2f} dB; "
         f"repeats {100 * np.mean(repeats):.0f} %. The bar, at most {100 * TIME:.0f} % of the time at {LOSS_DB:g} dB, "
-        f"and {100 * REPEATS:.0f} % for repeats, is {'reached on every capture' if ok else '**missed** on some captures'}.",
+        f"and {100 * REPEATS:.0f} % for repeats, is "
+        f"{'reached on every capture' if ok else '**missed** on some captures'}.",
         "",
     ]
     return lines
