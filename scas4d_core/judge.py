@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from math import nan
+from math import isfinite, nan
 from typing import Any
 
 import numpy as np
@@ -61,7 +61,7 @@ class CameraPast:
     """What is usual for one camera.
 
     Attributes:
-        place: dB of its last rendering, less the median over the cameras; NaN where not known.
+        place: dB of its last rendering, less the level of its frame; NaN where not known.
         brightness: mean of its picture, 0…1, in the exposure of frame 0; NaN where not known.
         out: frames in a row that it has been left out, 0 when it is believed.
     """
@@ -76,7 +76,7 @@ class Past:
     """What is usual for a scene; carried from commit to commit.
 
     Attributes:
-        cameras: by name. level: dB, median over the cameras at the end of an update; NaN where not known.
+        cameras: by name. level: dB at the end of an update, see ``level_of``; NaN where not known.
         updates: that went into it. held: frames in a row that were held. fitted: seconds, time of the last frame that
             was not. behind: frames since some were held or not moved, 0 once they are met as usual again. error: usual
             at the end of an update, by witness view.
@@ -162,7 +162,7 @@ def look(past: Past, bright: Mapping[str, float]) -> Look:
         name: value / past.of(name).brightness for name, value in bright.items() if past.of(name).brightness > DARKEST
     }
     if not ratios:
-        return Look(left_out=left_out)
+        return Look(left_out=_few(left_out, len(bright)))
     common = float(np.median(list(ratios.values())))
     enough = len(ratios) >= ENOUGH
     if not 1 / UNUSABLE <= common <= UNUSABLE and (enough or common < BLIND or common > 1 / BLIND):
@@ -180,7 +180,8 @@ def place(past: Past, psnr: Mapping[str, float]) -> dict[str, float]:
     known = {name: value for name, value in _capped(psnr).items() if past.of(name).place == past.of(name).place}
     if not known:
         return {}
-    shift = float(np.median([value - past.of(name).place for name, value in known.items()]))
+    believed = [name for name in known if not past.of(name).out] or list(known)
+    shift = float(np.median([known[name] - past.of(name).place for name in believed]))
     return {name: value - past.of(name).place - shift for name, value in known.items()}
 
 
@@ -204,7 +205,7 @@ def unmet(past: Past, psnr: Mapping[str, float]) -> str | None:
     """Why an update has not met its frame, or None. ``psnr``: dB by camera when last rendered."""
     if not psnr or past.level != past.level:
         return None
-    level = level_of(psnr)
+    level = level_of(past, psnr)
     drop = DROPS_DB[past.updates] if past.updates < len(DROPS_DB) else DROP_DB
     if level > past.level - drop:
         return None
@@ -219,13 +220,15 @@ def behind(past: Past, psnr: Mapping[str, float]) -> str | None:
     """
     if not (past.held or past.behind) or not psnr or past.level != past.level:
         return None
-    off = past.level - level_of(psnr)
+    off = past.level - level_of(past, psnr)
     return f"{off:.1f} dB less than before" if off > BEHIND_DB else None
 
 
-def level_of(psnr: Mapping[str, float]) -> float:
-    """DB, median over the cameras; NaN of none."""
-    return float(np.median(list(_capped(psnr).values()))) if psnr else nan
+def level_of(past: Past, psnr: Mapping[str, float]) -> float:
+    """DB, median over the cameras, each less its usual place: a short update renders a few of them; NaN of none."""
+    places = {name: past.of(name).place for name in psnr}
+    values = [value - (places[name] if isfinite(places[name]) else 0.0) for name, value in _capped(psnr).items()]
+    return float(np.median(values)) if values else nan
 
 
 def health(off: float | None) -> float:
@@ -244,11 +247,11 @@ def settle(past: Past, psnr: Mapping[str, float], bright: Mapping[str, float], e
     off = place(past, psnr)
     out = misfits(past, psnr, LAST_DB)
     believed = {n: v for n, v in psnr.items() if n not in out and not past.of(n).out}
-    level = float(np.median(list(believed.values()))) if believed else past.level
+    level = level_of(past, believed) if believed else past.level
     cameras = dict(past.cameras)
     for name, value in bright.items():
         before = past.of(name)
-        now = replace(before, brightness=value / exposure)
+        now = before  # of a camera that was not learnt from: what it showed is no sign of what is usual
         if before.out:
             fits = off.get(name, -np.inf) > FITS_DB
             now = replace(before, out=0) if fits else replace(before, out=before.out + 1)
@@ -257,7 +260,8 @@ def settle(past: Past, psnr: Mapping[str, float], bright: Mapping[str, float], e
         elif name in psnr:
             here = psnr[name] - level
             known = before.place == before.place and past.updates > 0
-            now = replace(now, place=before.place + PLACE_RATE * (here - before.place) if known else here)
+            here = before.place + PLACE_RATE * (here - before.place) if known else here
+            now = replace(before, place=here, brightness=value / exposure)
         cameras[name] = now
     known = past.updates > 0
     later = past.behind + 1 if behind(past, believed) and past.behind < CATCH_UP else 0

@@ -135,6 +135,39 @@ def test_a_camera_that_ends_badly_is_out_from_the_next_frame_and_comes_back_once
     assert unseen.of("c4").out == 3
 
 
+def test_a_camera_that_shows_nothing_is_seen_to_for_as_long_as_it_does() -> None:
+    black = times(0.0, "c3")
+    past = judge.settle(PAST, {name: value for name, value in USUAL.items() if name != "c3"}, black, 1.0)
+    assert past.of("c3") == PAST.of("c3")
+    assert list(judge.look(past, black).left_out) == ["c3"]
+
+
+@pytest.mark.parametrize("name", ["c0", "c9"])
+def test_an_update_that_renders_one_camera_says_as_much_as_one_that_renders_all(name: str) -> None:
+    cameras = {n: replace(camera, place=3 * camera.place) for n, camera in PAST.cameras.items()}
+    past = replace(PAST, cameras=cameras)
+    only = {name: LEVEL + cameras[name].place}
+    assert abs(cameras[name].place) > 4
+    assert judge.behind(replace(past, held=1), only) is None
+    after = judge.settle(past, only, BRIGHT, 1.0)
+    assert after.level == pytest.approx(LEVEL)
+    assert after.of(name).place == pytest.approx(cameras[name].place)
+    assert judge.unmet(past, {name: only[name] - judge.DROP_DB - 0.5}) is not None
+
+
+def test_cameras_that_are_out_are_held_against_those_that_are_believed() -> None:
+    out = NAMES[:5]
+    cameras = {n: replace(camera, out=int(n in out)) for n, camera in PAST.cameras.items()}
+    psnr = {n: value - 5 * (n in out) for n, value in USUAL.items()}
+    past = judge.settle(replace(PAST, cameras=cameras), psnr, BRIGHT, 1.0)
+    assert [past.of(name).out for name in NAMES] == [2] * 5 + [0] * 5
+
+
+def test_at_most_half_of_the_cameras_are_left_out_in_the_dark_too() -> None:
+    dark = Past({name: CameraPast(0.0, 0.0, 1) for name in NAMES}, LEVEL, 3)
+    assert judge.look(dark, BRIGHT).left_out == {}
+
+
 def test_what_is_usual_follows_slowly_and_not_what_was_left_out() -> None:
     better = judge.settle(PAST, {name: value + 2 for name, value in USUAL.items()}, times(1.2), 1.2)
     assert better.level == pytest.approx(LEVEL + judge.LEVEL_RATE * 2)
