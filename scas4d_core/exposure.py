@@ -1,4 +1,4 @@
-"""A frame that is exposed otherwise than those before: its gain is taken out of its pictures, and colours are held.
+"""A frame that is exposed otherwise than those before: its gain is taken out of its pictures, so that colours stay.
 
 Lights flicker, and cameras that choose their own exposure do it together. Learnt as colours, that would be unlearnt a
 frame later. How much brighter the pictures are is read against the scene as it stood: the median over the

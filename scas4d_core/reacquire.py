@@ -64,8 +64,7 @@ def reacquire(gaussians: Gaussians, views: Sequence[TrainingView], picture: Pict
         behind = picture.rasterizer.planes[:3, :height, :width]
         shown = view.exposure[:3, 0, None, None] * behind + view.exposure[:3, 1, None, None]
         now = np.abs(view.target[:3] - shown).max(axis=0) > DIFFERENT
-        area = now.sum() / max(1, before.sum())
-        if not SMALLEST_AREA <= area <= 1 / SMALLEST_AREA:
+        if not before.any() or not SMALLEST_AREA <= now.sum() / before.sum() <= 1 / SMALLEST_AREA:
             continue
         camera = rig[view.name]
         rays_before.append(_ray(camera, before))

@@ -99,22 +99,24 @@ class Trial:
     def run(self, given: Given) -> Outcome:
         """Try a frame. ``given.look.held`` is None."""
         settings, attempts = self._settings, list[str]()
-        exposure, first = 1.0, AS_SET
+        exposure = 1.0
         if given.look.exposure != 1.0:
             exposure, views = evened(self._factory, self._picture, given.state, given.views)
             given = replace(given, views=views)
-        updated, check = self._attempt(given, given.state, first, attempts)
+        updated, check = self._attempt(given, AS_SET, attempts)
         for manner in LADDER:
             if check.fault is None:
                 break
-            updated, check = self._attempt(given, given.state, manner, attempts)
+            updated, check = self._attempt(given, manner, attempts)
         if check.fault is not None:
             return self._held(given, updated, attempts, check.fault)
         degraded = attempts[-2] if len(attempts) > 1 else None
+        if not updated.losses:
+            return _stood(given, updated, exposure)
         why = self._unmet(given, updated)
         if why is not None:
             attempts[-1] += f": {why}"
-            again = self._sought(given, updated, attempts)
+            again = self._sought(given, updated, check.gaussians, attempts)
             if again is not None:
                 updated, check = again
                 degraded = f"{why}; {attempts[-1]}"
@@ -132,9 +134,10 @@ class Trial:
         nothing = Updated(given.state, given.motion, [], [], {}, kept="still")  # type: ignore[arg-type]
         return self._held(given, nothing, [], why)
 
-    def _attempt(self, given: Given, start: Gaussians, manner: Manner, told: list[str]) -> tuple[Updated, Checked]:
+    def _attempt(self, given: Given, manner: Manner, told: list[str]) -> tuple[Updated, Checked]:
         motion = None if manner.cold else given.motion
-        updated = self._updater.run(start, given.views, motion, given.seconds, given.seed, self._course(given, manner))
+        course = self._course(given, manner)
+        updated = self._updater.run(given.state, given.views, motion, given.seconds, given.seed, course)
         check = self._checked(given, given.state, updated)
         told.append(manner.name if check.fault is None else f"{manner.name}: {check.fault}")
         return updated, check
@@ -184,10 +187,16 @@ class Trial:
         """DB of the cameras that were learnt from to the end."""
         return {name: fit.psnr for name, fit in updated.cameras.items() if name not in updated.left_out}
 
-    def _sought(self, given: Given, tried: Updated, attempts: list[str]) -> tuple[Updated, Checked] | None:
-        """Longer, from where the silhouettes say that the object is, and from where the update ended; None: in vain."""
+    def _sought(
+        self, given: Given, tried: Updated, ended: Gaussians, attempts: list[str]
+    ) -> tuple[Updated, Checked] | None:
+        """Longer, from where the silhouettes say that the object is, and from where the update ended; None: in vain.
+
+        Args:
+            ended: the end of ``tried`` as it might be committed: from a Gaussian that is not finite none comes back.
+        """
         found = reacquire(given.state, given.views, self._picture, self._rig)
-        starts = [("sought from where the update ended", tried.gaussians)]
+        starts = [("sought from where the update ended", ended)]
         if found is not None:
             length = float(np.linalg.norm(found.shift))
             starts.insert(0, (f"sought {length:.2f} m away", shifted(given.state, found.shift)))
@@ -198,19 +207,19 @@ class Trial:
             why = check.fault or judge.unmet(given.past, self._met(updated))
             attempts.append(name if why is None else f"{name}: {why}")
             if why is None:
-                return (updated if start is not tried.gaussians else _after(updated, tried)), check
+                return (updated if start is not ended else _after(updated, tried)), check
         return None
 
     def _longer(self, given: Given, tried: Updated, check: Checked, attempts: list[str]) -> tuple[Updated, Checked]:
         """On from where an update ended; the better of both."""
         manner = replace(SOUGHT, name="on from where the update ended")
         updated = self._updater.run(
-            tried.gaussians, given.views, None, given.seconds, given.seed, self._course(given, manner)
+            check.gaussians, given.views, None, given.seconds, given.seed, self._course(given, manner)
         )
         again = self._checked(given, given.state, updated)
-        better = judge.level_of(self._met(updated)) > judge.level_of(self._met(tried))
+        after, before = (judge.level_of(given.past, self._met(one)) for one in (updated, tried))
         attempts.append(manner.name if again.fault is None else f"{manner.name}: {again.fault}")
-        return (_after(updated, tried), again) if again.fault is None and better else (tried, check)
+        return (_after(updated, tried), again) if again.fault is None and after > before else (tried, check)
 
     def _held(self, given: Given, updated: Updated, attempts: list[str], why: str) -> Outcome:
         past = replace(given.past, held=given.past.held + 1)
@@ -238,10 +247,7 @@ class Trial:
         past = judge.settle(past, psnr, given.brightness, exposure)
         if updated.errors.get("end"):
             past = replace(past, error=_usual(given.past.error, updated.errors[updated.kept]))
-        motion = None if check.held and not np.isfinite(updated.gaussians.means).all() else updated.motion
-        if not updated.losses:  # it stands, or its frame was sent twice: it may go on as it went
-            past = replace(past, behind=max(1, past.behind))  # it may not go on as it went, or from further away
-            return Outcome(updated, given.state, given.motion, past, fits, attempts=["not moved"], stood=True)
+        motion = updated.motion if updated.motion.finite else None
         return Outcome(
             updated,
             check.gaussians,
@@ -263,6 +269,12 @@ class Trial:
             self._picture.measure(state.means, state.factors, state.opacities, features, view)
             found[view.name] = self._picture.psnr
         return found
+
+
+def _stood(given: Given, updated: Updated, exposure: float) -> Outcome:
+    """Θ_{t−1} shows the frame: nothing was rendered that says how any camera fits, so what is usual stays as it was."""
+    past = replace(given.past, held=0, behind=max(1, given.past.behind))  # it may go on from here, or from further away
+    return Outcome(updated, given.state, given.motion, past, {}, attempts=["not moved"], exposure=exposure, stood=True)
 
 
 def _after(updated: Updated, first: Updated) -> Updated:

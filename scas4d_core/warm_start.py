@@ -69,6 +69,11 @@ class Motion:
     own_turns: Float
     seconds: float
 
+    @property
+    def finite(self) -> bool:
+        """Whether all of it is: else it would spoil the next start."""
+        return all(np.isfinite(array).all() for array in (*self.turns, *self.shifts, self.rest, self.own_turns))
+
     def after(self, first: Motion) -> Motion:
         """Both, one after the other in the same interval; small turns add up."""
         return replace(

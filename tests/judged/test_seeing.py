@@ -147,6 +147,21 @@ def test_a_jump_is_found(sizes: float) -> None:
     np.testing.assert_array_equal(moved.means[GOES:], BEFORE.means[GOES:])
 
 
+def test_a_camera_that_did_not_see_the_object_has_no_say_in_where_it_went() -> None:
+    frame, _ = FOOTAGE.jumped(0, 1.0)
+    away = BEFORE.means.copy()
+    away[BEFORE.moving] = [0, -500, 0]
+    images = {name: picture.copy() for name, picture in frame.images.items()}
+    unseen = BEFORE.replace(means=away)
+    features = np.concatenate([unseen.colours, unseen.foreground[:, None]], axis=1)
+    for view in views(frame):  # as the scene is shown, but for one pixel
+        PICTURE.measure(unseen.means, unseen.factors, unseen.opacities, features, view)
+        shown = PICTURE.rasterizer.planes[:3, : view.camera.height, : view.camera.width]
+        images[view.name] = np.rint(255 * shown.clip(0, 1)).astype(np.uint8).transpose(1, 2, 0).copy()
+        images[view.name][0, 0] = 255 - images[view.name][0, 0]
+    assert reacquire(unseen, views(replace(frame, images=images)), PICTURE, FACTORY.rig) is None
+
+
 def test_cameras_that_disagree_find_no_jump() -> None:
     jumped = [FOOTAGE.jumped(index, sizes)[0] for index, sizes in ((0, 1.0), (0, -1.0))]
     mixed = {name: jumped[k % 2].images[name] for k, name in enumerate(FOOTAGE.rig.names)}

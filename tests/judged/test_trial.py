@@ -146,6 +146,35 @@ def test_what_is_sought_from_where_an_update_ended_has_the_motion_of_both() -> N
     assert outcome.gaussians is not AFTER
 
 
+def test_nothing_is_sought_from_what_may_not_be_committed() -> None:
+    means = AFTER.means.copy()
+    means[0] = np.nan
+    spoilt = AFTER.replace(means=means)
+    for past, psnr in ((PAST, LEVEL - 20), (replace(PAST, held=1), LEVEL - 3)):
+        fake = Fake(met(psnr, spoilt), lambda previous, course: (previous, LEVEL))
+        outcome = trial(fake).run(given(past))
+        assert all(np.isfinite(start.means).all() for start in fake.starts)
+        assert np.isfinite(outcome.gaussians.means).all()
+
+
+def test_a_motion_that_is_not_finite_is_not_carried_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(globals(), "MOTION", replace(MOTION, rest=np.full((1, 3), np.nan)))
+    assert trial(Fake(met())).run(given()).motion is None
+
+
+def test_a_frame_that_stands_says_nothing_of_its_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
+    suspect = NAMES[0]
+    past = replace(PAST, held=1, cameras={**PAST.cameras, suspect: replace(PAST.of(suspect), out=2)})
+    fake = Fake(met())
+    run = fake.run
+    monkeypatch.setattr(fake, "run", lambda *asked: replace(run(*asked), losses=[], psnr=[], cameras={}, kept="still"))
+    asked = replace(given(past), views=VIEWS[1:], suspects=VIEWS[:1])
+    outcome = trial(fake).run(asked)
+    assert (outcome.stood, outcome.fresh, outcome.degraded) == (True, True, None)
+    assert (outcome.gaussians is BEFORE, outcome.motion is MOTION) == (True, True)
+    assert outcome.past == replace(past, held=0, behind=1)
+
+
 def test_frames_that_follow_others_are_not_sought_longer() -> None:
     fake = Fake(met(LEVEL - 3))
     outcome = trial(fake).run(given())
