@@ -45,10 +45,10 @@ class Carried:
     Attributes:
         motion: that was found, or None where the next update starts cold.
         labels: [N] what has been seen to move, in scenes without masks; None until something has.
-        seen: the views of the frame, in scenes without masks: the next are compared with them.
+        seen: views of the last frame that was believed, in scenes without masks: the next are compared with them.
         structure: digest of the clusters and neighbours that the motion belongs to.
         past: what is usual for the scene and its cameras.
-        shown: fingerprint of each picture of the frame (``repeats``).
+        shown: fingerprint of each picture of the last frame that was believed (``repeats``).
     """
 
     motion: Motion | None = None

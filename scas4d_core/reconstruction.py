@@ -370,12 +370,21 @@ class Reconstruction(Committed):
             outcome = trial.run(given)
         watch.lap("update")
         watch.move("update", "judge", trial.judging)
+        if outcome.fresh:
+            carried = replace(carried, shown=shown)
+            if not self._masked and look.exposure == 1.0:  # what another light changes has not moved
+                carried = replace(
+                    carried, seen=[view for view in given.views if view.name not in outcome.updated.left_out]
+                )
+        else:  # what seemed to move in its pictures is as little believed as they are
+            assert self._updater is not None
+            updater, carried = self._updater, self._carried
+            outcome = replace(outcome, gaussians=self._state(None), motion=carried.motion)
         report = self._report(frame, outcome, look, watch, dropped or {})
-        how = {"cold": carried.motion is None, "relabelled": updater is not self._updater}
+        how = {"cold": given.motion is None, "relabelled": updater is not self._updater}
         learnt = outcome.fresh and not outcome.stood
         past = replace(outcome.past, fitted=frame.time) if learnt else outcome.past
-        seen = carried.seen if not outcome.fresh else () if self._masked else views
-        carried = replace(carried, motion=outcome.motion, past=past, seen=seen, shown=shown)
+        carried = replace(carried, motion=outcome.motion, past=past)
         self._commit(report, outcome.gaussians, carried, {**how, **(notes or {})})
         self._updater = updater
         self._budget.learn(outcome.updated, perf_counter() - watch.began - watch.total)

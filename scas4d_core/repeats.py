@@ -26,7 +26,7 @@ def fingerprints(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, int]:
 
 
 def same_again(given: Given) -> Outcome:
-    """The outcome of a frame that shows what the one before showed."""
+    """The outcome of a frame that shows what the last one that was believed showed."""
     nothing = Updated(given.state, given.motion, [], [], {}, kept="still")  # type: ignore[arg-type]
-    past = replace(given.past, behind=max(1, given.past.behind))  # the scene may have stood, or gone further
+    past = replace(given.past, held=0, behind=max(1, given.past.behind))  # the scene may have stood, or gone further
     return Outcome(nothing, given.state, given.motion, past, {}, attempts=["the same pictures again"], stood=True)

@@ -222,6 +222,49 @@ def test_without_masks_everything_moves_until_motion_tells() -> None:
     assert 0 < report.moving < report.gaussians
 
 
+def unmet(patch: pytest.MonkeyPatch) -> None:
+    """From here on no frame is met."""
+    patch.setattr("scas4d_core.judge.unmet", lambda past, psnr: "it is another scene")
+
+
+def test_what_seems_to_move_in_a_frame_that_is_held_is_not_learnt() -> None:
+    frames = [replace(frame, masks={}) for frame in FRAMES]
+    scene, other = start(shortened(), frames[0]), start(shortened(), frames[0])
+    with pytest.MonkeyPatch.context() as patch:
+        unmet(patch)
+        held = scene.step(frames[2])
+    assert str(held.degraded).startswith("held")
+    assert held.moving == held.gaussians
+    assert scene.history.gaussians(frames[2].index).moving.all()
+    assert not scene.history.report(frames[2].index)["relabelled"]
+    back = replace(frames[1], index=15, time=frames[2].time + 1 / 30)
+    assert scene.step(back).moving == other.step(frames[1]).moving < held.gaussians
+
+
+def test_what_another_light_changes_has_not_moved(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scas4d_core.judge.ENOUGH", 1)
+    frames = [replace(frame, masks={}) for frame in FRAMES]
+    scene = start(frame=frames[0])
+    usual = scene.step(frames[1])
+    dim = {name: (0.75 * picture).astype(np.uint8) for name, picture in frames[1].images.items()}
+    report = scene.step(replace(frames[1], index=13, time=frames[1].time + 0.01, images=dim))
+    assert report.exposure == pytest.approx(0.75, abs=0.03)
+    again = scene.step(replace(frames[1], index=14, time=frames[1].time + 0.02))
+    assert again.exposure == 1.0
+    assert again.moving == report.moving == usual.moving < usual.gaussians
+
+
+def test_pictures_that_were_not_believed_are_not_taken_for_what_stands() -> None:
+    scene = start(shortened())
+    with pytest.MonkeyPatch.context() as patch:
+        unmet(patch)
+        for index in (11, 12):
+            report = scene.step(replace(FRAMES[1], index=index, time=5 + index / 1000))
+            assert str(report.degraded).startswith("held")
+    back = scene.step(replace(FRAMES[0], index=13, time=5.03))
+    assert (back.attempts, back.degraded) == (["the same pictures again"], None)
+
+
 def test_masks_that_weigh_nothing_or_are_not_used_are_not_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     scenes = [
         start(shortened(use_masks=False)),
