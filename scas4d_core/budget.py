@@ -1,7 +1,7 @@
 """A frame's budget in milliseconds: when its last iteration has to be over, from what the frames before took.
 
-Decoding comes before the iterations and is seen by the clock; comparing the end, writing the checkpoint and the commit
-come after them and are foreseen.
+Decoding comes before the iterations and is seen by the clock; comparing and checking the end, writing the checkpoint
+and the commit come after them and are foreseen.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Budget:
         return None if self.milliseconds is None else began + self.milliseconds / 1000 - self.after
 
     def learn(self, updated: Updated, commit: float) -> None:
-        """How long a frame took. ``commit``: seconds that writing took."""
+        """How long a frame took. ``commit``: seconds that checking and writing took."""
         if not updated.moments:
             return
         before = updated.seconds.get("start", 0.0)

@@ -387,7 +387,7 @@ class Reconstruction(Committed):
         carried = replace(carried, motion=outcome.motion, past=past)
         self._commit(report, outcome.gaussians, carried, {**how, **(notes or {})})
         self._updater = updater
-        self._budget.learn(outcome.updated, perf_counter() - watch.began - watch.total)
+        self._budget.learn(outcome.updated, trial.judging + perf_counter() - watch.began - watch.total)
         return report
 
     def spend(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from math import nan
 from time import perf_counter
 
 import numpy as np
@@ -58,7 +59,7 @@ class Outcome:
     """What is committed.
 
     Attributes:
-        updated: of the attempt that is committed, or of the last one where the frame is held.
+        updated: of the attempt that is committed; where the frame is held, of the last one before anything is sought.
         gaussians: Θ_t. motion: for the next update. past: what is usual now. fits: dB by camera above or below its
             usual place. held: Gaussians held one by one. degraded, attempts: see ``FrameReport``. bounded: axes set to
             the shortest or longest that they may be.
@@ -124,6 +125,7 @@ class Trial:
                 return self._held(given, updated, attempts, why)
             else:
                 degraded = f"{why}, for {settings.patience} frames: taken as it is from here on"
+                given = replace(given, past=replace(given.past, level=nan, updates=0))
         elif degraded is None and (why := self._behind(given, updated)) is not None:
             attempts[-1] += f": {why}"
             updated, check = self._longer(given, updated, check, attempts)
@@ -240,11 +242,8 @@ class Trial:
         psnr = {name: fit.psnr for name, fit in updated.cameras.items()}
         with self._timed():
             psnr |= self._suspects(given, check.gaussians)
-        past = given.past
-        if degraded is not None and past.held + 1 >= self._settings.patience:  # this is how it looks from now on
-            past = replace(past, level=float("nan"), updates=0)
-        fits = judge.place(past, psnr)
-        past = judge.settle(past, psnr, given.brightness, exposure)
+        fits = judge.place(given.past, psnr)
+        past = judge.settle(given.past, psnr, given.brightness, exposure)
         if updated.errors.get("end"):
             past = replace(past, error=_usual(given.past.error, updated.errors[updated.kept]))
         motion = updated.motion if updated.motion.finite else None

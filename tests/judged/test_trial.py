@@ -206,6 +206,14 @@ def test_patience_ends_and_then_it_is_taken_as_it_is() -> None:
     assert after.degraded is None
 
 
+def test_what_is_found_again_as_patience_ends_is_the_scene_as_it_was() -> None:
+    past = replace(PAST, updates=5, held=SETTINGS.patience - 1)
+    outcome = trial(Fake(met(LEVEL - 20), met(LEVEL - 4))).run(given(past))
+    assert outcome.fresh
+    assert "sought" in str(outcome.degraded)
+    assert (outcome.past.updates, outcome.past.level) == (6, LEVEL)
+
+
 def test_a_frame_whose_pictures_say_nothing_is_not_tried() -> None:
     fake = Fake(met())
     outcome = trial(fake).held(given(), "it is dark")
