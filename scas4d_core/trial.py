@@ -16,7 +16,7 @@ from scas4d_core.attempts import AS_SET, LADDER, SOUGHT, Checked, Course, Manner
 from scas4d_core.exposure import evened
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.judge import Look, Past
-from scas4d_core.pace import Counted, Pace, Timed, UntilMet
+from scas4d_core.pace import PROBE, Counted, Pace, Timed, UntilMet
 from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.reacquire import reacquire, shifted
 from scas4d_core.settings import UpdateSettings
@@ -181,7 +181,8 @@ class Trial:
             return judge.unmet(given.past, self._met(updated))
 
     def _behind(self, given: Given, updated: Updated) -> str | None:
-        if not self._settings.judge:
+        spent = given.end is not None and perf_counter() + PROBE * (given.each or 0.0) > given.end
+        if not self._settings.judge or spent:
             return None
         return judge.behind(given.past, self._met(updated))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from time import perf_counter
 
 import numpy as np
 import pytest
@@ -180,6 +181,14 @@ def test_frames_that_follow_others_are_not_sought_longer() -> None:
     outcome = trial(fake).run(given())
     assert names(fake) == ["as set"]
     assert outcome.past.behind == 0
+
+
+@pytest.mark.parametrize(("left", "tries"), [(-0.01, 1), (0.01, 1), (60.0, 2)])
+def test_frames_are_not_sought_longer_than_their_budget(left: float, tries: int) -> None:
+    fake = Fake(met(LEVEL - 3))
+    asked = replace(given(replace(PAST, held=1)), end=perf_counter() + left, each=0.01)
+    trial(fake).run(asked)
+    assert len(fake.courses) == tries
 
 
 def test_after_held_frames_the_level_waits_until_it_is_met_again_but_not_for_ever() -> None:
