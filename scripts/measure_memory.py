@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
-import sys
 
 import numpy as np
 
 from client.wire import RigModel
+from scas4d_core.bench.quality import peak_megabytes
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import Frame, InitialPoints
 from scas4d_core.presets import preset
@@ -72,8 +71,7 @@ def main() -> None:
     reconstruction = Reconstruction.start(rig, first, settings, points=cloud)
     for index in (1, 2):
         reconstruction.step(frame(rig, given.size, index, given.masks))
-    unit = 1 if sys.platform == "darwin" else 1024
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+    peak = peak_megabytes() or float("nan")
     expected = estimate(RigModel.of(rig), settings, ServerSettings()).worker_mb
     kept = len(reconstruction.history.gaussians(0))
     print(json.dumps({"peak_mb": round(peak), "estimate_mb": round(expected), "ratio": peak / expected, "kept": kept}))

@@ -31,6 +31,8 @@ TOLERANCE = 0.05
 """Of a budget that a frame may be off, or one iteration if that is more."""
 FRAMES = 50
 """Of a capture played back and forth."""
+FEW = 8
+"""Updates of a capture at most whose frames are repeated, or slowed."""
 COUNTED_FROM = 2
 """Updates before are not counted: the first has no motion to start from and knows no speed."""
 
@@ -115,8 +117,8 @@ def measure_adaptive(
     capture = open_capture(folder)
     sequences: dict[str, Callable[[], Iterator[Shown]]] = {
         "as it is": lambda: as_it_is(capture, updates),
-        "repeated": lambda: repeated(capture, updates),
-        "slowed": lambda: slowed(capture, updates, out),
+        "repeated": lambda: repeated(capture, min(updates, FEW)),
+        "slowed": lambda: slowed(capture, min(updates, FEW), out),
     }
     answers = []
     for what, frames in sequences.items():

@@ -19,11 +19,8 @@ ROOT = Path(__file__).parents[2]
 @pytest.mark.parametrize("arguments", [("--cameras", "16", "--size", "384"), ("--gaussians", "60000", "--masks")])
 def test_the_estimate_is_near_what_is_measured(arguments):
     command = [sys.executable, str(ROOT / "scripts/measure_memory.py"), *arguments]
-    for _ in range(2):  # where kernels had to be compiled, the compiler's memory was measured with it
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-        measured = json.loads(done.stdout.splitlines()[-1])
-        if measured["ratio"] <= 1.1:
-            break
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    measured = json.loads(done.stdout.splitlines()[-1])
     assert 0.6 <= measured["ratio"] <= 1.1, measured
 
 

@@ -245,7 +245,7 @@ def test_cuda_path_refuses_limits_that_gsplat_compiled_in(monkeypatch: pytest.Mo
 
 def test_missing_gsplat_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "gsplat", None)
-    with pytest.raises(ImportError, match=r"pip install 'scas4d\[cuda\]'"):
+    with pytest.raises(ImportError, match=r"pip install -e '.\[cuda\]'"):
         cuda.render(*some_gaussians(2), PARAMS, torch.zeros(4, dtype=torch.float64))
 
 
