@@ -450,10 +450,10 @@ class Reconstruction(Committed):
         resumed = None if self.resumed is None or self.report is not None else asdict(self.resumed)
         record = {**report.record(), "threads": get_num_threads(), "resumed": resumed, **more}
         self.history.append(report.index, report.time, gaussians, record)
-        if self._checkpoints is not None:
-            self._checkpoints.clean(self.history.indices)
         self._carried = carried
         self.report = report
+        if self._checkpoints is not None:
+            self._checkpoints.clean(self.history.indices)
 
     @property
     def _uses_masks(self) -> bool:

@@ -178,7 +178,7 @@ class Trial:
         if not self._settings.judge:
             return None
         with self._timed():
-            return judge.unmet(given.past, self._met(updated))
+            return judge.unmet(given.past, self._met(updated), len(updated.losses))
 
     def _behind(self, given: Given, updated: Updated) -> str | None:
         spent = given.end is not None and perf_counter() + PROBE * (given.each or 0.0) > given.end
@@ -207,7 +207,7 @@ class Trial:
             course = self._course(given, replace(SOUGHT, name=name))
             updated = self._updater.run(start, given.views, None, given.seconds, given.seed, course)
             check = self._checked(given, start, updated)
-            why = check.fault or judge.unmet(given.past, self._met(updated))
+            why = check.fault or judge.unmet(given.past, self._met(updated), len(updated.losses))
             attempts.append(name if why is None else f"{name}: {why}")
             if why is None:
                 return (updated if start is not ended else _after(updated, tried)), check
@@ -244,7 +244,7 @@ class Trial:
         with self._timed():
             psnr |= self._suspects(given, check.gaussians)
         fits = judge.place(given.past, psnr)
-        past = judge.settle(given.past, psnr, given.brightness, exposure)
+        past = judge.settle(given.past, psnr, given.brightness, exposure, len(updated.losses))
         if updated.errors.get("end"):
             past = replace(past, error=_usual(given.past.error, updated.errors[updated.kept]))
         motion = updated.motion if updated.motion.finite else None

@@ -104,6 +104,18 @@ def test_an_update_has_met_its_frame_or_says_by_how_much_not() -> None:
     assert judge.unmet(PAST, {}) is None
 
 
+def test_an_update_of_fewer_iterations_may_meet_its_frame_less_well() -> None:
+    past = judge.settle(PAST, USUAL, BRIGHT, 1.0, 100)
+    assert past.iterations == 100
+    worse = {name: value - judge.DROP_DB - 1.5 * judge.HALVED_DB for name, value in USUAL.items()}
+    assert judge.unmet(past, worse, 100) is not None
+    assert judge.unmet(past, worse, 50) is not None
+    assert judge.unmet(past, worse, 25) is None
+    assert judge.unmet(past, worse, 200) is not None
+    assert judge.settle(past, USUAL, BRIGHT, 1.0).iterations == 100
+    assert Past.of_arrays(past.arrays()) == past
+
+
 def test_above_clean_pictures_differences_are_no_sign_of_a_fault() -> None:
     cameras = {name: CameraPast(0.0, past.brightness, 0) for name, past in PAST.cameras.items()}
     past = replace(PAST, cameras=cameras, level=55.0)
