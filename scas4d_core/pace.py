@@ -1,13 +1,12 @@
 """How many iterations an update takes: a number, as many as fit into a time, or fewer once the pictures are met.
 
 The schedule of an update (when layers begin, how the rates fall) follows the share of the iterations that is done, so a
-pace says before each iteration how many there will be in all. What it said is recorded with the commit: ``Replayed``
-takes the same decisions again, whatever the clock says.
+pace says before each iteration how many there will be in all. What it said is recorded with the commit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Protocol
@@ -70,23 +69,6 @@ class Counted(Blind):
     def planned(self, done: int) -> int:
         """See ``Pace.planned``."""
         return _tell(self, done, self.most)
-
-
-@dataclass
-class Replayed(Blind):
-    """The decisions of an update that was."""
-
-    decisions: Sequence[tuple[int, int]]
-    told: list[tuple[int, int]] = field(default_factory=list)
-
-    @property
-    def most(self) -> int:
-        """See ``Pace``."""
-        return max(total for _, total in self.decisions)
-
-    def planned(self, done: int) -> int:
-        """See ``Pace.planned``."""
-        return _tell(self, done, [total for first, total in self.decisions if first <= done][-1])
 
 
 @dataclass
