@@ -10,9 +10,9 @@ PRESETS: dict[str, Settings] = {
     # fewer and bolder iterations, none where nothing moved; silhouettes are left to the pictures.
     "adaptive": Settings(
         update=UpdateSettings(
-            iterations=50,
-            cold_longer=4.0,
-            stop_gain=0.02,
+            iterations=55,
+            cold_longer=3.6,
+            stop_gain=0.005,
             still=0.02,
             layer_rates=(
                 LayerRates(rotation=0.044, translation=0.0088, scaling=0.002),
