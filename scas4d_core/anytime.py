@@ -48,8 +48,18 @@ class Anytime:
         """For a deformation that has taken Θ_{t−1}; without views nothing is compared."""
         return cls(deformation, previous, Witness(factory, picture, views))
 
-    def start(self, motion: Motion | None, seconds: float, settings: UpdateSettings) -> None:
-        """Set the deformation to the motion before, or to none where that shows the frame better."""
+    def start(
+        self, motion: Motion | None, seconds: float, settings: UpdateSettings, step: float | None = None
+    ) -> float:
+        """Set the deformation to the motion before, or to none where that shows the frame better.
+
+        Args:
+            seconds: since the motion before was found. step: since the frame before, where that was not moved: the
+                motion may have rested meanwhile. None: the same.
+
+        Returns:
+            The seconds that the motion is taken to have gone on for.
+        """
         previous = self.previous
         self._motion, self._seconds, self._settings = motion, seconds, settings
         self._measure("still", previous.means, previous.factors, previous.colours)
@@ -57,8 +67,22 @@ class Anytime:
         if motion is not None and self.errors:
             self.deformation.forward()
             self._measure("warm", self.deformation.means, self.deformation.factors, previous.colours)
+            if step is not None:
+                self._try_after_rest(motion, step)
             if self._mean("still") < self._mean("warm"):
                 self._set(None)
+        return self._seconds
+
+    def _try_after_rest(self, motion: Motion, step: float) -> None:
+        """The motion for the time since the frame before alone, kept where it shows the frame better."""
+        whole, errors = self._seconds, self.errors["warm"]
+        self._seconds = step
+        self._set(motion)
+        self.deformation.forward()
+        self._measure("warm", self.deformation.means, self.deformation.factors, self.previous.colours)
+        if mean_error(errors, list(errors)) <= self._mean("warm"):
+            self._seconds, self.errors["warm"] = whole, errors
+            self._set(motion)
 
     def stands(self, enough: Mapping[str, float] | None) -> bool:
         """Whether the frame before shows this one as well as ``enough``, errors by view; None: never."""

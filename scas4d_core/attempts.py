@@ -67,6 +67,7 @@ class Course:
         pace: how long. manner: how. gate: told each camera's first dB once all were rendered, it answers with those
             to leave out from then on; None: all stay. witness: whether start and end are compared (``anytime``).
         enough: errors of the witnesses, by view, at which the frame before needs no iteration; None: never.
+        step: seconds since the frame before, where nothing was learnt from that one, see ``Anytime.start``; else None.
     """
 
     pace: Pace
@@ -74,6 +75,7 @@ class Course:
     gate: Callable[[Mapping[str, float]], Mapping[str, str]] | None = None
     witness: bool = False
     enough: Mapping[str, float] | None = None
+    step: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

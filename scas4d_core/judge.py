@@ -51,6 +51,9 @@ MOST_OUT = 0.5
 CLEAN_DB = 40.0
 """All that is met better counts as this: beyond, 5 dB are a thousandth of the range, and no sign of a fault."""
 
+OTHER_EFFORT = 1.5
+"""Times more or fewer iterations than the update before, from which the usual level begins anew."""
+
 PLACE_RATE, LEVEL_RATE = 0.2, 0.3
 """How fast a camera's usual place and the usual level follow."""
 
@@ -217,23 +220,22 @@ def unmet(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | N
         return None
     level = level_of(past, psnr)
     drop = DROPS_DB[past.updates] if past.updates < len(DROPS_DB) else DROP_DB
-    if iterations and past.iterations > iterations:
-        drop += HALVED_DB * log2(past.iterations / iterations)
-    if level > past.level - drop:
+    if level > past.level - drop - _shorter(past, iterations):
         return None
     return f"the pictures are met at {level:.1f} dB, {past.level - level:.1f} dB less than usual"
 
 
-def behind(past: Past, psnr: Mapping[str, float]) -> str | None:
-    """Why an update after frames that were held or not moved should be sought longer, or None.
-
-    Args:
-        psnr: dB by camera when last rendered.
-    """
+def behind(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | None:
+    """Why an update after frames that were held or not moved should be sought longer, or None. See ``unmet``."""
     if not (past.held or past.behind) or not psnr or past.level != past.level:
         return None
     off = past.level - level_of(past, psnr)
-    return f"{off:.1f} dB less than before" if off > BEHIND_DB else None
+    return f"{off:.1f} dB less than before" if off > BEHIND_DB + _shorter(past, iterations) else None
+
+
+def _shorter(past: Past, iterations: int) -> float:
+    """DB that an update of so many iterations may be worse by, as it was told to take fewer than the one before."""
+    return HALVED_DB * log2(past.iterations / iterations) if 0 < iterations < past.iterations else 0.0
 
 
 def level_of(past: Past, psnr: Mapping[str, float]) -> float:
@@ -278,8 +280,10 @@ def settle(
             now = replace(before, place=here, brightness=value / exposure)
         cameras[name] = now
     known = past.updates > 0
-    later = past.behind + 1 if behind(past, believed) and past.behind < CATCH_UP else 0
+    later = past.behind + 1 if behind(past, believed, iterations) and past.behind < CATCH_UP else 0
     follows = LEVEL_RATE if later == 0 else 0.0
+    if later == 0 and iterations and not 1 / OTHER_EFFORT < iterations / max(1, past.iterations) < OTHER_EFFORT:
+        follows = 1.0
     return replace(
         past,
         cameras=cameras,

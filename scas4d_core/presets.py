@@ -12,7 +12,6 @@ PRESETS: dict[str, Settings] = {
         update=UpdateSettings(
             iterations=55,
             cold_longer=3.6,
-            stop_gain=0.005,
             still=0.02,
             layer_rates=(
                 LayerRates(rotation=0.044, translation=0.0088, scaling=0.002),

@@ -350,6 +350,7 @@ class Reconstruction(Committed):
             state=self._labelled(self._state(None), carried.labels),
             motion=carried.motion,
             seconds=frame.time - past.fitted if isfinite(past.fitted) else seconds,
+            step=seconds,
             views=[view for view in views if view.name not in look.left_out],
             suspects=[view for view in views if past.of(view.name).out],
             brightness=brightness,

@@ -34,7 +34,8 @@ class Given:
     """What a frame starts from.
 
     Attributes:
-        state: Θ_{t−1}. motion: that was found last, or None. seconds: since then. views: of the frame, to learn from.
+        state: Θ_{t−1}. motion: that was found last, or None. seconds: since then. step: since the frame before.
+        views: of the frame, to learn from.
         suspects: views of cameras that are left out. brightness: mean of each camera's picture. seed: of the update.
         past: what is usual. look: what the pictures say. end: moment by which the last iteration has to be over.
         each: seconds of an iteration in the updates before, or None. lengths: [N, 3] metres, of the axes in frame 0.
@@ -43,6 +44,7 @@ class Given:
     state: Gaussians
     motion: Motion | None
     seconds: float
+    step: float
     views: list[TrainingView]
     suspects: list[TrainingView]
     brightness: Mapping[str, float]
@@ -169,6 +171,7 @@ class Trial:
             gate=self._gate(given) if settings.judge else None,
             witness=settings.judge or settings.stop_gain > 0,
             enough=enough if settings.still > -1 and manner is AS_SET else None,
+            step=given.step if given.step < given.seconds else None,
         )  # fmt: skip
 
     def _gate(self, given: Given) -> Callable[[Mapping[str, float]], Mapping[str, str]]:
@@ -184,7 +187,7 @@ class Trial:
         spent = given.end is not None and perf_counter() + PROBE * (given.each or 0.0) > given.end
         if not self._settings.judge or spent:
             return None
-        return judge.behind(given.past, self._met(updated))
+        return judge.behind(given.past, self._met(updated), len(updated.losses))
 
     def _met(self, updated: Updated) -> dict[str, float]:
         """DB of the cameras that were learnt from to the end."""

@@ -98,7 +98,7 @@ class FrameUpdate:
             guards.reset()
         deformation.start(previous)
         anytime = Anytime.of(self._factory, self._picture, deformation, previous, views if course.witness else [])
-        anytime.start(motion, seconds, settings)
+        seconds = anytime.start(motion, seconds, settings, course.step)
         optimizers = self._optimizers(colours, course.manner, cold=motion is None)
         pace = Counted(0) if anytime.stands(course.enough) else course.pace
         story = Story(len(views))

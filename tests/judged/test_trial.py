@@ -81,7 +81,7 @@ def broken(previous: Gaussians, course: Course) -> tuple[Gaussians, float]:
 
 
 def given(past: Past = PAST, look: Look = Look()) -> Given:
-    return Given(BEFORE, MOTION, 1 / 30, VIEWS, [], BRIGHT, 1, past, look, lengths=axis_lengths(BEFORE))
+    return Given(BEFORE, MOTION, 1 / 30, 1 / 30, VIEWS, [], BRIGHT, 1, past, look, lengths=axis_lengths(BEFORE))
 
 
 def trial(fake: Fake, **changes: object) -> Trial:
