@@ -155,9 +155,22 @@ def test_after_a_gap_it_goes_on_where_the_service_says(client, capture):
 
 
 def test_a_full_queue_is_waited_for_and_counted(client, capture):
-    delivery = push(capture, client, frames=12, loop=True, ingest=IngestSettings(queue_frames=1))
+    """The scene rests after its first frame, until the rig has heard that there is no room."""
+
+    def rest(stage, done, total):
+        if stage == "frames" and not heard:
+            client.pause(client.scenes()[0].id)
+
+    def go_on(retry):
+        if not heard:
+            client.resume(client.scenes()[0].id)
+        heard.append(retry.reason)
+
+    heard = []
+    client.on_retry = go_on
+    delivery = push(capture, client, frames=12, loop=True, told=rest, ingest=IngestSettings(queue_frames=1))
     assert delivery.status.committed == 12
-    assert delivery.lateness.busy_count > 0
+    assert heard == ["busy"] * delivery.lateness.busy_count != []
     assert delivery.lateness.busy > 0
 
 
