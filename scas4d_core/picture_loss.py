@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scas4d_core.kernels import image_loss
 from scas4d_core.rasterize.cpu import CpuRasterizer, Gradients
 from scas4d_core.rasterize.limits import DEFAULT, Limits
-from scas4d_core.views import CHANNELS, LABEL, TrainingView, ViewFactory
+from scas4d_core.views import CHANNELS, LABEL, TrainingView, ViewFactory, means
 
 Array = NDArray[np.float32]
 
@@ -110,9 +110,9 @@ class PictureLoss:
     def colour_shift(self, view: TrainingView) -> tuple[float, float, float]:
         """Mean of the view's picture minus mean of what was rendered for it last, exposure included, RGB in 0…1."""
         height, width = view.camera.height, view.camera.width
-        rendered = self.rasterizer.planes[:3, :height, :width].mean(axis=(1, 2), dtype=np.float64)
+        rendered = means(self.rasterizer.planes[:3, :height, :width])
         shown = view.exposure[:3, 0] * rendered + view.exposure[:3, 1]
-        red, green, blue = (view.target[:3].mean(axis=(1, 2), dtype=np.float64) - shown).tolist()
+        red, green, blue = (view.mean - shown).tolist()
         return red, green, blue
 
     def coverage(

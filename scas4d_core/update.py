@@ -21,7 +21,7 @@ from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.update_plan import Rates, ViewPlan, first_lengths, mask_weight, plan_samples
-from scas4d_core.updated import Stopwatch, Story, Updated
+from scas4d_core.updated import REPORT, Stopwatch, Story, Updated
 from scas4d_core.views import TrainingView, ViewFactory
 from scas4d_core.warm_start import Motion, quaternion_products
 
@@ -52,7 +52,13 @@ class Updater(Protocol):
 
 
 class FrameUpdate:
-    """The ``Updater`` of the CPU; buffers are kept from frame to frame."""
+    """The ``Updater`` of the CPU; buffers are kept from frame to frame.
+
+    Attributes:
+        tells: whether what the report alone asks for is worked out; the state is the same without.
+    """
+
+    tells = True
 
     def __init__(
         self,
@@ -100,8 +106,9 @@ class FrameUpdate:
         anytime = Anytime.of(self._factory, self._picture, deformation, previous, views if course.witness else [])
         seconds = anytime.start(motion, seconds, settings, course.step)
         optimizers = self._optimizers(colours, course.manner, cold=motion is None)
+        soft = np.float32(settings.weights.soft_colour / max(colours.size, 1))  # of the mean absolute change of colour
         pace = Counted(0) if anytime.stands(course.enough) else course.pace
-        story = Story(len(views))
+        story = Story(len(views), self.tells)
         watch.lap("start")
         while (iteration := story.iterations) < (planned := pace.planned(iteration)):
             view = plan.take(iteration, planned)
@@ -113,6 +120,7 @@ class FrameUpdate:
             )
             loss = self._picture.image_part + self._picture.mask_part
             story.see(view, self._picture)
+            watch.lap(REPORT)
             loss += self._neighbour_terms(samples[iteration % len(samples)])
             if self._floor is not None:
                 loss += floor_term(
@@ -122,14 +130,17 @@ class FrameUpdate:
             weight = settings.weights.scale
             loss += weight * deformation.backward(gradients.means, gradients.factors, weight)
             watch.lap("cascade backward")
-            soft, g_soft = self._soft_colour(colours, previous.colours)
-            loss += soft
-            g_colours = gradients.features[:, :3] + g_soft
+            change = colours - previous.colours
+            g_colours = gradients.features[:, :3] + soft * np.sign(change)
             tables = [*deformation.cluster_gradients, deformation.delta_gradients, g_colours]
             for optimizer, table in zip(optimizers, tables, strict=True):
                 optimizer.step(table, iteration, planned)
             watch.lap("adam")
-            if story.end_iteration(loss, watch.total) and course.gate is not None:
+            if self.tells:
+                loss += float(soft * np.abs(change).sum(dtype=np.float64))
+            complete = story.end_iteration(loss, watch.total)
+            watch.lap(REPORT)
+            if complete and course.gate is not None:
                 plan.leave_out(story.leave_out(course.gate(story.first)))
                 watch.lap("judge")
             if pace.looks(story.iterations):
@@ -166,13 +177,6 @@ class FrameUpdate:
         strengths = (weights.rigidity, weights.isometry, weights.rotation)
         parts = self._deformation.neighbour_losses(sample, strengths)
         return float(np.dot(strengths, parts))
-
-    def _soft_colour(self, colours: Array, previous: Array) -> tuple[float, Array]:
-        """The weighted soft-colour loss, mean absolute change of colour, and its gradient."""
-        weight = np.float32(self.settings.weights.soft_colour / max(colours.size, 1))
-        change = colours - previous
-        gradient: Array = weight * np.sign(change)
-        return float(weight * np.abs(change).sum(dtype=np.float64)), gradient
 
     def _commit(self, previous: Gaussians, colours: Array) -> Gaussians:
         """Θ_t; the material rotation is the turn after all turns before."""

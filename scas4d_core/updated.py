@@ -12,10 +12,14 @@ from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.views import TrainingView
 from scas4d_core.warm_start import Motion
 
+REPORT = "report"
+"""The stage of what an update spends on its own report: these timers, losses that nothing but the curve asks for,
+colour shifts, and assembling, writing and publishing the record."""
+
 
 @dataclass
 class Stopwatch:
-    """Seconds by stage."""
+    """Seconds by stage. What the timers take themselves is booked to ``REPORT``."""
 
     seconds: dict[str, float] = field(default_factory=dict)
     began: float = field(default_factory=perf_counter)
@@ -30,7 +34,8 @@ class Stopwatch:
         """Book the time since the last lap to a stage."""
         now = perf_counter()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
-        self.last = now
+        self.last = perf_counter()
+        self.seconds[REPORT] = self.seconds.get(REPORT, 0.0) + self.last - now
 
     def move(self, stage: str, other: str, seconds: float) -> None:
         """Book a part of a stage to another."""
@@ -83,14 +88,15 @@ class Story:
     """What happens in an update, iteration by iteration.
 
     Args:
-        cameras: views of the frame.
+        cameras: views of the frame. shifts: whether the colour shift of each camera is worked out for the report.
 
     Attributes:
         losses, psnr, moments, left_out: see ``Updated``. first, last: dB by camera when first and last rendered.
     """
 
-    def __init__(self, cameras: int) -> None:
+    def __init__(self, cameras: int, shifts: bool = True) -> None:
         self._cameras = cameras
+        self._shifts = shifts
         self.losses: list[float] = []
         self.psnr: list[float] = []
         self.moments: list[float] = []
@@ -107,7 +113,7 @@ class Story:
         """A view was rendered and compared."""
         self.psnr.append(picture.psnr)
         self.first.setdefault(view.name, picture.psnr)
-        self.last[view.name] = CameraFit(picture.psnr, picture.colour_shift(view))
+        self.last[view.name] = CameraFit(picture.psnr, picture.colour_shift(view) if self._shifts else None)
 
     def end_iteration(self, loss: float, moment: float) -> bool:
         """An iteration is over; whether it is the one in which the last camera was rendered first."""

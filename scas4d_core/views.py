@@ -47,6 +47,18 @@ class TrainingView:
         image_loss.target_moments(self.target, self.scratch, means, squares)
         return means, squares
 
+    @cached_property
+    def mean(self) -> NDArray[np.float64]:
+        """[3] of the picture, RGB in 0…1; made when first asked for."""
+        return means(self.target[:3])
+
+
+def means(planes: Array) -> NDArray[np.float64]:
+    """[C] mean of each of [C, H, W] planes; summed along rows in float32, which is twice as fast."""
+    _, height, width = planes.shape
+    result: NDArray[np.float64] = planes.sum(axis=2).sum(axis=1, dtype=np.float64) / (height * width)
+    return result
+
 
 class ViewFactory:
     """Makes the training views of each frame of a rig; keeps the cameras and the scratch of the image loss."""
