@@ -8,16 +8,13 @@ from math import log10
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.guards import SMALLEST_SQUARE
 from scas4d_core.kernels import image_loss
 from scas4d_core.rasterize.cpu import CpuRasterizer, Gradients
 from scas4d_core.rasterize.limits import DEFAULT, Limits
 from scas4d_core.views import CHANNELS, LABEL, TrainingView, ViewFactory, means
 
 Array = NDArray[np.float32]
-
-
-SMALLEST_SQUARE = 1e-9
-"""Sum of squared differences below which two pictures count as equal: PSNR stays finite."""
 
 
 def _no_lap(stage: str) -> None:
