@@ -47,7 +47,8 @@ class FrameReport:
     """How frame 0, or the update of a frame, went.
 
     Attributes:
-        seconds: by stage. loss: each iteration's weighted sum; of frame 0 at most ``REPORTED_LOSSES`` means.
+        seconds: by stage; ``report`` is what this report costs, and the writing of the one before.
+        loss: each iteration's weighted sum; of frame 0 at most ``REPORTED_LOSSES`` means.
         psnr: dB, over the training views of the last iterations, each as it was rendered then; NaN where not measured.
         moving, gaussians: how many Gaussians move, and are.
         cameras: by name, how well each camera's picture was met when it was last rendered: a bumped camera shows.

@@ -15,6 +15,7 @@ import re
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,7 @@ class History:
 
     Attributes:
         damaged: frames whose file cannot be read, with the reason; they are not among ``indices``.
+        record_seconds: that the last ``append`` spent on the report: encoding it, and its share of writing, by bytes.
 
     Raises:
         HistoryError: ``directory`` already holds frames.
@@ -64,6 +66,7 @@ class History:
     def __init__(self, directory: Path | str | None = None) -> None:
         self.directory = None if directory is None else Path(directory)
         self.damaged: dict[int, str] = {}
+        self.record_seconds = 0.0
         self._fixed: Arrays = {}
         self._times: dict[int, float] = {}
         self._reports: dict[int, dict[str, Any]] = {}
@@ -130,12 +133,14 @@ class History:
         """
         if index <= self._newest():
             raise HistoryError(f"frame {index} comes after frame {self._newest()}; append frames in rising order")
+        began = perf_counter()
         try:
             said = json.dumps(dict(report or {}), allow_nan=False)
         except (TypeError, ValueError) as error:
             raise HistoryError(
                 f"frame {index}: the report is no JSON ({error}); give finite numbers, strings, lists, mappings"
             ) from error
+        self.record_seconds = perf_counter() - began
         arrays = gaussians.arrays()
         fixed = self._fixed or {name: np.array(arrays[name]) for name in FIXED}
         for name in FIXED:
@@ -152,8 +157,11 @@ class History:
             if not self._fixed:
                 write_npz(self.directory / "fixed.npz", fixed)
             file = self._file(index)
+            began = perf_counter()
             write_npz(file, {**frame, "time": np.float64(time), "report": np.frombuffer(said.encode(), np.uint8)})
-            self._stamps[index] = _stamp(file.stat())
+            stat = file.stat()
+            self.record_seconds += (perf_counter() - began) * len(said) / stat.st_size
+            self._stamps[index] = _stamp(stat)
         else:
             self._stamps[index] = (sum(array.nbytes for array in frame.values()), 0)
         self._fixed = fixed

@@ -41,7 +41,7 @@ from scas4d_core.static_scene import StaticResult, fit_static_scene
 from scas4d_core.trial import Given, Outcome, Trial
 from scas4d_core.update import FrameUpdate, Updater
 from scas4d_core.update_plan import mask_weight
-from scas4d_core.updated import Stopwatch
+from scas4d_core.updated import REPORT, Stopwatch
 from scas4d_core.views import TrainingView, ViewFactory, pictures_of
 from scas4d_core.witness import mean_error
 
@@ -413,11 +413,12 @@ class Reconstruction(Committed):
         self, frame: Frame, outcome: Outcome, look: judge.Look, watch: Stopwatch, dropped: Mapping[str, str]
     ) -> FrameReport:
         updated, gaussians = outcome.updated, outcome.gaussians
+        began = perf_counter()
         left_out = {**dropped, **look.left_out, **updated.left_out}
         stages = {"decode": watch.seconds["decode"], **updated.seconds}
         stages["judge"] = watch.seconds["judge"] + updated.seconds.get("judge", 0.0)
         stages["other"] = max(0.0, watch.seconds["update"] - sum(updated.seconds.values()))
-        return FrameReport(
+        report = FrameReport(
             index=frame.index,
             time=frame.time,
             iterations=len(updated.losses),
@@ -443,13 +444,19 @@ class Reconstruction(Committed):
             errors={kind: mean_error(errors, list(errors)) for kind, errors in updated.errors.items()},
             kept=updated.kept,
         )
+        stages[REPORT] = watch.seconds[REPORT] + updated.seconds.get(REPORT, 0.0) + perf_counter() - began
+        return report
 
     def _commit(self, report: FrameReport, gaussians: Gaussians, carried: Carried, more: Mapping[str, Any]) -> None:
         """The checkpoint first, then state and report in one rename."""
         if self._checkpoints is not None:
             self._checkpoints.save(report.index, carried)
+        began = perf_counter()
         resumed = None if self.resumed is None or self.report is not None else asdict(self.resumed)
         record = {**report.record(), "threads": get_num_threads(), "resumed": resumed, **more}
+        seconds = report.seconds  # a record cannot tell its own writing: it has that of the one before
+        seconds[REPORT] = seconds.get(REPORT, 0.0) + self.history.record_seconds + perf_counter() - began
+        record["seconds"] = dict(seconds)
         self.history.append(report.index, report.time, gaussians, record)
         self._carried = carried
         self.report = report

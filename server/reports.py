@@ -17,6 +17,8 @@ KEPT = 512
 def fill(report: FrameReportModel, committed: Mapping[str, Any]) -> None:
     """Puts the numbers of a commit into a frame's report."""
     seconds = {name: float(value) for name, value in committed.get("seconds", {}).items()}
+    if "report" in seconds:  # the one before was published after its commit
+        seconds["report"] += committed.get("publish_seconds") or 0.0
     seconds.setdefault("total", sum(seconds.values()))
     report.seconds = seconds
     report.iterations = committed.get("iterations")

@@ -84,6 +84,7 @@ class Worker:
         self._progress_at = 0.0
         self._budget = Budget()
         self._write_seconds: float | None = None
+        self._publish_seconds = 0.0
 
     def open(self) -> bool:
         """Takes up what is committed and says so; False where it cannot be gone on from."""
@@ -111,7 +112,10 @@ class Worker:
         stall = STALL_S
         while True:
             try:
-                self.connection.send(self.finish(message))
+                done = self.finish(message)
+                began = time.perf_counter()
+                self.connection.send(done)
+                self._publish_seconds += time.perf_counter() - began
                 return
             except Exception as error:  # whatever came of it, as zipfile closing what it could not write
                 if not no_room(error):
@@ -164,10 +168,17 @@ class Worker:
             if budget != self._budget:
                 self.reconstruction.spend(**budget.model_dump())
                 self._budget = budget
-            notes = {"budget": budget.model_dump(), "write_seconds": self._write_seconds}
+            notes = {
+                "budget": budget.model_dump(),
+                "write_seconds": self._write_seconds,
+                "publish_seconds": self._publish_seconds,
+            }
             report = self.reconstruction.step(frame, dropped=dropped, notes=notes, started=began)
             self._write_seconds = max(0.0, time.perf_counter() - began - sum(report.seconds.values()))
-        return Committed(frame.index, self.states.report(frame.index), tuple(self.retain()))
+        ended = time.perf_counter()
+        committed = self.states.report(frame.index)
+        self._publish_seconds = time.perf_counter() - ended
+        return Committed(frame.index, committed, tuple(self.retain()))
 
     def retain(self) -> list[int]:
         """Deletes old states by the scene's rule; what cannot be deleted now is next time."""

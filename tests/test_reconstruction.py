@@ -330,6 +330,16 @@ def test_per_gaussian_updates_run_as_well() -> None:
     assert np.isfinite(losses).all()
 
 
+def test_a_report_tells_what_it_costs_and_what_writing_the_one_before_did(tmp_path: Path) -> None:
+    scene = Reconstruction.start(training(), FRAMES[0], shortened(), points=points(), history=History(tmp_path))
+    written = scene.history.record_seconds
+    assert written > 0
+    report = scene.step(FRAMES[1])
+    committed = History.load(tmp_path).report(FRAMES[1].index)
+    assert committed["seconds"] == report.seconds
+    assert written < report.seconds["report"] < 0.5 * sum(report.seconds.values())
+
+
 def test_the_report_shows_the_camera_whose_colours_changed() -> None:
     reconstruction = start(shortened(iterations=20))
     bumped = reconstruction.rig.names[1]

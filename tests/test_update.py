@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from time import perf_counter
 from typing import Any
 
 import numba
@@ -23,7 +24,7 @@ from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.update import FrameUpdate
 from scas4d_core.update_plan import Rates, plan_samples
-from scas4d_core.updated import Updated
+from scas4d_core.updated import REPORT, Stopwatch, Updated
 from scas4d_core.views import TrainingView, ViewFactory
 
 BEFORE = make_box()
@@ -335,3 +336,24 @@ def test_a_layer_that_begins_late_stays_where_it_was_before() -> None:
     moved_by = [[bool(np.abs(table).max() > 0) for table in tables] for tables in seen]
     # Half of three iterations, rounded, is two: in the third (from 0) all learn, and the commit sees it.
     assert moved_by == [[False] * 4, [True, False, False, False], [True, False, False, False], [True] * 4]
+
+
+def test_the_stages_are_all_the_time_and_the_timers_are_a_part_of_the_report() -> None:
+    watch = Stopwatch(began=(now := perf_counter()), last=now)
+    for stage in ("one", "two", "one"):
+        watch.lap(stage)
+    assert set(watch.seconds) == {"one", "two", REPORT}
+    assert watch.seconds[REPORT] > 0
+    assert sum(watch.seconds.values()) == pytest.approx(watch.total)
+
+
+def test_an_update_that_tells_less_finds_the_same_bits() -> None:
+    updater, views = prepare()
+    told = updater.run(BEFORE, views, None, 1.0, seed=1)
+    updater.tells = False
+    quiet = updater.run(BEFORE, views, None, 1.0, seed=1)
+    for name, array in told.gaussians.arrays().items():
+        np.testing.assert_array_equal(array, quiet.gaussians.arrays()[name])
+    assert all(fit.colour_shift is not None for fit in told.cameras.values())
+    assert all(fit.colour_shift is None for fit in quiet.cameras.values())
+    assert quiet.losses != told.losses
