@@ -94,23 +94,28 @@ def effort(
     ] = None,
     frames: Annotated[int, typer.Option(min=5, help="Played back and forth under each budget.")] = 50,
     updates: Annotated[int, typer.Option(min=1, help="For the adaptive preset; all of the capture at most.")] = 100,
-    only: Annotated[list[str] | None, typer.Option(help="Only budgets, or only adaptive. May be repeated.")] = None,
+    only: Annotated[list[str] | None, typer.Option(help="Only report, budgets or adaptive. May be repeated.")] = None,
 ) -> None:
-    """Measures how budgets in milliseconds are kept, and what the adaptive preset spares. Wants a quiet machine.
+    """Measures what reports cost, how budgets in milliseconds are kept, and what the adaptive preset spares.
+
+    Wants a quiet machine.
 
     The answers become a part of the page that `scas4d bench frontier --only page` writes.
 
     Example: scas4d bench effort captures/robot --milliseconds 500
     """
     from scas4d_core.bench.effort import measure_adaptive, measure_budgets
+    from scas4d_core.bench.effort_report import measure_report
     from scas4d_core.warm_up import warm_up_elsewhere
 
-    parts = ("budgets", "adaptive")
+    parts = ("report", "budgets", "adaptive")
     for part in only or ():
         if part not in parts:
             raise typer.BadParameter(f"part {part!r} is unknown; choose of {', '.join(parts)}")
     warm_up_elsewhere()
     for capture in captures:
+        if "report" in (only or parts):
+            measure_report(capture, out)
         if "budgets" in (only or parts):
             measure_budgets(capture, out, milliseconds or (500.0, 1000.0, 2000.0), frames=frames)
         if "adaptive" in (only or parts):

@@ -82,7 +82,7 @@ def measure_budgets(
     capture = open_capture(folder)
     kept = []
     for budget in milliseconds:
-        settings = _changed(preset("scas4d"), budget_ms=budget)
+        settings = changed(preset("scas4d"), budget_ms=budget)
         one = Kept(budget)
         with tempfile.TemporaryDirectory() as directory:
             reconstruction = started(capture, settings, out, Path(directory))
@@ -102,7 +102,7 @@ def measure_budgets(
             f"    {capture.name}, {budget:g} ms: {100 * row['within']:.0f} % within, {100 * row['not_over']:.0f} % not "
             f"over; {row['iterations'][1]:.0f} iterations; worst {row['worst_off_ms']:+.0f} ms"
         )
-    return _leave(out, f"{capture.name}-budgets", capture, {"budgets": [one.row() for one in kept]})
+    return leave(out, f"{capture.name}-budgets", capture, {"budgets": [one.row() for one in kept]})
 
 
 def measure_adaptive(
@@ -122,7 +122,7 @@ def measure_adaptive(
     }
     answers = []
     for what, frames in sequences.items():
-        fixed = _changed(preset("scas4d"), still=-1.0)
+        fixed = changed(preset("scas4d"), still=-1.0)
         pair = {"scas4d": started(capture, fixed, out), name: started(capture, preset(name), out)}
         seconds: dict[str, list[float]] = {key: [] for key in pair}
         psnr: dict[str, list[float]] = {key: [] for key in pair}
@@ -156,7 +156,7 @@ def measure_adaptive(
         difference = answer["psnr"][name] - answer["psnr"]["scas4d"]
         told = "" if answer["time_repeats"] is None else f", repeats {100 * answer['time_repeats']:.0f} %"
         report(f"    {capture.name}, {what}: {100 * answer['time']:.0f} % of the time{told}, {difference:+.2f} dB")
-    return _leave(out, f"{capture.name}-{name}", capture, {"name": name, "sequences": answers})
+    return leave(out, f"{capture.name}-{name}", capture, {"name": name, "sequences": answers})
 
 
 def _score(reconstruction: Any, capture: Capture, truth: Mapping[str, NDArray[np.float32]]) -> float:
@@ -174,11 +174,13 @@ def _each(report: Any) -> float:
     return float((last.milliseconds - first.milliseconds) / 1000 / max(1, last.iterations - first.iterations))
 
 
-def _changed(settings: Settings, **changes: Any) -> Settings:
+def changed(settings: Settings, **changes: Any) -> Settings:
+    """The settings with others of the update."""
     return settings.model_copy(update={"update": settings.update.model_copy(update=changes)})
 
 
-def _leave(out: Path, name: str, capture: Capture, answer: Row) -> Row:
+def leave(out: Path, name: str, capture: Capture, answer: Row) -> Row:
+    """Write an answer as ``out/effort/<name>.json``, with what it was measured on."""
     from scas4d_core.kernels.jit import threads
 
     row: Row = {

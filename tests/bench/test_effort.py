@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from scas4d_core.bench import effort, effort_report
 from scas4d_core.bench.effort import Kept
 from scas4d_core.bench.effort_page import effort_text
 from scas4d_core.bench.sequences import as_it_is, back_and_forth, repeated
 from scas4d_core.captures import open_capture
+from scas4d_core.update import FrameUpdate
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "robot"
 
@@ -61,3 +63,31 @@ def test_the_page_judges(tmp_path: Path) -> None:
     assert "reached on every capture" in text
     adaptive(0.7)
     assert "**missed** on some captures" in effort_text(tmp_path, ["robot"])
+
+
+def test_the_page_tells_what_reports_cost(tmp_path: Path) -> None:
+    (tmp_path / "effort").mkdir()
+    row = {"capture": "robot", "updates": 11, "share_worst": 0.03, "milliseconds": 9.0, "ratio": 1.01}
+    for share, verdict in ((0.0123, "reached"), (0.0223, "**missed**")):
+        told = {**row, "share": share, "ratio_quartiles": [0.99, 1.02]}
+        (tmp_path / "effort" / "robot-report.json").write_text(json.dumps(told))
+        assert f"| {100 * share:.2f} % | 3.00 % | 1.010 (0.990 to 1.020) | {verdict} |" in effort_text(
+            tmp_path, ["robot"]
+        )
+
+
+def test_reports_are_measured_with_and_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = effort.preset("scas4d")
+    few = few.model_copy(
+        update={
+            "static": few.static.model_copy(update={"iterations": 20}),
+            "update": few.update.model_copy(update={"iterations": 5}),
+        }
+    )
+    monkeypatch.setattr(effort_report, "preset", lambda name: few)
+    row = effort_report.measure_report(SAMPLE, tmp_path, updates=3, report=lambda line: None)
+    assert row["updates"] == 2
+    assert 0 < row["share"] <= row["share_worst"] < 1
+    assert row["stages"]["report"] > 0
+    assert FrameUpdate.tells
+    assert (tmp_path / "effort" / "robot-report.json").exists()
