@@ -23,6 +23,16 @@ LARGEST = EXPONENT / log2(e)
 ClusterMap = Literal["centred", "published"]
 """Which form of equation (6): scaling about the cluster's pivot, or about the world's origin as published."""
 
+Covariance = Literal["entangled", "separate"]
+"""What moves a Gaussian's covariance beside its own ΔR and Δs.
+
+"entangled", equation (5): the Jacobian of the map that moves its mean. "separate": the product of its clusters'
+rotations R_j alone; what the map bends, shears or scales does not reach it. The paper compares equation (5) with a
+covariance that is learnt apart from the positions altogether, so that a wheel's Gaussians keep their orientation while
+they go round; that the rotations are kept is ours, and asks less of ΔR and Δs. The same parameters give the same means,
+turns and material rotations in both.
+"""
+
 
 class ClusterParams(NamedTuple):
     """Learnt parameters of the K clusters of one layer, in the paper's symbols; all zeros is the identity when centred.
@@ -232,22 +242,39 @@ def cascade(points: Tensor, layers: Sequence[Layer], kind: ClusterMap = "centred
     return Transported(points, jacobians, rotations)
 
 
+def cluster_rotations(count: int, layers: Sequence[Layer], like: Tensor) -> Tensor:
+    """[count, 3, 3] of ``like``'s dtype and device: R_K … R_2 R_1, the rotations of the clusters of each point."""
+    product = torch.eye(3, dtype=like.dtype, device=like.device).expand(count, 3, 3)
+    for labels, params in layers:
+        product = quaternion_matrices(rotation_quaternions(params.r))[labels] @ product
+    return product
+
+
 def deform(
-    means: Tensor, factors: Tensor, layers: Sequence[Layer], deltas: Deltas, kind: ClusterMap = "centred"
+    means: Tensor,
+    factors: Tensor,
+    layers: Sequence[Layer],
+    deltas: Deltas,
+    kind: ClusterMap = "centred",
+    covariance: Covariance = "entangled",
 ) -> Deformed:
     """Equation (5) on factors: the cascade, then Δp, ΔR, Δs of each Gaussian.
 
     mean = x_K + Δp; F = R(Δr)·J·F_previous·diag(exp Δs); turn = q(Δr) ∘ Q, flipped to w ≥ 0. Then Σ = F Fᵀ is
-    J Σ_previous Jᵀ where the deltas are 0.
+    J Σ_previous Jᵀ where the deltas are 0. Where the covariance is separate, R_K … R_1 takes the place of J.
 
     Args:
         means: [M, 3] metres, of the previous frame.
         factors: [M, 3, 3] of the previous frame.
         layers: coarse to fine.
         deltas: per Gaussian.
-        kind: form of the cluster map.
+        kind: form of the cluster map. covariance: what moves the factors.
     """
     points, jacobians, rotations = cascade(means, layers, kind)
+    if covariance == "separate":
+        jacobians = cluster_rotations(len(means), layers, means)
+    elif covariance != "entangled":
+        raise ValueError(f"covariance {covariance!r} is unknown; give 'entangled' or 'separate'")
     dq = rotation_quaternions(deltas.dr)
     moved = quaternion_matrices(dq) @ jacobians @ factors * torch.exp(deltas.ds.clamp(-LARGEST, LARGEST))[:, None, :]
     turns = quaternion_product(dq, rotations)

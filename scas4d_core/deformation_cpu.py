@@ -29,6 +29,10 @@ Array = NDArray[np.float32]
 class CpuDeformation:
     """The cascade of a hierarchy, what each Gaussian adds, and the terms that tie neighbours together.
 
+    Args:
+        bounds: [M, 3] metres, the length each axis may have before the scale loss. cluster_map, covariance: see
+            ``deformation``.
+
     Attributes:
         clusters: per layer [K, 10], columns r, t, c, s. deltas: [M, 9], columns Δp, Δr, Δs.
         cluster_gradients, delta_gradients: the same shapes, filled by ``backward``.
@@ -45,11 +49,13 @@ class CpuDeformation:
         neighbours: Neighbours | None,
         bounds: Array,
         cluster_map: Literal["centred", "published"],
+        covariance: Literal["entangled", "separate"] = "entangled",
     ) -> None:
         self.hierarchy = hierarchy
         self.neighbours = neighbours
         self._bounds = bounds
         self._about_origin = np.float32(cluster_map == "published")
+        self._separate = True if covariance == "separate" else None
         count = len(hierarchy.rows)
         layers = len(hierarchy.sizes)
         blocks = Blocks.of(hierarchy)
@@ -125,7 +131,7 @@ class CpuDeformation:
         """Equations (5) to (7): fill ``means``, ``factors`` and ``turns``."""
         deform(
             self._parameters, self._offsets, self._ranges, self._clusters_of, self._entries, self._rows, self._present,
-            self._before, self.deltas, self._about_origin, self._points, self._sums, self._tables,
+            self._before, self.deltas, self._about_origin, self._separate, self._points, self._sums, self._tables,
             self.means, self.factors, self._state, self._acted,
         )  # fmt: skip
         self.means[self.held_back], self.factors[self.held_back] = self._held
@@ -157,8 +163,9 @@ class CpuDeformation:
         axes = max(1, 3 * len(self.hierarchy.rows))
         deform_backward(
             self._offsets, self._ranges, self._clusters_of, self._entries, self._rows, self._present, self._before,
-            self.deltas, self._about_origin, self._points, self._tables, np.float32(scale_weight / axes), self._bounds,
-            g_means, g_factors, self._tied, self._records, self._gradients, self.delta_gradients, self._excess,
+            self.deltas, self._about_origin, self._separate, self._points, self._tables,
+            np.float32(scale_weight / axes), self._bounds, g_means, g_factors, self._tied, self._records,
+            self._gradients, self.delta_gradients, self._excess,
         )  # fmt: skip
         return float(self._excess.sum(dtype=np.float64)) / axes
 

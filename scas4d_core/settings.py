@@ -133,7 +133,14 @@ class Weights(Model):
 class UpdateSettings(Model):
     """One update: from Θ_{t−1} and the pictures of frame t to Θ_t."""
 
-    iterations: int = Field(100, ge=1, description="Iterations a frame, one forward and backward render each.")
+    iterations: int = Field(100, ge=1, description="Iterations a frame, each a step down the gradient.")
+    views: int = Field(
+        1,
+        ge=1,
+        le=8,
+        description="Training views that an iteration renders forward and backward; losses and gradients are their "
+        "mean. The paper does not say how many; its code base, Dynamic3DGaussians, takes one.",
+    )
     budget_ms: Positive | None = Field(
         None,
         description="Milliseconds that a frame may take, decoding and commit included; then there are as many "
@@ -166,6 +173,11 @@ class UpdateSettings(Model):
     smallest_cluster: int = Field(8, ge=1, description="Layers are capped so that clusters hold this many on average.")
     cluster_map: Literal["centred", "published"] = Field(
         "centred", description="Scaling about the pivot (translation-equivariant) or about the world origin (paper)."
+    )
+    covariance: Literal["entangled", "separate"] = Field(
+        "entangled",
+        description="A Gaussian's covariance follows the Jacobian of the map that moves it (paper), or turns with its "
+        "clusters' rotations alone and has its extent from Δs.",
     )
     layer_rates: tuple[LayerRates, ...] = Field(
         (

@@ -18,6 +18,7 @@ from scas4d_core.hierarchy import Hierarchy
 from scas4d_core.neighbours import Neighbours
 from scas4d_core.pace import Counted
 from scas4d_core.picture_loss import PictureLoss
+from scas4d_core.rasterize.cpu import Gradients
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.update_plan import Rates, ViewPlan, first_lengths, mask_weight, plan_samples
@@ -79,7 +80,7 @@ class FrameUpdate:
         limits = scene_limits(scene.near, factory.rig.radius)
         self._picture = PictureLoss(factory, scene.background, weights.image, mask, limits=limits)
         bounds = np.maximum(first_lengths(hierarchy, first), np.float32(settings.max_scale))
-        self._deformation = CpuDeformation(hierarchy, neighbours, bounds, settings.cluster_map)
+        self._deformation = CpuDeformation(hierarchy, neighbours, bounds, settings.cluster_map, settings.covariance)
 
     def run(
         self,
@@ -111,16 +112,11 @@ class FrameUpdate:
         story = Story(len(views), self.tells)
         watch.lap("start")
         while (iteration := story.iterations) < (planned := pace.planned(iteration)):
-            view = plan.take(iteration, planned)
+            seen = plan.take(iteration, planned)
             deformation.forward()
             features[:, :3] = colours
             watch.lap("cascade")
-            gradients = self._picture.evaluate(
-                deformation.means, deformation.factors, previous.opacities, features, view, watch.lap
-            )
-            loss = self._picture.image_part + self._picture.mask_part
-            story.see(view, self._picture)
-            watch.lap(REPORT)
+            loss, gradients = self._pictures(seen, previous.opacities, features, story, watch)
             loss += self._neighbour_terms(samples[iteration % len(samples)])
             if self._floor is not None:
                 loss += floor_term(
@@ -171,6 +167,30 @@ class FrameUpdate:
         by_row = np.full(len(colours), rates.colour_standing, np.float32)
         by_row[self.hierarchy.rows] = rates.colour
         return [*optimizers, Adam(colours, [1.0] * 3, rates, by_row=by_row)]
+
+    def _pictures(
+        self, views: list[TrainingView], opacities: Array, features: Array, story: Story, watch: Stopwatch
+    ) -> tuple[float, Gradients]:
+        """Image and mask loss, the mean over the views, and its gradients; a single view's are the rasterizer's own."""
+        deformation, picture = self._deformation, self._picture
+        loss, total = 0.0, None
+        for view in views:
+            found = picture.evaluate(deformation.means, deformation.factors, opacities, features, view, watch.lap)
+            loss += picture.image_part + picture.mask_part
+            story.see(view, picture)
+            watch.lap(REPORT)
+            if len(views) == 1:
+                return loss, found
+            if total is None:
+                total = Gradients(*(array.copy() for array in found))
+            else:
+                for array, more in zip(total, found, strict=True):
+                    array += more
+        assert total is not None  # an iteration has a view
+        for array in total:
+            array /= len(views)
+        watch.lap("render backward")
+        return loss / len(views), total
 
     def _neighbour_terms(self, sample: NDArray[np.int64]) -> float:
         weights = self.settings.weights

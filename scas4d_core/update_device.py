@@ -7,6 +7,7 @@ views, the samples, the rates, the hierarchy and the warm start are those of the
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 import torch
@@ -82,6 +83,7 @@ class DeviceUpdate:
             max_scale=settings.max_scale,
             background=scene.background,
             cluster_map=settings.cluster_map,
+            covariance=settings.covariance,
             floor=scene.floor,
             near=scene_limits(scene.near, factory.rig.radius).near,
             device=device,
@@ -112,13 +114,13 @@ class DeviceUpdate:
         rates = self._update.rates.tried(manner.rates, manner.rigid, manner.hold_colours)
         update = replace(self._update, rates=rates.hurried(settings.cold_start) if motion is None else rates)
         start, deltas = tables.split()
-        distinct = {id(view): view for view in pictures}
+        distinct = {id(view): view for seen in pictures for view in seen}
         place = {key: index for index, key in enumerate(distinct)}
         watch.lap("start")
         found = update.run(
             previous,
             [self._on_device(view) for view in distinct.values()],
-            [place[id(view)] for view in pictures],
+            [[place[id(view)] for view in seen] for seen in pictures],
             start=start,
             deltas=deltas,
             rows=[samples[iteration % len(samples)] for iteration in range(most)],
@@ -127,7 +129,7 @@ class DeviceUpdate:
         watch.lap("iterations")
         motion = Motion.of(Tables.of(hierarchy, found), seconds)
         watch.lap("commit")
-        cameras = {view.name: CameraFit(psnr) for view, psnr in zip(pictures, found.psnr, strict=False)}
+        cameras = {view.name: CameraFit(psnr) for view, psnr in zip(chain(*pictures), found.psnr, strict=False)}
         return Updated(
             found.gaussians, motion, found.losses, found.psnr, watch.seconds, cameras, planned=course.pace.told
         )

@@ -99,7 +99,7 @@ class Rates:
 
 
 class ViewPlan:
-    """Which view each iteration trains: random rounds over all, coarser pictures first where the settings say so.
+    """Which views each iteration trains: random rounds over all, coarser pictures first where the settings say so.
 
     Args:
         most: iterations there can be at most; the order of more begins again.
@@ -115,7 +115,8 @@ class ViewPlan:
     ) -> None:
         self._factory = factory
         self._views = views
-        self._order = view_order(len(views), most, rng)
+        self._order = view_order(len(views), most * settings.views, rng)
+        self._each = settings.views
         self._until, self._scale = settings.coarse_until, settings.coarse_scale
         self._small: dict[int, TrainingView] = {}
         self._next = 0
@@ -127,14 +128,18 @@ class ViewPlan:
         if all(view.name in self._left_out for view in self._views):
             raise ValueError(f"all {len(self._views)} views are left out; an update needs one")
 
-    def take(self, iteration: int, iterations: int) -> TrainingView:
-        """The view of an iteration, counted from 0, of so many as are planned."""
+    def take(self, iteration: int, iterations: int) -> list[TrainingView]:
+        """The next ``views`` views, for an iteration, counted from 0, of so many as are planned."""
+        coarse = iteration < round(self._until * iterations)
+        return [self._next_view(coarse) for _ in range(self._each)]
+
+    def _next_view(self, coarse: bool) -> TrainingView:
         while True:
             index = self._order[self._next % len(self._order)]
             self._next += 1
             if self._views[index].name not in self._left_out:
                 break
-        if iteration >= round(self._until * iterations):
+        if not coarse:
             return self._views[index]
         if index not in self._small:
             self._small[index] = self._factory.coarser(self._views[index], self._scale)

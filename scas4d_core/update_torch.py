@@ -17,7 +17,16 @@ from torch import Tensor
 
 from scas4d_core import losses
 from scas4d_core.cameras import Camera
-from scas4d_core.deformation import ClusterMap, ClusterParams, Deformed, Deltas, Layer, deform, material_rotations
+from scas4d_core.deformation import (
+    ClusterMap,
+    ClusterParams,
+    Covariance,
+    Deformed,
+    Deltas,
+    Layer,
+    deform,
+    material_rotations,
+)
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.pace import Pace, Timed
 from scas4d_core.rasterize import cuda, twin
@@ -105,7 +114,7 @@ class Updated(NamedTuple):
         layers: cluster parameters at the end, coarse to fine; the next frame's warm start.
         deltas: per Gaussian at the end.
         losses: one weighted sum an iteration.
-        psnr: dB, of the view that each iteration rendered.
+        psnr: dB, of each view that was rendered, in order.
     """
 
     gaussians: Gaussians
@@ -128,7 +137,7 @@ class TorchUpdate:
         rates, weights: of the parameters and of the terms.
         max_scale: metres; longer axes are held at their length of frame 0.
         background: RGB behind everything.
-        cluster_map: form of equation (6).
+        cluster_map: form of equation (6). covariance: what moves a Gaussian's, see ``deformation.Covariance``.
         floor: plane inside, see ``floor.floor_inside``, or None.
         near: metres; nothing nearer to a camera is drawn.
         device: "cpu" rasterizes with the twin, "cuda" with gsplat.
@@ -144,6 +153,7 @@ class TorchUpdate:
     max_scale: float = 0.02
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     cluster_map: ClusterMap = "centred"
+    covariance: Covariance = "entangled"
     floor: tuple[float, float, float, float] | None = None
     near: float = DEFAULT.near
     device: str = "cpu"
@@ -167,7 +177,7 @@ class TorchUpdate:
         self,
         gaussians: Gaussians,
         views: Sequence[TrainingView],
-        order: Sequence[int],
+        order: Sequence[int | Sequence[int]],
         *,
         start: Sequence[ClusterArrays] | None = None,
         deltas: DeltaArrays | None = None,
@@ -180,7 +190,8 @@ class TorchUpdate:
         Args:
             gaussians: Θ_{t−1}.
             views: training views of frame t.
-            order: index of the view of each iteration; its length is the number of iterations.
+            order: index of the view of each iteration, or of its views, whose mean counts; its length is the number of
+                iterations.
             start: cluster parameters to start from (warm start), coarse to fine; None: the identity.
             deltas: per-Gaussian parameters to start from; None: the identity.
             rows: per iteration the rows among the moving whose neighbours are looked at; None: all.
@@ -217,7 +228,8 @@ class TorchUpdate:
             if on_iteration is not None:
                 on_iteration(iteration + 1)
         # The losses stay on the device until here: reading each would make the host wait for it.
-        found, psnr = (torch.stack(values).tolist() for values in zip(*history, strict=True)) if history else ([], [])
+        found = torch.stack([loss for loss, _ in history]).tolist() if history else []
+        psnr = torch.cat([psnr for _, psnr in history]).tolist() if history else []
         return scene.result(gaussians, found, psnr)
 
 
@@ -242,7 +254,7 @@ class _Scene:
     distances: Tensor
     first_lengths: Tensor
     views: list[tuple[CameraParams, Tensor, Tensor | None, Tensor | None]]
-    psnr: Tensor = field(default_factory=lambda: torch.tensor(torch.nan))
+    psnr: Tensor = field(default_factory=lambda: torch.zeros(0))
 
     @classmethod
     def of(
@@ -342,12 +354,25 @@ class _Scene:
     def deformed(self) -> Deformed:
         """The moving Gaussians under the present parameters."""
         means, factors = self.means[self.moving], self.factors[self.moving]
-        return deform(means, factors, self.layers, self.deltas, self.update.cluster_map)
+        return deform(means, factors, self.layers, self.deltas, self.update.cluster_map, self.update.covariance)
 
-    def loss(self, view: int, rows: Tensor | None) -> Tensor:
-        """The weighted sum of the terms, seen from one view; leaves the view's ``psnr``."""
-        camera, image, mask, exposure = self.views[view]
+    def loss(self, views: int | Sequence[int], rows: Tensor | None) -> Tensor:
+        """The weighted sum of the terms, those of pictures the mean over the views; leaves the views' ``psnr``."""
+        numbers = [views] if isinstance(views, int) else list(views)
         now = self.deformed()
+        seen = [self._picture_terms(number, now) for number in numbers]
+        self.psnr = torch.stack([psnr for _, psnr in seen])
+        terms = [term / len(numbers) for terms_of_view, _ in seen for term in terms_of_view]
+        weights = self.update.weights
+        if weights.soft_colour > 0:
+            terms.append(weights.soft_colour * losses.soft_colour_loss(self.colours, self.previous_colours))
+        if len(self.moving):
+            terms += self._motion_terms(now, rows)
+        return torch.stack(terms).sum()
+
+    def _picture_terms(self, view: int, now: Deformed) -> tuple[list[Tensor], Tensor]:
+        """The weighted terms of one view's pictures, and its PSNR."""
+        camera, image, mask, exposure = self.views[view]
         features, background = self.colours, [*self.update.background]
         if mask is not None and self.update.weights.mask > 0:
             features = torch.cat([features, self.foreground[:, None]], dim=1)
@@ -366,14 +391,9 @@ class _Scene:
         if exposure is not None:
             colour = colour * exposure[:, 0] + exposure[:, 1]
         terms = [weights.image * losses.image_loss(colour, image)]
-        self.psnr = losses.psnr(colour.detach(), image)
         if mask is not None and weights.mask > 0:
             terms.append(weights.mask * losses.image_loss(picture[..., 3:], mask))
-        if weights.soft_colour > 0:
-            terms.append(weights.soft_colour * losses.soft_colour_loss(self.colours, self.previous_colours))
-        if len(self.moving):
-            terms += self._motion_terms(now, rows)
-        return torch.stack(terms).sum()
+        return terms, losses.psnr(colour.detach(), image)
 
     def _motion_terms(self, now: Deformed, rows: Tensor | None) -> list[Tensor]:
         """The weighted terms over the moving Gaussians."""

@@ -62,8 +62,9 @@ class Updated:
     """What an update leaves: Θ_t, the motion that warms the next start, and how it went.
 
     Attributes:
-        losses: each iteration's weighted sum. psnr: dB of the view that it rendered. moments: seconds from the start
-            of the update to its end. seconds: by stage.
+        losses: each iteration's weighted sum. psnr: dB of each view as it was rendered, in order, as many an iteration
+            as the settings say. moments: seconds from the start of the update to the end of each iteration. seconds:
+            by stage.
         cameras: how well each camera was met, by name. left_out: cameras that the gate left out, with the reason.
         planned: what the pace planned, see ``pace.Pace.told``.
         errors: image loss by witness view, of the frame before ("still"), the warm start ("warm") and the end ("end");
@@ -97,6 +98,7 @@ class Story:
     def __init__(self, cameras: int, shifts: bool = True) -> None:
         self._cameras = cameras
         self._shifts = shifts
+        self._complete = False
         self.losses: list[float] = []
         self.psnr: list[float] = []
         self.moments: list[float] = []
@@ -117,10 +119,10 @@ class Story:
 
     def end_iteration(self, loss: float, moment: float) -> bool:
         """An iteration is over; whether it is the one in which the last camera was rendered first."""
-        complete = len(self.first) == self._cameras and self.iterations + 1 == self._cameras
+        before, self._complete = self._complete, len(self.first) == self._cameras
         self.losses.append(loss)
         self.moments.append(moment)
-        return complete
+        return self._complete and not before
 
     def leave_out(self, found: Mapping[str, str]) -> Mapping[str, str]:
         """The gate's answer, kept and passed on."""

@@ -15,17 +15,19 @@ from box_scene import MOVING, SHIFT, TURN, make_box, make_rig, moved, take_frame
 from scas4d_core import update as update_module
 from scas4d_core import update_torch
 from scas4d_core.adam import Adam
+from scas4d_core.attempts import Course
 from scas4d_core.deformation_cpu import CpuDeformation
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.kernels import neighbour_terms
 from scas4d_core.neighbours import Neighbours, build_neighbours
+from scas4d_core.pace import Counted
 from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.update import FrameUpdate
-from scas4d_core.update_plan import Rates, plan_samples
+from scas4d_core.update_plan import Rates, ViewPlan, plan_samples
 from scas4d_core.updated import REPORT, Stopwatch, Updated
-from scas4d_core.views import TrainingView, ViewFactory
+from scas4d_core.views import TrainingView, ViewFactory, view_order
 
 BEFORE = make_box()
 AFTER = moved(BEFORE)
@@ -166,6 +168,7 @@ class Iteration:
         colours = (BEFORE.colours + 0.05 * rng.normal(size=BEFORE.colours.shape)).astype(np.float32)
         self.parameters = [*clusters, deltas, colours]
         self.gradients: list[np.ndarray] = []
+        seen: list[int] = []
 
         def step(optimizer: Adam, gradients: np.ndarray, number: int, factor: float) -> None:
             table = len(self.gradients) % len(self.parameters)
@@ -175,7 +178,7 @@ class Iteration:
         evaluate, neighbour_losses = PictureLoss.evaluate, CpuDeformation.neighbour_losses
 
         def rendered(loss: PictureLoss, *given: Any) -> Any:
-            self.view = RIG.names.index(given[4].name)
+            seen.append(RIG.names.index(given[4].name))
             return evaluate(loss, *given)
 
         def looked_at(deformation: CpuDeformation, sample: np.ndarray, *given: Any) -> Any:
@@ -187,10 +190,12 @@ class Iteration:
         monkeypatch.setattr(CpuDeformation, "neighbour_losses", looked_at)
         self.loss = updater.run(BEFORE, views, None, 1.0, seed=9).losses[1]
         self.gradients = self.gradients[len(self.parameters) :]
+        assert len(seen) == 2 * settings.views
+        self.views = seen[settings.views :]
 
 
 def twin_iteration(fused: Iteration, settings: UpdateSettings, masks: bool) -> tuple[float, list[np.ndarray]]:
-    """Loss and gradients of the same parameters and view in float64 torch."""
+    """Loss and gradients of the same parameters and views in float64 torch."""
     rows, weights = fused.hierarchy.rows, settings.weights
     terms = {name: getattr(weights, name) for name in update_torch.TermWeights.__dataclass_fields__}
     update_of_twin = update_torch.TorchUpdate(
@@ -211,6 +216,7 @@ def twin_iteration(fused: Iteration, settings: UpdateSettings, masks: bool) -> t
         weights=update_torch.TermWeights(**terms),
         max_scale=settings.max_scale,
         cluster_map=settings.cluster_map,
+        covariance=settings.covariance,
         dtype=torch.float64,
     )
     frame = take_frame(1, 1.0, AFTER, RIG, masks)
@@ -225,7 +231,7 @@ def twin_iteration(fused: Iteration, settings: UpdateSettings, masks: bool) -> t
     given = torch.tensor(colours, dtype=torch.float64)
     scene.free_colours = (given[scene.moving], given[scene.standing])
     scene.parameter_groups(update_of_twin.rates)
-    loss = scene.loss(fused.view, torch.tensor(fused.sample))
+    loss = scene.loss(fused.views, torch.tensor(fused.sample))
     loss.backward()
 
     def gradient(*tensors: Any) -> np.ndarray:
@@ -243,9 +249,27 @@ def twin_iteration(fused: Iteration, settings: UpdateSettings, masks: bool) -> t
 def test_one_whole_iteration_agrees_with_the_float64_twin(
     clusters: tuple[int, ...], cluster_map: str, masks: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = SETTINGS.model_copy(
-        update={"clusters": clusters, "cluster_map": cluster_map, "neighbour_sample": 150, "neighbours": 6}
-    )
+    agrees_with_the_twin({"clusters": clusters, "cluster_map": cluster_map}, masks, monkeypatch)
+
+
+@pytest.mark.parametrize("masks", [True, False])
+def test_an_iteration_of_two_views_agrees_with_the_float64_twin(masks: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    agrees_with_the_twin({"views": 2}, masks, monkeypatch)
+
+
+def test_an_iteration_with_a_separate_covariance_agrees_with_the_float64_twin(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    agrees_with_the_twin({"covariance": "separate"}, True, monkeypatch)
+
+
+def test_motion_is_found_with_a_separate_covariance() -> None:
+    found = update(CALM.model_copy(update={"covariance": "separate"}), masks=False)
+    assert np.median(errors(found.gaussians, AFTER)) < 1e-3
+
+
+def agrees_with_the_twin(changes: dict[str, Any], masks: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = SETTINGS.model_copy(update={"neighbour_sample": 150, "neighbours": 6, **changes})
     fused = Iteration(settings, monkeypatch, masks)
     _, gradients = twin_iteration(fused, settings, masks)
     assert len(gradients) == len(fused.gradients)
@@ -256,10 +280,70 @@ def test_one_whole_iteration_agrees_with_the_float64_twin(
         assert np.linalg.norm((value - wanted) / scale) < 1e-3 * np.linalg.norm(wanted / scale), f"table {table}"
 
 
+@pytest.mark.parametrize("views", [1, 2])
 @pytest.mark.parametrize("masks", [True, False])
-def test_the_reported_loss_is_that_of_the_twin(masks: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    fused = Iteration(SETTINGS, monkeypatch, masks)
-    assert fused.loss == pytest.approx(twin_iteration(fused, SETTINGS, masks)[0], rel=2e-5)
+def test_the_reported_loss_is_that_of_the_twin(masks: bool, views: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = SETTINGS.model_copy(update={"views": views})
+    fused = Iteration(settings, monkeypatch, masks)
+    assert fused.loss == pytest.approx(twin_iteration(fused, settings, masks)[0], rel=2e-5)
+
+
+def test_several_views_are_a_mean_and_one_is_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mean of a view and itself is that view to the last bit, and so is the whole update."""
+    given: list[tuple[bool, float]] = []
+    inside, evaluate = FrameUpdate._pictures, PictureLoss.evaluate
+    last: list[Any] = []
+
+    def rendered(picture: PictureLoss, *arguments: Any) -> Any:
+        last[:] = [evaluate(picture, *arguments), picture.image_part + picture.mask_part]
+        return last[0]
+
+    def pictures(updater: FrameUpdate, *arguments: Any) -> Any:
+        loss, gradients = inside(updater, *arguments)
+        given.append((gradients is last[0], loss - last[1]))
+        return loss, gradients
+
+    monkeypatch.setattr(PictureLoss, "evaluate", rendered)
+    monkeypatch.setattr(FrameUpdate, "_pictures", pictures)
+    found = []
+    for count in (1, 2, 4):
+        updater, views = prepare(SETTINGS.model_copy(update={"iterations": 4, "views": count}))
+        found.append(updater.run(BEFORE, views[:1], None, 1.0, seed=1))
+        assert len(found[-1].losses) == 4
+        assert len(found[-1].psnr) == 4 * count
+    assert given == [(True, 0.0)] * 4 + [(False, 0.0)] * 8
+    for other in found[1:]:
+        assert other.losses == found[0].losses
+        for name, array in found[0].gaussians.arrays().items():
+            np.testing.assert_array_equal(getattr(other.gaussians, name), array)
+
+
+@pytest.mark.parametrize("each", [1, 2, 5])
+def test_each_view_has_its_turn_before_any_has_another(each: int) -> None:
+    settings = SETTINGS.model_copy(update={"views": each})
+    _, views = prepare(settings)
+    count, most = len(views), 30
+    plan = ViewPlan(ViewFactory(RIG), views, settings, most, np.random.default_rng(7))
+    taken = [plan.take(iteration, most) for iteration in range(most)]
+    assert {len(seen) for seen in taken} == {each}
+    order = [view.name for seen in taken for view in seen]
+    assert order == [views[index].name for index in view_order(count, most * each, np.random.default_rng(7))]
+    rounds = [order[start : start + count] for start in range(0, len(order) - count + 1, count)]
+    assert all(len(set(names)) == count for names in rounds)
+
+
+def test_cameras_are_judged_once_all_were_seen() -> None:
+    _, views = prepare()
+    for each in (1, 2, len(views) + 2):
+        asked: list[int] = []
+        updater, _ = prepare(SETTINGS.model_copy(update={"iterations": 2 * len(views), "views": each}))
+
+        def gate(first: Any, asked: list[int] = asked) -> dict[str, str]:
+            asked.append(len(first))
+            return {}
+
+        updater.run(BEFORE, views, None, 1.0, 1, Course(Counted(2 * len(views)), gate=gate))
+        assert asked == [len(views)]
 
 
 def test_without_a_graph_no_neighbour_term_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:

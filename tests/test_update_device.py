@@ -108,7 +108,7 @@ def test_a_warm_update_agrees_with_the_cpu(on_device: Updated, on_cpu: Updated) 
     for a, b in zip(on_device.motion.shifts, on_cpu.motion.shifts, strict=True):
         np.testing.assert_allclose(a, b, atol=WORST_M)
     assert on_device.motion.seconds == 1.0
-    assert set(on_device.seconds) == {"start", "iterations", "commit"}
+    assert set(on_device.seconds) == {"start", "iterations", "commit", "report"}
 
 
 def test_the_state_is_what_the_cpu_would_hand_on(on_device: Updated, on_cpu: Updated) -> None:
@@ -157,6 +157,28 @@ def test_a_cold_start_hurries_as_on_the_cpu() -> None:
     wanted = run(updater(FrameUpdate, short), None)
     assert loss_difference(found, wanted)[0] < FIRST_LOSS
     assert np.median(distances(found, wanted)) < 0.1 * np.median(distances(found, slow))
+
+
+def test_several_views_an_iteration_are_those_of_the_cpu(motion: Motion) -> None:
+    two = SETTINGS.model_copy(update={"iterations": 4, "views": 2})
+    found, wanted = (
+        run(updater(DeviceUpdate, two, device="cpu", dtype=torch.float64), motion),
+        run(updater(FrameUpdate, two), motion),
+    )
+    assert len(found.losses) == 4
+    assert len(found.psnr) == len(wanted.psnr) == 8
+    assert loss_difference(found, wanted).max() < LOSS
+    np.testing.assert_allclose(found.psnr, wanted.psnr, atol=PSNR_DB)
+    one = run(updater(FrameUpdate, two.model_copy(update={"views": 1})), motion)
+    assert loss_difference(found, one).max() > 5 * LOSS
+
+
+@pytest.mark.parametrize("covariance", ["entangled", "separate"])
+def test_the_covariance_is_the_one_asked_for(covariance: str) -> None:
+    asked = SETTINGS.model_copy(update={"covariance": covariance})
+    made = updater(DeviceUpdate, asked, device="cpu")
+    assert isinstance(made, DeviceUpdate)
+    assert made._update.covariance == covariance
 
 
 def test_without_neighbours_and_without_layers() -> None:

@@ -22,7 +22,7 @@ CAPTURE_CHANGES: Mapping[str, tuple[str, ...]] = {}
 
 LATER: Mapping[str, Mapping[str, Any]] = {
     "static": {"stop_gain": 0.0},
-    "update": {"budget_ms": None, "stop_gain": 0.0, "cold_longer": 1.0},
+    "update": {"budget_ms": None, "stop_gain": 0.0, "cold_longer": 1.0, "views": 1, "covariance": "entangled"},
 }
 """Settings that rows measured before do not name, by group, with the value that they had in effect."""
 

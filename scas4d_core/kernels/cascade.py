@@ -7,7 +7,7 @@ Q to the next.
 
 Cluster map, y = x − p, z = c·y + s, f = 2σ(2z), f' = f(2 − f):
 centred x' = p + t + f R y, published x' = f (R y + p + t); both have J = R (f I + f' e cᵀ)
-with e = y, or e = y + Rᵀ(p + t).
+with e = y, or e = y + Rᵀ(p + t). Where the covariance is separate, a factor is turned by R instead of carried by J.
 """
 
 from __future__ import annotations
@@ -147,11 +147,12 @@ def polar(table, about_origin, f, yx, yy, yz):
 
 
 @kernel
-def carry(table, about_origin, points, place, v, present, lane, acted):
+def carry(table, about_origin, separate, points, place, v, present, lane, acted):
     """Factors and turns of a block through a layer, in place.
 
     Args:
-        table: [23] of its cluster. points: x, y, z of the block from flat index ``place`` on, as they enter.
+        table: [23] of its cluster. separate: None: J is applied to the factors; else R alone.
+        points: x, y, z of the block from flat index ``place`` on, as they enter.
         v: [13, 16] factors 0–8 and turns 9–12.
         present: flat; from ``lane`` on, 0 for a Gaussian that is not counted, else 1.
         acted: [3 or more] int64, added to: for how many of them the guards in ``ACTED`` acted; None: not counted.
@@ -167,10 +168,15 @@ def carry(table, about_origin, points, place, v, present, lane, acted):
             lanes.load(v, lanes.COUNT * (3 + column)),
             lanes.load(v, lanes.COUNT * (6 + column)),
         )
-        along = slope * (j0 * table[19] + j1 * table[20] + j2 * table[21])
-        lanes.store(v, lanes.COUNT * column, f * (j0 * table[0] + j1 * table[1] + j2 * table[2]) + ux * along)
-        lanes.store(v, lanes.COUNT * (3 + column), f * (j0 * table[3] + j1 * table[4] + j2 * table[5]) + uy * along)
-        lanes.store(v, lanes.COUNT * (6 + column), f * (j0 * table[6] + j1 * table[7] + j2 * table[8]) + uz * along)
+        if separate is None:  # known as the kernel is compiled
+            along = slope * (j0 * table[19] + j1 * table[20] + j2 * table[21])
+            lanes.store(v, lanes.COUNT * column, f * (j0 * table[0] + j1 * table[1] + j2 * table[2]) + ux * along)
+            lanes.store(v, lanes.COUNT * (3 + column), f * (j0 * table[3] + j1 * table[4] + j2 * table[5]) + uy * along)
+            lanes.store(v, lanes.COUNT * (6 + column), f * (j0 * table[6] + j1 * table[7] + j2 * table[8]) + uz * along)
+        else:
+            lanes.store(v, lanes.COUNT * column, j0 * table[0] + j1 * table[1] + j2 * table[2])
+            lanes.store(v, lanes.COUNT * (3 + column), j0 * table[3] + j1 * table[4] + j2 * table[5])
+            lanes.store(v, lanes.COUNT * (6 + column), j0 * table[6] + j1 * table[7] + j2 * table[8])
     a = polar(table, about_origin, f, yx, yy, yz)
     qw, qx, qy, qz = product(table[9], table[10], table[11], table[12], a[0], a[1], a[2], a[3])
     ow, ox, oy, oz = product(
@@ -194,11 +200,11 @@ def carry(table, about_origin, points, place, v, present, lane, acted):
 
 
 @kernel
-def carry_backward(table, about_origin, points, place, v, entering, g, records, record):
+def carry_backward(table, about_origin, separate, points, place, v, entering, g, records, record):
     """Backward of a layer for a block.
 
     Args:
-        table, about_origin, points, place: as for ``carry``.
+        table, about_origin, separate, points, place: as for ``carry``.
         v: factors and turns as they enter, from flat index ``entering`` on.
         g: [16, 16] gradients in place: point 0–2, factor 3–11, turn 12–15; of what leaves, then of what enters.
         records: out from flat index ``record`` on, the block's share of its cluster's gradient.
@@ -226,18 +232,19 @@ def carry_backward(table, about_origin, points, place, v, entering, g, records, 
         along = j0 * cx + j1 * cy + j2 * cz
         # Gradient of f and of the factor's columns: what R turns.
         h0, h1, h2 = g0 * r0 + g1 * r3 + g2 * r6, g0 * r1 + g1 * r4 + g2 * r7, g0 * r2 + g1 * r5 + g2 * r8
-        g_f += h0 * j0 + h1 * j1 + h2 * j2
-        outer = ux * g0 + uy * g1 + uz * g2
-        g_slope += outer * along
-        pull = slope * along
-        gux += pull * g0
-        guy += pull * g1
-        guz += pull * g2
-        g_along = slope * outer
-        gcx += g_along * j0
-        gcy += g_along * j1
-        gcz += g_along * j2
-        g0, g1, g2 = f * g0, f * g1, f * g2
+        if separate is None:
+            g_f += h0 * j0 + h1 * j1 + h2 * j2
+            outer = ux * g0 + uy * g1 + uz * g2
+            g_slope += outer * along
+            pull = slope * along
+            gux += pull * g0
+            guy += pull * g1
+            guz += pull * g2
+            g_along = slope * outer
+            gcx += g_along * j0
+            gcy += g_along * j1
+            gcz += g_along * j2
+            g0, g1, g2 = f * g0, f * g1, f * g2
         gr0 += g0 * j0
         gr1 += g0 * j1
         gr2 += g0 * j2
@@ -247,9 +254,11 @@ def carry_backward(table, about_origin, points, place, v, entering, g, records, 
         gr6 += g2 * j0
         gr7 += g2 * j1
         gr8 += g2 * j2
-        lanes.store(g, n * (3 + column), f * h0 + g_along * cx)
-        lanes.store(g, n * (6 + column), f * h1 + g_along * cy)
-        lanes.store(g, n * (9 + column), f * h2 + g_along * cz)
+        if separate is None:
+            h0, h1, h2 = f * h0 + g_along * cx, f * h1 + g_along * cy, f * h2 + g_along * cz
+        lanes.store(g, n * (3 + column), h0)
+        lanes.store(g, n * (6 + column), h1)
+        lanes.store(g, n * (9 + column), h2)
     # The rotations: Q' = (q(r) ∘ polar) ∘ Q.
     aw, ax, ay, az, ex, ey, ez, dot, nx, ny, nz, cosine, sx, sy, sz, rho, scale, half = polar(
         table, about_origin, f, yx, yy, yz

@@ -73,7 +73,7 @@ def block_sums(points, present, sums):
 
 @parallel_kernel
 def deform(
-    parameters, offsets, ranges, clusters, entries, rows, present, before, deltas, about_origin,
+    parameters, offsets, ranges, clusters, entries, rows, present, before, deltas, about_origin, separate,
     points, sums, tables, means, factors, state, acted,
 ):  # fmt: skip
     """The moved Gaussians: M that move, of N, in B blocks, under L layers of K clusters together.
@@ -85,7 +85,8 @@ def deform(
         entries, rows: [B, 16] int64, each Gaussian's row among the M and among the N.
         present: [B, 16] float32, 0 where a Gaussian is repeated, else 1.
         before: [B, 9, 16] factors of frame t−1. deltas: [M, 9] Δp, Δr, Δs.
-        about_origin: 0 for the centred map, 1 for the published one.
+        about_origin: 0 for the centred map, 1 for the published one. separate: None: J is applied to the factors; else
+            R alone.
         points: [max(L, 1), B, 3, 16] as they enter each layer; the first is given, the others are filled.
         sums: [max(L, 1), B, 3] of them; likewise. tables: out [K, 23].
         means [N, 3], factors [N, 3, 3]: out at ``rows``. state: [M, 16], out its means and turns, see ``deltas``.
@@ -112,8 +113,8 @@ def deform(
             for layer in range(layers):
                 place = (layer * blocks + block) * 3 * lanes.COUNT
                 carry(
-                    tables[clusters[block, layer]], about_origin, points, place, v, present, block * lanes.COUNT,
-                    acted[task],
+                    tables[clusters[block, layer]], about_origin, separate, points, place, v, present,
+                    block * lanes.COUNT, acted[task],
                 )  # fmt: skip
             if layers > 0:
                 move_points(
@@ -129,7 +130,7 @@ def deform(
 
 @parallel_kernel
 def deform_backward(
-    offsets, ranges, clusters, entries, rows, present, before, deltas, about_origin, points, tables,
+    offsets, ranges, clusters, entries, rows, present, before, deltas, about_origin, separate, points, tables,
     scale_weight, bounds, g_means, g_factors, g_tied, records, gradients, g_deltas, losses,
 ):  # fmt: skip
     """Backward of ``deform``, with the gradient of the scale loss added.
@@ -154,8 +155,8 @@ def deform_backward(
                 leaving[:] = v[layer * CARRIED : (layer + 1) * CARRIED]
                 place = (layer * blocks + block) * 3 * lanes.COUNT
                 carry(
-                    tables[clusters[block, layer]], about_origin, points, place, leaving, present, block * lanes.COUNT,
-                    None,
+                    tables[clusters[block, layer]], about_origin, separate, points, place, leaving, present,
+                    block * lanes.COUNT, None,
                 )  # fmt: skip
             losses[block] = apply_own_backward(
                 deltas, entries, rows, block * lanes.COUNT, present, v, layers * CARRIED, scale_weight, bounds,
@@ -166,8 +167,9 @@ def deform_backward(
                 place = (layer * blocks + block) * 3 * lanes.COUNT
                 record = (block * layers + layer) * records.shape[2]
                 carry_backward(
-                    tables[clusters[block, layer]], about_origin, points, place, v, layer * CARRIED, g, records, record
-                )
+                    tables[clusters[block, layer]], about_origin, separate, points, place, v, layer * CARRIED, g,
+                    records, record,
+                )  # fmt: skip
     for layer in range(layers):
         for j in prange(offsets[layer], offsets[layer + 1]):
             cluster_gradient(records, layer, ranges[j, 0], ranges[j, 1], tables[j], gradients[j])

@@ -30,9 +30,12 @@ def starts_of(labels: np.ndarray) -> np.ndarray:
     return np.searchsorted(labels, np.arange(labels.max() + 2)).astype(np.int64)
 
 
+@pytest.mark.parametrize("covariance", ["entangled", "separate"])
 @pytest.mark.parametrize("kind", ["centred", "published"])
 @pytest.mark.parametrize(("points", "sizes"), [(5, ()), (5, (2,)), (333, (3, 7, 20)), (1000, (1, 40))])
-def test_cascade_and_deltas_agree_with_the_twin(kind: str, points: int, sizes: tuple[int, ...]) -> None:
+def test_cascade_and_deltas_agree_with_the_twin(
+    kind: str, points: int, sizes: tuple[int, ...], covariance: str
+) -> None:
     rng = np.random.default_rng(points)
     labels = hierarchy(points, sizes, rng)
     x = rng.normal(size=(points, 3)).astype(np.float32)
@@ -55,7 +58,7 @@ def test_cascade_and_deltas_agree_with_the_twin(kind: str, points: int, sizes: t
     own_leaf = torch.tensor(own, dtype=torch.float64, requires_grad=True)
     twin = deformation.deform(
         torch.tensor(x, dtype=torch.float64), torch.tensor(factors, dtype=torch.float64), layers,
-        deformation.Deltas(own_leaf[:, :3], own_leaf[:, 3:6], own_leaf[:, 6:]), kind,
+        deformation.Deltas(own_leaf[:, :3], own_leaf[:, 3:6], own_leaf[:, 6:]), kind, covariance,
     )  # fmt: skip
     scale = losses.scale_loss(twin.factors, torch.full((points, 3), 0.08, dtype=torch.float64), 0.01)
     total = (
@@ -70,7 +73,7 @@ def test_cascade_and_deltas_agree_with_the_twin(kind: str, points: int, sizes: t
     rows = rng.permutation(points)
     model = CpuDeformation(
         Hierarchy(rows, tuple(k.astype(np.int32) for k in labels), tuple(starts_of(k) for k in labels)),
-        None, bound, kind,
+        None, bound, kind, covariance,
     )  # fmt: skip
     model.start(gaussians(scattered(x, rows), scattered(factors, rows)))
     for table, values in zip([*model.clusters, model.deltas], [*parameters, own], strict=True):

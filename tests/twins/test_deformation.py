@@ -169,6 +169,30 @@ def test_covariance_is_pushed_forward_and_deltas_come_last() -> None:
     torch.testing.assert_close(own.factors, quaternion_matrices(rotation_quaternions(deltas.dr)) @ scaled)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_separate_covariance_turns_with_the_clusters_and_nothing_else(kind: str) -> None:
+    points, factors, layers = normal(12, 3), normal(12, 3, 3, seed=5), some_layers(12)
+    deltas = Deltas(normal(12, 3, seed=6), normal(12, 3, seed=7, scale=0.2), normal(12, 3, seed=8, scale=0.2))
+    entangled, separate = (deform(points, factors, layers, deltas, kind, c) for c in ("entangled", "separate"))
+    torch.testing.assert_close(separate.means, entangled.means, rtol=0, atol=0)
+    torch.testing.assert_close(separate.turns, entangled.turns, rtol=0, atol=0)
+    assert (separate.factors - entangled.factors).abs().max() > 0.1
+    first, second = (quaternion_matrices(rotation_quaternions(params.r))[labels] for labels, params in layers)
+    own = quaternion_matrices(rotation_quaternions(deltas.dr))
+    torch.testing.assert_close(separate.factors, own @ second @ first @ factors @ torch.diag_embed(deltas.ds.exp()))
+    alone = deform(points, factors, layers, Deltas.identity(12), kind, "separate")
+    sizes = [torch.linalg.svdvals(f) for f in (alone.factors, factors)]
+    torch.testing.assert_close(*sizes)  # neither bent nor scaled
+    rigid = [Layer(k, p._replace(c=torch.zeros_like(p.c), s=torch.zeros_like(p.s))) for k, p in layers]
+    same = [deform(points, factors, rigid, deltas, kind, c).factors for c in ("entangled", "separate")]
+    torch.testing.assert_close(*same)
+
+
+def test_unknown_covariance_is_named() -> None:
+    with pytest.raises(ValueError, match="'loose' is unknown; give 'entangled' or 'separate'"):
+        deform(normal(2, 3), normal(2, 3, 3), [], Deltas.identity(2), "centred", "loose")  # type: ignore[arg-type]
+
+
 def test_turns_have_positive_w_and_the_rotation_of_the_product() -> None:
     # Two turns of 120 degrees about z make −120 degrees, whose product quaternion has w < 0.
     r = torch.tensor([[0, 0, 3**0.5]], dtype=torch.float64)
@@ -190,8 +214,9 @@ def test_gradients_of_the_map(kind: str) -> None:
     )
 
 
+@pytest.mark.parametrize("covariance", ["entangled", "separate"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_gradients_of_the_whole_deformation(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gradients_of_the_whole_deformation(kind: str, covariance: str, monkeypatch: pytest.MonkeyPatch) -> None:
     points, factors = normal(4, 3), normal(4, 3, 3, seed=5)
     labels = [torch.zeros(4, dtype=torch.int64), torch.tensor([0, 0, 1, 1])]
     deltas = [normal(4, 3, seed=i, scale=0.2) for i in (6, 7, 8)]
@@ -201,7 +226,7 @@ def test_gradients_of_the_whole_deformation(kind: str, monkeypatch: pytest.Monke
 
     def deformed(*p: torch.Tensor) -> tuple[torch.Tensor, ...]:
         layers = [Layer(labels[0], ClusterParams(*p[:4])), Layer(labels[1], ClusterParams(*p[4:8]))]
-        return tuple(deform(points, factors, layers, Deltas(*p[8:]), kind))
+        return tuple(deform(points, factors, layers, Deltas(*p[8:]), kind, covariance))
 
     inputs = [*some_params(1, 30), *some_params(2), *deltas]
     assert torch.autograd.gradcheck(deformed, [tensor.requires_grad_() for tensor in inputs])
