@@ -88,10 +88,16 @@ AXES: Mapping[str, tuple[Variant, ...]] = {
         _changed("½ size for 60 %", "update.coarse_until", 0.6),
         _changed("¼ size for 30 %", "update.coarse_until", 0.3, "update.coarse_scale=0.25"),
     ),
+    "views": (
+        _changed("2 views", "update.views", 2),
+        _changed("4 views", "update.views", 4),
+        Variant("50 iterations of 2 views", iterations=50, changes=("update.views=2",)),
+    ),
     "gaussians": tuple(
         _changed(f"{count:,} Gaussians", "static.max_gaussians", count) for count in (6_000, 12_000, 40_000)
     ),
     "max-scale": (_changed("max_scale 2 m", "update.max_scale", 2.0),),
+    "covariance": (_changed("separate covariance", "update.covariance", "separate"),),
     "seeds": tuple(
         Variant(f"{name} {DEFAULT_ITERATIONS}, seed {seed}", name, seed=seed) for name in METHODS for seed in SEEDS[1:]
     ),

@@ -38,8 +38,10 @@ AXIS_WORDS: Mapping[str, str] = {
     "layers": "Layers",
     "clusters": "Clusters of the first layer",
     "pyramid": "Image pyramid",
+    "views": "Views per iteration",
     "gaussians": "Budget of Gaussians",
     "max-scale": "Largest scale",
+    "covariance": "Covariance",
 }
 COLUMNS = (
     ("PSNR dB", "psnr", ".2f"),
@@ -190,10 +192,11 @@ def _text(
 
 {_provenance(out, captures)}
 
-An iteration is one forward and backward render of one training view. Each row covers the first {updates} updates of a
-capture, from a frame 0 that all its rows share; accuracy is the mean over these updates and the test cameras.
-Definitions: [quality.md](quality.md), `scas4d_core/bench/measure.py`. Seconds are medians of one update, pictures
-decoded and state committed. A setting is dominated where another one is at least as fast and more accurate.
+An iteration is one forward and backward render of one training view, or of several where a line says so. Each row
+covers the first {updates} updates of a capture, from a frame 0 that all its rows share; accuracy is the mean over these
+updates and the test cameras. Definitions: [quality.md](quality.md), `scas4d_core/bench/measure.py`. Seconds are medians
+of one update, pictures decoded and state committed. A setting is dominated where another one is at least as fast and
+more accurate.
 
 ## What to choose
 
@@ -250,7 +253,6 @@ scas4d bench frontier {" ".join(f"CAPTURES/{name}" for name in captures)} --page
 Accuracy does not depend on what else a machine does; seconds do. They come from a pass of their own in which all
 settings take turns (`--only times`) where it was made, and are CPU seconds of rows on one thread otherwise. A budget of
 Gaussians has a frame 0 of its own, and only "through a whole capture" covers more than the first updates.
-There is no setting of views per iteration, so there is no such axis.
 """
 
 

@@ -20,6 +20,7 @@ OTHER_AXES = {
     "clusters": ("clusters of the first layer N", "D", OKABE_ITO[3]),
     "pyramid": ("image pyramid", "^", OKABE_ITO[5]),
     "gaussians": ("budget of Gaussians", "v", OKABE_ITO[4]),
+    "views": ("views per iteration", "X", "#882255"),
     "adaptive": ("other presets", "P", OKABE_ITO[7]),
 }
 """In words, marker and colour."""

@@ -69,8 +69,6 @@ does not agree with one that is not. Where the paper shows a picture only, its c
 
 ## Left out
 
-- Entangled against separate covariance: the covariance of a Gaussian always follows the Jacobian of its motion here,
-  and no setting separates them.
 - LPIPS: its weights are a download that the studies do without.
 - The offline methods of the paper's second table: other programs.
 - Robot-Task and five scenes of Panoptic: no such captures.

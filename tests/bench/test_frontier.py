@@ -75,6 +75,10 @@ def test_every_setting_is_another_and_the_default_comes_first():
     assert len(set(settings)) == len(settings)
     assert {len(v.settings.update.clusters) for v in AXES["layers"]} == {1, 2, 4, 5}  # the default has three
     assert [v.settings.update.clusters[0] for v in AXES["clusters"]] == [16, 32, 48]
+    assert [(v.settings.update.iterations, v.settings.update.views) for v in (DEFAULT, *AXES["views"])] == [
+        (100, 1), (100, 2), (100, 4), (50, 2),
+    ]  # fmt: skip
+    assert [v.settings.update.covariance for v in (DEFAULT, *AXES["covariance"])] == ["entangled", "separate"]
     seeds = AXES["seeds"]
     assert {(v.settings.static.seed, v.settings.update.seed) for v in seeds} == {(0, 1), (0, 2)}
     assert variants(["iterations"], most_iterations=25)[0] == DEFAULT
@@ -89,6 +93,7 @@ def test_only_what_is_missing_is_measured_the_cheapest_first(tmp_path, monkeypat
     there = Variant("scas4d 25", "scas4d", 25)
     row = made_row(there, "robot", 5)
     del row["settings"]["static"]["stop_gain"]  # came later
+    del row["settings"]["update"]["views"], row["settings"]["update"]["covariance"]
     store.put(row)
     store.put(made_row(Variant("scas4d 10", "scas4d", 10), "robot", 3))  # other updates
     store.put(made_row(Variant("scas4d 50", "scas4d", 50), "robot", 5) | {"error": "killed"})
@@ -223,6 +228,10 @@ def test_the_page_has_its_plots_and_tables(tmp_path):
             assert picture.width > 900
             assert (colours == (0, 0x72, 0xB2)).all(axis=1).sum() > 500  # the line of scas4d
     assert "ahead at 10 of 10 budgets" in text
+    for words, label in (("Views per iteration", "50 iterations of 2 views"), ("Covariance", "separate covariance")):
+        table = text.split(f"**{words}**\n\n")[1].split("\n\n")[0]
+        assert f"| {label} |" in table
+        assert "| scas4d 100 |" in table
     assert f"| scas4d 100 | 1.00 | 1.00 | 1.00 | {made_psnr(DEFAULT):.2f} |" in text
     assert "`scas4d` robot 0.20, cloth 0.20 (3 seeds)" in text
     refused = CliRunner().invoke(app, [*command, "--only", "plots"])

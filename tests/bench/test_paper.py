@@ -103,6 +103,7 @@ def test_every_experiment_compares_what_it_has():
     wanted = needed()
     assert len(set(wanted)) == len(wanted)
     assert {DEFAULT, BASE_2000, variant("K=5"), variant("N=16"), variant("max_scale 2 m")} <= set(wanted)
+    assert variant("separate covariance") in wanted
 
 
 def test_captures_without_rows_come_from_the_study_of_the_bars(tmp_path):
@@ -136,6 +137,8 @@ def test_the_command_writes_every_experiment(tmp_path):
         f"| Online comparison, PSNR | Ours, 100 – Dynamic3DGS, 100 | {ours - base:+.2f} | +9.21 | sign and size |"
         in text
     )
+    other = made_psnr(variant("separate covariance"))
+    assert f"| Entangled against separate covariance | Entangled – Separate | {ours - other:+.2f} | – | sign |" in text
     assert "costs 0.50 times that of one of `scas4d`" in text
 
 
