@@ -52,14 +52,17 @@ class FrameReport:
         psnr: dB, over the training views of the last iterations, each as it was rendered then; NaN where not measured.
         moving, gaussians: how many Gaussians move, and are.
         cameras: by name, how well each camera's picture was met when it was last rendered: a bumped camera shows.
-        used: cameras whose pictures were learnt from. dropped: cameras left out, with the reason.
+        used: cameras whose pictures were learnt from; none of a frame that was held or stood. dropped: cameras left
+            out, with the reason.
         degraded: why the state is not the frame's, or only by half; None for a frame that went as it should.
         attempts: how often and in which manner the update was tried, with what came of each.
-        exposure: times that the frame was seen to be brighter than frame 0.
+        exposure: times that the frame was seen to be brighter than the light in which the colours are; of a frame that
+            was not tried, as the mean brightness of its pictures says. A light that stays becomes that of the colours.
         held: Gaussians held one by one as they were before. guards: by name, how often each guard acted.
         planned: (iteration, iterations in all) whenever the pace planned otherwise. curve: of the last attempt.
         errors: mean image loss of the witnesses for the frame before ("still"), going on as before ("warm"), and the
-            end of the update ("end"). kept: which of them the state is.
+            end of the update ("end"), in pictures without what ``exposure`` says. kept: which of them the state is;
+            "still" where the frame was held.
     """
 
     index: int

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from math import isfinite, log2, nan
+from math import isfinite, log2, log10, nan
 from typing import Any
 
 import numpy as np
@@ -82,9 +82,11 @@ class Past:
 
     Attributes:
         cameras: by name. level: dB at the end of an update, see ``level_of``; NaN where not known.
-        updates: that went into it. held: frames in a row that were held. fitted: seconds, time of the last frame that
-            was not. behind: frames since some were held or not moved, 0 once they are met as usual again.
+        updates: that went into it. held: frames in a row that were held although their pictures say something. fitted:
+            seconds, time of the last frame that was learnt from. behind: frames since some were held or not moved, 0
+            once they are met as usual again.
         iterations: of the last update. error: usual at the end of an update, by witness view.
+        light: times that the last frame was brighter, ``Look.exposure``. lit: frames in a row in a light like this.
     """
 
     cameras: Mapping[str, CameraPast] = field(default_factory=dict)
@@ -95,6 +97,8 @@ class Past:
     behind: int = 0
     iterations: int = 0
     error: Mapping[str, float] = field(default_factory=dict)
+    light: float = 1.0
+    lit: int = 0
 
     @classmethod
     def of_first(cls, psnr: Mapping[str, float], bright: Mapping[str, float]) -> Past:
@@ -107,12 +111,11 @@ class Past:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """As arrays, for a checkpoint."""
         rows = [(past.place, past.brightness, past.out) for past in self.cameras.values()]
+        scene = [self.level, self.updates, self.held, self.fitted, self.behind, self.iterations, self.light, self.lit]
         return {
             "names": np.array(list(self.cameras), np.str_),
             "cameras": np.array(rows, np.float64).reshape(-1, 3),
-            "scene": np.array(
-                [self.level, self.updates, self.held, self.fitted, self.behind, self.iterations], np.float64
-            ),
+            "scene": np.array(scene, np.float64),
             "witnesses": np.array(list(self.error), np.str_),
             "error": np.array(list(self.error.values()), np.float64),
         }
@@ -128,9 +131,12 @@ class Past:
             return cls()
         rows = zip(arrays["names"].tolist(), arrays["cameras"].tolist(), strict=True)
         cameras = {name: CameraPast(place, bright, int(out)) for name, (place, bright, out) in rows}
-        level, updates, held, fitted, behind, iterations = arrays["scene"].tolist()
+        level, updates, held, fitted, behind, iterations, *light = arrays["scene"].tolist()
+        light, lit = light or (1.0, 0)  # an older checkpoint knows nothing of the light
         error = dict(zip(arrays["witnesses"].tolist(), arrays["error"].tolist(), strict=True))
-        return cls(cameras, level, int(updates), int(held), fitted, int(behind), int(iterations), error)
+        return cls(
+            cameras, level, int(updates), int(held), fitted, int(behind), int(iterations), error, light, int(lit)
+        )
 
     def of(self, name: str) -> CameraPast:
         """What is usual for a camera; nothing for one that is new."""
@@ -181,6 +187,22 @@ def look(past: Past, bright: Mapping[str, float]) -> Look:
     if not enough or 1 / EXPOSURE <= common <= EXPOSURE:
         common = 1.0
     return Look(common, _few(left_out, len(bright)))
+
+
+def lit(past: Past, seen: Look) -> Past:
+    """The past with the light of a frame: how long it has been another one, and the same; darkness is none."""
+    light = seen.exposure
+    if light == 1.0 or not BLIND <= light <= 1 / BLIND:
+        return replace(past, light=1.0, lit=0)
+    same = past.lit > 0 and 1 / EXPOSURE <= light / past.light <= EXPOSURE
+    return replace(past, light=light, lit=past.lit + 1 if same else 1)
+
+
+def relit(past: Past, gain: float) -> Past:
+    """What is usual once a light is the usual one: a brighter one makes what is not met brighter, too."""
+    cameras = {name: replace(one, brightness=gain * one.brightness) for name, one in past.cameras.items()}
+    level = past.level - max(0.0, 20 * log10(gain))
+    return replace(past, cameras=cameras, level=level, error={}, light=1.0, lit=0)
 
 
 def place(past: Past, psnr: Mapping[str, float]) -> dict[str, float]:

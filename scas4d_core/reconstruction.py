@@ -344,6 +344,7 @@ class Reconstruction(Committed):
         watch.lap("decode")
         brightness = judge.brightness(frame.images)
         look = judge.look(past, brightness) if self.settings.update.judge else judge.Look()
+        past = judge.lit(past, look)
         watch.lap("judge")
         updater, carried = self._learn_what_moves(views, look)
         given = Given(
@@ -363,9 +364,7 @@ class Reconstruction(Committed):
         )
         trial = Trial(updater, self._factory, self._picture, self._effort)
         shown = fingerprints(frame.images)
-        if look.held:
-            outcome = trial.held(given, look.held)
-        elif shown == carried.shown and self._effort.still > -1:
+        if not look.held and shown == carried.shown and self._effort.still > -1:
             outcome = same_again(given)
         else:
             outcome = trial.run(given)
@@ -373,7 +372,7 @@ class Reconstruction(Committed):
         watch.move("update", "judge", trial.judging)
         if outcome.fresh:
             carried = replace(carried, shown=shown)
-            if not self._masked and look.exposure == 1.0:  # what another light changes has not moved
+            if not self._masked and outcome.exposure == 1.0:  # what another light changes has not moved
                 carried = replace(
                     carried, seen=[view for view in given.views if view.name not in outcome.updated.left_out]
                 )
@@ -431,7 +430,7 @@ class Reconstruction(Committed):
                 name: replace(fit, health=judge.health(outcome.fits.get(name))) for name, fit in updated.cameras.items()
             },
             used=[name for name in self.rig.names if name in frame.images and name not in left_out]
-            if outcome.fresh
+            if outcome.fresh and not outcome.stood
             else [],
             dropped=left_out,
             degraded=outcome.degraded,

@@ -29,4 +29,5 @@ def same_again(given: Given) -> Outcome:
     """The outcome of a frame that shows what the last one that was believed showed."""
     nothing = Updated(given.state, given.motion, [], [], {}, kept="still")  # type: ignore[arg-type]
     past = replace(given.past, held=0, behind=max(1, given.past.behind))  # the scene may have stood, or gone further
-    return Outcome(nothing, given.state, given.motion, past, {}, attempts=["the same pictures again"], stood=True)
+    said, exposure = ["the same pictures again"], given.look.exposure
+    return Outcome(nothing, given.state, given.motion, past, {}, attempts=said, exposure=exposure, stood=True)

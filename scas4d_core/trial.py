@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from scas4d_core import judge
 from scas4d_core.attempts import AS_SET, LADDER, SOUGHT, Checked, Course, Manner, checked
-from scas4d_core.exposure import evened
+from scas4d_core.exposure import evened, gain_of, relit
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.judge import Look, Past
 from scas4d_core.pace import PROBE, Counted, Pace, Timed, UntilMet
@@ -27,6 +27,9 @@ from scas4d_core.warm_start import Motion
 
 ERROR_RISE = 1.02
 """Times that the usual error of a witness rises at most in an update."""
+
+HELD = "held as it was: "
+"""How the reason begins that the report gives for a frame whose state is the one before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,19 +103,23 @@ class Trial:
         self.judging = 0.0
 
     def run(self, given: Given) -> Outcome:
-        """Try a frame. ``given.look.held`` is None."""
+        """Try a frame."""
+        if given.past.lit >= self._settings.patience and (outcome := self._relit(given)) is not None:
+            return outcome
+        if given.look.held:
+            return self._unseen(given, given.look.held)
         settings, attempts = self._settings, list[str]()
         exposure = 1.0
         if given.look.exposure != 1.0:
-            exposure, views = evened(self._factory, self._picture, given.state, given.views)
-            given = replace(given, views=views)
+            exposure, views, suspects = evened(self._factory, self._picture, given.state, given.views, given.suspects)
+            given = replace(given, views=views, suspects=suspects)
         updated, check = self._attempt(given, AS_SET, attempts)
         for manner in LADDER:
             if check.fault is None:
                 break
             updated, check = self._attempt(given, manner, attempts)
         if check.fault is not None:
-            return self._held(given, updated, attempts, check.fault)
+            return self._held(given, updated, attempts, check.fault, exposure)
         degraded = attempts[-2] if len(attempts) > 1 else None
         if not updated.losses:
             return _stood(given, updated, exposure)
@@ -124,7 +131,7 @@ class Trial:
                 updated, check = again
                 degraded = f"{why}; {attempts[-1]}"
             elif given.past.held + 1 < settings.patience:
-                return self._held(given, updated, attempts, why)
+                return self._held(given, updated, attempts, why, exposure)
             else:
                 degraded = f"{why}, for {settings.patience} frames: taken as it is from here on"
                 given = replace(given, past=replace(given.past, level=nan, updates=0))
@@ -133,10 +140,29 @@ class Trial:
             updated, check = self._longer(given, updated, check, attempts)
         return self._committed(given, updated, check, degraded, attempts, exposure)
 
-    def held(self, given: Given, why: str) -> Outcome:
-        """A frame whose pictures say nothing: the state stays, nothing is tried."""
+    def _unseen(self, given: Given, why: str) -> Outcome:
+        """A frame whose pictures say nothing: the state stays, nothing is tried, and no patience is lost with it."""
         nothing = Updated(given.state, given.motion, [], [], {}, kept="still")  # type: ignore[arg-type]
-        return self._held(given, nothing, [], why)
+        past = replace(given.past, behind=max(1, given.past.behind))
+        return self._stays(given, nothing, past, [], why, given.look.exposure)
+
+    def _relit(self, given: Given) -> Outcome | None:
+        """A frame in a light that has stayed: the colours take it on; None where no camera tells how bright it is."""
+        gain = gain_of(self._picture, given.state, given.views)
+        if gain is None:
+            return None
+        outcome = self.run(
+            replace(
+                given,
+                state=relit(given.state, gain),
+                past=judge.relit(given.past, gain),
+                look=replace(given.look, exposure=1.0, held=None),
+            )
+        )
+        if outcome.fresh:
+            return replace(outcome, attempts=[f"{gain:.2g} times the light, for good", *outcome.attempts])
+        why = f"in {gain:.2g} times the light {str(outcome.degraded).removeprefix(HELD)}"
+        return self._held(given, outcome.updated, outcome.attempts, why, given.look.exposure)
 
     def _attempt(self, given: Given, manner: Manner, told: list[str]) -> tuple[Updated, Checked]:
         motion = None if manner.cold else given.motion
@@ -162,7 +188,7 @@ class Trial:
         iterations = round(longer * settings.iterations)
         pace: Pace = Counted(iterations)
         if given.end is not None:
-            pace = Timed(given.end, given.each)
+            pace = Timed(self._until(given, manner, given.end), given.each)
         if settings.stop_gain > 0:
             pace = UntilMet(pace, settings.stop_gain, max(settings.own_start, *settings.layer_starts))
         enough = {name: (1 + settings.still) * error for name, error in past.error.items()}
@@ -174,6 +200,11 @@ class Trial:
             step=given.step if given.step < given.seconds else None,
         )  # fmt: skip
 
+    def _until(self, given: Given, manner: Manner, end: float) -> float:
+        """The moment by which an attempt has to be over: after held frames half is kept for what may be sought."""
+        now = perf_counter()
+        return (now + end) / 2 if given.past.held and manner is AS_SET and now < end else end
+
     def _gate(self, given: Given) -> Callable[[Mapping[str, float]], Mapping[str, str]]:
         return lambda first: judge.misfits(given.past, first, judge.FIRST_DB)
 
@@ -184,10 +215,13 @@ class Trial:
             return judge.unmet(given.past, self._met(updated), len(updated.losses))
 
     def _behind(self, given: Given, updated: Updated) -> str | None:
-        spent = given.end is not None and perf_counter() + PROBE * (given.each or 0.0) > given.end
-        if not self._settings.judge or spent:
+        if not self._settings.judge or self._spent(given):
             return None
         return judge.behind(given.past, self._met(updated), len(updated.losses))
+
+    def _spent(self, given: Given, more: int = 0) -> bool:
+        """Whether the budget has no time left for another attempt, and as long as so many iterations take before it."""
+        return given.end is not None and perf_counter() + (PROBE + more) * (given.each or 0.0) > given.end
 
     def _met(self, updated: Updated) -> dict[str, float]:
         """DB of the cameras that were learnt from to the end."""
@@ -201,19 +235,25 @@ class Trial:
         Args:
             ended: the end of ``tried`` as it might be committed: from a Gaussian that is not finite none comes back.
         """
+        if self._spent(given, len(given.views)):
+            attempts.append("not sought: the budget is spent")
+            return None
         found = reacquire(given.state, given.views, self._picture, self._rig)
         starts = [("sought from where the update ended", ended)]
         if found is not None:
             length = float(np.linalg.norm(found.shift))
             starts.insert(0, (f"sought {length:.2f} m away", shifted(given.state, found.shift)))
         for name, start in starts:
+            if self._spent(given):
+                attempts.append(f"not {name}: the budget is spent")
+                break
             course = self._course(given, replace(SOUGHT, name=name))
             updated = self._updater.run(start, given.views, None, given.seconds, given.seed, course)
             check = self._checked(given, start, updated)
             why = check.fault or judge.unmet(given.past, self._met(updated), len(updated.losses))
             attempts.append(name if why is None else f"{name}: {why}")
             if why is None:
-                return (updated if start is not ended else _after(updated, tried)), check
+                return _told(updated if start is not ended else _after(updated, tried), tried), check
         return None
 
     def _longer(self, given: Given, tried: Updated, check: Checked, attempts: list[str]) -> tuple[Updated, Checked]:
@@ -225,14 +265,20 @@ class Trial:
         again = self._checked(given, given.state, updated)
         after, before = (judge.level_of(given.past, self._met(one)) for one in (updated, tried))
         attempts.append(manner.name if again.fault is None else f"{manner.name}: {again.fault}")
-        return (_after(updated, tried), again) if again.fault is None and after > before else (tried, check)
+        better = again.fault is None and after > before
+        return (_told(_after(updated, tried), tried), again) if better else (tried, check)
 
-    def _held(self, given: Given, updated: Updated, attempts: list[str], why: str) -> Outcome:
+    def _held(self, given: Given, updated: Updated, attempts: list[str], why: str, exposure: float) -> Outcome:
+        """A frame that could not be met; patience ends."""
         past = replace(given.past, held=given.past.held + 1)
+        return self._stays(given, updated, past, attempts, why, exposure)
+
+    def _stays(
+        self, given: Given, updated: Updated, past: Past, attempts: list[str], why: str, exposure: float
+    ) -> Outcome:
         fits = judge.place(past, {name: fit.psnr for name, fit in updated.cameras.items()})
-        return Outcome(
-            updated, given.state, given.motion, past, fits, 0, f"held as it was: {why}", attempts, fresh=False
-        )
+        updated = replace(updated, kept="still")
+        return Outcome(updated, given.state, given.motion, past, fits, 0, HELD + why, attempts, exposure, fresh=False)
 
     def _committed(
         self,
@@ -245,7 +291,10 @@ class Trial:
     ) -> Outcome:
         psnr = {name: fit.psnr for name, fit in updated.cameras.items()}
         with self._timed():
-            psnr |= self._suspects(given, check.gaussians)
+            # Short updates render a camera long before their end: what does not fit is looked at once more.
+            off = judge.misfits(given.past, psnr, judge.LAST_DB)
+            again = [view for view in given.views if view.name in off]
+            psnr |= self._measured([*again, *given.suspects], check.gaussians)
         fits = judge.place(given.past, psnr)
         past = judge.settle(given.past, psnr, given.brightness, exposure, len(updated.losses))
         if updated.errors.get("end"):
@@ -264,11 +313,11 @@ class Trial:
             bounded=check.bounded,
         )
 
-    def _suspects(self, given: Given, state: Gaussians) -> dict[str, float]:
-        """DB of cameras that are left out: so they come back once they fit."""
+    def _measured(self, views: list[TrainingView], state: Gaussians) -> dict[str, float]:
+        """DB of cameras as a state shows them; those that are left out come back so, once they fit."""
         features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
         found = {}
-        for view in given.suspects:
+        for view in views:
             self._picture.measure(state.means, state.factors, state.opacities, features, view)
             found[view.name] = self._picture.psnr
         return found
@@ -283,6 +332,14 @@ def _stood(given: Given, updated: Updated, exposure: float) -> Outcome:
 def _after(updated: Updated, first: Updated) -> Updated:
     """An update that went on from where another ended: its motion is that of both."""
     return replace(updated, motion=updated.motion.after(first.motion))
+
+
+def _told(updated: Updated, first: Updated) -> Updated:
+    """An update that was tried again: "still" and "warm" are those of the frame before, "end" is what is committed."""
+    errors = {kind: error for kind, error in first.errors.items() if kind != "end"}
+    if updated.errors:
+        errors["end"] = updated.errors[updated.kept]
+    return replace(updated, errors=errors, kept="end")
 
 
 def _usual(before: Mapping[str, float], now: Mapping[str, float]) -> dict[str, float]:

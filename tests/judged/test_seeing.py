@@ -11,7 +11,7 @@ from scas4d_core.anytime import Anytime
 from scas4d_core.attempts import Course
 from scas4d_core.cameras import rig_inside
 from scas4d_core.captures.frame import Frame
-from scas4d_core.exposure import evened
+from scas4d_core.exposure import evened, gain_of, relit
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import build_hierarchy
 from scas4d_core.pace import Counted
@@ -118,9 +118,11 @@ def test_cameras_that_were_left_out_have_no_say_in_what_is_best() -> None:
 def test_the_gain_of_the_light_is_found_and_taken_out(gain: float) -> None:
     frame = FOOTAGE.frame(0)
     brighter = {name: (gain * picture).round().clip(0, 255).astype(np.uint8) for name, picture in frame.images.items()}
-    found, without = evened(FACTORY, PICTURE, BEFORE, views(replace(frame, images=brighter)))
+    sent = views(replace(frame, images=brighter))
+    found, without, others = evened(FACTORY, PICTURE, BEFORE, sent[2:], sent[:2])
     assert found == pytest.approx(gain, rel=0.03)
-    for view, usual in zip(without, views(frame), strict=True):
+    assert gain_of(PICTURE, BEFORE, sent) == pytest.approx(gain, rel=0.03)
+    for view, usual in zip([*others, *without], views(frame), strict=True):
         assert view.name == usual.name
         assert abs(float((view.target[:3] - usual.target[:3]).mean())) < 0.02
         np.testing.assert_array_equal(view.target[3:], usual.target[3:])
@@ -128,9 +130,22 @@ def test_the_gain_of_the_light_is_found_and_taken_out(gain: float) -> None:
 
 def test_pictures_that_are_not_brighter_stay_as_they_are() -> None:
     before = views(FOOTAGE.frame(1))
-    found, without = evened(FACTORY, PICTURE, BEFORE, before)
+    found, without, others = evened(FACTORY, PICTURE, BEFORE, before[2:], before[:2])
     assert found == 1.0
-    assert all(one is other for one, other in zip(before, without, strict=True))
+    assert all(one is other for one, other in zip(before, [*others, *without], strict=True))
+
+
+@pytest.mark.parametrize("value", [0, 255])
+def test_pictures_without_a_light_tell_of_none(value: int) -> None:
+    frame = FOOTAGE.frame(0)
+    filled = {name: np.full_like(picture, value) for name, picture in frame.images.items()}
+    assert gain_of(PICTURE, BEFORE, views(replace(frame, images=filled))) is None
+
+
+def test_a_state_in_another_light_is_no_brighter_than_white() -> None:
+    colours = np.array([[0.2, 0.8, 1.2]], np.float32).repeat(len(BEFORE), axis=0)
+    np.testing.assert_allclose(relit(BEFORE.replace(colours=colours), 2.0).colours[0], [0.4, 1.0, 1.2])
+    np.testing.assert_allclose(relit(BEFORE.replace(colours=colours), 0.5).colours[0], [0.1, 0.4, 0.6])
 
 
 @pytest.mark.parametrize("sizes", [0.5, 1.0, 2.0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from scas4d_core.cameras import Rig
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import build_hierarchy
 from scas4d_core.judge import Look, Past
+from scas4d_core.pace import Timed
 from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.settings import UpdateSettings
 from scas4d_core.stability.frames_footage import MadeUp
@@ -191,6 +193,24 @@ def test_frames_are_not_sought_longer_than_their_budget(left: float, tries: int)
     assert len(fake.courses) == tries
 
 
+@pytest.mark.parametrize(("left", "tries"), [(-0.01, 1), (0.01, 1), (60.0, 2)])
+def test_what_was_lost_is_not_sought_longer_than_the_budget(left: float, tries: int) -> None:
+    fake = Fake(met(LEVEL - 20), met(LEVEL))
+    outcome = trial(fake).run(replace(given(), end=perf_counter() + left, each=0.01))
+    assert len(fake.courses) == tries
+    assert outcome.fresh == (tries > 1)
+    assert any("the budget is spent" in attempt for attempt in outcome.attempts) == (tries == 1)
+
+
+def test_after_a_held_frame_half_of_the_budget_is_kept_for_what_is_sought() -> None:
+    now = perf_counter()
+    for past, ends in ((PAST, [60.0]), (replace(PAST, held=1), [30.0, 60.0])):
+        fake = Fake(met(LEVEL - 3), met(LEVEL))
+        trial(fake).run(replace(given(past), end=now + 60.0, each=0.01))
+        paces = [course.pace for course in fake.courses]
+        assert [pace.end - now for pace in paces if isinstance(pace, Timed)] == pytest.approx(ends, abs=2.0)
+
+
 def test_after_held_frames_the_level_waits_until_it_is_met_again_but_not_for_ever() -> None:
     past = replace(PAST, held=2)
     for number in range(1, judge.CATCH_UP + 1):
@@ -223,13 +243,43 @@ def test_what_is_found_again_as_patience_ends_is_the_scene_as_it_was() -> None:
     assert (outcome.past.updates, outcome.past.level) == (6, LEVEL)
 
 
+DARK = Look(0.02, held="it is dark")
+
+
 def test_a_frame_whose_pictures_say_nothing_is_not_tried() -> None:
     fake = Fake(met())
-    outcome = trial(fake).held(given(), "it is dark")
+    outcome = trial(fake).run(given(look=DARK))
     assert fake.courses == []
     assert outcome.gaussians is BEFORE
     assert (outcome.degraded, outcome.fresh, outcome.motion is MOTION) == ("held as it was: it is dark", False, True)
-    assert outcome.past.held == 1
+    assert (outcome.exposure, outcome.updated.kept) == (0.02, "still")
+
+
+def test_darkness_costs_no_patience_and_what_comes_after_is_caught_up_with() -> None:
+    past = PAST
+    for _ in range(3 * SETTINGS.patience):
+        past = trial(Fake(met())).run(given(past, DARK)).past
+    assert (past.held, past.level) == (0, LEVEL)
+    outcome = trial(Fake(met(LEVEL - 20))).run(given(past))
+    assert (outcome.fresh, outcome.past.held) == (False, 1)
+    assert trial(Fake(met(LEVEL - 3))).run(given(past)).past.behind == 2  # its level waits
+
+
+def test_a_held_frame_is_told_as_it_is() -> None:
+    outcome = trial(Fake(met(LEVEL - 20))).run(given())
+    assert (outcome.fresh, outcome.updated.kept) == (False, "still")
+
+
+def test_what_is_sought_is_told_with_the_errors_of_the_frame_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = Fake(met(LEVEL - 20), met(LEVEL))
+    told = iter(
+        [{"still": {"c0": 0.5}, "warm": {"c0": 0.4}, "end": {"c0": 0.3}}, {"still": {"c0": 0.1}, "end": {"c0": 0.2}}]
+    )
+    kept, run = iter(["end", "still"]), fake.run
+    monkeypatch.setattr(fake, "run", lambda *asked: replace(run(*asked), errors=next(told), kept=next(kept)))
+    outcome = trial(fake).run(given())
+    assert outcome.updated.errors == {"still": {"c0": 0.5}, "warm": {"c0": 0.4}, "end": {"c0": 0.1}}
+    assert (outcome.updated.kept, outcome.past.error) == ("end", {"c0": 0.1})
 
 
 def test_without_the_judge_nothing_is_sought_or_held_but_the_ladder_stands() -> None:
@@ -269,6 +319,38 @@ def test_suspects_come_back_once_they_fit() -> None:
 
 FITTED = gone(BEFORE, 0.08)
 """The truth of frame 1."""
+
+
+@pytest.mark.parametrize(("end", "out"), [(FITTED, 0), (gone(BEFORE, 0.5), 1)])
+def test_a_camera_that_was_rendered_long_before_the_end_is_looked_at_again(
+    end: Gaussians, out: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a short update the last picture of some cameras is that of its start."""
+    level = float(np.median([_shown(view) for view in VIEWS]))
+    fake, past = Fake(met(level, end)), replace(PAST, updates=5, level=level)
+    run = fake.run
+
+    def early(*asked: Any) -> Updated:
+        updated = run(*asked)
+        return replace(updated, cameras={**updated.cameras, NAMES[0]: CameraFit(level - 9)})
+
+    monkeypatch.setattr(fake, "run", early)
+    assert trial(fake).run(given(past)).past.of(NAMES[0]).out == out
+
+
+def test_suspects_are_looked_at_in_the_light_that_the_colours_are_in() -> None:
+    """Else a camera that fits does not come back while the light is another."""
+    suspect, gain = NAMES[0], 1.5
+    images = {name: (gain * picture).round().clip(0, 255).astype(np.uint8) for name, picture in FRAME.images.items()}
+    bright = FACTORY.views(replace(FRAME, images=images), {})
+    level = float(np.median([_shown(view) for view in VIEWS]))
+    cameras = {**PAST.cameras, suspect: replace(PAST.of(suspect), out=2, place=0.0)}
+    asked = replace(
+        given(replace(PAST, cameras=cameras, level=level), Look(gain)), views=bright[1:], suspects=bright[:1]
+    )
+    outcome = trial(Fake(met(level, FITTED))).run(asked)
+    assert outcome.exposure == pytest.approx(gain, rel=0.03)
+    assert outcome.past.of(suspect).out == 0
 
 
 def _shown(view: TrainingView) -> float:
