@@ -218,6 +218,7 @@ function redraw() {
   const updates = reports.filter((one) => one !== first);
   const budgets = updates.filter((one) => one.budget);
   const changes = new Map(budgets.slice(1).map((one, i) => [one.index, change(budgets[i].budget, one.budget)]));
+  tradeoff.follow(updates);
   seconds.set(reports.map((one) => ({ index: one.index, fault: fault(one), held: reasonOf(one), change: changes.get(one.index),
     value: one === first ? null : one.seconds?.total ?? null })));
   const times = updates.map((one) => one.seconds?.total).filter((value) => value !== undefined).sort((a, b) => a - b);

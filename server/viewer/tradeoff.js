@@ -3,7 +3,11 @@
 import { element, step } from "./charts.js";
 import { call, scenePath } from "./service.js";
 
-const [LEFT, RIGHT, TOP, BOTTOM] = [44, 14, 16, 26];
+// Below the plot is a strip of its own for what has a time but no error, so that the two are not taken for each other.
+const [LEFT, RIGHT, TOP, STRIP, BOTTOM] = [48, 20, 36, 34, 18];
+const EFFECT_FRAMES = 16;
+// Under a budget in time every frame has iterations of its own: measured points whose times differ by less are one.
+const ALIKE = 1.06;
 const EVERY_MS = 3000;
 const REPLAY_EVERY_MS = 700;
 const REPLAYED = [25, 50, 200];
@@ -13,13 +17,42 @@ const RANGES = { iterations: [5, 1000], budget_ms: [20, 20000] };
 const UNITS = { iterations: "iterations", budget_ms: "ms" };
 const HOW = { measured: "measured on frames of the scene", replayed: "replayed", extrapolated: "extrapolated: its time alone" };
 
+/** So many milliseconds in the unit that people say them in. */
+const spoken = (time) => (time < 1000 ? `${short(time)} ms` : `${short(time / 1000)} s`);
+
+const middle = (values) => [...values].sort((a, b) => a - b)[values.length >> 1];
+
 /** Three digits that mean something are enough to choose by. */
 const short = (value) => Number(value.toPrecision(value < 100 ? 2 : 3));
+
+/** The points, with the measured ones that took about as long as one: means by frames. */
+function grouped(points) {
+  const groups = [];
+  for (const point of points.filter((one) => one.kind === "measured").sort((a, b) => a.milliseconds - b.milliseconds)) {
+    const last = groups.at(-1);
+    if (last && point.milliseconds < ALIKE * last[0].milliseconds) last.push(point);
+    else groups.push([point]);
+  }
+  const measured = groups.map((group) => {
+    if (group.length === 1) return group[0];
+    const mean = (name) => {
+      const known = group.filter((one) => one[name] !== null);
+      const frames = known.reduce((sum, one) => sum + one.frames, 0);
+      return frames ? known.reduce((sum, one) => sum + one.frames * one[name], 0) / frames : null;
+    };
+    const counts = group.map((one) => one.iterations);
+    return {
+      ...group[0], iterations: Math.round(mean("iterations")), milliseconds: mean("milliseconds"), error: mean("error"), psnr: mean("psnr"),
+      frames: group.reduce((sum, one) => sum + one.frames, 0), from: Math.min(...counts), to: Math.max(...counts),
+    };
+  });
+  return [...measured, ...points.filter((one) => one.kind !== "measured")];
+}
 
 export class Tradeoff {
   /** @param $ finds an element by its id */
   constructor($) {
-    Object.assign(this, { $, scene: null, model: null, asked: null, effective: null, timer: null, due: 0, moving: false });
+    Object.assign(this, { $, scene: null, model: null, asked: null, effective: null, timer: null, due: 0, moving: false, putting: false, updates: [] });
     $("budget-kind").addEventListener("change", () => this.place(true));
     $("budget").addEventListener("input", () => {
       this.moving = true;
@@ -27,6 +60,8 @@ export class Tradeoff {
       this.draw();
     });
     $("budget").addEventListener("change", () => this.put());
+    // Let go where it was: that is no change, and no event says so.
+    $("budget").addEventListener("pointerup", () => setTimeout(() => this.putting || this.rest(), 50));
     $("measure").addEventListener("click", () => this.measure());
     new ResizeObserver(() => this.draw()).observe($("tradeoff"));
   }
@@ -39,7 +74,7 @@ export class Tradeoff {
 
   close() {
     clearTimeout(this.timer);
-    Object.assign(this, { scene: null, model: null, asked: null, effective: null, timer: null, moving: false });
+    Object.assign(this, { scene: null, model: null, asked: null, effective: null, timer: null, moving: false, updates: [] });
     this.say("");
     this.draw();
     this.place();
@@ -49,6 +84,12 @@ export class Tradeoff {
   refresh(soonest = 0) {
     if (!this.scene || this.timer) return;
     this.timer = setTimeout(() => this.load(), Math.max(soonest, this.due - performance.now(), 0));
+  }
+
+  /** @param updates reports of the frames after the first, by index */
+  follow(updates) {
+    this.updates = updates.filter((one) => one.seconds?.total !== undefined);
+    this.tell();
   }
 
   async load() {
@@ -103,9 +144,10 @@ export class Tradeoff {
     const [kind, effective] = [this.$("budget-kind"), this.effective];
     slider.disabled = kind.disabled = !effective;
     if (effective && !chosen) {
-      kind.value = effective.budget_ms !== null ? "budget_ms" : this.asked.iterations !== null ? "iterations" : "";
+      kind.value = this.held;
     }
-    slider.hidden = !kind.value;
+    slider.hidden = this.$("budget-ends").hidden = !kind.value;
+    if (kind.value) RANGES[kind.value].forEach((end, i) => { this.$("budget-ends").children[i].textContent = kind.value === "iterations" ? end : spoken(end); });
     if (effective && kind.value) {
       const known = this.effective[kind.value] ?? this.milliseconds(this.effective.iterations) ?? 1000;
       const [from, to] = RANGES[kind.value];
@@ -125,31 +167,63 @@ export class Tradeoff {
     const words = this.$("budget-words");
     const effective = this.effective;
     this.$("budget-value").textContent = effective && this.kind ? `${this.value} ${UNITS[this.kind]}` : "";
+    this.$("budget-effect").textContent = effective ? this.effect() : "";
     if (!effective) return words.textContent = "";
-    const own = effective.budget_ms === null ? `${effective.iterations} iterations a frame` : `as many iterations as fit into ${short(effective.budget_ms)} ms`;
+    const own = effective.budget_ms === null ? `${effective.iterations} iterations a frame` : `as many iterations as fit into ${spoken(effective.budget_ms)}`;
     const now = `Now: ${own}${this.asked.iterations === null && this.asked.budget_ms === null ? ", as the scene was made" : `, from frame ${this.since} on`}.`;
     const model = this.model?.model;
     let then = "";
     if (this.moving && model) {
-      then = this.kind === "iterations" ? ` Then: about ${short(this.milliseconds(this.value))} ms a frame.`
+      then = this.kind === "iterations" ? ` Then: about ${spoken(this.milliseconds(this.value))} a frame.`
         : ` Then: about ${Math.max(1, Math.round((this.value - model.fixed) / model.per_iteration))} iterations a frame.`;
     }
+    else if (this.kind && this.kind !== this.held) then = " Move the slider to change it.";
     words.textContent = now + then;
+  }
+
+  /** Which kind of budget holds: by time or by iterations; none where it is as the scene was made. */
+  get held() {
+    return this.effective.budget_ms !== null ? "budget_ms" : this.asked.iterations !== null ? "iterations" : "";
+  }
+
+  /** What the last change has brought: the frames since beside those before. */
+  effect() {
+    if (!this.updates.length || this.since === null || this.since === undefined) return "";
+    const after = this.updates.filter((one) => one.index >= this.since).slice(-EFFECT_FRAMES);
+    const before = this.updates.filter((one) => one.index < this.since).slice(-EFFECT_FRAMES);
+    if (!before.length) return "";
+    if (!after.length) return `No frame since; the ${before.length === 1 ? "one" : before.length} before: ${this.brought(before)}.`;
+    return `Since then, ${after.length === 1 ? "one frame" : `${after.length} frames`}: ${this.brought(after)}; before: ${this.brought(before)}.`;
+  }
+
+  brought(updates) {
+    const psnr = updates.map((one) => one.psnr).filter((value) => value !== null && value !== undefined);
+    const time = spoken(1000 * middle(updates.map((one) => one.seconds.total)));
+    return psnr.length ? `${time}, ${middle(psnr).toFixed(1)} dB a frame` : `${time} a frame`;
+  }
+
+  /** The control goes back to the budget that holds. */
+  rest() {
+    this.moving = false;
+    this.place();
+    this.draw();
   }
 
   async put() {
     const scene = this.scene;
+    this.putting = true;
     const body = { ...this.asked, iterations: null, budget_ms: null };
     if (this.kind) body[this.kind] = this.value;
     try {
       const budget = await call("PUT", `${scenePath(scene)}/budget`, body);
       if (this.scene !== scene) return;
-      Object.assign(this, { asked: budget.asked, effective: budget.effective, since: budget.since, moving: false });
-      this.place();
-      this.draw();
+      Object.assign(this, { asked: budget.asked, effective: budget.effective, since: budget.since });
+      this.rest();
     } catch (error) {
       this.moving = false;
       this.say(error.message, true);
+    } finally {
+      this.putting = false;
     }
   }
 
@@ -176,11 +250,11 @@ export class Tradeoff {
     const svg = this.$("tradeoff");
     const { clientWidth, clientHeight } = svg;
     svg.replaceChildren();
-    const points = this.model?.points.filter((point) => point.iterations > 0) ?? [];
+    const points = grouped(this.model?.points.filter((point) => point.iterations > 0) ?? []);
     // Settings that judge nothing have no witnesses: then the PSNR stands for the accuracy.
     const by = points.some((point) => point.error !== null) ? "error" : "psnr";
     const known = points.filter((point) => point[by] !== null);
-    this.$("tradeoff-unit").textContent = by === "error" ? "error over ms a frame" : "PSNR, dB, over ms a frame";
+    this.$("tradeoff-unit").textContent = by === "error" ? "error against time a frame" : "PSNR against time a frame";
     this.$("tradeoff-key").hidden = !known.length;
     if (!clientWidth) return;
     svg.setAttribute("viewBox", `0 0 ${clientWidth} ${clientHeight}`);
@@ -189,7 +263,8 @@ export class Tradeoff {
       return;
     }
     const width = clientWidth - LEFT - RIGHT;
-    const height = clientHeight - TOP - BOTTOM;
+    const height = clientHeight - TOP - STRIP - BOTTOM;
+    const base = TOP + height + STRIP;
     const times = points.map((point) => point.milliseconds);
     const [first, last] = [Math.min(...times) / 1.15, Math.max(...times) * 1.15];
     const x = (time) => LEFT + Math.log(time / first) / Math.log(last / first) * width;
@@ -203,23 +278,46 @@ export class Tradeoff {
       element("text", { x: LEFT - 5, y: y(value) + 3.5, class: "label end" }, svg).textContent =
         value.toFixed(Math.max(0, -Math.floor(Math.log10(tick) + 1e-9)));
     }
+    element("text", { x: 2, y: 11, class: "label start" }, svg).textContent =
+      by === "error" ? "error of training views, lower is better" : "PSNR of training views, dB, higher is better";
+    const unmeasured = points.some((point) => point[by] === null);
+    if (unmeasured) element("text", { x: LEFT - 5, y: base - 7, class: "label end" }, svg).textContent = "no error";
+    element("rect", { x: LEFT, y: TOP + height + 8, width, height: STRIP - 8, class: "strip" }, svg);
+    element("line", { x1: LEFT, x2: clientWidth - RIGHT, y1: base, y2: base, class: "axis" }, svg);
     for (let power = 10 ** Math.floor(Math.log10(first)); power < last; power *= 10) {
       for (const time of [power, 2 * power, 5 * power].filter((one) => one > first && one < last)) {
-        element("line", { x1: x(time), x2: x(time), y1: TOP + height, y2: TOP + height + 3, class: "grid" }, svg);
-        element("text", { x: x(time), y: clientHeight - 4, class: "label" }, svg).textContent = time;
+        element("line", { x1: x(time), x2: x(time), y1: base, y2: base + 4, class: "axis" }, svg);
+        element("text", { x: x(time), y: clientHeight - 3, class: "label" }, svg).textContent = spoken(time);
       }
     }
     const chosen = this.chosen();
     if (chosen && chosen > first && chosen < last) {
-      element("line", { x1: x(chosen), x2: x(chosen), y1: TOP, y2: TOP + height, class: "chosen" }, svg);
+      element("line", { x1: x(chosen), x2: x(chosen), y1: TOP - 3, y2: base, class: "chosen" }, svg);
+      const [at, edge] = [x(chosen), 26];
+      element("text", { x: Math.min(Math.max(at, LEFT + edge), clientWidth - edge), y: TOP - 6, class: "label budget" }, svg).textContent =
+        this.moving ? "new budget" : "budget";
     }
     const replayed = known.filter((point) => point.kind === "replayed");
     if (replayed.length > 1) {
       const way = [...replayed].sort((a, b) => a.iterations - b.iterations);
       element("path", { d: way.map((one, i) => `${i ? "L" : "M"}${x(one.milliseconds)} ${y(one[by])}`).join(""), class: "way" }, svg);
     }
+    const place = (point) => [x(point.milliseconds), point[by] === null ? base - 3 : y(point[by])];
+    const taken = points.map((point) => place(point)).map(([px, py]) => [px - 4, px + 4, py - 4, py + 4]);
+    /** A label beside its point, where it hides nothing; else the point has it as a title alone. */
+    const label = (px, places, words) => {
+      const half = 3.4 * words.length + 1;
+      for (const [side, at] of places) {
+        const middle = px + side * (half + 7);
+        const box = [middle - half, middle + half, at - 9, at];
+        if (taken.some((one) => one[0] < box[1] && box[0] < one[1] && one[2] < box[3] && box[2] < one[3])) continue;
+        taken.push(box);
+        element("text", { x: middle, y: at, class: "label" }, svg).textContent = words;
+        return;
+      }
+    };
     for (const point of points) {
-      const [px, py] = [x(point.milliseconds), point[by] === null ? TOP + height : y(point[by])];
+      const [px, py] = place(point);
       if (point.kind !== "extrapolated" && point[by] === null) continue;
       const shapes = {
         measured: ["circle", { cx: px, cy: py, r: 4.2 }],
@@ -229,8 +327,10 @@ export class Tradeoff {
       const made = element(shapes[point.kind][0], { ...shapes[point.kind][1], class: `point ${point.kind}` }, svg);
       element("title", {}, made).textContent = this.words(point);
       // Below what was measured, above the others: the same number of iterations is often in both.
-      const below = point.kind === "measured" ? 16 : -10;
-      element("text", { x: px, y: py + below, class: "label" }, svg).textContent = point.iterations;
+      const above = { measured: 8, replayed: 9, extrapolated: 12 }[point.kind];
+      const [over, under, beside] = [[0, py - above], [0, py + 16], py + 4];
+      const places = { measured: [under, over], replayed: [over, under], extrapolated: [over] }[point.kind];
+      label(px, [...places, [1, beside], [-1, beside]], point.from < point.to ? `${point.from}–${point.to}` : `${point.iterations}`);
     }
   }
 
@@ -243,7 +343,7 @@ export class Tradeoff {
   }
 
   words(point) {
-    const figures = [`${point.iterations} iterations`, `${short(point.milliseconds)} ms a frame`];
+    const figures = [point.from < point.to ? `${point.from} to ${point.to} iterations` : `${point.iterations} iterations`, `${spoken(point.milliseconds)} a frame`];
     if (point.error !== null) figures.push(`error ${point.error.toFixed(4)}`);
     if (point.psnr !== null) figures.push(`${point.psnr.toFixed(1)} dB`);
     const from = point.frames ? `, ${point.frames} ${point.frames === 1 ? "frame" : "frames"}` : "";

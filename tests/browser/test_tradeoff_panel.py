@@ -9,6 +9,17 @@ from stage import opened, push, shown, start_scene, until
 from client.sdk import Client
 from client.wire import Budget
 
+GROUPED = """async () => {
+  const { Tradeoff } = await import("/viewer/tradeoff.js");
+  const panel = new Tradeoff((id) => document.getElementById(id));
+  const point = { kind: "measured", error: 0.02, psnr: 30, threads: 1 };
+  const points = [[90, 1000, 3], [110, 1010, 4], [200, 2000, 2]].map(([iterations, milliseconds, frames]) =>
+    ({ ...point, iterations, milliseconds, frames }));
+  const effective = { iterations: 100, budget_ms: 1000 };
+  panel.show({ points, model: null, replay: { state: "none" } }, { asked: effective, effective, since: 1 });
+}"""
+"""Draws points that a fake cannot have run: of two that took as long, and one that took longer."""
+
 
 @pytest.fixture
 def ran(service):
@@ -53,8 +64,10 @@ def test_a_budget_that_is_moved_holds_from_the_next_frame_on(page, service, ran)
     page.keyboard.press("End")
     until(page, "document.getElementById('budget-words').innerText.includes('1000 iterations a frame, from frame 9')")
     assert sdk.budget(id).asked == Budget(iterations=1000)
+    assert text(page, "budget-effect").startswith("No frame since")
     push(sdk, id, 9)
     until(page, "document.querySelectorAll('#seconds .change').length === 2")
+    until(page, "document.getElementById('budget-effect').innerText.startsWith('Since then, one frame: 8 s')")
     page.select_option("#budget-kind", "budget_ms")
     page.focus("#budget")
     page.keyboard.press("Home")
@@ -64,6 +77,45 @@ def test_a_budget_that_is_moved_holds_from_the_next_frame_on(page, service, ran)
     until(page, "document.getElementById('budget-words').innerText.includes('as the scene was made')")
     assert sdk.budget(id).asked == Budget()
     assert page.faults == []
+
+
+def test_a_slider_that_is_let_go_where_it_was_changes_nothing(page, service, ran):
+    sdk, id = ran
+    opened(page, service, id)
+    until(page, "document.getElementById('budget-value').innerText === '40 iterations'")
+    before = sdk.budget(id)
+    page.locator("#budget").scroll_into_view_if_needed()
+    box = page.locator("#budget").bounding_box()
+    share = float(page.locator("#budget").input_value()) / 1000
+    x, y = box["x"] + 8 + share * (box["width"] - 16), box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 60, y, steps=3)
+    until(page, "document.querySelector('#tradeoff .budget').textContent === 'new budget'")
+    assert "Then: about" in text(page, "budget-words")
+    page.mouse.move(x, y, steps=3)
+    page.mouse.up()
+    until(page, "document.querySelector('#tradeoff .budget').textContent === 'budget'")
+    until(page, "document.getElementById('budget-value').innerText === '40 iterations'")
+    assert sdk.budget(id) == before
+    assert page.faults == []
+
+
+def test_frames_under_a_budget_in_time_are_one_point(page, service):
+    with Client(service.url, patience=30) as sdk:
+        id = start_scene(sdk, "times")
+        for index in range(4):
+            push(sdk, id, index)
+            sdk.wait(id, index)
+        opened(page, service, id)
+        until(page, "document.querySelectorAll('#tradeoff .point.measured').length === 1")
+        page.evaluate(GROUPED)
+        assert page.locator("#tradeoff .point.measured").count() == 2
+        titles = page.locator("#tradeoff .point.measured title").all_text_contents()
+        assert titles[0].startswith("90 to 110 iterations")
+        assert "7 frames" in titles[0]
+        sdk.delete_scene(id)
+        assert page.faults == []
 
 
 def test_other_budgets_are_measured_on_request_until_told_to_stop(page, service, ran):
