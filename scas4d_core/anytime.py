@@ -100,6 +100,12 @@ class Anytime:
         found = self.witness.errors(deformation.means, deformation.factors, self.previous.opacities, features)
         return mean_error(found, list(found))
 
+    def error_of(self, state: Gaussians) -> float:
+        """Mean error of the witnesses for a state."""
+        features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
+        found = self.witness.errors(state.means, state.factors, state.opacities, features)
+        return mean_error(found, list(found))
+
     def end(self, colours: Array, story: Story) -> str:
         """Which state is best of "still", "warm" and "end"; the deformation is set to it.
 

@@ -141,6 +141,11 @@ class UntilMet:
         return _tell(self, done, total if self._end is None else min(total, self._end))
 
 
+def by_clock(pace: Pace | None) -> bool:
+    """Whether a pace looks at a clock, itself or the one that it shortens."""
+    return by_clock(pace.pace) if isinstance(pace, UntilMet) else isinstance(pace, Timed)
+
+
 def _tell(pace: Pace, done: int, total: int) -> int:
     if not pace.told or pace.told[-1][1] != total:
         pace.told.append((done, total))

@@ -8,41 +8,39 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import chain
+from time import perf_counter
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from scas4d_core import update_torch
+from scas4d_core.anytime import Anytime
 from scas4d_core.attempts import Course
+from scas4d_core.deformation_cpu import CpuDeformation
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import Hierarchy
 from scas4d_core.neighbours import Neighbours
 from scas4d_core.pace import Counted
+from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.update_plan import Rates, ViewPlan, first_lengths, mask_weight, plan_samples
 from scas4d_core.update_torch import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchUpdate
-from scas4d_core.updated import CameraFit, Stopwatch, Updated
+from scas4d_core.updated import CameraFit, Stopwatch, Story, Updated
 from scas4d_core.views import LABEL, TrainingView, ViewFactory
-from scas4d_core.warm_start import Motion, warm_start
+from scas4d_core.warm_start import Motion
 
 Array = NDArray[np.float32]
 
 
 @dataclass(eq=False)
 class Tables:
-    """``warm_start.Parameters`` on the host."""
+    """``warm_start.Parameters`` as ``update_torch`` gives and takes them."""
 
     hierarchy: Hierarchy
     clusters: list[Array]
     deltas: Array
-
-    @classmethod
-    def identity(cls, hierarchy: Hierarchy) -> Tables:
-        """Zeros."""
-        clusters = [np.zeros((size, 10), np.float32) for size in hierarchy.sizes]
-        return cls(hierarchy, clusters, np.zeros((len(hierarchy.rows), 9), np.float32))
 
     @classmethod
     def of(cls, hierarchy: Hierarchy, found: update_torch.Updated) -> Tables:
@@ -73,19 +71,26 @@ class DeviceUpdate:
         self.settings = settings
         self.hierarchy = hierarchy
         self._factory = factory
+        weights = settings.weights
+        mask = mask_weight(settings, len(hierarchy.rows), len(first))
+        limits = scene_limits(scene.near, factory.rig.radius)
+        self._picture = PictureLoss(factory, scene.background, weights.image, mask, limits=limits)
+        lengths = first_lengths(hierarchy, first)
+        bounds = np.maximum(lengths, np.float32(settings.max_scale))
+        self._deformation = CpuDeformation(hierarchy, neighbours, bounds, settings.cluster_map, settings.covariance)
         self._update = TorchUpdate(
             moving=hierarchy.rows,
             labels=[labels.astype(np.int64) for labels in hierarchy.labels],
             graph=_graph(neighbours, len(hierarchy.rows)),
-            first_lengths=first_lengths(hierarchy, first),
+            first_lengths=lengths,
             rates=Rates.of(settings, len(hierarchy.sizes), factory.rig.radius),
-            weights=_weights(settings, neighbours is not None, mask_weight(settings, len(hierarchy.rows), len(first))),
+            weights=_weights(settings, neighbours is not None, mask),
             max_scale=settings.max_scale,
             background=scene.background,
             cluster_map=settings.cluster_map,
             covariance=settings.covariance,
             floor=scene.floor,
-            near=scene_limits(scene.near, factory.rig.radius).near,
+            near=limits.near,
             device=device,
             dtype=dtype,
         )
@@ -99,23 +104,31 @@ class DeviceUpdate:
         seed: int,
         course: Course | None = None,
     ) -> Updated:
-        """Find D_t and apply it, see ``update.Updater.run``; start and end are not compared, and no gate is asked."""
+        """Find D_t and apply it, see ``update.Updater.run``; no gate is asked.
+
+        Start and end are compared on a few small pictures that the CPU renders, as for ``update.FrameUpdate``.
+        """
         settings, hierarchy = self.settings, self.hierarchy
         course = course or Course(Counted(settings.iterations))
         rng = np.random.default_rng([settings.seed, seed])
         watch = Stopwatch()
+        deformation = self._deformation
+        deformation.start(previous)
+        anytime = Anytime.of(self._factory, self._picture, deformation, previous, views if course.witness else [])
+        seconds = anytime.start(motion, seconds, settings, course.step)
+        stands = anytime.stands(course.enough)
+        pace = Counted(0) if stands else course.pace
         most = course.pace.most
         plan = ViewPlan(self._factory, views, settings, most, rng)
-        pictures = [plan.take(iteration, settings.iterations) for iteration in range(most)]
+        pictures = [plan.take(iteration, settings.iterations) for iteration in range(0 if stands else most)]
         samples = plan_samples(len(hierarchy.rows), settings.neighbour_sample, rng)
-        tables = Tables.identity(hierarchy)
-        warm_start(tables, motion, seconds, settings)
         manner = course.manner
         rates = self._update.rates.tried(manner.rates, manner.rigid, manner.hold_colours)
         update = replace(self._update, rates=rates.hurried(settings.cold_start) if motion is None else rates)
-        start, deltas = tables.split()
+        start, deltas = Tables(hierarchy, deformation.clusters, deformation.deltas).split()
         distinct = {id(view): view for seen in pictures for view in seen}
         place = {key: index for index, key in enumerate(distinct)}
+        story = Story(len(views))
         watch.lap("start")
         found = update.run(
             previous,
@@ -124,15 +137,26 @@ class DeviceUpdate:
             start=start,
             deltas=deltas,
             rows=[samples[iteration % len(samples)] for iteration in range(most)],
-            pace=course.pace,
+            on_iteration=lambda _: story.moments.append(perf_counter() - watch.began),
+            pace=pace,
+            look=anytime.error_of,
         )
         watch.lap("iterations")
-        motion = Motion.of(Tables.of(hierarchy, found), seconds)
+        if story.moments:
+            story.moments[-1] = watch.total  # a device may be behind its host: it is through here
+        story.losses, story.psnr = found.losses, found.psnr
+        story.last = {view.name: CameraFit(psnr) for view, psnr in zip(chain(*pictures), found.psnr, strict=False)}
+        _take(deformation, Tables.of(hierarchy, found))
+        kept = anytime.end(found.gaussians.colours, story)
+        watch.lap("end")
+        state = found.gaussians if kept == "end" else previous
+        if kept == "warm":
+            start, deltas = Tables(hierarchy, deformation.clusters, deformation.deltas).split()
+            state = update.run(previous, [], [], start=start, deltas=deltas).gaussians
+        updated = story.updated(state, Motion.of(deformation, seconds), pace, anytime.errors, kept)
         watch.lap("commit")
-        cameras = {view.name: CameraFit(psnr) for view, psnr in zip(chain(*pictures), found.psnr, strict=False)}
-        return Updated(
-            found.gaussians, motion, found.losses, found.psnr, watch.seconds, cameras, planned=course.pace.told
-        )
+        updated.seconds.update(watch.seconds)
+        return updated
 
     def _on_device(self, view: TrainingView) -> update_torch.TrainingView:
         """The view as ``update_torch`` takes it; a picture smaller than its camera's is a coarse one."""
@@ -142,6 +166,13 @@ class DeviceUpdate:
         target = np.moveaxis(view.target, 0, -1)
         mask = target[..., LABEL] if target.shape[-1] > LABEL else None
         return update_torch.TrainingView(camera, target[..., :LABEL], mask, view.exposure[:LABEL])
+
+
+def _take(deformation: CpuDeformation, tables: Tables) -> None:
+    """Set a deformation to what was found."""
+    for values, given in zip(deformation.clusters, tables.clusters, strict=True):
+        values[:] = given
+    deformation.deltas[:] = tables.deltas
 
 
 def _graph(neighbours: Neighbours | None, count: int) -> Graph:

@@ -28,7 +28,7 @@ from scas4d_core.deformation import (
     material_rotations,
 )
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.pace import Pace, Timed
+from scas4d_core.pace import Pace, by_clock
 from scas4d_core.rasterize import cuda, twin
 from scas4d_core.rasterize.limits import DEFAULT, GSPLAT, Limits
 from scas4d_core.rasterize.twin import CameraParams, Rendered
@@ -184,6 +184,7 @@ class TorchUpdate:
         rows: Sequence[NDArray[np.int64]] | None = None,
         on_iteration: Callable[[int], None] | None = None,
         pace: Pace | None = None,
+        look: Callable[[Gaussians], float] | None = None,
     ) -> Updated:
         """Find the deformation from Θ_{t−1} to the pictures of frame t.
 
@@ -197,6 +198,7 @@ class TorchUpdate:
             rows: per iteration the rows among the moving whose neighbours are looked at; None: all.
             on_iteration: called with the number of iterations done.
             pace: how many of the order's are taken; None: all.
+            look: the error of a state, for a pace that looks at it.
 
         Raises:
             IndexError: the order names a view that is not there.
@@ -208,7 +210,7 @@ class TorchUpdate:
         base = [(group["lr"], group["begins"]) for group in optimizer.param_groups]
         history: list[tuple[Tensor, Tensor]] = []
         for iteration, view in enumerate(order):
-            if self.on_cuda and isinstance(pace, Timed) and iteration % TIMED_EVERY == 0:
+            if self.on_cuda and by_clock(pace) and iteration % TIMED_EVERY == 0:
                 torch.cuda.synchronize()  # the host runs ahead: its clock would not see the device's work
             planned = len(order) if pace is None else pace.planned(iteration)
             if iteration >= planned:
@@ -227,6 +229,8 @@ class TorchUpdate:
             history.append((loss.detach(), scene.psnr))
             if on_iteration is not None:
                 on_iteration(iteration + 1)
+            if pace is not None and look is not None and pace.looks(iteration + 1):
+                pace.saw(iteration + 1, look(scene.result(gaussians, [], []).gaussians))
         # The losses stay on the device until here: reading each would make the host wait for it.
         found = torch.stack([loss for loss, _ in history]).tolist() if history else []
         psnr = torch.cat([psnr for _, psnr in history]).tolist() if history else []

@@ -12,9 +12,13 @@ import torch.utils.cpp_extension
 from box_scene import MOVING, make_box, make_rig, moved, take_frame, to_user
 
 from scas4d_core import device, reconstruction, update_device
+from scas4d_core.attempts import Course
+from scas4d_core.budget import Budget
 from scas4d_core.device import DeviceError, require_device
+from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import build_hierarchy
 from scas4d_core.neighbours import build_neighbours
+from scas4d_core.pace import COOLING, LOOK_EVERY, Counted, Timed, UntilMet
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import LayerRates, SceneSettings, Settings, UpdateSettings, Weights
 from scas4d_core.static_scene import StaticResult
@@ -23,6 +27,7 @@ from scas4d_core.update_device import DeviceUpdate
 from scas4d_core.updated import Updated
 from scas4d_core.views import ViewFactory
 from scas4d_core.warm_start import Motion
+from scas4d_core.witness import mean_error
 
 BEFORE = make_box()
 AFTER = moved(BEFORE)
@@ -108,7 +113,7 @@ def test_a_warm_update_agrees_with_the_cpu(on_device: Updated, on_cpu: Updated) 
     for a, b in zip(on_device.motion.shifts, on_cpu.motion.shifts, strict=True):
         np.testing.assert_allclose(a, b, atol=WORST_M)
     assert on_device.motion.seconds == 1.0
-    assert set(on_device.seconds) == {"start", "iterations", "commit", "report"}
+    assert set(on_device.seconds) == {"start", "iterations", "end", "commit", "report"}
 
 
 def test_the_state_is_what_the_cpu_would_hand_on(on_device: Updated, on_cpu: Updated) -> None:
@@ -262,3 +267,58 @@ def test_cuda_agrees_with_the_cpu(on_cpu: Updated, motion: Motion) -> None:
     # gsplat caps a Gaussian's alpha at 0.999 and not 0.99; the box's opacities, 0.9, meet neither.
     assert loss_difference(found, on_cpu)[0] < 1e-4
     assert_agree(found, on_cpu)
+
+
+class Ticks:
+    """A clock that goes on by a tick whenever it is looked at."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        self.now += 1.0
+        return self.now
+
+
+def course_run(course: Course, motion: Motion | None = None, after: Gaussians = AFTER, seed: int = 1) -> Updated:
+    plain = SETTINGS.model_copy(update={"coarse_until": 0.0})
+    views = ViewFactory(RIG).views(take_frame(1, 1.0, after, RIG, True), {})
+    return updater(DeviceUpdate, plain, device="cpu").run(BEFORE, views, motion, 1.0, seed, course)
+
+
+def test_an_update_by_the_clock_ends_with_it_and_tells_what_an_iteration_takes() -> None:
+    found = course_run(Course(Timed(6.5, 1.0, clock=Ticks())))
+    assert 1 <= len(found.losses) == found.planned[-1][1] < SETTINGS.iterations
+    assert len(found.moments) == len(found.losses)
+    assert found.moments == sorted(found.moments)
+    budget = Budget(500.0)
+    budget.learn(found, commit=0.0)
+    assert budget.each is not None
+    assert 0 < budget.each <= found.moments[-1]
+
+
+def test_an_update_ends_once_nothing_is_gained() -> None:
+    found = course_run(Course(UntilMet(Counted(40), 0.9), witness=True))
+    assert len(found.losses) == 2 * LOOK_EVERY + round(COOLING * 40)
+
+
+def test_start_and_end_are_compared_and_a_frame_that_stands_needs_no_iteration() -> None:
+    moves = course_run(Course(Counted(8), witness=True))
+    assert moves.kept == "end"
+    assert mean_error(moves.errors["end"], list(moves.errors["end"])) < mean_error(
+        moves.errors["still"], list(moves.errors["still"])
+    )
+    stands = course_run(Course(Counted(8), witness=True, enough=moves.errors["still"]), after=BEFORE)
+    assert (stands.losses, stands.kept, stands.gaussians is BEFORE) == ([], "still", True)
+
+
+def test_an_update_is_not_worse_than_going_on_as_before(motion: Motion) -> None:
+    """One step of a thousand times the size spoils what the motion before had right."""
+    wild = SETTINGS.model_copy(update={"rate_position": 0.2, "coarse_until": 0.0})
+    views = ViewFactory(RIG).views(take_frame(1, 1.0, AFTER, RIG, True), {})
+    course = Course(Counted(2), witness=True)
+    found = updater(DeviceUpdate, wild, device="cpu").run(BEFORE, views, motion, 1.0, 1, course)
+    usual = updater(FrameUpdate, wild).run(BEFORE, views, motion, 1.0, 1, course)
+    assert found.kept == usual.kept == "warm"
+    np.testing.assert_allclose(found.gaussians.means, usual.gaussians.means, atol=1e-5)
+    np.testing.assert_allclose(found.gaussians.rotations, usual.gaussians.rotations, atol=1e-5)
+    np.testing.assert_array_equal(found.gaussians.colours, BEFORE.colours)
