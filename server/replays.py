@@ -119,11 +119,20 @@ class Replays:
         return base, indices
 
     def _own_iterations(self) -> int:
-        """What the scene runs: as its budget says, or, where that is a time, what fitted into it last."""
+        """What the scene runs: as its budget says, or, where that is a time, what fitted into it last.
+
+        A frame that stood still or was held says nothing of that.
+        """
         scene = self._scene
         budget = effective(scene.spec.settings, scene.ledger.budgets[-1][1])
-        ran = scene.frames[scene.committed[-1]].report.iterations
-        return ran if budget.budget_ms is not None and ran else budget.iterations
+        if budget.budget_ms is not None:
+            for index in reversed(scene.committed[1:]):
+                report = scene.frames[index].report
+                if report.iterations is None:  # older than those in memory
+                    break
+                if report.iterations and report.degraded is None:
+                    return report.iterations
+        return budget.iterations
 
     def _message(self, index: int) -> FrameReady:
         entry = self._scene.frames[index]

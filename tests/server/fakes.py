@@ -12,8 +12,9 @@ import numpy as np
 from scas4d_core import tracks
 from scas4d_core.gaussians import Gaussians
 
-SLOW, SLOW_RAISES, RAISES, DIES, HELD, LEAVES_OUT = 200, 201, 250, 251, 240, 241
+SLOW, SLOW_RAISES, RAISES, DIES, HELD, LEAVES_OUT, STANDS = 200, 201, 250, 251, 240, 241, 242
 ITERATIONS = 100
+MS_EACH = 2.0
 RAISES_IN_REPLAY, DIES_IN_REPLAY = 666, 667
 SLOW_S = 2.0
 STEP_M = 0.125
@@ -93,12 +94,14 @@ class FakeReconstruction:
         record = {**asdict(report), "used": list(frame.images), "dropped": dropped or {}, **(notes or {})}
         if red == HELD:
             record |= {"degraded": "held as it was: the fake was told so", "kept": "still", "used": []}
+        if red == STANDS:
+            record |= {"iterations": 0, "kept": "still", "used": []}
         if red == LEAVES_OUT:
             record["dropped"] = {**record["dropped"], "c1": "it shows nothing"}
         first = self.iterations // 2
         record["curve"] = [
-            {"iterations": first, "milliseconds": 2.0 * first, "loss": 0.5},
-            {"iterations": self.iterations, "milliseconds": 2.0 * self.iterations, "loss": 0.25},
+            {"iterations": first, "milliseconds": MS_EACH * first, "loss": 0.5},
+            {"iterations": self.iterations, "milliseconds": MS_EACH * self.iterations, "loss": 0.25},
         ]
         record["errors"] = {"still": 0.5, "end": 1 / self.iterations}
         record |= {"kept": record.get("kept", "end"), "attempts": ["as set"], "threads": 2}
@@ -111,7 +114,7 @@ class FakeReconstruction:
         return self.commit(frame, dropped, notes)
 
     def spend(self, *, iterations=None, budget_ms=None, stop_gain=None, still=None):
-        self.iterations = iterations or ITERATIONS
+        self.iterations = int(budget_ms / MS_EACH) if budget_ms else iterations or ITERATIONS
 
 
 class FakeReader:

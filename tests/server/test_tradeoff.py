@@ -99,6 +99,19 @@ def test_a_replay_measures_other_budgets_beside_the_scenes_own(ran):
     assert [sdk.frame(id, index).iterations for index in range(8)] == [100] * 4 + [40] * 4
 
 
+def test_what_fits_into_a_time_is_told_by_frames_that_moved_and_were_met(sdk):
+    id = sdk.create_scene(make_rig(), frames_per_second=10).id
+    push(sdk, id, [0])
+    sdk.set_budget(id, budget_ms=60 * fakes.MS_EACH)
+    push(sdk, id, range(1, 4))
+    push(sdk, id, [4], red=fakes.HELD)
+    push(sdk, id, [5], red=fakes.STANDS)
+    assert sdk.frame(id, 5).iterations == 0
+    assert sdk.replay(id, [10], frames=1).replay.iterations == [60, 10]
+    assert replayed(sdk, id).replay.state == "done"
+    sdk.delete_scene(id)
+
+
 def test_one_replay_at_a_time_and_the_scene_goes_on_beside_it(sdk, http):
     id = sdk.create_scene(make_rig(), frames_per_second=10).id
     push(sdk, id, range(2))
