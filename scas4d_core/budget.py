@@ -43,5 +43,5 @@ class Budget:
         if self.each is None:
             self.each, self.after = each, after
         else:
-            self.each += RATE * (each - self.each)
+            self.each = min(each, self.each + RATE * (each - self.each))  # one slow frame is forgotten with the next
             self.after += RATE * (after - self.after)

@@ -106,5 +106,12 @@ def test_a_budget_learns_what_an_iteration_and_the_end_take() -> None:
     assert (budget.each, budget.after) == before
 
 
+def test_one_slow_frame_costs_the_next_one_its_iterations_but_no_more() -> None:
+    budget = Budget(500.0)
+    for each in (0.01, 30.0, 0.01):
+        budget.learn(updated(20, each), commit=0.02)
+    assert budget.each == pytest.approx(0.01)
+
+
 def test_without_a_budget_there_is_no_end() -> None:
     assert Budget(None).end(3.0) is None
