@@ -147,9 +147,9 @@ class Trial:
         return self._stays(given, nothing, past, [], why, given.look.exposure)
 
     def _relit(self, given: Given) -> Outcome | None:
-        """A frame in a light that has stayed: the colours take it on; None where no camera tells how bright it is."""
+        """A frame in a light that has stayed: the colours take it on; None where the cameras tell of no other light."""
         gain = gain_of(self._picture, given.state, given.views)
-        if gain is None:
+        if gain is None or 1 / judge.EXPOSURE <= gain <= judge.EXPOSURE:
             return None
         outcome = self.run(
             replace(
@@ -250,7 +250,10 @@ class Trial:
             course = self._course(given, replace(SOUGHT, name=name))
             updated = self._updater.run(start, given.views, None, given.seconds, given.seed, course)
             check = self._checked(given, start, updated)
-            why = check.fault or judge.unmet(given.past, self._met(updated), len(updated.losses))
+            both = len(tried.losses) + len(
+                updated.losses
+            )  # a few iterations more are no excuse for meeting it less well
+            why = check.fault or judge.unmet(given.past, self._met(updated), both)
             attempts.append(name if why is None else f"{name}: {why}")
             if why is None:
                 return _told(updated if start is not ended else _after(updated, tried), tried), check

@@ -202,6 +202,19 @@ def test_what_was_lost_is_not_sought_longer_than_the_budget(left: float, tries: 
     assert any("the budget is spent" in attempt for attempt in outcome.attempts) == (tries == 1)
 
 
+def test_what_is_sought_for_a_moment_has_to_meet_its_frame_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = Fake(met(LEVEL - 20))
+    run, counts = fake.run, iter([64, 1])
+    monkeypatch.setattr(fake, "run", lambda *asked: replace(run(*asked), losses=[0.1] * next(counts)))
+    outcome = trial(fake).run(given(replace(PAST, updates=5, iterations=64)))
+    assert (len(fake.courses), outcome.fresh) == (2, False)
+
+
+def test_brighter_pictures_of_a_scene_that_is_not_are_no_other_light() -> None:
+    outcome = trial(Fake(met())).run(given(replace(PAST, lit=SETTINGS.patience), Look(1.2)))
+    assert (outcome.attempts, outcome.exposure) == (["as set"], 1.0)
+
+
 def test_after_a_held_frame_half_of_the_budget_is_kept_for_what_is_sought() -> None:
     now = perf_counter()
     for past, ends in ((PAST, [60.0]), (replace(PAST, held=1), [30.0, 60.0])):
