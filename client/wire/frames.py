@@ -108,7 +108,7 @@ class FrameReportModel(Model):
     tries: list[str] = Field(
         default_factory=list, description="In which manner the update was tried, and what came of each."
     )
-    exposure: float | None = Field(default=None, description="Times brighter than frame 0, as far as it was seen.")
+    exposure: float | None = Field(default=None, description="Times brighter than the light that the colours are in.")
     held_gaussians: int | None = Field(default=None, description="That stayed as they were before, one by one.")
     guards: dict[str, int] = Field(default_factory=dict, description="How often each guard acted.")
     budget: Budget | None = Field(default=None, description="What the update was told; nulls: as the scene was made.")
