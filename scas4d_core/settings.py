@@ -167,8 +167,8 @@ class UpdateSettings(Model):
     patience: int = Field(
         10,
         ge=1,
-        description="Frames in a row that are held because they cannot be met, before the scene is another; dark ones do "
-        "not count. A light that stays for so many is the scene's own.",
+        description="Frames in a row that are held because they cannot be met, before the scene is another; dark ones "
+        "do not count. A light that stays for so many is the scene's own.",
     )
     clusters: tuple[int, ...] = Field(
         (64, 320, 1280), description="Clusters per layer, coarse to fine (the paper's); empty: each Gaussian alone."

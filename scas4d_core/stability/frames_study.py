@@ -152,7 +152,7 @@ def _said(step: Step) -> str:
     words = [] if report.degraded is None else [report.degraded]
     if report.dropped:
         words.append("without " + ", ".join(f"{name} ({why})" for name, why in report.dropped.items()))
-    if report.exposure != 1.0:
+    if report.exposure != 1.0 and report.used:
         words.append(f"{report.exposure:.2g} times as bright")
     return "; ".join(words or report.attempts)
 
