@@ -151,7 +151,7 @@ def _draw(
 ) -> list[str]:
     """Draws what there are rows for; the files' names."""
     words = f"mean of {', '.join(captures)}; first {updates} updates"
-    plots.draw_frontier(means, words, folder / "frontier.png")
+    plots.draw_frontier(means, words, folder / "frontier.png", _deviations(points, captures))
     plots.draw_captures(points, captures, folder / "captures.png")
     drawn = ["frontier.png", "captures.png"]
     watched = next((row for name in captures if (row := read_convergence(out, name))), None)
@@ -165,6 +165,16 @@ def _draw(
     bars = [p for label in BARS for p in means if p.variant.label == label and not p.variant.whole]
     plots.draw_stages(bars, words, folder / "stages.png")
     return [*drawn, "stages.png"]
+
+
+def _deviations(points: Sequence[Point], captures: Sequence[str]) -> dict[str, float]:
+    """dB, by method: standard deviation over seeds of a mean over captures, whose seeds are independent."""
+    found = {method: [spread(points, method, name) for name in captures] for method in METHODS}
+    return {
+        method: sum(one[0] ** 2 for one in each if one is not None) ** 0.5 / len(each)
+        for method, each in found.items()
+        if None not in each
+    }
 
 
 def _text(
