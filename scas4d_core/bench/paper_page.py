@@ -110,11 +110,12 @@ def sentence(outcome: Outcome, digits: int, unit: str) -> str:
     what = f"{outcome.claim.what[0].upper()}{outcome.claim.what[1:]} ({outcome.claim.first} – {outcome.claim.second})"
     if outcome.own is None:
         return f"{what}: not measured."
-    paper = "only shown" if outcome.paper is None else f"{outcome.paper:+.{digits}f}"
-    return (
-        f"{what}: {outcome.own:+.{digits}f}, in the paper {paper}{unit}; {_word(outcome)}, "
-        f"on {outcome.same_sign} of {len(outcome.captures)} captures alone."
-    )
+    own = f"{outcome.own:+.{digits}f}"
+    if outcome.paper is None:
+        figures = f"{own}{unit}, in the paper only shown"
+    else:
+        figures = f"{own}, in the paper {outcome.paper:+.{digits}f}{unit}"
+    return f"{what}: {figures}; {_word(outcome)}, on {outcome.same_sign} of {len(outcome.captures)} captures alone."
 
 
 def summary(outcomes: Sequence[Outcome], by_title: Mapping[str, Sequence[Outcome]]) -> str:

@@ -147,3 +147,7 @@ def test_a_sentence_says_how_it_came_out():
     assert sentence(outcome, 2, " dB") == (
         "Better (a – b): -10.00, in the paper +6.00 dB; does not agree, on 0 of 1 captures alone."
     )
+    shown = gain({"robot": (30.0, 20.0)}, {}, expected=1)
+    assert sentence(shown, 2, " dB") == (
+        "Better (a – b): +10.00 dB, in the paper only shown; agrees in sign, on 1 of 1 captures alone."
+    )
