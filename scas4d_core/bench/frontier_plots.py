@@ -88,6 +88,8 @@ SIDES = (
     *((3, 11, "left", "bottom"), (3, -11, "left", "top"), (-3, 11, "right", "bottom"), (-3, -11, "right", "top")),
 )
 """Where a name may stand beside its point: offset in points, alignments; what comes first is preferred."""
+FAR = 150
+"""What a place that is far off its point counts: more than a line that is crossed, less than a name that is hidden."""
 LABEL_GAP = 8.5
 """Points between the middles of labels that stand one above the other."""
 
@@ -431,7 +433,8 @@ def _name(axes: Any, named: Sequence[tuple[float, float, str, str]], avoided: Se
             box = label.get_window_extent()
             inside = axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1 and axes.bbox.y0 <= box.y0
             hidden = sum(box.overlaps(other) for other in taken) + 100 * (not inside)
-            tried.append((1000 * hidden + sum(box.overlaps(other) for other in crossed), label, box))
+            lines = sum(box.overlaps(other) for other in crossed)
+            tried.append((1000 * hidden + lines + FAR * (abs(up) > LABEL_GAP), label, box))
         best = min(tried, key=lambda one: one[0])
         for one in tried:
             if one is not best:

@@ -6,8 +6,9 @@ import { call, scenePath } from "./service.js";
 // Below the plot is a strip of its own for what has a time but no error, so that the two are not taken for each other.
 const [LEFT, RIGHT, TOP, STRIP, BOTTOM] = [48, 20, 36, 34, 18];
 const EFFECT_FRAMES = 16;
-// Under a budget in time every frame has iterations of its own: measured points whose times differ by less are one.
-const ALIKE = 1.06;
+// Under a budget in time every frame has iterations of its own: measured points of about the same time and not too
+// different iterations are one.
+const [ALIKE_TIME, ALIKE_ITERATIONS] = [1.06, 1.5];
 const EVERY_MS = 3000;
 const REPLAY_EVERY_MS = 700;
 const REPLAYED = [25, 50, 200];
@@ -29,8 +30,10 @@ const short = (value) => Number(value.toPrecision(value < 100 ? 2 : 3));
 function grouped(points) {
   const groups = [];
   for (const point of points.filter((one) => one.kind === "measured").sort((a, b) => a.milliseconds - b.milliseconds)) {
-    const last = groups.at(-1);
-    if (last && point.milliseconds < ALIKE * last[0].milliseconds) last.push(point);
+    const alike = (name, factor) => (one) => Math.abs(Math.log(one[name] / point[name])) < Math.log(factor);
+    const fits = (group) => group.every(alike("milliseconds", ALIKE_TIME)) && group.every(alike("iterations", ALIKE_ITERATIONS));
+    const group = groups.find(fits);
+    if (group) group.push(point);
     else groups.push([point]);
   }
   const measured = groups.map((group) => {
@@ -272,7 +275,7 @@ export class Tradeoff {
     const pad = Math.max(0.15 * (Math.max(...values) - Math.min(...values)), 0.05 * Math.max(...values), 1e-9);
     const [low, high] = [Math.max(0, Math.min(...values) - pad), Math.max(...values) + pad];
     const y = (value) => TOP + (high - value) / (high - low) * height;
-    const tick = step(high - low, 3);
+    const tick = step(high - low, 4);
     for (let value = Math.ceil(low / tick) * tick; value <= high; value += tick) {
       element("line", { x1: LEFT, x2: clientWidth - RIGHT, y1: y(value), y2: y(value), class: "grid" }, svg);
       element("text", { x: LEFT - 5, y: y(value) + 3.5, class: "label end" }, svg).textContent =
@@ -304,6 +307,7 @@ export class Tradeoff {
     }
     const place = (point) => [x(point.milliseconds), point[by] === null ? base - 3 : y(point[by])];
     const taken = points.map((point) => place(point)).map(([px, py]) => [px - 4, px + 4, py - 4, py + 4]);
+    if (chosen) taken.push([x(chosen) - 1, x(chosen) + 1, TOP, base]);
     /** A label beside its point, where it hides nothing; else the point has it as a title alone. */
     const label = (px, places, words) => {
       const half = 3.4 * words.length + 1;
