@@ -177,6 +177,8 @@ class WorldFrame:
 
 AUTO_RIG_RADIUS_M = 3.0
 """``metres_per_unit="auto"`` takes the rig's radius for this many metres: a room-sized stage."""
+ONE_PLACE = 1e-8
+"""User's units, or metres: a rig with a smaller radius is at one place; what is left is rounding of the poses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,19 +219,45 @@ class Rig:
 
     @property
     def radius(self) -> float:
-        """1.1 x the largest distance of a camera centre from their mean: the scene radius of Dynamic3DGaussians."""
-        distances = [np.linalg.norm(camera.centre - self.centre) for camera in self.cameras]
-        return float(1.1 * max(distances))
+        """1.1 x the largest distance of a camera centre from their mean: the scene radius of Dynamic3DGaussians.
+
+        One camera, or several at one place, say nothing of how large their scene is, and with 0 nothing would move:
+        then it is ``AUTO_RIG_RADIUS_M``, in the unit that the cameras are in.
+        """
+        return AUTO_RIG_RADIUS_M if self.at_one_place else self._spread
+
+    @property
+    def at_one_place(self) -> bool:
+        """Whether the cameras have no extent to measure the scene by."""
+        return self._spread < ONE_PLACE
+
+    @property
+    def _spread(self) -> float:
+        return float(1.1 * max(np.linalg.norm(camera.centre - self.centre) for camera in self.cameras))
 
     def world_frame(self, metres_per_unit: float | str = 1.0) -> WorldFrame:
         """The frame recentred on the rig.
 
         Args:
             metres_per_unit: metres in one unit of the calibration, or "auto" to take the rig's radius for 3 m.
+
+        Raises:
+            CameraError: not a positive number, "auto" for cameras at one place, or poses too far away for numbers.
         """
+        with np.errstate(over="ignore", invalid="ignore"):
+            far = not np.isfinite(self._spread)
+        if far:
+            raise CameraError(
+                "camera centres are too far away for numbers; give world_to_camera in other units"
+            )
         if metres_per_unit == "auto":
-            radius = self.radius
-            metres = AUTO_RIG_RADIUS_M / radius if radius > 0 else 1.0
+            if self.at_one_place:
+                raise CameraError(
+                    f"metres_per_unit 'auto' goes by how far apart the cameras are, and {len(self)} camera(s) are at "
+                    f"one place; give metres_per_unit as a number, such that what they see is about "
+                    f"{AUTO_RIG_RADIUS_M:g} m away"
+                )
+            metres = AUTO_RIG_RADIUS_M / self.radius
         else:
             metres = float(metres_per_unit)
             if not (np.isfinite(metres) and metres > 0):

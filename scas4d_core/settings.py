@@ -20,7 +20,9 @@ class SceneSettings(Model):
     """How the outside world enters."""
 
     metres_per_unit: Positive | Literal["auto"] = Field(
-        1.0, description="Metres in one unit of the calibration; 'auto' takes the rig's radius for 3 m."
+        1.0,
+        description="Metres in one unit of the calibration; 'auto' takes the rig's radius for 3 m. A single "
+        "camera tells no size: give a number such that what it sees is about 3 m away.",
     )
     image_scale: float = Field(1.0, gt=0, le=1, description="Pictures are resized by this before anything else.")
     background: tuple[float, float, float] = Field(

@@ -184,12 +184,13 @@ class CoreEngine:
 
     def reader(self, rig: Rig, settings: Any, history: History) -> Reader:
         """`Committed`, on one thread: the others belong to the update."""
+        from scas4d_core.cameras import rig_inside
         from scas4d_core.committed import Committed
         from scas4d_core.rasterize.limits import scene_limits
 
         _one_thread()
         world = rig.world_frame(settings.scene.metres_per_unit)
-        limits = scene_limits(settings.scene.near, rig.radius * world.metres_per_unit)
+        limits = scene_limits(settings.scene.near, rig_inside(world, rig.cameras).radius)
         return Committed(history, world, limits)
 
 

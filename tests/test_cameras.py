@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scas4d_core.cameras import Camera, CameraError, Rig, WorldFrame
+from scas4d_core.cameras import Camera, CameraError, Rig, WorldFrame, rig_inside
 
 
 def rotation(seed):
@@ -76,6 +76,25 @@ def test_auto_takes_the_radius_for_three_metres():
     rig = Rig(cameras)
     assert rig.radius == pytest.approx(110)
     assert rig.world_frame("auto").metres_per_unit == pytest.approx(3 / 110)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_cameras_at_one_place_take_a_scene_of_three_metres(count):
+    rig = Rig(tuple(camera(seed, str(seed), (7000.0, 0.1, -70.0)) for seed in range(count)))
+    assert rig.at_one_place
+    inside = rig_inside(rig.world_frame(0.01), rig.cameras)
+    assert inside.radius == 3.0
+    with pytest.raises(CameraError, match=r"give metres_per_unit as a number.*about 3 m"):
+        rig.world_frame("auto")
+    apart = Rig((*rig.cameras, camera(9, "apart", (7001.0, 0.1, -70.0))))
+    assert not apart.at_one_place
+    assert apart.radius < 3.0
+
+
+def test_poses_beyond_all_numbers_are_refused():
+    rig = Rig((camera(0, "a", (1e308, 1e308, 1e308)), camera(1, "b", (-1e308, 0, 0))))
+    with pytest.raises(CameraError, match="give world_to_camera in other units"):
+        rig.world_frame()
 
 
 def changed(field, index, value):

@@ -330,6 +330,22 @@ def test_per_gaussian_updates_run_as_well() -> None:
     assert np.isfinite(losses).all()
 
 
+def test_one_camera_moves_what_it_sees_about_three_metres_away() -> None:
+    rig, points_seen = Rig(make_rig().cameras[:1]), InitialPoints(BOX.means, BOX.colours.copy(), BOX.foreground.copy())
+    frames = [replace(frame, images={rig.names[0]: frame.images[rig.names[0]]}) for frame in FRAMES]
+    frames = [replace(frame, masks={name: frame.masks[name] for name in rig.names}) for frame in frames]
+    settings = shortened(iterations=20).model_copy(update={"scene": SceneSettings()})
+    scene = Reconstruction.start(rig, frames[0], settings, points=points_seen)
+    assert scene.rig.radius == 3.0
+    report = scene.step(frames[1])
+    assert report.degraded is None
+    before, after = (scene.history.gaussians(frame.index).means for frame in frames[:2])
+    assert np.linalg.norm(after - before, axis=1).max() > 0.01
+    automatic = settings.model_copy(update={"scene": SceneSettings(metres_per_unit="auto")})
+    with pytest.raises(ValueError, match="give metres_per_unit as a number"):
+        Reconstruction.start(rig, frames[0], automatic, points=points_seen)
+
+
 def test_a_report_tells_what_it_costs_and_what_writing_the_one_before_did(tmp_path: Path) -> None:
     scene = Reconstruction.start(training(), FRAMES[0], shortened(), points=points(), history=History(tmp_path))
     written = scene.history.record_seconds

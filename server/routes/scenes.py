@@ -8,6 +8,7 @@ from fastapi import APIRouter, Response
 from pydantic import ValidationError
 
 from client.wire import SceneCreate, SceneList, SceneStatus
+from scas4d_core.cameras import CameraError
 from scas4d_core.presets import PRESETS
 from scas4d_core.settings import Settings
 from server import devices, estimate, validation
@@ -43,6 +44,16 @@ def scene_settings(request: SceneCreate) -> Settings:
         raise validation.first_of(error, model=Settings, prefix="settings") from None
 
 
+def check_unit(request: SceneCreate, settings: Settings) -> None:
+    """Refuses a unit that the rig cannot tell."""
+    unit = settings.scene.metres_per_unit
+    try:
+        request.rig.rig().world_frame(unit)
+    except CameraError as error:
+        what, _, remedy = str(error).partition("; ")
+        raise Problem(422, what, field="settings.scene.metres_per_unit", value=unit, remedy=remedy) from None
+
+
 @router.post("", status_code=201)
 async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, response: Response) -> SceneStatus:
     """Creates a scene from a rig; it waits for its first frame."""
@@ -57,6 +68,7 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
                 value=f"{camera.width}x{camera.height}",
                 remedy="send smaller pictures with the intrinsics to match, or raise SCAS4D_MAX_IMAGE_PIXELS",
             )
+    check_unit(request, settings)
     estimate.check(request.rig, settings, server)
     await devices.require(settings.device)
     scene = await scenes.create(request, settings)

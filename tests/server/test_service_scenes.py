@@ -58,6 +58,11 @@ def set_camera(field, value):
     return lambda body: body["rig"]["cameras"][0].__setitem__(field, value)
 
 
+def one_camera(body):
+    body["rig"]["cameras"] = body["rig"]["cameras"][:1]
+    body["settings"] = {"scene": {"metres_per_unit": "auto"}}
+
+
 BAD = {
     "no cameras": (lambda b: b["rig"].__setitem__("cameras", []), "cameras"),
     "axes": (lambda b: b["rig"].__setitem__("axes", "opengl"), "axes"),
@@ -78,6 +83,7 @@ BAD = {
     ),
     "setting out of range": (lambda b: b.__setitem__("settings", {"update": {"iterations": 0}}), "iterations"),
     "setting of another kind": (lambda b: b.__setitem__("settings", {"update": 3}), "settings.update"),
+    "unit of one camera": (one_camera, "settings.scene.metres_per_unit"),
     "misspelt": (lambda b: b.__setitem__("rigg", 1), "rigg"),
 }
 
