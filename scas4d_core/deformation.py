@@ -26,11 +26,9 @@ ClusterMap = Literal["centred", "published"]
 Covariance = Literal["entangled", "separate"]
 """What moves a Gaussian's covariance beside its own ΔR and Δs.
 
-"entangled", equation (5): the Jacobian of the map that moves its mean. "separate": the product of its clusters'
-rotations R_j alone; what the map bends, shears or scales does not reach it. The paper compares equation (5) with a
-covariance that is learnt apart from the positions altogether, so that a wheel's Gaussians keep their orientation while
-they go round; that the rotations are kept is ours, and asks less of ΔR and Δs. The same parameters give the same means,
-turns and material rotations in both.
+"entangled", equation (5): the Jacobian of the map that moves its mean. "separate": nothing, as in the paper's ablation,
+which learns the covariance apart from the positions; a wheel's Gaussians then keep their orientation while they go
+round, where ΔR does not turn them. The same parameters give the same means and turns in both.
 """
 
 
@@ -242,14 +240,6 @@ def cascade(points: Tensor, layers: Sequence[Layer], kind: ClusterMap = "centred
     return Transported(points, jacobians, rotations)
 
 
-def cluster_rotations(count: int, layers: Sequence[Layer], like: Tensor) -> Tensor:
-    """[count, 3, 3] of ``like``'s dtype and device: R_K … R_2 R_1, the rotations of the clusters of each point."""
-    product = torch.eye(3, dtype=like.dtype, device=like.device).expand(count, 3, 3)
-    for labels, params in layers:
-        product = quaternion_matrices(rotation_quaternions(params.r))[labels] @ product
-    return product
-
-
 def deform(
     means: Tensor,
     factors: Tensor,
@@ -261,7 +251,7 @@ def deform(
     """Equation (5) on factors: the cascade, then Δp, ΔR, Δs of each Gaussian.
 
     mean = x_K + Δp; F = R(Δr)·J·F_previous·diag(exp Δs); turn = q(Δr) ∘ Q, flipped to w ≥ 0. Then Σ = F Fᵀ is
-    J Σ_previous Jᵀ where the deltas are 0. Where the covariance is separate, R_K … R_1 takes the place of J.
+    J Σ_previous Jᵀ where the deltas are 0. Where the covariance is separate, J is left out.
 
     Args:
         means: [M, 3] metres, of the previous frame.
@@ -271,12 +261,13 @@ def deform(
         kind: form of the cluster map. covariance: what moves the factors.
     """
     points, jacobians, rotations = cascade(means, layers, kind)
-    if covariance == "separate":
-        jacobians = cluster_rotations(len(means), layers, means)
-    elif covariance != "entangled":
+    if covariance not in ("entangled", "separate"):
         raise ValueError(f"covariance {covariance!r} is unknown; give 'entangled' or 'separate'")
     dq = rotation_quaternions(deltas.dr)
-    moved = quaternion_matrices(dq) @ jacobians @ factors * torch.exp(deltas.ds.clamp(-LARGEST, LARGEST))[:, None, :]
+    carried = quaternion_matrices(dq)
+    if covariance == "entangled":
+        carried = carried @ jacobians
+    moved = carried @ factors * torch.exp(deltas.ds.clamp(-LARGEST, LARGEST))[:, None, :]
     turns = quaternion_product(dq, rotations)
     turns = torch.where(turns[:, :1] < 0, -turns, turns)
     return Deformed(points + deltas.dp, moved, turns)

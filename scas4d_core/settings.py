@@ -181,8 +181,8 @@ class UpdateSettings(Model):
     )
     covariance: Literal["entangled", "separate"] = Field(
         "entangled",
-        description="A Gaussian's covariance follows the Jacobian of the map that moves it (paper), or turns with its "
-        "clusters' rotations alone and has its extent from Δs.",
+        description="A Gaussian's covariance follows the Jacobian of the map that moves it (paper), or is learnt apart "
+        "from the positions, by its own ΔR and Δs alone (the paper's ablation).",
     )
     layer_rates: tuple[LayerRates, ...] = Field(
         (

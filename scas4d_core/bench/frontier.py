@@ -97,13 +97,16 @@ AXES: Mapping[str, tuple[Variant, ...]] = {
         _changed(f"{count:,} Gaussians", "static.max_gaussians", count) for count in (6_000, 12_000, 40_000)
     ),
     "max-scale": (_changed("max_scale 2 m", "update.max_scale", 2.0),),
-    "covariance": (_changed("separate covariance", "update.covariance", "separate"),),
+    "covariance": (_changed("separate covariance", "update.covariance", "separate", "update.own_start=0"),),
     "seeds": tuple(
         Variant(f"{name} {DEFAULT_ITERATIONS}, seed {seed}", name, seed=seed) for name in METHODS for seed in SEEDS[1:]
     ),
     "drift": tuple(Variant(f"{name} {count}", name, count, whole=True) for name, count in DRIFT),
 }
-"""One setting at a time; layers in between are spaced evenly in their logarithm, and the default is on every axis."""
+"""One setting at a time; layers in between are spaced evenly in their logarithm, and the default is on every axis.
+
+A separate covariance is all ΔR and Δs: there each Gaussian's own begins at once, with the first layer.
+"""
 
 
 def variants(axes: Sequence[str] = (), most_iterations: int | None = None) -> list[Variant]:

@@ -7,7 +7,7 @@ Q to the next.
 
 Cluster map, y = x − p, z = c·y + s, f = 2σ(2z), f' = f(2 − f):
 centred x' = p + t + f R y, published x' = f (R y + p + t); both have J = R (f I + f' e cᵀ)
-with e = y, or e = y + Rᵀ(p + t). Where the covariance is separate, a factor is turned by R instead of carried by J.
+with e = y, or e = y + Rᵀ(p + t). Where the covariance is separate, a factor stays as it is.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ def carry(table, about_origin, separate, points, place, v, present, lane, acted)
     """Factors and turns of a block through a layer, in place.
 
     Args:
-        table: [23] of its cluster. separate: None: J is applied to the factors; else R alone.
+        table: [23] of its cluster. separate: None: J is applied to the factors; else nothing.
         points: x, y, z of the block from flat index ``place`` on, as they enter.
         v: [13, 16] factors 0–8 and turns 9–12.
         present: flat; from ``lane`` on, 0 for a Gaussian that is not counted, else 1.
@@ -162,21 +162,17 @@ def carry(table, about_origin, separate, points, place, v, present, lane, acted)
     )  # fmt: skip
     f, yx, yy, yz, ux, uy, uz, exponent = scaled(table, about_origin, x, y, z)
     slope = f * (TWO - f)
-    for column in range(3):
-        j0, j1, j2 = (
-            lanes.load(v, lanes.COUNT * column),
-            lanes.load(v, lanes.COUNT * (3 + column)),
-            lanes.load(v, lanes.COUNT * (6 + column)),
-        )
-        if separate is None:  # known as the kernel is compiled
+    if separate is None:  # known as the kernel is compiled
+        for column in range(3):
+            j0, j1, j2 = (
+                lanes.load(v, lanes.COUNT * column),
+                lanes.load(v, lanes.COUNT * (3 + column)),
+                lanes.load(v, lanes.COUNT * (6 + column)),
+            )
             along = slope * (j0 * table[19] + j1 * table[20] + j2 * table[21])
             lanes.store(v, lanes.COUNT * column, f * (j0 * table[0] + j1 * table[1] + j2 * table[2]) + ux * along)
             lanes.store(v, lanes.COUNT * (3 + column), f * (j0 * table[3] + j1 * table[4] + j2 * table[5]) + uy * along)
             lanes.store(v, lanes.COUNT * (6 + column), f * (j0 * table[6] + j1 * table[7] + j2 * table[8]) + uz * along)
-        else:
-            lanes.store(v, lanes.COUNT * column, j0 * table[0] + j1 * table[1] + j2 * table[2])
-            lanes.store(v, lanes.COUNT * (3 + column), j0 * table[3] + j1 * table[4] + j2 * table[5])
-            lanes.store(v, lanes.COUNT * (6 + column), j0 * table[6] + j1 * table[7] + j2 * table[8])
     a = polar(table, about_origin, f, yx, yy, yz)
     qw, qx, qy, qz = product(table[9], table[10], table[11], table[12], a[0], a[1], a[2], a[3])
     ow, ox, oy, oz = product(
@@ -224,15 +220,17 @@ def carry_backward(table, about_origin, separate, points, place, v, entering, g,
     gux, guy, guz = f * gx, f * gy, f * gz
     gcx = gcy = gcz = nothing
     gr0 = gr1 = gr2 = gr3 = gr4 = gr5 = gr6 = gr7 = gr8 = nothing
-    for column in range(3):
-        j0 = lanes.load(v, entering + n * column)
-        j1 = lanes.load(v, entering + n * (3 + column))
-        j2 = lanes.load(v, entering + n * (6 + column))
-        g0, g1, g2 = lanes.load(g, n * (3 + column)), lanes.load(g, n * (6 + column)), lanes.load(g, n * (9 + column))
-        along = j0 * cx + j1 * cy + j2 * cz
-        # Gradient of f and of the factor's columns: what R turns.
-        h0, h1, h2 = g0 * r0 + g1 * r3 + g2 * r6, g0 * r1 + g1 * r4 + g2 * r7, g0 * r2 + g1 * r5 + g2 * r8
-        if separate is None:
+    if separate is None:
+        for column in range(3):
+            j0 = lanes.load(v, entering + n * column)
+            j1 = lanes.load(v, entering + n * (3 + column))
+            j2 = lanes.load(v, entering + n * (6 + column))
+            g0 = lanes.load(g, n * (3 + column))
+            g1 = lanes.load(g, n * (6 + column))
+            g2 = lanes.load(g, n * (9 + column))
+            along = j0 * cx + j1 * cy + j2 * cz
+            # Gradient of f and of the factor's columns: what R turns.
+            h0, h1, h2 = g0 * r0 + g1 * r3 + g2 * r6, g0 * r1 + g1 * r4 + g2 * r7, g0 * r2 + g1 * r5 + g2 * r8
             g_f += h0 * j0 + h1 * j1 + h2 * j2
             outer = ux * g0 + uy * g1 + uz * g2
             g_slope += outer * along
@@ -244,21 +242,19 @@ def carry_backward(table, about_origin, separate, points, place, v, entering, g,
             gcx += g_along * j0
             gcy += g_along * j1
             gcz += g_along * j2
-            g0, g1, g2 = f * g0, f * g1, f * g2
-        gr0 += g0 * j0
-        gr1 += g0 * j1
-        gr2 += g0 * j2
-        gr3 += g1 * j0
-        gr4 += g1 * j1
-        gr5 += g1 * j2
-        gr6 += g2 * j0
-        gr7 += g2 * j1
-        gr8 += g2 * j2
-        if separate is None:
-            h0, h1, h2 = f * h0 + g_along * cx, f * h1 + g_along * cy, f * h2 + g_along * cz
-        lanes.store(g, n * (3 + column), h0)
-        lanes.store(g, n * (6 + column), h1)
-        lanes.store(g, n * (9 + column), h2)
+            k0, k1, k2 = f * g0, f * g1, f * g2
+            gr0 += k0 * j0
+            gr1 += k0 * j1
+            gr2 += k0 * j2
+            gr3 += k1 * j0
+            gr4 += k1 * j1
+            gr5 += k1 * j2
+            gr6 += k2 * j0
+            gr7 += k2 * j1
+            gr8 += k2 * j2
+            lanes.store(g, n * (3 + column), f * h0 + g_along * cx)
+            lanes.store(g, n * (6 + column), f * h1 + g_along * cy)
+            lanes.store(g, n * (9 + column), f * h2 + g_along * cz)
     # The rotations: Q' = (q(r) ∘ polar) ∘ Q.
     aw, ax, ay, az, ex, ey, ez, dot, nx, ny, nz, cosine, sx, sy, sz, rho, scale, half = polar(
         table, about_origin, f, yx, yy, yz

@@ -86,7 +86,7 @@ def deform(
         present: [B, 16] float32, 0 where a Gaussian is repeated, else 1.
         before: [B, 9, 16] factors of frame t−1. deltas: [M, 9] Δp, Δr, Δs.
         about_origin: 0 for the centred map, 1 for the published one. separate: None: J is applied to the factors; else
-            R alone.
+            nothing.
         points: [max(L, 1), B, 3, 16] as they enter each layer; the first is given, the others are filled.
         sums: [max(L, 1), B, 3] of them; likewise. tables: out [K, 23].
         means [N, 3], factors [N, 3, 3]: out at ``rows``. state: [M, 16], out its means and turns, see ``deltas``.

@@ -78,7 +78,9 @@ def test_every_setting_is_another_and_the_default_comes_first():
     assert [(v.settings.update.iterations, v.settings.update.views) for v in (DEFAULT, *AXES["views"])] == [
         (100, 1), (100, 2), (100, 4), (50, 2),
     ]  # fmt: skip
-    assert [v.settings.update.covariance for v in (DEFAULT, *AXES["covariance"])] == ["entangled", "separate"]
+    assert [(v.settings.update.covariance, v.settings.update.own_start) for v in (DEFAULT, *AXES["covariance"])] == [
+        ("entangled", 0.4), ("separate", 0.0),
+    ]  # fmt: skip
     seeds = AXES["seeds"]
     assert {(v.settings.static.seed, v.settings.update.seed) for v in seeds} == {(0, 1), (0, 2)}
     assert variants(["iterations"], most_iterations=25)[0] == DEFAULT
