@@ -22,7 +22,7 @@ from scas4d_core.views import LABEL, TrainingView, ViewFactory
 Array = NDArray[np.float32]
 
 DARK = 0.05
-"""Mean of the channels, 0…1, from which a pixel tells how bright the light is."""
+"""Of a channel, 0…1, from which it tells how bright the light is."""
 PIXELS = 100
 """Of every other row and column that a camera needs to have a say."""
 SATURATED = 0.99
@@ -81,10 +81,10 @@ def _gain(views: Sequence[TrainingView], shown: Sequence[Array]) -> float | None
 
 
 def _ratio(picture: Array, shown: Array) -> list[float]:
-    """Median over the pixels of how much brighter a picture is than what was shown; none where both are dark."""
-    here, there = picture[:, ::2, ::2].mean(axis=0), shown[:, ::2, ::2].mean(axis=0)
+    """Median over pixels and channels of how much brighter a picture is than what was shown; none of too few."""
+    here, there = picture[:, ::2, ::2], shown[:, ::2, ::2]
     says = (there > DARK) & (there < SATURATED) & (here > DARK / 2) & (here < SATURATED)
-    return [float(np.median(here[says] / there[says]))] if says.sum() >= PIXELS else []
+    return [float(np.median(here[says] / there[says]))] if says.sum() >= 3 * PIXELS else []
 
 
 def _without(view: TrainingView, gain: float, shown: Array) -> Array:

@@ -299,7 +299,9 @@ def settle(
             here = psnr[name] - level
             known = before.place == before.place and past.updates > 0
             here = before.place + PLACE_RATE * (here - before.place) if known else here
-            now = replace(before, place=here, brightness=value / exposure)
+            new = before.brightness != before.brightness  # saturated pictures hide how much brighter another light is
+            usual = value / exposure if exposure == 1.0 or new else before.brightness
+            now = replace(before, place=here, brightness=usual)
         cameras[name] = now
     known = past.updates > 0
     later = past.behind + 1 if behind(past, believed, iterations) and past.behind < CATCH_UP else 0
