@@ -86,7 +86,8 @@ class Past:
             seconds, time of the last frame that was learnt from. behind: frames since some were held or not moved, 0
             once they are met as usual again.
         iterations: of the last update. error: usual at the end of an update, by witness view.
-        light: times that the last frame was brighter, ``Look.exposure``. lit: frames in a row in a light like this.
+        light: times that the last frame was brighter, ``Look.exposure``. lit: frames in a row that were brighter, or
+            that were darker.
     """
 
     cameras: Mapping[str, CameraPast] = field(default_factory=dict)
@@ -190,11 +191,11 @@ def look(past: Past, bright: Mapping[str, float]) -> Look:
 
 
 def lit(past: Past, seen: Look) -> Past:
-    """The past with the light of a frame: how long it has been another one, and the same; darkness is none."""
+    """The past with the light of a frame: how long it has been brighter, or darker; darkness is none."""
     light = seen.exposure
     if light == 1.0 or not BLIND <= light <= 1 / BLIND:
         return replace(past, light=1.0, lit=0)
-    same = past.lit > 0 and 1 / EXPOSURE <= light / past.light <= EXPOSURE
+    same = past.lit > 0 and (light > 1) == (past.light > 1)
     return replace(past, light=light, lit=past.lit + 1 if same else 1)
 
 
@@ -299,9 +300,7 @@ def settle(
             here = psnr[name] - level
             known = before.place == before.place and past.updates > 0
             here = before.place + PLACE_RATE * (here - before.place) if known else here
-            new = before.brightness != before.brightness  # saturated pictures hide how much brighter another light is
-            usual = value / exposure if exposure == 1.0 or new else before.brightness
-            now = replace(before, place=here, brightness=usual)
+            now = replace(before, place=here, brightness=value / exposure)
         cameras[name] = now
     known = past.updates > 0
     later = past.behind + 1 if behind(past, believed, iterations) and past.behind < CATCH_UP else 0
