@@ -33,6 +33,8 @@ FRAMES = 50
 """Of a capture played back and forth."""
 FEW = 8
 """Updates of a capture at most whose frames are repeated, or slowed."""
+SEEDS = 3
+"""Of the updates of a capture as it is."""
 COUNTED_FROM = 2
 """Updates before are not counted: the first has no motion to start from and knows no speed."""
 
@@ -106,57 +108,79 @@ def measure_budgets(
 
 
 def measure_adaptive(
-    folder: Path, out: Path, *, name: str = "adaptive", updates: int = 10, report: Report = print
+    folder: Path, out: Path, *, name: str = "adaptive", updates: int = 10, seeds: int = SEEDS, report: Report = print
 ) -> Row:
     """A preset that spares effort against ``scas4d``, frame by frame in turns, on a capture as it is, with frames
     repeated, and slowed; leaves ``out/effort/<capture>-<name>.json``.
 
     Args:
         folder: of a capture with test cameras. out: folder of a study, with its frames 0. updates: of the capture.
+        seeds: of the updates, tried on the capture as it is; what the first update finds or loses goes by chance.
     """
     capture = open_capture(folder)
-    sequences: dict[str, Callable[[], Iterator[Shown]]] = {
-        "as it is": lambda: as_it_is(capture, updates),
-        "repeated": lambda: repeated(capture, min(updates, FEW)),
-        "slowed": lambda: slowed(capture, min(updates, FEW), out),
+    few = min(updates, FEW)
+    sequences: dict[str, tuple[int, Callable[[], Iterator[Shown]]]] = {
+        "as it is": (seeds, lambda: as_it_is(capture, updates)),
+        "repeated": (1, lambda: repeated(capture, few)),
+        "slowed": (1, lambda: slowed(capture, few, out)),
     }
     answers = []
-    for what, frames in sequences.items():
-        fixed = changed(preset("scas4d"), still=-1.0)
-        pair = {"scas4d": started(capture, fixed, out), name: started(capture, preset(name), out)}
-        seconds: dict[str, list[float]] = {key: [] for key in pair}
-        psnr: dict[str, list[float]] = {key: [] for key in pair}
-        iterations: list[int] = []
-        repeats: list[bool] = []
-        for number, shown in enumerate(frames()):
-            for key in list(pair) if number % 2 else list(pair)[::-1]:
-                began = time.perf_counter()
-                done = pair[key].step(shown.frame, started=began)
-                seconds[key].append(time.perf_counter() - began)
-                psnr[key].append(_score(pair[key], capture, shown.truth))
-                if key == name:
-                    iterations.append(done.iterations)
-            repeats.append(shown.repeats)
-        taken = {key: np.array(values) for key, values in seconds.items()}
-        again = np.array(repeats)
-        answer = {
-            "sequence": what,
-            "frames": len(again),
-            "psnr": {key: float(np.mean(values)) for key, values in psnr.items()},
-            "seconds": {key: float(np.median(values)) for key, values in taken.items()},
-            "time": float(taken[name].sum() / taken["scas4d"].sum()),
-            "time_repeats": float(
-                taken[name][again].sum() / taken["scas4d"][~again].sum() * (~again).sum() / again.sum()
-            )
-            if again.any()
-            else None,
-            "iterations": np.percentile(iterations, (0, 50, 100)).tolist(),
-        }
+    for what, (tries, frames) in sequences.items():
+        turns = Turns(("scas4d", name))
+        for seed in range(tries):
+            fixed, spare = (changed(preset(key), seed=seed) for key in turns.names)
+            turns.take(capture, (changed(fixed, still=-1.0), spare), frames(), out)
+        answer = {"sequence": what, **turns.row()}
         answers.append(answer)
         difference = answer["psnr"][name] - answer["psnr"]["scas4d"]
         told = "" if answer["time_repeats"] is None else f", repeats {100 * answer['time_repeats']:.0f} %"
         report(f"    {capture.name}, {what}: {100 * answer['time']:.0f} % of the time{told}, {difference:+.2f} dB")
     return leave(out, f"{capture.name}-{name}", capture, {"name": name, "sequences": answers})
+
+
+class Turns:
+    """Two settings on the same frames, in turns: what each frame took, and how well it was met.
+
+    Args:
+        names: of the settings; the first is what the other is compared with.
+    """
+
+    def __init__(self, names: tuple[str, str]) -> None:
+        self.names = names
+        self._seconds: dict[str, list[float]] = {name: [] for name in names}
+        self._psnr: dict[str, list[list[float]]] = {name: [] for name in names}
+        self._iterations: list[int] = []
+        self._repeats: list[bool] = []
+
+    def take(self, capture: Capture, settings: tuple[Settings, Settings], frames: Iterator[Shown], out: Path) -> None:
+        """One sequence of frames more, each of the two from frame 0 on."""
+        pair = {name: started(capture, one, out) for name, one in zip(self.names, settings, strict=True)}
+        for values in self._psnr.values():
+            values.append([])
+        for number, shown in enumerate(frames):
+            for name in self.names if number % 2 else self.names[::-1]:
+                began = time.perf_counter()
+                done = pair[name].step(shown.frame, started=began)
+                self._seconds[name].append(time.perf_counter() - began)
+                self._psnr[name][-1].append(_score(pair[name], capture, shown.truth))
+                if name == self.names[1]:
+                    self._iterations.append(done.iterations)
+            self._repeats.append(shown.repeats)
+
+    def row(self) -> Row:
+        """The answer over all sequences taken; ``psnr`` and ``psnr_each`` in dB, times as shares of the first's."""
+        full, spared = (np.array(self._seconds[name]) for name in self.names)
+        again = np.array(self._repeats)
+        each = {name: [float(np.mean(values)) for values in self._psnr[name]] for name in self.names}
+        return {
+            "frames": len(self._psnr[self.names[0]][0]),
+            "psnr": {name: float(np.mean(values)) for name, values in each.items()},
+            "psnr_each": each,
+            "seconds": {name: float(np.median(values)) for name, values in self._seconds.items()},
+            "time": float(spared.sum() / full.sum()),
+            "time_repeats": float(spared[again].mean() / full[~again].mean()) if again.any() else None,
+            "iterations": np.percentile(self._iterations, (0, 50, 100)).tolist(),
+        }
 
 
 def _score(reconstruction: Any, capture: Capture, truth: Mapping[str, NDArray[np.float32]]) -> float:

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from scas4d_core.bench import effort, effort_report
-from scas4d_core.bench.effort import Kept
+from scas4d_core.bench.effort import Kept, Turns
 from scas4d_core.bench.effort_page import effort_text
 from scas4d_core.bench.sequences import as_it_is, back_and_forth, repeated
 from scas4d_core.captures import open_capture
+from scas4d_core.settings import Settings
 from scas4d_core.update import FrameUpdate
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "robot"
@@ -44,6 +45,24 @@ def test_repeats_are_said() -> None:
     assert not any(shown.repeats for shown in as_it_is(capture, 3))
 
 
+def test_two_settings_take_turns(tmp_path: Path) -> None:
+    """Every frame of every seed is counted, and its repeats apart."""
+    capture = open_capture(SAMPLE)
+    rough = {"static": {"iterations": 20}, "update": {"still": 0.02, "judge": False}}
+    many, few = (
+        Settings.model_validate({**rough, "update": {**rough["update"], "iterations": count}}) for count in (8, 2)
+    )
+    turns = Turns(("many", "few"))
+    for _ in range(2):
+        turns.take(capture, (many, few), repeated(capture, 2), tmp_path)
+    row = turns.row()
+    assert row["frames"] == 4
+    assert row["iterations"] == [0, 1, 2]
+    assert {name: len(values) for name, values in row["psnr_each"].items()} == {"many": 2, "few": 2}
+    assert row["psnr"] == {name: values[0] for name, values in row["psnr_each"].items()}  # the same seed twice
+    assert row["time_repeats"] < row["time"] < 1
+
+
 def test_the_page_judges(tmp_path: Path) -> None:
     assert effort_text(tmp_path, ["robot"]) == ""
     folder = tmp_path / "effort"
@@ -52,7 +71,8 @@ def test_the_page_judges(tmp_path: Path) -> None:
     (folder / "robot-budgets.json").write_text(json.dumps({"capture": "robot", "budgets": kept}))
 
     def adaptive(time: float) -> None:
-        one = {"frames": 9, "psnr": {"scas4d": 30.0, "adaptive": 29.95}, "time": time, "time_repeats": 0.05}
+        psnr, each = {"scas4d": 30.0, "adaptive": 29.95}, {"scas4d": [29.5, 30.5], "adaptive": [29.95]}
+        one = {"frames": 9, "psnr": psnr, "psnr_each": each, "time": time, "time_repeats": 0.05}
         rows = [{**one, "sequence": name} for name in ("as it is", "repeated", "slowed")]
         (folder / "robot-adaptive.json").write_text(json.dumps({"capture": "robot", "sequences": rows}))
 
@@ -60,6 +80,7 @@ def test_the_page_judges(tmp_path: Path) -> None:
     text = effort_text(tmp_path, ["robot"])
     assert "| robot | 500 | 100 % | 100 % | +0.0 | +0.0 | 9 | reached |" in text
     assert "**missed** |" in text
+    assert "(29.95 ± 0.00 : 30.00 ± 0.50)" in text
     assert "reached on every capture" in text
     adaptive(0.7)
     assert "**missed** on some captures" in effort_text(tmp_path, ["robot"])
