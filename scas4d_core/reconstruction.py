@@ -43,6 +43,7 @@ from scas4d_core.update import FrameUpdate, Updater
 from scas4d_core.update_plan import mask_weight
 from scas4d_core.updated import REPORT, Stopwatch
 from scas4d_core.views import TrainingView, ViewFactory, pictures_of
+from scas4d_core.warm_up import warm_up_elsewhere
 from scas4d_core.witness import mean_error
 
 __all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "Resumed", "StepError", "View"]
@@ -109,6 +110,8 @@ class Reconstruction(Committed):
     def _of(cls, rig: Rig, settings: Settings, history: History) -> Reconstruction:
         """Without a frame yet; ``rig`` in the user's world."""
         require_device(settings.device)
+        if settings.device == "cpu":
+            warm_up_elsewhere()
         world = rig.world_frame(settings.scene.metres_per_unit)
         scaled = rig_inside(world, rig.scaled(settings.scene.image_scale).cameras)
         self = cls(settings, scaled, world, history)

@@ -18,6 +18,9 @@ SIZE, BALL_M = 32, 0.4
 
 log = logging.getLogger("scas4d.kernels")
 
+_settled = False
+"""This process has asked for its kernels, or compiles them itself."""
+
 
 def marker() -> Path | None:
     """The file that says that this version's kernels are in the cache for this processor; None where there is none.
@@ -39,13 +42,22 @@ def warm_up_elsewhere() -> None:
 
     A kernel that a process has compiled and the same one loaded from the cache differ in the last bits (seen in
     ``project``: products and sums are fused at other places). Results have to be the same in every process that takes
-    a scene up, so none computes with what it compiled itself.
+    a scene up, so none computes with what it compiled itself: ``Reconstruction`` asks for this before its first frame.
     """
+    global _settled
+    if _settled:
+        return
+    _settled = True
     mark = marker()
     if mark is None or mark.exists():
         return
-    program = [sys.executable, "-c", "from scas4d_core.warm_up import warm_up; warm_up()"]
-    if subprocess.run(program, stdin=subprocess.DEVNULL).returncode != 0:
+    # The same sources: they may be where only this process looks.
+    program = "import sys; sys.path[:] = sys.argv[1:]; from scas4d_core.warm_up import warm_up; warm_up()"
+    try:
+        done = subprocess.run([sys.executable, "-c", program, *sys.path], stdin=subprocess.DEVNULL).returncode == 0
+    except OSError:  # no interpreter to be found from inside another program
+        done = False
+    if not done:
         log.warning("kernels could not be compiled beforehand; states may differ in last bits after a restart")
 
 
@@ -56,6 +68,8 @@ def warm_up() -> None:
     """
     from scas4d_core.reconstruction import Reconstruction
 
+    global _settled
+    _settled = True
     settings = Settings.model_validate({"static": {"iterations": 30, "densify_from": 5, "densify_every": 10}})
     settings = settings.model_copy(update={"update": settings.update.model_copy(update={"iterations": 4})})
     rig = _rig()

@@ -137,11 +137,8 @@ class CoreEngine:
         dropped: Mapping[str, str] | None = None,
         notes: Mapping[str, Any] | None = None,
     ) -> Reconstruction:
-        """`Reconstruction.start`, with kernels from the cache: the same bits in every process."""
+        """`Reconstruction.start`."""
         from scas4d_core.reconstruction import Reconstruction
-        from scas4d_core.warm_up import warm_up_elsewhere
-
-        warm_up_elsewhere()
 
         return Reconstruction.start(
             rig, frame, settings, points=points, progress=progress, history=history, dropped=dropped, notes=notes
@@ -150,11 +147,8 @@ class CoreEngine:
     def resume(
         self, rig: Rig, settings: Any, history: History, *, held: Callable[[int], bool] = lambda index: True
     ) -> Reconstruction:
-        """`Reconstruction.resume`, with kernels from the cache."""
+        """`Reconstruction.resume`."""
         from scas4d_core.reconstruction import Reconstruction
-        from scas4d_core.warm_up import warm_up_elsewhere
-
-        warm_up_elsewhere()
 
         return Reconstruction.resume(rig, settings, history, held=held)
 
@@ -176,9 +170,7 @@ class CoreEngine:
     ) -> Replayed:
         """`scas4d_core.tradeoff.replay`, on one thread: the others belong to the update."""
         from scas4d_core.tradeoff import replay
-        from scas4d_core.warm_up import warm_up_elsewhere
 
-        warm_up_elsewhere()
         _one_thread()
         return replay(rig, settings, history, base, frames, iterations, over)
 

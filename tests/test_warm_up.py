@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
 
-from scas4d_core import warm_up
+from scas4d_core import reconstruction, warm_up
 from scas4d_core.kernels import jit
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.settings import Settings
 
 
 @pytest.mark.parametrize("there", [False, True])
@@ -17,12 +20,14 @@ def test_another_process_compiles_what_the_cache_lacks(tmp_path, monkeypatch, th
     if there:
         mark.touch()
     started = []
+    monkeypatch.setattr(warm_up, "_settled", False)
     monkeypatch.setattr(warm_up, "marker", lambda: mark)
     monkeypatch.setattr(
         subprocess, "run", lambda program, **_: started.append(program) or SimpleNamespace(returncode=0)
     )
     warm_up.warm_up_elsewhere()
     assert len(started) == (0 if there else 1)
+    assert all(program[-len(sys.path) :] == sys.path for program in started)  # it finds the same sources
 
 
 def test_the_mark_is_in_the_cache_of_this_version():
@@ -41,7 +46,52 @@ def test_a_checkout_elsewhere_has_a_mark_of_its_own(monkeypatch):
 
 
 def test_where_it_fails_the_scene_is_not_kept_from_starting(tmp_path, monkeypatch, caplog):
+    def no_interpreter(program, **_):
+        raise FileNotFoundError(program[0])
+
     monkeypatch.setattr(warm_up, "marker", lambda: tmp_path / "warm")
-    monkeypatch.setattr(subprocess, "run", lambda program, **_: SimpleNamespace(returncode=1))
-    warm_up.warm_up_elsewhere()
-    assert "could not be compiled" in caplog.text
+    for fails in (lambda program, **_: SimpleNamespace(returncode=1), no_interpreter):
+        caplog.clear()
+        monkeypatch.setattr(warm_up, "_settled", False)
+        monkeypatch.setattr(subprocess, "run", fails)
+        warm_up.warm_up_elsewhere()
+        assert "could not be compiled" in caplog.text
+
+
+@pytest.mark.parametrize(("device", "asked"), [("cpu", 1), ("cuda", 0)])
+def test_a_scene_asks_before_its_first_frame_and_no_process_asks_twice(tmp_path, monkeypatch, device, asked):
+    started = []
+    monkeypatch.setattr(warm_up, "_settled", False)
+    monkeypatch.setattr(warm_up, "marker", lambda: tmp_path / "warm")
+    monkeypatch.setattr(
+        subprocess, "run", lambda program, **_: started.append(program) or SimpleNamespace(returncode=0)
+    )
+    monkeypatch.setattr(reconstruction, "require_device", lambda _: None)
+
+    def nothing_before(*_):
+        assert len(started) == asked
+        raise Reached
+
+    monkeypatch.setattr(Reconstruction, "_fit_static", nothing_before)
+    rig = warm_up._rig()
+    for _ in range(2):
+        with pytest.raises(Reached):
+            Reconstruction.start(rig, warm_up._frame(rig, 0, True), Settings(device=device))
+    assert len(started) == asked
+
+
+class Reached(Exception):
+    """Frame 0 would be fitted now."""
+
+
+def test_a_process_that_compiles_starts_no_other(monkeypatch):
+    monkeypatch.setattr(warm_up, "_settled", False)
+    monkeypatch.setattr(warm_up, "marker", lambda: pytest.fail("the cache was asked"))
+
+    def first_scene(*_, **__):
+        warm_up.warm_up_elsewhere()
+        raise Reached
+
+    monkeypatch.setattr(Reconstruction, "start", first_scene)
+    with pytest.raises(Reached):
+        warm_up.warm_up()
