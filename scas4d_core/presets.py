@@ -11,15 +11,15 @@ PRESETS: dict[str, Settings] = {
     "adaptive": Settings(
         update=UpdateSettings(
             iterations=51,
-            cold_longer=3.9,
+            cold_longer=3.4,
             still=0.02,
             layer_rates=(
                 LayerRates(rotation=0.044, translation=0.0088, scaling=0.002),
                 LayerRates(rotation=0.011, translation=0.0022, scaling=0.002),
                 LayerRates(rotation=0.0022, translation=0.00044, scaling=0.002),
             ),
-            rate_position=2e-4,
-            rate_rotation=0.0025,
+            rate_position=4.8e-4,
+            rate_rotation=0.006,
             rate_colour=0.00375,
             beta1=0.7,
             beta2=0.9,
