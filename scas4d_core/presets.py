@@ -10,8 +10,8 @@ PRESETS: dict[str, Settings] = {
     # fewer and bolder iterations, none where nothing moved; silhouettes are left to the pictures.
     "adaptive": Settings(
         update=UpdateSettings(
-            iterations=51,
-            cold_longer=3.4,
+            iterations=50,
+            cold_longer=3.0,
             still=0.02,
             layer_rates=(
                 LayerRates(rotation=0.044, translation=0.0088, scaling=0.002),
