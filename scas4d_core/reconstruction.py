@@ -21,7 +21,6 @@ from scas4d_core.attempts import axis_lengths
 from scas4d_core.budget import Budget
 from scas4d_core.cameras import Rig, WorldFrame, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
-from scas4d_core.captures.images import resize_area
 from scas4d_core.checkpoint import Carried, CheckpointError, Checkpoints, digest
 from scas4d_core.committed import Committed, View
 from scas4d_core.device import require_device
@@ -42,7 +41,7 @@ from scas4d_core.trial import Given, Outcome, Trial
 from scas4d_core.update import FrameUpdate, Updater
 from scas4d_core.update_plan import mask_weight
 from scas4d_core.updated import REPORT, Stopwatch
-from scas4d_core.views import TrainingView, ViewFactory, pictures_of
+from scas4d_core.views import TrainingView, ViewFactory, scaled_to
 from scas4d_core.warm_up import warm_up_elsewhere
 from scas4d_core.witness import mean_error
 
@@ -522,14 +521,4 @@ class Reconstruction(Committed):
 
     def _scaled(self, frame: Frame) -> Frame:
         """The frame with its pictures at the size of ``rig``."""
-        if self.settings.scene.image_scale == 1.0:
-            return frame
-        sizes = {camera.name: (camera.width, camera.height) for camera in self.rig.cameras}
-        images, masks = {}, {}
-        for name, size in sizes.items():
-            if name in frame.images:
-                image, mask = pictures_of(frame, name, self._sizes[name])
-                images[name] = resize_area(image, size)
-                if mask is not None:
-                    masks[name] = (resize_area(255 * mask, size) >= 128).astype(np.uint8)
-        return Frame(frame.index, frame.time, images, masks)
+        return frame if self.settings.scene.image_scale == 1.0 else scaled_to(self.rig, frame, self._sizes)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import Rig
 from scas4d_core.captures.frame import Frame
-from scas4d_core.captures.images import area_average
+from scas4d_core.captures.images import area_average, resize_area
 from scas4d_core.kernels import image_loss
 from scas4d_core.rasterize.cpu import CameraArrays
 
@@ -141,6 +141,26 @@ def pictures_of(
                 f"(array {array.shape}), the rig says {width}x{height} (array {shape})"
             )
     return image, mask
+
+
+def scaled_to(rig: Rig, frame: Frame, sizes: Mapping[str, tuple[int, int]]) -> Frame:
+    """The frame with its pictures of the rig's cameras at the size that those have.
+
+    Args:
+        sizes: (width, height) that each camera's pictures come in.
+
+    Raises:
+        ValueError: a picture or a mask is of another size.
+    """
+    images, masks = {}, {}
+    for camera in rig.cameras:
+        name, size = camera.name, (camera.width, camera.height)
+        if name in frame.images:
+            image, mask = pictures_of(frame, name, sizes[name])
+            images[name] = resize_area(image, size)
+            if mask is not None:
+                masks[name] = (resize_area(255 * mask, size) >= 128).astype(np.uint8)
+    return Frame(frame.index, frame.time, images, masks)
 
 
 def view_order(count: int, iterations: int, rng: np.random.Generator) -> Sequence[int]:
