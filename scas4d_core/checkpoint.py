@@ -14,16 +14,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
-from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.captures.frame import Frame
-from scas4d_core.hierarchy import Hierarchy
 from scas4d_core.history import NEWEST_KEPT
 from scas4d_core.judge import Past
-from scas4d_core.neighbours import Neighbours
 from scas4d_core.npz import read_npz, write_npz
 from scas4d_core.views import TrainingView, ViewFactory
 from scas4d_core.warm_start import Motion
@@ -57,17 +54,6 @@ class Carried:
     structure: int = 0
     past: Past = field(default_factory=Past)
     shown: Mapping[str, int] = field(default_factory=dict)
-
-
-def digest(hierarchy: Hierarchy, neighbours: Neighbours | None) -> int:
-    """CRC-32 of the clusters and the neighbour graph."""
-    arrays = [hierarchy.rows, *hierarchy.labels, *hierarchy.starts]
-    if neighbours is not None:
-        arrays += [neighbours.index, neighbours.weights, neighbours.distances]
-    value = 0
-    for array in arrays:
-        value = crc32(np.ascontiguousarray(array).view(np.uint8).data, value)
-    return value
 
 
 class Checkpoints:

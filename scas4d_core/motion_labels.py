@@ -32,6 +32,9 @@ MAJORITY = 0.5
 STANDING_SHARE = 0.1
 """Share of standing Gaussians from which a scene has something that stands; below, their labels are noise."""
 
+NEW_LABELS = 0.01
+"""Share of all Gaussians that must be found moving anew before the hierarchy is built again."""
+
 
 def settled(gaussians: Gaussians) -> Gaussians:
     """The Gaussians of frame 0 with labels that can be relied on.
@@ -76,3 +79,26 @@ def moving_between(
         says += sees & (inside > IN_CHANGE * total)
     moving: NDArray[np.bool_] = (says >= 2) & (says > MAJORITY * asked)
     return moving
+
+
+def labels_learnt(
+    gaussians: Gaussians,
+    known: NDArray[np.bool_] | None,
+    before: Sequence[TrainingView],
+    now: Sequence[TrainingView],
+    picture: PictureLoss,
+) -> NDArray[np.bool_] | None:
+    """[N] what has been seen to move by now, or None where that is no more than before, or hardly.
+
+    Args:
+        gaussians: Θ_{t−1}. known: [N] what had been seen to move before, or None.
+        before, now: see ``moving_between``.
+    """
+    found = moving_between(gaussians, before, now, picture)
+    known = np.zeros(len(gaussians), np.bool_) if known is None else known
+    return None if (found & ~known).sum() <= NEW_LABELS * len(gaussians) else found | known
+
+
+def labelled(gaussians: Gaussians, labels: NDArray[np.bool_] | None) -> Gaussians:
+    """The Gaussians with the labels [N] learnt from motion, where there are any."""
+    return gaussians if labels is None else gaussians.replace(foreground=labels.astype(np.float32))

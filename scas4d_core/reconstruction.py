@@ -21,24 +21,22 @@ from scas4d_core.attempts import axis_lengths
 from scas4d_core.budget import Budget
 from scas4d_core.cameras import Rig, WorldFrame, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
-from scas4d_core.checkpoint import Carried, CheckpointError, Checkpoints, digest
+from scas4d_core.checkpoint import Carried, CheckpointError, Checkpoints
 from scas4d_core.committed import Committed, View
 from scas4d_core.device import require_device
-from scas4d_core.floor import floor_inside
 from scas4d_core.frame_report import REPORTED_ITERATIONS, REPORTED_LOSSES, FrameReport, Progress, curve, means
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.hierarchy import build_hierarchy
 from scas4d_core.history import History, HistoryError
 from scas4d_core.initial_points import initial_points
-from scas4d_core.motion_labels import moving_between, settled
-from scas4d_core.neighbours import build_neighbours
+from scas4d_core.motion_labels import labelled, labels_learnt, settled
 from scas4d_core.picture_loss import PictureLoss
+from scas4d_core.prepare import prepare
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.repeats import fingerprints, same_again
 from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.static_scene import StaticResult, fit_static_scene
 from scas4d_core.trial import Given, Outcome, Trial
-from scas4d_core.update import FrameUpdate, Updater
+from scas4d_core.update import Updater
 from scas4d_core.update_plan import mask_weight
 from scas4d_core.updated import REPORT, Stopwatch
 from scas4d_core.views import TrainingView, ViewFactory, scaled_to
@@ -46,9 +44,6 @@ from scas4d_core.warm_up import warm_up_elsewhere
 from scas4d_core.witness import mean_error
 
 __all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "Resumed", "StepError", "View"]
-
-NEW_LABELS = 0.01
-"""Share of all Gaussians that must be found moving anew before the hierarchy is built again."""
 
 
 class StepError(ValueError):
@@ -157,7 +152,7 @@ class Reconstruction(Committed):
         self._exposures = result.exposures
         self._lengths = axis_lengths(result.gaussians)
         self._masked = len(frame.masks) > 0
-        self._updater, structure = self._prepared(result.gaussians)
+        self._updater, structure = self._prepared(result.gaussians, None)
         seen = () if self._masked else self._factory.views(self._scaled(frame), {}, use_masks=False)
         report = FrameReport(
             index=frame.index,
@@ -240,7 +235,7 @@ class Reconstruction(Committed):
         self._exposures = {name: np.array(exposure, np.float32) for name, exposure in report["exposures"].items()}
         self._lengths = axis_lengths(copy.gaussians(first))
         labels = self._labels_of(index)
-        self._updater, structure = self._prepared(self._labelled(copy.gaussians(first), labels))
+        self._updater, structure = self._prepared(copy.gaussians(first), labels)
         self._carried = Carried(labels=labels, structure=structure)
         return self
 
@@ -270,7 +265,7 @@ class Reconstruction(Committed):
         else:
             index = whole[-1]
         labels = self._labels_of(index) if carried is None else carried.labels
-        self._updater, structure = self._prepared(self._labelled(history.gaussians(history.indices[0]), labels))
+        self._updater, structure = self._prepared(history.gaussians(history.indices[0]), labels)
         if carried is not None and carried.structure != structure:
             faults.append("clusters came out otherwise than before: the next update starts without a motion")
             carried = replace(carried, motion=None, structure=structure)
@@ -350,7 +345,7 @@ class Reconstruction(Committed):
         watch.lap("judge")
         updater, carried = self._learn_what_moves(views, look)
         given = Given(
-            state=self._labelled(self._state(None), carried.labels),
+            state=labelled(self._state(None), carried.labels),
             motion=carried.motion,
             seconds=frame.time - past.fitted if isfinite(past.fitted) else seconds,
             step=seconds,
@@ -481,43 +476,16 @@ class Reconstruction(Committed):
         carried = self._carried
         if self._masked or not carried.seen or look.held or look.exposure != 1.0:
             return self._updater, carried
-        state = self._state(None)
         believed = [view for view in views if view.name not in look.left_out]
-        found = moving_between(state, carried.seen, believed, self._picture)
-        known = np.zeros(len(state), np.bool_) if carried.labels is None else carried.labels
-        if (found & ~known).sum() <= NEW_LABELS * len(state):
+        labels = labels_learnt(self._state(None), carried.labels, carried.seen, believed, self._picture)
+        if labels is None:
             return self._updater, carried
-        labels = found | known
-        updater, structure = self._prepared(self._labelled(self.history.gaussians(self.history.indices[0]), labels))
+        updater, structure = self._prepared(self.history.gaussians(self.history.indices[0]), labels)
         return updater, replace(carried, labels=labels, motion=None, structure=structure)
 
-    def _labelled(self, gaussians: Gaussians, labels: NDArray[np.bool_] | None) -> Gaussians:
-        """The Gaussians with the labels learnt from motion, where there are any."""
-        return gaussians if labels is None else gaussians.replace(foreground=labels.astype(np.float32))
-
-    def _prepared(self, gaussians: Gaussians) -> tuple[Updater, int]:
-        """The updater for the hierarchy and the neighbour graph of what moves, and the digest of both."""
-        settings = self.settings.update
-        hierarchy = build_hierarchy(
-            gaussians.means, gaussians.moving, settings.clusters, settings.smallest_cluster, settings.seed
-        )
-        weights = settings.weights
-        tied = weights.rigidity + weights.isometry + weights.rotation > 0
-        neighbours = (
-            build_neighbours(gaussians.means[hierarchy.rows], settings.neighbours, settings.neighbour_falloff)
-            if tied
-            else None
-        )
-        structure = digest(hierarchy, neighbours)
-        scene = self.settings.scene
-        if scene.floor is not None:
-            scene = scene.model_copy(update={"floor": floor_inside(scene.floor, self.world)})
-        given = (self._factory, scene, settings, hierarchy, neighbours, gaussians)
-        if self.settings.device == "cpu":
-            return FrameUpdate(*given), structure
-        from scas4d_core.update_device import DeviceUpdate  # torch is loaded only where it is used
-
-        return DeviceUpdate(*given, device=self.settings.device), structure
+    def _prepared(self, first: Gaussians, labels: NDArray[np.bool_] | None) -> tuple[Updater, int]:
+        """The updater for what moves in Θ_0, and the digest of its clusters and neighbours."""
+        return prepare(labelled(first, labels), self._factory, self.settings, self.world)
 
     def _scaled(self, frame: Frame) -> Frame:
         """The frame with its pictures at the size of ``rig``."""
