@@ -7,7 +7,7 @@ before (``checkpoint``), so that ``resume`` goes on after any end of the process
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from math import inf, isfinite, nan
 from time import perf_counter
 from typing import Any
@@ -21,7 +21,7 @@ from scas4d_core.attempts import axis_lengths
 from scas4d_core.budget import Budget
 from scas4d_core.cameras import Rig, WorldFrame, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
-from scas4d_core.checkpoint import Carried, CheckpointError, Checkpoints
+from scas4d_core.checkpoint import Carried, Checkpoints
 from scas4d_core.committed import Committed, View
 from scas4d_core.device import require_device
 from scas4d_core.frame_report import REPORTED_ITERATIONS, REPORTED_LOSSES, FrameReport, Progress, curve, means
@@ -33,6 +33,7 @@ from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.prepare import prepare
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.repeats import fingerprints, same_again
+from scas4d_core.resuming import Fixed, Resumed, ResumeError, find_commit, fixed
 from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.static_scene import StaticResult, fit_static_scene
 from scas4d_core.trial import Given, Outcome, Trial
@@ -50,28 +51,6 @@ class StepError(ValueError):
     """A frame that cannot be stepped to; the state is as it was."""
 
 
-class ResumeError(ValueError):
-    """A history that cannot be gone on from; the message says what is damaged."""
-
-
-@dataclass(frozen=True)
-class Resumed:
-    """Where a scene was taken up again.
-
-    Attributes:
-        index: the commit that it goes on from.
-        undone: committed frames after it that were taken back; each has to be given again, or is lost.
-        faults: why, a sentence for each file that could not be used; empty after an ordinary end.
-        cold: the state is whole, but what the next update needs beside it is not: that starts without a motion, and
-            the scene is no longer bit-identical to one that was not disturbed.
-    """
-
-    index: int
-    undone: list[int]
-    faults: list[str]
-    cold: bool
-
-
 class Reconstruction(Committed):
     """One scene, from frame 0 on. Made by ``start`` or, from what another process left on disk, by ``resume``.
 
@@ -86,17 +65,15 @@ class Reconstruction(Committed):
         self.rig = rig
         self._factory = ViewFactory(rig)
         self._sizes: dict[str, tuple[int, int]] = {}
-        self._exposures: dict[str, NDArray[np.float32]] = {}
         self.static: StaticResult | None = None
         self.report: FrameReport | None = None
         self.resumed: Resumed | None = None
-        self._masked = True
+        self._fixed: Fixed
         self._carried = Carried()
         self._checkpoints = None if history.directory is None else Checkpoints(history.directory)
         limits = scene_limits(settings.scene.near, rig.radius)
         self._picture = PictureLoss(self._factory, settings.scene.background, 1.0, 0.0, limits=limits)
-        self._updater: Updater | None = None
-        self._lengths: NDArray[np.float32] | None = None
+        self._updater: Updater
         self._effort = settings.update
         self._budget = Budget(settings.update.budget_ms)
 
@@ -149,11 +126,9 @@ class Reconstruction(Committed):
         result = replace(result, gaussians=settled(result.gaussians))
         fitted = perf_counter()
         self.static = result
-        self._exposures = result.exposures
-        self._lengths = axis_lengths(result.gaussians)
-        self._masked = len(frame.masks) > 0
+        self._fixed = Fixed(len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians))
         self._updater, structure = self._prepared(result.gaussians, None)
-        seen = () if self._masked else self._factory.views(self._scaled(frame), {}, use_masks=False)
+        seen = () if self._fixed.masked else self._factory.views(self._scaled(frame), {}, use_masks=False)
         report = FrameReport(
             index=frame.index,
             time=frame.time,
@@ -168,7 +143,7 @@ class Reconstruction(Committed):
             dropped=dict(dropped or {}),
         )
         first = {
-            "masked": self._masked,
+            "masked": self._fixed.masked,
             "exposures": {name: exposure.tolist() for name, exposure in result.exposures.items()},
         }
         past = judge.Past.of_first(
@@ -202,15 +177,16 @@ class Reconstruction(Committed):
         if history.directory is None or not history.indices:
             raise ResumeError("the history holds no committed frame; start the scene with its first frame")
         self = cls._of(rig, settings, history)
-        first = history.indices[0]
+        assert self._checkpoints is not None
         try:
-            report = history.report(first)
-            self._masked = bool(report["masked"])
-            self._exposures = {name: np.array(e, np.float32) for name, e in report["exposures"].items()}
-            self._lengths = axis_lengths(history.gaussians(first))
+            self._fixed = fixed(history)
         except (HistoryError, KeyError) as error:
             raise ResumeError(f"the first frame, which every update needs, cannot be read ({error})") from error
-        self._take_up(held)
+        index, left, faults = find_commit(history, self._checkpoints, self._factory, held)
+        same = self._go_on(Carried(labels=self._labels_of(index)) if left is None else left)
+        if left is not None and not same:
+            faults.append("clusters came out otherwise than before: the next update starts without a motion")
+        self.resumed = Resumed(index, history.cut(index), faults, cold=left is None or not same)
         return self
 
     @classmethod
@@ -230,56 +206,22 @@ class Reconstruction(Committed):
         for one in sorted({first, index}):
             copy.append(one, history.time(one), history.gaussians(one), history.report(one))
         self = cls._of(rig, settings, copy)
-        report = copy.report(first)
-        self._masked = bool(report["masked"])
-        self._exposures = {name: np.array(exposure, np.float32) for name, exposure in report["exposures"].items()}
-        self._lengths = axis_lengths(copy.gaussians(first))
-        labels = self._labels_of(index)
-        self._updater, structure = self._prepared(copy.gaussians(first), labels)
-        self._carried = Carried(labels=labels, structure=structure)
+        self._fixed = fixed(copy)
+        self._go_on(Carried(labels=self._labels_of(index)))
         return self
 
-    def _take_up(self, held: Callable[[int], bool]) -> None:
-        """Find the commit to go on from, and cut the history after it."""
-        history = self.history
-        assert self._checkpoints is not None
-        faults = list(history.damaged.values())
-        whole: list[int] = []
-        carried: Carried | None = None
-        for index in reversed(history.indices):
-            try:
-                history.gaussians(index)
-                history.report(index)
-                whole.append(index)
-                carried = self._checkpoints.load(index, self._factory)
-                break
-            except (HistoryError, CheckpointError) as error:
-                faults.append(str(error))
-                if index not in self._checkpoints.indices() and whole:
-                    break  # so old that it has none any more: nothing before it has one either
-        if not whole:
-            raise ResumeError("no state can be read: " + "; ".join(faults))
-        later = sorted({*history.indices, *history.damaged})
-        if carried is None or not all(held(index) for index in later if index > whole[-1]):
-            index, carried = whole[0], None
-        else:
-            index = whole[-1]
-        labels = self._labels_of(index) if carried is None else carried.labels
-        self._updater, structure = self._prepared(history.gaussians(history.indices[0]), labels)
-        if carried is not None and carried.structure != structure:
-            faults.append("clusters came out otherwise than before: the next update starts without a motion")
-            carried = replace(carried, motion=None, structure=structure)
-            cold = True
-        else:
-            cold = carried is None
-        self._carried = carried or Carried(labels=labels, structure=structure)
-        undone = history.cut(index)
-        self.resumed = Resumed(index, undone, faults, cold)
+    def _go_on(self, carried: Carried) -> bool:
+        """Prepare the updates after a committed one; whether the motion that it left fits the clusters of now."""
+        first = self.history.gaussians(self.history.indices[0])
+        self._updater, structure = self._prepared(first, carried.labels)
+        same = carried.structure == structure
+        self._carried = carried if same else replace(carried, motion=None, structure=structure)
+        return same
 
     def _labels_of(self, index: int) -> NDArray[np.bool_] | None:
         """The labels learnt, as far as the state tells."""
         moving = self.history.gaussians(index).moving
-        return None if self._masked or moving.all() else moving
+        return None if self._fixed.masked or moving.all() else moving
 
     def _fit_static(self, frame: Frame, points: InitialPoints | None, tell: Callable[[Progress], None]) -> StaticResult:
         """Frame 0 from a first cloud, which is made from the pictures where none is given.
@@ -335,7 +277,7 @@ class Reconstruction(Committed):
         past = self._carried.past
         frame = replace(frame, images=dict(frame.images))  # decoded once: a capture's pictures are, whenever looked at
         try:
-            views = self._factory.views(self._scaled(frame), self._exposures, self._uses_masks)
+            views = self._factory.views(self._scaled(frame), self._fixed.exposures, self._uses_masks)
         except ValueError as error:
             raise StepError(str(error)) from error
         watch.lap("decode")
@@ -357,7 +299,7 @@ class Reconstruction(Committed):
             look=look,
             end=self._budget.end(watch.began),
             each=self._budget.each,
-            lengths=self._lengths,
+            lengths=self._fixed.lengths,
         )
         trial = Trial(updater, self._factory, self._picture, self._effort)
         shown = fingerprints(frame.images)
@@ -369,12 +311,11 @@ class Reconstruction(Committed):
         watch.move("update", "judge", trial.judging)
         if outcome.fresh:
             carried = replace(carried, shown=shown)
-            if not self._masked and outcome.exposure == 1.0:  # what another light changes has not moved
+            if not self._fixed.masked and outcome.exposure == 1.0:  # what another light changes has not moved
                 carried = replace(
                     carried, seen=[view for view in given.views if view.name not in outcome.updated.left_out]
                 )
         else:  # what seemed to move in its pictures is as little believed as they are
-            assert self._updater is not None
             updater, carried = self._updater, self._carried
             outcome = replace(outcome, gaussians=self._state(None), motion=carried.motion)
         report = self._report(frame, outcome, look, watch, dropped or {})
@@ -462,7 +403,6 @@ class Reconstruction(Committed):
     @property
     def _uses_masks(self) -> bool:
         """Whether updates look at masks: where no term asks for them they are not even read."""
-        assert self._updater is not None
         settings, moving = self.settings.update, len(self._updater.hierarchy.rows)
         return settings.use_masks and mask_weight(settings, moving, len(self._state(None))) > 0
 
@@ -472,9 +412,8 @@ class Reconstruction(Committed):
         The labels become part of the state with the commit of this frame. A hierarchy of other Gaussians is a new one:
         the motion before does not fit it, and the update starts cold.
         """
-        assert self._updater is not None
         carried = self._carried
-        if self._masked or not carried.seen or look.held or look.exposure != 1.0:
+        if self._fixed.masked or not carried.seen or look.held or look.exposure != 1.0:
             return self._updater, carried
         believed = [view for view in views if view.name not in look.left_out]
         labels = labels_learnt(self._state(None), carried.labels, carried.seen, believed, self._picture)

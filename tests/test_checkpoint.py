@@ -148,7 +148,7 @@ def test_the_scenes_are_what_they_should_be(undisturbed):
     assert any(relabelled[1:])
     assert 0 < scene._carried.labels.sum() < len(BOX)
     scene, _ = undisturbed("masks, floor, image scale and exposures")
-    assert any((exposure != [1, 0]).any() for exposure in scene._exposures.values())
+    assert any((exposure != [1, 0]).any() for exposure in scene._fixed.exposures.values())
 
 
 def test_resumed_after_every_single_frame(undisturbed, tmp_path):
