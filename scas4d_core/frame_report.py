@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
-from math import isfinite
+from math import isfinite, nan
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from scas4d_core.updated import CameraFit
+from scas4d_core import judge
+from scas4d_core.captures.frame import Frame
+from scas4d_core.static_scene import StaticResult
+from scas4d_core.trial import Outcome
+from scas4d_core.updated import REPORT, CameraFit, Stopwatch
+from scas4d_core.witness import mean_error
 
 REPORTED_ITERATIONS = 24
 """The report's training loss is a mean over this many last iterations: about one round of a rig's cameras."""
@@ -99,6 +106,90 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_finite(inner) for inner in value]
     return None if isinstance(value, float) and not isfinite(value) else value
+
+
+def report_of_first(
+    frame: Frame,
+    result: StaticResult,
+    names: Sequence[str],
+    moving: int,
+    seconds: dict[str, float],
+    dropped: Mapping[str, str] | None,
+) -> FrameReport:
+    """The report of frame 0.
+
+    Args:
+        names: of the rig's cameras. moving: Gaussians in the hierarchy. seconds: by stage.
+        dropped: cameras that the caller has left out, with the reason.
+    """
+    return FrameReport(
+        index=frame.index,
+        time=frame.time,
+        iterations=len(result.losses),
+        seconds=seconds,
+        loss=means(result.losses, REPORTED_LOSSES),
+        psnr=_last(result.psnr),
+        moving=moving,
+        gaussians=len(result.gaussians),
+        cameras=result.cameras,
+        used=[name for name in names if name in frame.images],
+        dropped=dict(dropped or {}),
+    )
+
+
+def report_of_update(
+    frame: Frame,
+    outcome: Outcome,
+    look: judge.Look,
+    names: Sequence[str],
+    watch: Stopwatch,
+    dropped: Mapping[str, str] | None,
+) -> FrameReport:
+    """The report of an update.
+
+    Args:
+        outcome: what is committed. look: what the frame's pictures said. names: of the rig's cameras.
+        watch: with the stages "decode", "judge" and "update".
+        dropped: cameras that the caller has left out, with the reason.
+    """
+    updated, gaussians = outcome.updated, outcome.gaussians
+    began = perf_counter()
+    left_out = {**(dropped or {}), **look.left_out, **updated.left_out}
+    learnt = outcome.fresh and not outcome.stood
+    stages = {"decode": watch.seconds["decode"], **updated.seconds}
+    stages["judge"] = watch.seconds["judge"] + updated.seconds.get("judge", 0.0)
+    stages["other"] = max(0.0, watch.seconds["update"] - sum(updated.seconds.values()))
+    report = FrameReport(
+        index=frame.index,
+        time=frame.time,
+        iterations=len(updated.losses),
+        seconds=stages,
+        loss=updated.losses,
+        psnr=_last(updated.psnr),
+        moving=int(gaussians.moving.sum()),
+        gaussians=len(gaussians),
+        cameras={
+            name: replace(fit, health=judge.health(outcome.fits.get(name))) for name, fit in updated.cameras.items()
+        },
+        used=[name for name in names if name in frame.images and name not in left_out] if learnt else [],
+        dropped=left_out,
+        degraded=outcome.degraded,
+        attempts=outcome.attempts,
+        exposure=outcome.exposure,
+        held=outcome.held,
+        guards={**updated.guards, "axis_bounds": outcome.bounded},
+        planned=updated.planned,
+        curve=curve(updated.losses, updated.moments),
+        errors={kind: mean_error(errors, list(errors)) for kind, errors in updated.errors.items()},
+        kept=updated.kept,
+    )
+    stages[REPORT] = watch.seconds[REPORT] + updated.seconds.get(REPORT, 0.0) + perf_counter() - began
+    return report
+
+
+def _last(psnr: Sequence[float]) -> float:
+    """Mean dB of the last views rendered."""
+    return float(np.mean(psnr[-REPORTED_ITERATIONS:])) if psnr else nan
 
 
 def means(values: list[float], most: int) -> list[float]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
-from math import inf, isfinite, nan
+from math import inf, isfinite
 from time import perf_counter
 from typing import Any
 
@@ -24,7 +24,7 @@ from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.checkpoint import Carried, Checkpoints
 from scas4d_core.committed import Committed, View
 from scas4d_core.device import require_device
-from scas4d_core.frame_report import REPORTED_ITERATIONS, REPORTED_LOSSES, FrameReport, Progress, curve, means
+from scas4d_core.frame_report import FrameReport, Progress, report_of_first, report_of_update
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.history import History, HistoryError
 from scas4d_core.initial_points import initial_points
@@ -36,13 +36,12 @@ from scas4d_core.repeats import fingerprints, same_again
 from scas4d_core.resuming import Fixed, Resumed, ResumeError, find_commit, fixed
 from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.static_scene import StaticResult, fit_static_scene
-from scas4d_core.trial import Given, Outcome, Trial
+from scas4d_core.trial import Given, Trial
 from scas4d_core.update import Updater
 from scas4d_core.update_plan import mask_weight
 from scas4d_core.updated import REPORT, Stopwatch
 from scas4d_core.views import TrainingView, ViewFactory, scaled_to
 from scas4d_core.warm_up import warm_up_elsewhere
-from scas4d_core.witness import mean_error
 
 __all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "Resumed", "StepError", "View"]
 
@@ -129,19 +128,8 @@ class Reconstruction(Committed):
         self._fixed = Fixed(len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians))
         self._updater, structure = self._prepared(result.gaussians, None)
         seen = () if self._fixed.masked else self._factory.views(self._scaled(frame), {}, use_masks=False)
-        report = FrameReport(
-            index=frame.index,
-            time=frame.time,
-            iterations=len(result.losses),
-            seconds={"fit": fitted - began, "prepare": perf_counter() - fitted},
-            loss=means(result.losses, REPORTED_LOSSES),
-            psnr=float(np.mean(result.psnr[-REPORTED_ITERATIONS:])) if result.psnr else nan,
-            moving=len(self._updater.hierarchy.rows),
-            gaussians=len(result.gaussians),
-            cameras=result.cameras,
-            used=[name for name in self.rig.names if name in frame.images],
-            dropped=dict(dropped or {}),
-        )
+        seconds = {"fit": fitted - began, "prepare": perf_counter() - fitted}
+        report = report_of_first(frame, result, self.rig.names, len(self._updater.hierarchy.rows), seconds, dropped)
         first = {
             "masked": self._fixed.masked,
             "exposures": {name: exposure.tolist() for name, exposure in result.exposures.items()},
@@ -318,7 +306,7 @@ class Reconstruction(Committed):
         else:  # what seemed to move in its pictures is as little believed as they are
             updater, carried = self._updater, self._carried
             outcome = replace(outcome, gaussians=self._state(None), motion=carried.motion)
-        report = self._report(frame, outcome, look, watch, dropped or {})
+        report = report_of_update(frame, outcome, look, self.rig.names, watch, dropped)
         how = {"cold": given.motion is None, "relabelled": updater is not self._updater}
         learnt = outcome.fresh and not outcome.stood
         past = replace(outcome.past, fitted=frame.time) if learnt else outcome.past
@@ -345,44 +333,6 @@ class Reconstruction(Committed):
         changes = {name: value for name, value in told.items() if value is not None}
         self._effort = UpdateSettings.model_validate({**self.settings.update.model_dump(), **changes})
         self._budget.milliseconds = self._effort.budget_ms
-
-    def _report(
-        self, frame: Frame, outcome: Outcome, look: judge.Look, watch: Stopwatch, dropped: Mapping[str, str]
-    ) -> FrameReport:
-        updated, gaussians = outcome.updated, outcome.gaussians
-        began = perf_counter()
-        left_out = {**dropped, **look.left_out, **updated.left_out}
-        stages = {"decode": watch.seconds["decode"], **updated.seconds}
-        stages["judge"] = watch.seconds["judge"] + updated.seconds.get("judge", 0.0)
-        stages["other"] = max(0.0, watch.seconds["update"] - sum(updated.seconds.values()))
-        report = FrameReport(
-            index=frame.index,
-            time=frame.time,
-            iterations=len(updated.losses),
-            seconds=stages,
-            loss=updated.losses,
-            psnr=float(np.mean(updated.psnr[-REPORTED_ITERATIONS:])) if updated.psnr else nan,
-            moving=int(gaussians.moving.sum()),
-            gaussians=len(gaussians),
-            cameras={
-                name: replace(fit, health=judge.health(outcome.fits.get(name))) for name, fit in updated.cameras.items()
-            },
-            used=[name for name in self.rig.names if name in frame.images and name not in left_out]
-            if outcome.fresh and not outcome.stood
-            else [],
-            dropped=left_out,
-            degraded=outcome.degraded,
-            attempts=outcome.attempts,
-            exposure=outcome.exposure,
-            held=outcome.held,
-            guards={**updated.guards, "axis_bounds": outcome.bounded},
-            planned=updated.planned,
-            curve=curve(updated.losses, updated.moments),
-            errors={kind: mean_error(errors, list(errors)) for kind, errors in updated.errors.items()},
-            kept=updated.kept,
-        )
-        stages[REPORT] = watch.seconds[REPORT] + updated.seconds.get(REPORT, 0.0) + perf_counter() - began
-        return report
 
     def _commit(self, report: FrameReport, gaussians: Gaussians, carried: Carried, more: Mapping[str, Any]) -> None:
         """The checkpoint first, then state and report in one rename."""
