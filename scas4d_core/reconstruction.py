@@ -24,18 +24,18 @@ from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.checkpoint import Carried, Checkpoints
 from scas4d_core.committed import Committed, View
 from scas4d_core.device import require_device
+from scas4d_core.first_frame import Fixed, fit_first
 from scas4d_core.frame_report import FrameReport, Progress, report_of_first, report_of_update
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.history import History, HistoryError
-from scas4d_core.initial_points import initial_points
 from scas4d_core.motion_labels import labelled, labels_learnt, settled
 from scas4d_core.picture_loss import PictureLoss
 from scas4d_core.prepare import prepare
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.repeats import fingerprints, same_again
-from scas4d_core.resuming import Fixed, Resumed, ResumeError, find_commit, fixed
+from scas4d_core.resuming import Resumed, ResumeError, find_commit
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.static_scene import StaticResult, fit_static_scene
+from scas4d_core.static_scene import StaticResult
 from scas4d_core.trial import Given, Trial
 from scas4d_core.update import Updater
 from scas4d_core.update_plan import mask_weight
@@ -121,7 +121,9 @@ class Reconstruction(Committed):
             raise ValueError(f"frame {frame.index}: time {frame.time} s must be finite")
         self = cls._of(rig, settings, History() if history is None else history)
         began = perf_counter()
-        result = static or self._fit_static(self._scaled(frame), points, progress or (lambda _: None))
+        result = static or fit_first(
+            self._scaled(frame), points, self._factory, settings, self.world, progress or (lambda _: None)
+        )
         result = replace(result, gaussians=settled(result.gaussians))
         fitted = perf_counter()
         self.static = result
@@ -130,10 +132,6 @@ class Reconstruction(Committed):
         seen = () if self._fixed.masked else self._factory.views(self._scaled(frame), {}, use_masks=False)
         seconds = {"fit": fitted - began, "prepare": perf_counter() - fitted}
         report = report_of_first(frame, result, self.rig.names, len(self._updater.hierarchy.rows), seconds, dropped)
-        first = {
-            "masked": self._fixed.masked,
-            "exposures": {name: exposure.tolist() for name, exposure in result.exposures.items()},
-        }
         past = judge.Past.of_first(
             {name: fit.psnr for name, fit in result.cameras.items()},
             judge.brightness(frame.images),
@@ -141,7 +139,7 @@ class Reconstruction(Committed):
         carried = Carried(
             seen=seen, structure=structure, past=replace(past, fitted=frame.time), shown=fingerprints(frame.images)
         )
-        self._commit(report, result.gaussians, carried, {**first, **(notes or {})})
+        self._commit(report, result.gaussians, carried, {**self._fixed.record(), **(notes or {})})
         return self
 
     @classmethod
@@ -167,7 +165,7 @@ class Reconstruction(Committed):
         self = cls._of(rig, settings, history)
         assert self._checkpoints is not None
         try:
-            self._fixed = fixed(history)
+            self._fixed = Fixed.of(history)
         except (HistoryError, KeyError) as error:
             raise ResumeError(f"the first frame, which every update needs, cannot be read ({error})") from error
         index, left, faults = find_commit(history, self._checkpoints, self._factory, held)
@@ -194,7 +192,7 @@ class Reconstruction(Committed):
         for one in sorted({first, index}):
             copy.append(one, history.time(one), history.gaussians(one), history.report(one))
         self = cls._of(rig, settings, copy)
-        self._fixed = fixed(copy)
+        self._fixed = Fixed.of(copy)
         self._go_on(Carried(labels=self._labels_of(index)))
         return self
 
@@ -210,31 +208,6 @@ class Reconstruction(Committed):
         """The labels learnt, as far as the state tells."""
         moving = self.history.gaussians(index).moving
         return None if self._fixed.masked or moving.all() else moving
-
-    def _fit_static(self, frame: Frame, points: InitialPoints | None, tell: Callable[[Progress], None]) -> StaticResult:
-        """Frame 0 from a first cloud, which is made from the pictures where none is given.
-
-        It is made inside: the same wherever the user's origin is and whatever the unit.
-        """
-        scene, static = self.settings.scene, self.settings.static
-        if points is None:
-            points = initial_points(
-                self.rig, frame.images, frame.masks, None,
-                lambda stage, done, total: tell(Progress(stage, done, total)),
-            )  # fmt: skip
-            positions = points.positions
-        else:
-            positions = self.world.to_inside(points.positions)
-        return fit_static_scene(
-            self._factory,
-            self._factory.views(frame, {}),
-            positions,
-            points.colours,
-            points.foreground,
-            scene,
-            static,
-            lambda done, loss: tell(Progress("fitting frame 0", done, static.iterations, {"loss": loss})),
-        )
 
     def step(
         self,

@@ -5,10 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-from scas4d_core.attempts import axis_lengths
 from scas4d_core.checkpoint import Carried, CheckpointError, Checkpoints
 from scas4d_core.history import History, HistoryError
 from scas4d_core.views import ViewFactory
@@ -34,33 +30,6 @@ class Resumed:
     undone: list[int]
     faults: list[str]
     cold: bool
-
-
-@dataclass(frozen=True, eq=False)
-class Fixed:
-    """What frame 0 leaves to every update.
-
-    Attributes:
-        masked: whether it had masks. exposures: [3, 2] gain and offset by camera.
-        lengths: [N, 3] metres, of the axes of the Gaussians.
-    """
-
-    masked: bool
-    exposures: dict[str, NDArray[np.float32]]
-    lengths: NDArray[np.float32]
-
-
-def fixed(history: History) -> Fixed:
-    """What the first frame of a history left.
-
-    Raises:
-        HistoryError: it cannot be read. KeyError: its report lacks something.
-    """
-    first = history.indices[0]
-    report = history.report(first)
-    masked = bool(report["masked"])
-    exposures = {name: np.array(exposure, np.float32) for name, exposure in report["exposures"].items()}
-    return Fixed(masked, exposures, axis_lengths(history.gaussians(first)))
 
 
 def find_commit(

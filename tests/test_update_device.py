@@ -253,7 +253,7 @@ def test_a_reconstruction_refuses_before_it_fits_anything(monkeypatch: pytest.Mo
         raise DeviceError(f"no {name}")
 
     monkeypatch.setattr(reconstruction, "require_device", refuse)
-    monkeypatch.setattr(reconstruction, "fit_static_scene", functools.partial(pytest.fail, "fitted"))
+    monkeypatch.setattr(reconstruction, "fit_first", functools.partial(pytest.fail, "fitted"))
     with pytest.raises(DeviceError, match="no cuda"):
         Reconstruction.start(RIG, take_frame(0, 0.0, BEFORE, RIG), Settings(device="cuda"))
 

@@ -72,7 +72,7 @@ def test_a_scene_asks_before_its_first_frame_and_no_process_asks_twice(tmp_path,
         assert len(started) == asked
         raise Reached
 
-    monkeypatch.setattr(Reconstruction, "_fit_static", nothing_before)
+    monkeypatch.setattr(reconstruction, "fit_first", nothing_before)
     rig = warm_up._rig()
     for _ in range(2):
         with pytest.raises(Reached):
