@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from scas4d_core.captures.frame import Frame
 from scas4d_core.history import NEWEST_KEPT
 from scas4d_core.judge import Past
 from scas4d_core.npz import read_npz, write_npz
+from scas4d_core.trial import Outcome
 from scas4d_core.views import TrainingView, ViewFactory
 from scas4d_core.warm_start import Motion
 
@@ -54,6 +55,25 @@ class Carried:
     structure: int = 0
     past: Past = field(default_factory=Past)
     shown: Mapping[str, int] = field(default_factory=dict)
+
+    def after(
+        self, outcome: Outcome, time: float, views: Sequence[TrainingView] | None, shown: Mapping[str, int]
+    ) -> Carried:
+        """What the next frame leaves in turn; of pictures that were not believed nothing is kept.
+
+        Args:
+            outcome: of that frame. time: its, seconds.
+            views: that it was updated with, or None in scenes with masks. shown: fingerprints of its pictures.
+        """
+        learnt = outcome.fresh and not outcome.stood
+        past = replace(outcome.past, fitted=time) if learnt else outcome.past
+        carried = replace(self, motion=outcome.motion, past=past)
+        if not outcome.fresh:
+            return carried
+        if views is not None and outcome.exposure == 1.0:  # what another light changes has not moved
+            seen = [view for view in views if view.name not in outcome.updated.left_out]
+            carried = replace(carried, seen=seen)
+        return replace(carried, shown=shown)
 
 
 class Checkpoints:

@@ -132,13 +132,9 @@ class Reconstruction(Committed):
         seen = () if self._fixed.masked else self._factory.views(self._scaled(frame), {}, use_masks=False)
         seconds = {"fit": fitted - began, "prepare": perf_counter() - fitted}
         report = report_of_first(frame, result, self.rig.names, len(self._updater.hierarchy.rows), seconds, dropped)
-        past = judge.Past.of_first(
-            {name: fit.psnr for name, fit in result.cameras.items()},
-            judge.brightness(frame.images),
-        )
-        carried = Carried(
-            seen=seen, structure=structure, past=replace(past, fitted=frame.time), shown=fingerprints(frame.images)
-        )
+        psnr = {name: fit.psnr for name, fit in result.cameras.items()}
+        past = replace(judge.Past.of_first(psnr, judge.brightness(frame.images)), fitted=frame.time)
+        carried = Carried(seen=seen, structure=structure, past=past, shown=fingerprints(frame.images))
         self._commit(report, result.gaussians, carried, {**self._fixed.record(), **(notes or {})})
         return self
 
@@ -228,24 +224,17 @@ class Reconstruction(Committed):
         Raises:
             StepError: not later than the last frame, no picture of the rig, or a picture of another size.
         """
-        last = self.history.indices[-1]
-        if frame.index <= last:
-            raise StepError(f"frame {frame.index} is not after the last committed frame {last}")
-        seconds = frame.time - self.history.time(last)
-        if not 0 < seconds < inf:
-            raise StepError(f"frame {frame.index}: time {frame.time} s is not after {self.history.time(last)} s")
+        seconds = self._seconds_to(frame)
         watch = Stopwatch() if started is None else Stopwatch(began=started, last=started)
-        past = self._carried.past
         frame = replace(frame, images=dict(frame.images))  # decoded once: a capture's pictures are, whenever looked at
-        try:
-            views = self._factory.views(self._scaled(frame), self._fixed.exposures, self._uses_masks)
-        except ValueError as error:
-            raise StepError(str(error)) from error
+        views = self._views(frame)
         watch.lap("decode")
+
         brightness = judge.brightness(frame.images)
-        look = judge.look(past, brightness) if self.settings.update.judge else judge.Look()
-        past = judge.lit(past, look)
+        look = judge.look(self._carried.past, brightness) if self.settings.update.judge else judge.Look()
+        past = judge.lit(self._carried.past, look)
         watch.lap("judge")
+
         updater, carried = self._learn_what_moves(views, look)
         given = Given(
             state=labelled(self._state(None), carried.labels),
@@ -264,30 +253,40 @@ class Reconstruction(Committed):
         )
         trial = Trial(updater, self._factory, self._picture, self._effort)
         shown = fingerprints(frame.images)
-        if not look.held and shown == carried.shown and self._effort.still > -1:
-            outcome = same_again(given)
-        else:
-            outcome = trial.run(given)
+        again = not look.held and shown == carried.shown and self._effort.still > -1
+        outcome = same_again(given) if again else trial.run(given)
         watch.lap("update")
         watch.move("update", "judge", trial.judging)
-        if outcome.fresh:
-            carried = replace(carried, shown=shown)
-            if not self._fixed.masked and outcome.exposure == 1.0:  # what another light changes has not moved
-                carried = replace(
-                    carried, seen=[view for view in given.views if view.name not in outcome.updated.left_out]
-                )
-        else:  # what seemed to move in its pictures is as little believed as they are
+
+        if not outcome.fresh:  # what seemed to move in its pictures is as little believed as they are
             updater, carried = self._updater, self._carried
             outcome = replace(outcome, gaussians=self._state(None), motion=carried.motion)
         report = report_of_update(frame, outcome, look, self.rig.names, watch, dropped)
         how = {"cold": given.motion is None, "relabelled": updater is not self._updater}
-        learnt = outcome.fresh and not outcome.stood
-        past = replace(outcome.past, fitted=frame.time) if learnt else outcome.past
-        carried = replace(carried, motion=outcome.motion, past=past)
+        carried = carried.after(outcome, frame.time, None if self._fixed.masked else given.views, shown)
         self._commit(report, outcome.gaussians, carried, {**how, **(notes or {})})
         self._updater = updater
         self._budget.learn(outcome.updated, trial.judging + perf_counter() - watch.began - watch.total)
         return report
+
+    def _seconds_to(self, frame: Frame) -> float:
+        """Seconds from the last committed frame to one that comes after it."""
+        last = self.history.indices[-1]
+        if frame.index <= last:
+            raise StepError(f"frame {frame.index} is not after the last committed frame {last}")
+        seconds = frame.time - self.history.time(last)
+        if not 0 < seconds < inf:
+            raise StepError(f"frame {frame.index}: time {frame.time} s is not after {self.history.time(last)} s")
+        return seconds
+
+    def _views(self, frame: Frame) -> list[TrainingView]:
+        """The views of a frame; without masks where no term asks for them: they are not even read."""
+        settings, moving = self.settings.update, len(self._updater.hierarchy.rows)
+        try:
+            use_masks = settings.use_masks and mask_weight(settings, moving, len(self._state(None))) > 0
+            return self._factory.views(self._scaled(frame), self._fixed.exposures, use_masks)
+        except ValueError as error:
+            raise StepError(str(error)) from error
 
     def spend(
         self,
@@ -322,12 +321,6 @@ class Reconstruction(Committed):
         self.report = report
         if self._checkpoints is not None:
             self._checkpoints.clean(self.history.indices)
-
-    @property
-    def _uses_masks(self) -> bool:
-        """Whether updates look at masks: where no term asks for them they are not even read."""
-        settings, moving = self.settings.update, len(self._updater.hierarchy.rows)
-        return settings.use_masks and mask_weight(settings, moving, len(self._state(None))) > 0
 
     def _learn_what_moves(self, views: list[TrainingView], look: judge.Look) -> tuple[Updater, Carried]:
         """Where frame 0 had no mask, the pictures tell what moves; what has moved once stays in the hierarchy.
