@@ -60,3 +60,14 @@ def quaternions_to_matrices(quaternions: NDArray[Any]) -> NDArray[Any]:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def moving_extent(gaussians: Gaussians) -> float:
+    """Longest side, in metres, of the box that holds 98 % of the moving Gaussians on each axis (of all if none moves).
+
+    The unit of tolerances and features that should not depend on the size of the scene; the few Gaussians that
+    stray do not change it.
+    """
+    means = gaussians.means[gaussians.moving] if gaussians.moving.any() else gaussians.means
+    low, high = np.percentile(means, (1, 99), axis=0)
+    return float(np.max(high - low))

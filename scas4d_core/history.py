@@ -1,17 +1,13 @@
 """Θ_0 … Θ_t: the committed states of a scene, in memory or in a directory. Numpy only.
 
-On disk a history is ``fixed.npz`` (opacities and ids, written once) and one ``frame_<index>.npz`` a committed frame,
-which holds its state, its time and its report. Every file is written beside its place, synced and renamed: a file with
-its final name is whole, the rename is the commit, and the directory listing is the only index there is. One process
-appends and deletes; others read, and see what it did with ``refresh``.
+On disk (``frame_files``) a history is one file with opacities and ids, written once, and one a committed frame, which
+holds its state, its time and its report; its rename to its final name is the commit. One process appends and deletes;
+others read, and see what it did with ``refresh``.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
-import re
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -21,8 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.frame_files import Arrays, FrameFiles, HistoryError, Stamp, UnreadableFrameError
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.npz import clear_parts, read_npz, sync_folder, write_npz
+from scas4d_core.npz import clear_parts
+
+__all__ = ["FIXED", "FRAMES_KEPT", "NEWEST_KEPT", "PER_FRAME", "History", "HistoryError", "UnreadableFrameError"]
 
 PER_FRAME = ("means", "rotations", "factors", "colours", "foreground")
 """Arrays of ``Gaussians`` that may differ from frame to frame."""
@@ -32,20 +31,6 @@ FRAMES_KEPT = 4
 """Frames of a history on disk that stay in memory: the newest, and the last ones asked for."""
 NEWEST_KEPT = 2
 """Newest states that retention never deletes: should the last be damaged, the one before it is gone on from."""
-
-_FRAME_FILE = re.compile(r"frame_(\d{6,})\.npz")
-
-Arrays = dict[str, NDArray[Any]]
-Stamp = tuple[int, int]
-"""Bytes and time of change of a file, in ns: whether it is the one that was read."""
-
-
-class HistoryError(ValueError):
-    """A history that cannot be extended or read: the message names the frame or file, the fault and the remedy."""
-
-
-class UnreadableFrameError(HistoryError):
-    """A frame that is not in the history, or whose file is damaged."""
 
 
 class History:
@@ -64,7 +49,7 @@ class History:
     """
 
     def __init__(self, directory: Path | str | None = None) -> None:
-        self.directory = None if directory is None else Path(directory)
+        self._files = None if directory is None else FrameFiles(Path(directory))
         self.damaged: dict[int, str] = {}
         self.record_seconds = 0.0
         self._fixed: Arrays = {}
@@ -72,9 +57,9 @@ class History:
         self._reports: dict[int, dict[str, Any]] = {}
         self._stamps: dict[int, Stamp] = {}
         self._frames: OrderedDict[int, Arrays] = OrderedDict()
-        if self.directory is not None:
-            self.directory.mkdir(parents=True, exist_ok=True)
-            if self._listed():
+        if self._files is not None:
+            self._files.directory.mkdir(parents=True, exist_ok=True)
+            if self._files.listed():
                 raise HistoryError(f"{self.directory} already holds a history; open it with History.load or empty it")
 
     @classmethod
@@ -90,14 +75,14 @@ class History:
         Raises:
             HistoryError: no history there, or the file that all frames need is damaged.
         """
-        folder = Path(directory)
-        if not (folder / "fixed.npz").exists():
-            raise HistoryError(f"{folder} holds no history: fixed.npz is missing")
+        files = FrameFiles(Path(directory))
+        if not files.fixed.exists():
+            raise HistoryError(f"{files.directory} holds no history: {files.fixed.name} is missing")
         history = cls()
-        history.directory = folder
+        history._files = files
         history.refresh(only)
         if history._stamps:
-            history._fixed = _read(folder / "fixed.npz", FIXED)
+            history._fixed = files.read_fixed(FIXED)
         return history
 
     @classmethod
@@ -110,7 +95,7 @@ class History:
         folder = Path(directory)
         folder.mkdir(parents=True, exist_ok=True)
         clear_parts(folder)
-        return cls.load(folder) if (folder / "fixed.npz").exists() else cls(folder)
+        return cls.load(folder) if FrameFiles(folder).fixed.exists() else cls(folder)
 
     def save(self, directory: Path | str) -> None:
         """Writes a copy of this history into another directory, one frame at a time."""
@@ -153,20 +138,18 @@ class History:
             if len(arrays[name]) != count:
                 raise HistoryError(f"frame {index}: {name} has {len(arrays[name])} rows; give {count}, one a Gaussian")
         frame = {name: np.array(arrays[name]) for name in PER_FRAME}
-        if self.directory is not None:
+        if self._files is not None:
             if not self._fixed:
-                write_npz(self.directory / "fixed.npz", fixed)
-            file = self._file(index)
+                self._files.write_fixed(fixed)
             began = perf_counter()
-            write_npz(file, {**frame, "time": np.float64(time), "report": np.frombuffer(said.encode(), np.uint8)})
-            stat = file.stat()
-            self.record_seconds += (perf_counter() - began) * len(said) / stat.st_size
-            self._stamps[index] = _stamp(stat)
+            written = {**frame, "time": np.float64(time), "report": np.frombuffer(said.encode(), np.uint8)}
+            self._stamps[index] = self._files.write(index, written)
+            self.record_seconds += (perf_counter() - began) * len(said) / self._stamps[index][0]
         else:
             self._stamps[index] = (sum(array.nbytes for array in frame.values()), 0)
         self._fixed = fixed
         self._times[index] = float(time)
-        if self.directory is None:
+        if self._files is None:
             self._reports[index] = json.loads(said)
         self.damaged.pop(index, None)
         self._keep(index, frame)
@@ -180,10 +163,10 @@ class History:
         Returns:
             The indices that are new (or written anew), and those that are gone.
         """
-        if self.directory is None:
+        if self._files is None:
             return [], []
         looked_at = {*self._times, *self.damaged} if only is None else set(only)
-        listed = self._listed() if only is None else self._stamped(looked_at)
+        listed = self._files.listed() if only is None else self._files.stamped(looked_at)
         gone = sorted(index for index in looked_at if index in self._times and index not in listed)
         changed = [index for index, stamp in listed.items() if self._stamps.get(index) != stamp]
         for index in [*gone, *changed]:
@@ -194,7 +177,7 @@ class History:
         added = []
         for index in changed:
             try:
-                self._times[index] = float(read_npz(self._file(index), ("time",))["time"])
+                self._times[index] = self._files.time(index)
             except FileNotFoundError:  # deleted since it was listed
                 continue
             except ValueError as error:
@@ -206,7 +189,7 @@ class History:
         if added and added[0] < newest:
             self._times = dict(sorted(self._times.items()))
         if added and not self._fixed:
-            self._fixed = _read(self.directory / "fixed.npz", FIXED)
+            self._fixed = self._files.read_fixed(FIXED)
         return added, gone
 
     def retain(self, *, last: int | None = None, size_bytes: int | None = None) -> list[int]:
@@ -236,8 +219,8 @@ class History:
             if len(deleted) >= surplus and excess <= 0:
                 break
             excess -= self._stamps[index][0]
-            if self.directory is not None:
-                self._file(index).unlink(missing_ok=True)
+            if self._files is not None:
+                self._files.remove(index)
             self._forget(index)
             deleted.append(index)
         return deleted
@@ -250,13 +233,18 @@ class History:
         """
         known = sorted(index for index in {*self._times, *self.damaged} if index > after)
         for index in reversed(known):  # the newest first: a cut that is itself cut short leaves a history without gaps
-            if self.directory is not None:
-                self._file(index).unlink(missing_ok=True)
+            if self._files is not None:
+                self._files.remove(index)
             self._forget(index)
             self.damaged.pop(index, None)
-        if known and self.directory is not None:
-            sync_folder(self.directory)
+        if known and self._files is not None:
+            self._files.sync()
         return known
+
+    @property
+    def directory(self) -> Path | None:
+        """Where the frames are kept; None in memory."""
+        return None if self._files is None else self._files.directory
 
     def __len__(self) -> int:
         return len(self._times)
@@ -286,13 +274,13 @@ class History:
             HistoryError: the frame was not committed, or its file is damaged.
         """
         self._require(index)
-        if self.directory is None:
+        if self._files is None:
             return dict(self._reports[index])
         text = self._from_file(index, ("report",))["report"].tobytes()
         try:
             report: dict[str, Any] = json.loads(text)
         except ValueError as error:
-            raise HistoryError(f"{self._file(index)}: its report is no JSON ({error})") from error
+            raise HistoryError(f"{self._files.path(index)}: its report is no JSON ({error})") from error
         return report
 
     def gaussians(self, index: int) -> Gaussians:
@@ -355,34 +343,10 @@ class History:
         """Index of the last frame, -1 without one; ``indices`` copies all of them."""
         return next(reversed(self._times), -1)
 
-    def _file(self, index: int) -> Path:
-        assert self.directory is not None
-        return self.directory / f"frame_{index:06d}.npz"
-
-    def _listed(self) -> dict[int, Stamp]:
-        """The frames in the directory, rising."""
-        assert self.directory is not None
-        found: dict[int, Stamp] = {}
-        with os.scandir(self.directory) as entries:
-            for entry in entries:
-                if match := _FRAME_FILE.fullmatch(entry.name):
-                    try:
-                        found[int(match[1])] = _stamp(entry.stat())
-                    except FileNotFoundError:  # deleted meanwhile
-                        continue
-        return dict(sorted(found.items()))
-
-    def _stamped(self, indices: Iterable[int]) -> dict[int, Stamp]:
-        """The same of some frames, without looking at the others."""
-        found: dict[int, Stamp] = {}
-        for index in sorted(indices):
-            with contextlib.suppress(FileNotFoundError):
-                found[index] = _stamp(self._file(index).stat())
-        return found
-
     def _from_file(self, index: int, names: Sequence[str]) -> Arrays:
+        assert self._files is not None
         try:
-            return _read(self._file(index), names)
+            return self._files.read(index, names)
         except FileNotFoundError:
             self._forget(index)  # the process that appends has deleted it
             self._require(index)
@@ -396,30 +360,7 @@ class History:
 
     def _keep(self, index: int, frame: Arrays) -> None:
         self._frames[index] = frame
-        if self.directory is not None:
+        if self._files is not None:
             newest = self._newest()
             for old in [i for i in self._frames if i != newest][: max(0, len(self._frames) - FRAMES_KEPT)]:
                 del self._frames[old]
-
-
-def moving_extent(gaussians: Gaussians) -> float:
-    """Longest side, in metres, of the box that holds 98 % of the moving Gaussians on each axis (of all if none moves).
-
-    The unit of tolerances and features that should not depend on the size of the scene; the few Gaussians that
-    stray do not change it.
-    """
-    means = gaussians.means[gaussians.moving] if gaussians.moving.any() else gaussians.means
-    low, high = np.percentile(means, (1, 99), axis=0)
-    return float(np.max(high - low))
-
-
-def _stamp(status: os.stat_result) -> Stamp:
-    return status.st_size, status.st_mtime_ns
-
-
-def _read(path: Path, names: Sequence[str]) -> Arrays:
-    """Named arrays of an npz."""
-    try:
-        return read_npz(path, names)
-    except ValueError as error:
-        raise UnreadableFrameError(f"{error}; restore it or start the scene anew") from error

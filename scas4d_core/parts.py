@@ -20,8 +20,8 @@ from sklearn.cluster import KMeans
 from sklearn.metrics import silhouette_score
 from threadpoolctl import threadpool_limits
 
-from scas4d_core.gaussians import Gaussians, quaternions_to_matrices
-from scas4d_core.history import History, moving_extent
+from scas4d_core.gaussians import Gaussians, moving_extent, quaternions_to_matrices
+from scas4d_core.history import History
 from scas4d_core.settings import Model
 
 Features = NDArray[np.float32]

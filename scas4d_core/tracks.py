@@ -18,8 +18,8 @@ from pydantic import Field
 from scipy.ndimage import distance_transform_edt, maximum_filter
 
 from scas4d_core.cameras import Camera, WorldFrame
-from scas4d_core.gaussians import Gaussians, quaternions_to_matrices
-from scas4d_core.history import History, moving_extent
+from scas4d_core.gaussians import Gaussians, moving_extent, quaternions_to_matrices
+from scas4d_core.history import History
 from scas4d_core.rasterize.limits import DEFAULT, Limits
 from scas4d_core.ray_depth import ray_depths
 from scas4d_core.settings import Model

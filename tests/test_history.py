@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.frame_files import FrameFiles
 from scas4d_core.history import PER_FRAME, History, HistoryError
 
 
@@ -168,7 +169,7 @@ def test_a_reader_that_is_told_what_changed_looks_at_nothing_else(tmp_path, monk
     alone = History.load(tmp_path, only=(2, 5))
     assert alone.indices == [2]
     assert same(alone.gaussians(2), state(1))
-    monkeypatch.setattr(History, "_listed", None)  # the directory is not looked through
+    monkeypatch.setattr(FrameFiles, "listed", None)  # the directory is not looked through
     writer.append(8, 1.0, state(8))
     assert writer.retain(last=2) == [2, 4]
     assert reader.refresh((8, 2)) == ([8], [2])
