@@ -38,8 +38,8 @@ SEQUENCE = ["0a", "2b", "1b", "3a", "0b", "1a"]
 def updated(state: Gaussians, hierarchy: Hierarchy, rig: Rig, monkeypatch: pytest.MonkeyPatch) -> Updated:
     """An update that looks at the views of SEQUENCE, whatever the order of the rig's cameras."""
 
-    def take(plan: ViewPlan, iteration: int, iterations: int) -> TrainingView:
-        return next(view for view in plan._views if view.name == SEQUENCE[iteration])
+    def take(plan: ViewPlan, iteration: int, iterations: int) -> list[TrainingView]:
+        return [view for view in plan._views if view.name == SEQUENCE[iteration]]
 
     monkeypatch.setattr(ViewPlan, "take", take)
     factory = ViewFactory(rig)
