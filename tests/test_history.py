@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from scas4d_core.gaussians import Gaussians
 from scas4d_core.frame_files import FrameFiles
+from scas4d_core.gaussians import Gaussians
 from scas4d_core.history import PER_FRAME, History, HistoryError
 
 
