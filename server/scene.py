@@ -12,6 +12,7 @@ from typing import Any
 from client.wire import FrameReportModel, FrameState, ProgressModel, SceneState, SceneStatus
 from scas4d_core.cameras import Camera
 from server import metrics, reports, worker
+from server.background import Background
 from server.definition import Definition
 from server.disk import no_room
 from server.facts import Died, Fact, FramesDeleted, SetAside, StatesDeleted
@@ -23,11 +24,11 @@ from server.journal import Journal
 from server.messages import Answer, Broken, Committed, FrameReady, Progressed, Query, Ready, SceneSpec, Stalled
 from server.messages import SetAside as SetAsideMessage
 from server.placement import Ended, Placement, Process
-from server.problems import Problem
 from server.readers import Readers
 from server.recovery import Recovered
 from server.replays import Replays
 from server.retention import Held, deletable
+from server.scene_lookup import camera_of, committed_frame_of, report_of
 from server.scene_status import state_of, status_of
 from server.settings import ServerSettings
 from server.supervision import Supervision, given_up
@@ -85,7 +86,7 @@ class Scene:
         self._holding = 0
         self._stopping = False
         self._again: asyncio.TimerHandle | None = None
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._background = Background(self._failed)
         self._placement = placement
         self._hub = hub
         self._files = reports.ReportFiles(self.spec.states)
@@ -144,57 +145,15 @@ class Scene:
 
     def camera(self, name: str) -> Camera:
         """A camera of the rig by name."""
-        if name not in self.rig.names:
-            raise Problem(
-                422,
-                f"the rig has no camera {name!r}",
-                field="camera",
-                value=name,
-                remedy=f"name one of {', '.join(self.rig.names)}, or give the camera itself",
-            )
-        return self.rig[name]
+        return camera_of(self, name)
 
     def committed_frame(self, index: int | None, field: str = "frame") -> int:
         """The index, or the last one for None, checked to be committed."""
-        if not self.committed:
-            raise Problem(
-                409,
-                "no frame of this scene is committed yet",
-                field=field,
-                remedy="wait until `committed` in the scene's status is above 0",
-                state=self.state,
-            )
-        if index is None:
-            return self.committed[-1]
-        entry = self.frames.get(index)
-        if entry is None or entry.state != FrameState.COMMITTED or entry.deleted:
-            state = "not here" if entry is None else entry.state.value
-            said = "deleted by the scene's retention" if entry is not None and entry.deleted else state
-            raise Problem(
-                404,
-                f"frame {index} is {said}; only committed frames that are kept can be read",
-                field=field,
-                value=index,
-                remedy=f"ask for a committed frame, {self.committed[0]} to {self.committed[-1]}",
-            )
-        return index
+        return committed_frame_of(self, index, field)
 
     async def report(self, index: int) -> FrameReportModel | None:
         """What became of a frame, its numbers read from disk where they are not in memory; None: it is not known."""
-        entry = self.frames.get(index)
-        if entry is None:
-            parts = self.ledger.open.get(index)
-            if parts is None:
-                return None
-            return FrameReportModel(
-                scene=self.id, index=index, time=parts.time, state=FrameState.OPEN, received=parts.cameras, held=True
-            )
-        found = entry.report
-        if found.state == FrameState.COMMITTED and not found.deleted and not entry.measured:
-            numbers = await asyncio.to_thread(self._files.read, index)
-            reports.fill(found, numbers)
-            self.frames.remember(index, numbers)
-        return found
+        return await report_of(self, self._files, index)
 
     async def ask(self, query: Query) -> Answer:
         """The reader process's answer; see `Readers.ask`."""
@@ -395,16 +354,12 @@ class Scene:
 
     def background(self, coroutine: Coroutine[Any, Any, None]) -> None:
         """In the background, in the order of the calls where they do not wait; the scene's end cancels it."""
-        task = asyncio.get_running_loop().create_task(coroutine)
-        self._tasks.add(task)
-        task.add_done_callback(self._done)
+        self._background.run(coroutine)
 
-    def _done(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
-            self.ledger.fatal = f"the service failed: {type(error).__name__}: {error}"
-            log.error("scene %s", self.id, exc_info=error)
-            self._tell(SceneChanged())
+    def _failed(self, error: BaseException) -> None:
+        self.ledger.fatal = f"the service failed: {type(error).__name__}: {error}"
+        log.error("scene %s", self.id, exc_info=error)
+        self._tell(SceneChanged())
 
     async def stop(self) -> None:
         """Ends both processes; what is on disk stays."""
@@ -412,8 +367,7 @@ class Scene:
         if self._again is not None:
             self._again.cancel()
         self.ingest.stop()
-        for task in tuple(self._tasks):
-            task.cancel()
+        self._background.cancel()
         seconds = self.server.stop_seconds
         await asyncio.gather(self._worker.stop(seconds), self._questions.stop(seconds), self.replays.stop())
         await self.journal.close()
