@@ -58,7 +58,9 @@ class Timed:
 def measure_times(
     folder: Path, variants: Sequence[Variant], out: Path, *, rounds: int = ROUNDS, report: Report = print
 ) -> Row:
-    """Times settings on a capture and leaves the answer in ``out/timing/<capture>.json``, in place of what was there.
+    """Times settings on a capture and leaves the answer in ``out/timing/<capture>.json``.
+
+    What was timed there before, and is not now, stays: its seconds times what the first setting's are to its own then.
 
     Args:
         folder: of the capture.
@@ -102,6 +104,7 @@ def measure_times(
         "rounds": turns - 1,
         "settings": [_answer(one, ratios[number]) for number, one in enumerate(timed)],
     }
+    row["settings"] += _timed_before(read_times(out, capture.name), row["settings"])
     path = out / "timing" / f"{capture.name}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(row, indent=1))
@@ -115,6 +118,28 @@ def read_times(out: Path, capture: str) -> Row | None:
         return None
     row: Row = json.loads(path.read_text())
     return row
+
+
+def _timed_before(before: Row | None, now: Sequence[Row]) -> list[Row]:
+    """The answers of an earlier pass that the one of today lacks, in its seconds; none where it had another first."""
+    if before is None:
+        return []
+    first, *others = before["settings"]
+    if _unseeded(first["settings"]) != _unseeded(now[0]["settings"]):
+        return []
+    scale = now[0]["seconds"] / first["seconds"]
+    have = [_unseeded(answer["settings"]) for answer in now]
+    kept = [answer for answer in others if _unseeded(answer["settings"]) not in have]
+    return [
+        {
+            **answer,
+            "seconds": scale * answer["seconds"],
+            "seconds_each": [round(scale * value, 4) for value in answer["seconds_each"]],
+            "cpu_seconds": scale * answer["cpu_seconds"],
+            "stages": {name: scale * value for name, value in answer["stages"].items()},
+        }
+        for answer in kept
+    ]
 
 
 def time_of(times: Row | None, settings: Settings) -> Row | None:

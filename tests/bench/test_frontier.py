@@ -279,6 +279,13 @@ def test_settings_are_timed_in_turns_and_the_first_round_does_not_count(box_capt
     assert (other["seconds_each"], other["ratio"], other["gaussians"]) == ([6.0], 3.0, 7)
     assert timing.time_of(row, seeded.settings)["label"] == "short"
     assert timing.time_of(row, DEFAULT.settings) is None
+    paces[short.settings.update.iterations] = 2.0  # a busier machine
+    alone = timing.measure_times(box_capture, [short], tmp_path, rounds=5, report=lambda line: None)
+    kept = alone["settings"][1]
+    assert (kept["label"], kept["seconds"], kept["ratio"]) == ("long", 12.0, 3.0)
+    assert kept["stages"] == {"render": 6.0}
+    timing.measure_times(box_capture, [long], tmp_path, rounds=5, report=lambda line: None)
+    assert len(timing.read_times(tmp_path, "box")["settings"]) == 1  # nothing to compare by
     with pytest.raises(ValueError, match="rounds is 0"):
         timing.measure_times(box_capture, [short], tmp_path, rounds=0)
 
