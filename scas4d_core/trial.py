@@ -147,10 +147,15 @@ class Trial:
         return self._stays(given, nothing, past, [], why, given.look.exposure)
 
     def _relit(self, given: Given) -> Outcome | None:
-        """A frame in a light that has stayed: the colours take it on; None where the cameras tell of no other light."""
+        """A frame in a light that has stayed: the colours take it on; None where the cameras tell of no other light.
+
+        Where what is seen is as bright as it was, what is new makes the pictures brighter: no reason to hold them.
+        """
         gain = gain_of(self._picture, given.state, given.views)
-        if gain is None or 1 / judge.EXPOSURE <= gain <= judge.EXPOSURE:
+        same = gain is not None and 1 / judge.EXPOSURE <= gain <= judge.EXPOSURE
+        if gain is None or (same and given.look.held is None):
             return None
+        gain, light = (1.0, "the same light") if same else (gain, f"{gain:.2g} times the light")
         outcome = self.run(
             replace(
                 given,
@@ -160,8 +165,8 @@ class Trial:
             )
         )
         if outcome.fresh:
-            return replace(outcome, attempts=[f"{gain:.2g} times the light, for good", *outcome.attempts])
-        why = f"in {gain:.2g} times the light {str(outcome.degraded).removeprefix(HELD)}"
+            return replace(outcome, attempts=[f"{light}, for good", *outcome.attempts])
+        why = f"in {light} {str(outcome.degraded).removeprefix(HELD)}"
         return self._held(given, outcome.updated, outcome.attempts, why, given.look.exposure)
 
     def _attempt(self, given: Given, manner: Manner, told: list[str]) -> tuple[Updated, Checked]:
@@ -250,9 +255,8 @@ class Trial:
             course = self._course(given, replace(SOUGHT, name=name))
             updated = self._updater.run(start, given.views, None, given.seconds, given.seed, course)
             check = self._checked(given, start, updated)
-            both = len(tried.losses) + len(
-                updated.losses
-            )  # a few iterations more are no excuse for meeting it less well
+            # A few iterations more are no excuse for meeting it less well.
+            both = len(tried.losses) + len(updated.losses)
             why = check.fault or judge.unmet(given.past, self._met(updated), both)
             attempts.append(name if why is None else f"{name}: {why}")
             if why is None:

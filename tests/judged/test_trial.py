@@ -215,6 +215,23 @@ def test_brighter_pictures_of_a_scene_that_is_not_are_no_other_light() -> None:
     assert (outcome.attempts, outcome.exposure) == (["as set"], 1.0)
 
 
+def test_pictures_that_stay_brighter_in_the_same_light_are_not_held_for_ever() -> None:
+    """Something bright has come in: the cameras tell of no other light, and it is learnt as it is."""
+    bright = {name: 2.5 * value for name, value in BRIGHT.items()}
+    past, fake = PAST, Fake(met())
+    for number in range(1, SETTINGS.patience + 1):
+        look = judge.look(past, bright)
+        past = judge.lit(past, look)
+        assert look.held
+        outcome = trial(fake).run(replace(given(past, look), brightness=bright))
+        past = outcome.past
+        assert outcome.fresh == (number == SETTINGS.patience)
+    assert outcome.gaussians is AFTER
+    np.testing.assert_array_equal(fake.starts[0].colours, BEFORE.colours)
+    assert outcome.attempts == ["the same light, for good", "as set"]
+    assert (judge.look(past, bright), past.lit) == (Look(), 0)
+
+
 def test_after_a_held_frame_half_of_the_budget_is_kept_for_what_is_sought() -> None:
     now = perf_counter()
     for past, ends in ((PAST, [60.0]), (replace(PAST, held=1), [30.0, 60.0])):
