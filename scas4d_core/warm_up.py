@@ -64,17 +64,19 @@ def warm_up_elsewhere() -> None:
 def warm_up() -> None:
     """Reconstructs two frames of a ball, 32x32 pixels and a few dozen iterations, once with masks and once without.
 
-    Kernels are compiled for types, not for sizes: what this leaves in the cache (`kernels.jit`) serves all scenes.
+    Kernels are compiled for types, not for sizes: what this leaves in the cache (`kernels.jit`) serves all scenes. A
+    separate covariance has kernels of its own.
     """
     from scas4d_core.reconstruction import Reconstruction
 
     global _settled
     _settled = True
     settings = Settings.model_validate({"static": {"iterations": 30, "densify_from": 5, "densify_every": 10}})
-    settings = settings.model_copy(update={"update": settings.update.model_copy(update={"iterations": 4})})
     rig = _rig()
     points = _points()
-    for masked in (True, False):
+    for masked, covariance in ((True, "entangled"), (False, "separate")):
+        update = settings.update.model_copy(update={"iterations": 4, "covariance": covariance})
+        settings = settings.model_copy(update={"update": update})
         reconstruction = Reconstruction.start(rig, _frame(rig, 0, masked), settings, points=points)
         for index in (1, 2):
             reconstruction.step(_frame(rig, index, masked))

@@ -95,3 +95,25 @@ def test_a_process_that_compiles_starts_no_other(monkeypatch):
     monkeypatch.setattr(Reconstruction, "start", first_scene)
     with pytest.raises(Reached):
         warm_up.warm_up()
+
+
+def test_the_kernels_of_either_covariance_are_compiled(monkeypatch, tmp_path):
+    asked = []
+
+    class Scene:
+        def step(self, frame):
+            pass
+
+        render = tracks_of_pixels = parts = lambda *_: None
+
+    def start(rig, frame, settings, **_):
+        asked.append((bool(frame.masks), settings.update.covariance))
+        return Scene()
+
+    monkeypatch.setattr(warm_up, "_settled", True)
+    monkeypatch.setattr(warm_up, "marker", lambda: tmp_path / "warm")
+    monkeypatch.setattr(Reconstruction, "start", start)
+    warm_up.warm_up()
+    assert {masked for masked, _ in asked} == {True, False}
+    assert {covariance for _, covariance in asked} == {"entangled", "separate"}
+    assert (tmp_path / "warm").exists()
