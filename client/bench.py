@@ -22,7 +22,7 @@ def quality(
     captures: Annotated[list[Path], typer.Argument(metavar="CAPTURE...", help="Folders with test cameras.")],
     out: Study = STUDY,
     preset: Annotated[
-        list[str] | None, typer.Option(help="scas4d (the default) or dynamic3dgs; may be repeated.")
+        list[str] | None, typer.Option(help="scas4d (the default), adaptive or dynamic3dgs; may be repeated.")
     ] = None,
     iterations: Annotated[
         list[int] | None, typer.Option(min=1, help="Of an update; the preset's when left out. May be repeated.")

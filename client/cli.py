@@ -24,7 +24,7 @@ app.add_typer(bench.app, name="bench")
 commands.register(app)
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture.")]
-Preset = Annotated[str, typer.Option(help="Named settings: scas4d or dynamic3dgs.")]
+Preset = Annotated[str, typer.Option(help="Named settings: scas4d, adaptive or dynamic3dgs.")]
 Changes = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="As update.iterations=200.")]
 Frames = Annotated[int | None, typer.Option(min=1, help="Only so many frames.")]
 Out = Annotated[Path, typer.Option(help="Where pictures go.")]

@@ -84,7 +84,7 @@ def push(
     capture_fps: CaptureFps = None,
     masks: Masks = True,
     encoding: Encode = Encoding.JPEG,
-    preset: Annotated[str, typer.Option(help="Named settings: scas4d or dynamic3dgs.")] = "scas4d",
+    preset: Annotated[str, typer.Option(help="Named settings: scas4d, adaptive or dynamic3dgs.")] = "scas4d",
     changes: Annotated[
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="As update.iterations=200.")
     ] = None,
