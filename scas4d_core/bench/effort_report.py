@@ -49,9 +49,12 @@ def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report
             frame = capture.frame(index)
             dict(frame.images), dict(frame.masks)  # decoded before, so that both find them so
             for tells in (True, False) if index % 2 else (False, True):
-                FrameUpdate.tells = tells
                 began = time.process_time()
-                done = scenes[tells].step(frame)
+                FrameUpdate.tells = tells
+                try:
+                    done = scenes[tells].step(frame)
+                finally:
+                    FrameUpdate.tells = True
                 taken = time.process_time() - began
                 if index < COUNTED_FROM:
                     continue
@@ -60,7 +63,6 @@ def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report
                     found = {**done.seconds, REPORT: done.seconds[REPORT] + _published(scenes[tells], index)}
                     stages.append(found)
                     shares.append(found[REPORT] / sum(found.values()))
-        FrameUpdate.tells = True
     ratios = np.array(cpu[True]) / np.array(cpu[False])
     answer = {
         "updates": len(shares),
