@@ -53,11 +53,9 @@ def warm_up_elsewhere() -> None:
         return
     # The same sources: they may be where only this process looks.
     program = "import sys; sys.path[:] = sys.argv[1:]; from scas4d_core.warm_up import warm_up; warm_up()"
+    command = [sys.executable or "python3", "-c", program, *sys.path]
     try:
-        done = (
-            subprocess.run([sys.executable or "python3", "-c", program, *sys.path], stdin=subprocess.DEVNULL).returncode
-            == 0
-        )
+        done = subprocess.run(command, stdin=subprocess.DEVNULL).returncode == 0
     except OSError:  # no interpreter to be found from inside another program
         done = False
     if not done:
