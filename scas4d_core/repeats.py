@@ -7,13 +7,12 @@ motion before them leads.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.trial import Given, Outcome
+from scas4d_core.trial import Given, Outcome, stood
 from scas4d_core.updated import Updated
 
 EVERY = 4
@@ -27,7 +26,5 @@ def fingerprints(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, int]:
 
 def same_again(given: Given) -> Outcome:
     """The outcome of a frame that shows what the last one that was believed showed."""
-    nothing = Updated(given.state, given.motion, [], [], {}, kept="still")  # type: ignore[arg-type]
-    past = replace(given.past, held=0, behind=max(1, given.past.behind))  # the scene may have stood, or gone further
-    said, exposure = ["the same pictures again"], given.look.exposure
-    return Outcome(nothing, given.state, given.motion, past, {}, attempts=said, exposure=exposure, stood=True)
+    nothing = Updated.nothing(given.state, given.motion)
+    return stood(given, nothing, given.look.exposure, "the same pictures again")

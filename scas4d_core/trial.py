@@ -122,7 +122,7 @@ class Trial:
             return self._held(given, updated, attempts, check.fault, exposure)
         degraded = attempts[-2] if len(attempts) > 1 else None
         if not updated.losses:
-            return _stood(given, updated, exposure)
+            return stood(given, updated, exposure, "not moved")
         why = self._unmet(given, updated)
         if why is not None:
             attempts[-1] += f": {why}"
@@ -142,7 +142,7 @@ class Trial:
 
     def _unseen(self, given: Given, why: str) -> Outcome:
         """A frame whose pictures say nothing: the state stays, nothing is tried, and no patience is lost with it."""
-        nothing = Updated(given.state, given.motion, [], [], {}, kept="still")  # type: ignore[arg-type]
+        nothing = Updated.nothing(given.state, given.motion)
         past = replace(given.past, behind=max(1, given.past.behind))
         return self._stays(given, nothing, past, [], why, given.look.exposure)
 
@@ -330,10 +330,10 @@ class Trial:
         return found
 
 
-def _stood(given: Given, updated: Updated, exposure: float) -> Outcome:
+def stood(given: Given, updated: Updated, exposure: float, said: str) -> Outcome:
     """Θ_{t−1} shows the frame: nothing was rendered that says how any camera fits, so what is usual stays as it was."""
     past = replace(given.past, held=0, behind=max(1, given.past.behind))  # it may go on from here, or from further away
-    return Outcome(updated, given.state, given.motion, past, {}, attempts=["not moved"], exposure=exposure, stood=True)
+    return Outcome(updated, given.state, given.motion, past, {}, attempts=[said], exposure=exposure, stood=True)
 
 
 def _after(updated: Updated, first: Updated) -> Updated:

@@ -84,6 +84,11 @@ class Updated:
     kept: str = "end"
     guards: dict[str, int] = field(default_factory=dict)
 
+    @classmethod
+    def nothing(cls, state: Gaussians, motion: Motion | None) -> Updated:
+        """What a frame leaves for which no iteration is run: the state, and the motion, if any, as they were."""
+        return cls(state, motion, [], [], {}, kept="still")  # type: ignore[arg-type]
+
 
 class Story:
     """What happens in an update, iteration by iteration.
