@@ -187,7 +187,7 @@ def cluster_map(
     With d = x − p, z = c·d + s, f = 2σ(2z), f' = f(2−f):
     centred x' = p + t + f·R d; published x' = (R d + p + t)·f. Both have J = R (f·I + f'·y·cᵀ), y = d for the first,
     y = Rᵀ(R d + p + t) for the second. The published map scales about the world's origin and so is not
-    translation-equivariant; the two agree where c = s = 0.
+    translation-equivariant; the two agree where c = s = 0. Where every parameter is 0, points keep their bits.
 
     Args:
         points: [M, 3] metres.
@@ -201,17 +201,19 @@ def cluster_map(
     rotation = quaternion_matrices(q)[labels]
     offset = points - pivot
     f, df = scaling_factor((c * offset).sum(-1) + params.s[labels])
-    turned = (rotation @ offset[..., None])[..., 0]
+    # Points go by their change: every term but the point itself is 0 where the parameters are.
+    unit = torch.eye(3, dtype=points.dtype, device=points.device)
+    step = ((rotation - unit) @ offset[..., None])[..., 0]
+    placed = points + (t + step)
     if kind == "centred":
-        moved = pivot + t + f[:, None] * turned
+        moved = placed + (f - 1)[:, None] * (offset + step)
         y = offset
     elif kind == "published":
-        placed = turned + pivot + t
-        moved = placed * f[:, None]
+        moved = placed + (f - 1)[:, None] * placed
         y = (rotation.mT @ placed[..., None])[..., 0]
     else:
         raise ValueError(f"cluster map {kind!r} is unknown; give 'centred' or 'published'")
-    inner = f[:, None, None] * torch.eye(3, dtype=points.dtype, device=points.device)
+    inner = f[:, None, None] * unit
     inner = inner + df[:, None, None] * y[:, :, None] * c[:, None, :]
     return Transported(moved, rotation @ inner, quaternion_product(q[labels], polar_rotation(f, y, c)))
 

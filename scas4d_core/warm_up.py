@@ -6,6 +6,8 @@ import hashlib
 import logging
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +25,7 @@ _settled = False
 
 
 def marker() -> Path | None:
-    """The file that says that this version's kernels are in the cache for this processor; None where there is none.
+    """The file that says that this version's kernels are in the cache for this target; None where there is none.
 
     Numba keeps what it compiled by the path of the source, so a checkout elsewhere has a mark of its own.
     """
@@ -34,7 +36,9 @@ def marker() -> Path | None:
 
     folder = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     where = hashlib.sha256(str(Path(jit.__file__).parent).encode()).hexdigest()[:8]
-    return Path(folder) / f"warm-{binding.get_host_cpu_name()}-{where}" if folder else None
+    named = numba.config.CPU_NAME  # type: ignore[attr-defined]
+    target = f"{named}{numba.config.CPU_FEATURES or ''}" if named else binding.get_host_cpu_name()  # type: ignore[attr-defined]
+    return Path(folder) / f"warm-{target}-{where}" if folder else None
 
 
 def warm_up_elsewhere() -> None:
@@ -51,6 +55,25 @@ def warm_up_elsewhere() -> None:
     mark = marker()
     if mark is None or mark.exists():
         return
+    with _alone(mark):
+        if not mark.exists():  # another process may have compiled them meanwhile
+            _compile_elsewhere()
+
+
+@contextmanager
+def _alone(mark: Path) -> Iterator[None]:
+    """One process at a time compiles for a target: several would share the cores and do the same."""
+    try:
+        import fcntl
+    except ImportError:  # not on this system: they compile side by side, as harmless as it is slow
+        yield
+        return
+    with mark.with_name(f"{mark.name}.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _compile_elsewhere() -> None:
     # The same sources: they may be where only this process looks.
     program = "import sys; sys.path[:] = sys.argv[1:]; from scas4d_core.warm_up import warm_up; warm_up()"
     command = [sys.executable or "python3", "-c", program, *sys.path]

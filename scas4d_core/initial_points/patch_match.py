@@ -10,7 +10,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from scas4d_core.kernels.jit import inline, kernel, parallel_kernel
 
 REACH = 2
 """Samples on either side of the centre of a patch: 5 × 5 of them,"""
@@ -24,7 +26,7 @@ NO_MATCH = 2.0
 _SAMPLES = (2 * REACH + 1) ** 2
 
 
-@njit(cache=True, inline="always")
+@inline
 def _random(key: int, draw: int) -> float:
     """A number in [0, 1) that depends on its arguments alone, whatever thread asks (splitmix64)."""
     z = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03)
@@ -34,7 +36,7 @@ def _random(key: int, draw: int) -> float:
     return float(z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
-@njit(cache=True, fastmath=True)
+@kernel
 def _cost(
     patch: Any, weight: Any, mean: float, deviation: float, x: float, y: float, depth: float,
     nx: float, ny: float, nz: float, inverse: Any, others: Any, matrices: Any, shifts: Any, best: int,
@@ -102,7 +104,7 @@ def _cost(
     return (low0 + low1 + low2) / 3.0 if low2 < NO_MATCH else NO_MATCH
 
 
-@njit(cache=True, fastmath=True)
+@kernel
 def _patch(image: Any, x: int, y: int, patch: Any, weight: Any) -> tuple[float, float]:
     """Fill the samples about a pixel and their weights (near in value counts more); mean and deviation."""
     height, width = image.shape
@@ -124,7 +126,7 @@ def _patch(image: Any, x: int, y: int, patch: Any, weight: Any) -> tuple[float, 
     return mean, np.sqrt(max(sum_ii / sum_w - mean * mean, 0.0))
 
 
-@njit(cache=True, parallel=True)
+@parallel_kernel
 def _sweep(
     image: Any, active: Any, prior: Any, depth: Any, normal: Any, cost: Any, inverse: Any, others: Any, matrices: Any,
     shifts: Any, near: float, far: float, round_: int, colour: int, best: int, seed: int,

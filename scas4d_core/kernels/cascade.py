@@ -8,6 +8,9 @@ Q to the next.
 Cluster map, y = x − p, z = c·y + s, f = 2σ(2z), f' = f(2 − f):
 centred x' = p + t + f R y, published x' = f (R y + p + t); both have J = R (f I + f' e cᵀ)
 with e = y, or e = y + Rᵀ(p + t). Where the covariance is separate, a factor stays as it is.
+
+Points go by their change, x' = w + (f − 1) u with w = x + t + (R − I) y, u = R y or u = w: every term but x is 0 where
+the parameters are, so that the identity keeps every bit on every processor.
 """
 
 from __future__ import annotations
@@ -18,8 +21,9 @@ from scas4d_core.guards import EMPTY_CLUSTER, EXPONENT, HALF_TURN
 from scas4d_core.kernels import lanes
 from scas4d_core.kernels.jit import LOG2_E, ONE, TWO, ZERO, inline, kernel
 
-# Columns of a cluster's table: rotation matrix 0–8, quaternion 9–12, pivot 13–15, translation 16–18, c 19–21, s 22.
-TABLE = 23
+# Columns of a cluster's table: rotation matrix 0–8, quaternion 9–12, pivot 13–15, translation 16–18, c 19–21, s 22, the
+# diagonal of R − I 23–25.
+TABLE = 26
 # Columns of a cluster's parameters: r 0–2, t 3–5, c 6–8, s 9.
 PARAMETERS = 10
 # A block's share of its cluster's gradient: rotation matrix 0–8, quaternion 9–12, t 13–15; then c 16–18, s 19.
@@ -71,7 +75,7 @@ def cluster_table(parameters, sums, first, last, count, table):
     Args:
         parameters: [10]. sums: [blocks, 3] of the points of each block as moved by the layers above; the cluster has
             the blocks from ``first`` to before ``last``, ``count`` points.
-        table: out [23].
+        table: out [26].
     """
     px = py = pz = np.float64(0.0)
     for block in range(first, last):
@@ -89,6 +93,7 @@ def cluster_table(parameters, sums, first, last, count, table):
     table[9], table[10], table[11], table[12] = w, x, y, z
     for k in range(7):
         table[16 + k] = parameters[3 + k]
+    table[23], table[24], table[25] = -TWO * (y * y + z * z), -TWO * (x * x + z * z), -TWO * (x * x + y * y)
 
 
 @inline
@@ -109,12 +114,12 @@ def scaled(table, about_origin, x, y, z):
 @inline
 def moved(table, about_origin, x, y, z):
     """Points after a layer."""
-    f, _, _, _, ux, uy, uz, _ = scaled(table, about_origin, x, y, z)
-    centred = ONE - about_origin
+    f, yx, yy, yz, ux, uy, uz, _ = scaled(table, about_origin, x, y, z)
+    more = f - ONE
     return (
-        f * ux + centred * (table[13] + table[16]),
-        f * uy + centred * (table[14] + table[17]),
-        f * uz + centred * (table[15] + table[18]),
+        x + (table[16] + (yx * table[23] + yy * table[1] + yz * table[2]) + more * ux),
+        y + (table[17] + (yx * table[3] + yy * table[24] + yz * table[5]) + more * uy),
+        z + (table[18] + (yx * table[6] + yy * table[7] + yz * table[25]) + more * uz),
     )
 
 
@@ -151,7 +156,7 @@ def carry(table, about_origin, separate, points, place, v, present, lane, acted)
     """Factors and turns of a block through a layer, in place.
 
     Args:
-        table: [23] of its cluster. separate: None: J is applied to the factors; else nothing.
+        table: [26] of its cluster. separate: None: J is applied to the factors; else nothing.
         points: x, y, z of the block from flat index ``place`` on, as they enter.
         v: [13, 16] factors 0–8 and turns 9–12.
         present: flat; from ``lane`` on, 0 for a Gaussian that is not counted, else 1.

@@ -88,7 +88,7 @@ def deform(
         about_origin: 0 for the centred map, 1 for the published one. separate: None: J is applied to the factors; else
             nothing.
         points: [max(L, 1), B, 3, 16] as they enter each layer; the first is given, the others are filled.
-        sums: [max(L, 1), B, 3] of them; likewise. tables: out [K, 23].
+        sums: [max(L, 1), B, 3] of them; likewise. tables: out [K, 26].
         means [N, 3], factors [N, 3, 3]: out at ``rows``. state: [M, 16], out its means and turns, see ``deltas``.
         acted: out [tasks of ``BLOCKS`` blocks, 3] int64, how often the guards in ``cascade.ACTED`` acted.
     """

@@ -22,16 +22,19 @@ llvm.set_option("scas4d", "-unroll-full-max-count=8")
 # Overlap checks hoisted out of the loop over rows compare whole arrays, find overlap, and take the scalar path.
 llvm.set_option("scas4d", "-hoist-runtime-checks=false")
 
-# NaN and infinity keep their meaning: fast-math that assumes them away turns 0/0 into a silent identity.
-FAST_MATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
+# No fast math: every operation rounds as IEEE 754 says, in the order written, so that kernels compute the same bits on
+# every processor. An estimated reciprocal (`arcp`, `afn`) rounds as its maker likes, a product fused with a sum
+# (`contract`) where there is such an instruction, a reordered sum (`reassoc`) by the width of the registers. Sums over
+# many numbers are written in lanes instead. What it costs an update is within what can be measured (docs/kernels.md).
+STRICT: dict[str, Any] = {"fastmath": False, "error_model": "numpy"}
 
-kernel: Any = njit(cache=True, fastmath=FAST_MATH, error_model="numpy")
+kernel: Any = njit(cache=True, **STRICT)
 """A function on one thread, or called from inside a kernel."""
 
-parallel_kernel: Any = njit(cache=True, fastmath=FAST_MATH, error_model="numpy", parallel=True)
+parallel_kernel: Any = njit(cache=True, parallel=True, **STRICT)
 """A function over ``prange`` tasks. Tasks write disjoint places: the result does not depend on the thread count."""
 
-inline: Any = njit(cache=True, fastmath=FAST_MATH, error_model="numpy", inline="always")
+inline: Any = njit(cache=True, inline="always", **STRICT)
 """A few lines shared by kernels."""
 
 ZERO = np.float32(0.0)

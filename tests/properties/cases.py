@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from scas4d_core.cameras import Camera
-from scas4d_core.deformation import ClusterParams, Deltas, Layer
+from scas4d_core.deformation import ClusterMap, ClusterParams, Deltas, Layer
 from scas4d_core.deformation_cpu import CpuDeformation
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.hierarchy import Hierarchy
@@ -64,13 +64,13 @@ def some_rotation(seed: int) -> np.ndarray:
     return Rotation.random(random_state=seed % 2**32).as_matrix()
 
 
-def on_cpu(motion: Motion) -> CpuDeformation:
+def on_cpu(motion: Motion, kind: ClusterMap = "centred") -> CpuDeformation:
     """The same deformation as the fused kernels compute it, in float32."""
     labels = [layer.labels.numpy() for layer in motion.layers]
     starts = tuple(np.searchsorted(of, np.arange(of.max() + 2)).astype(np.int64) for of in labels)
     count = len(motion.means)
     hierarchy = Hierarchy(np.arange(count), tuple(of.astype(np.int32) for of in labels), starts)
-    made = CpuDeformation(hierarchy, None, np.full((count, 3), 1e9, np.float32), "centred")
+    made = CpuDeformation(hierarchy, None, np.full((count, 3), 1e9, np.float32), kind)
     made.start(gaussians(motion.means, motion.factors))
     for table, (_, (r, t, c, s)) in zip(made.clusters, motion.layers, strict=True):
         table[:] = torch.cat([r, t, c, s[:, None]], dim=1).numpy()
