@@ -4,7 +4,8 @@ Sent again is what does the same when it is done twice: reading, and every frame
 content.
 
 ============================  =====================================================================================
-429                           after the seconds that the service asks for, `busy` seconds in all
+429                           after the seconds that the service asks for, `busy` seconds in all; where it predicts
+                              them (`retry_after_seconds`), a long wait is asked about again at half of it
 502, 503, 504, 507, and a     after 0.2, 0.4, 0.8 … 5 s, each cut at random to 50…100 % so that many senders do not
 connection that breaks        return together, or later where the answer says so; until `outage` seconds after the
 or cannot be made             first failure of the call
@@ -32,6 +33,9 @@ from client.errors import ServiceUnreachable, error_of
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 5.0
 SHORTEST_BUSY_WAIT_S = 0.1
+SURE_S, LONGEST_BUSY_WAIT_S = 2.0, 10.0
+"""A prediction up to the first is waited for whole, a longer one by half and at most the second: frame 0 may end sooner
+than predicted, and then the rig should not sleep."""
 OUTAGE_STATUSES = (502, 503, 504, 507)
 
 BUSY_S = 3600.0
@@ -111,11 +115,16 @@ class Retries:
     def _busy_wait(self, asked: float | None, response: httpx.Response) -> float | None:
         if self._busy_left <= 0:
             return None
-        wait = max(asked if asked is not None else 1.0, SHORTEST_BUSY_WAIT_S) * random.uniform(1.0, 1.1)
+        problem = error_of(response).problem
+        asked = 1.0 if asked is None else asked
+        predicted = (problem.model_extra or {}).get("retry_after_seconds")
+        if isinstance(predicted, int | float):
+            asked = float(predicted) if predicted <= SURE_S else min(max(SURE_S, predicted / 2), LONGEST_BUSY_WAIT_S)
+        wait = max(asked, SHORTEST_BUSY_WAIT_S) * random.uniform(1.0, 1.1)
         wait = min(wait, self._busy_left)
         self._busy_left -= wait
         self._failed_at, self._failures = None, 0  # it answers
-        return self._tell(Retry("busy", wait, error_of(response).problem.detail))
+        return self._tell(Retry("busy", wait, problem.detail))
 
     def _outage_wait(self, asked: float, detail: str) -> float | None:
         now = time.monotonic()

@@ -13,6 +13,11 @@ from server.problems import Problem, counted
 if TYPE_CHECKING:
     from server.scene import Scene
 
+LONGEST_S = 60.0
+"""The longest that a sender is told to wait: a prediction that far ahead is a guess."""
+PAUSED_S = 5.0
+"""A sender to a paused scene asks again after so long: nothing tells when a person lets it go on."""
+
 
 class Admission:
     """The rules of one scene's door. Nothing here changes anything."""
@@ -109,17 +114,26 @@ class Admission:
         return scene.rules.when_full == "skip" and bool(scene.ledger.waiting())
 
     def full(self, index: int) -> Problem:
-        """429 with Retry-After, about as long as an update takes."""
+        """429: how long until the frame at work ends and one that waits takes its place.
+
+        ``Retry-After`` holds whole seconds, the document's ``retry_after_seconds`` the same unrounded.
+        """
         scene = self._scene
-        wait = min(60, max(1, math.ceil(scene.last_seconds)))
+        if scene.ledger.paused:
+            seconds, remedy = PAUSED_S, f"let the scene go on: POST /v1/scenes/{scene.id}/resume"
+        else:
+            seconds = min(scene.clock.remaining(), LONGEST_S)
+            remedy = f"send the same frame again in {counted(math.ceil(seconds), 'second')}"
         return Problem(
             429,
-            f"{counted(scene.queued, 'frame')} of at most {scene.queue_limit} wait already",
+            f"{counted(scene.queued, 'frame')} of at most {scene.queue_limit} wait already"
+            + (" and the scene is paused" if scene.ledger.paused else ""),
             field="n",
             value=index,
-            remedy=f"send the same frame again in {counted(wait, 'second')}",
-            headers={"Retry-After": str(wait)},
+            remedy=remedy,
+            headers={"Retry-After": str(max(1, math.ceil(seconds)))},
             queued=scene.queued,
+            retry_after_seconds=round(seconds, 3),
         )
 
     def skips(self, index: int) -> list[Fact]:

@@ -32,6 +32,7 @@ from server.scene_lookup import camera_of, committed_frame_of, report_of
 from server.scene_status import state_of, status_of
 from server.settings import ServerSettings
 from server.supervision import Supervision, given_up
+from server.work_clock import WorkClock
 
 log = logging.getLogger("scas4d.server")
 
@@ -77,7 +78,7 @@ class Scene:
         self.progress: ProgressModel | None = None
         self.points_sha256: str | None = None
         self.gaussians: int | None = None
-        self.last_seconds = 1.0
+        self.clock = WorkClock()
         self.door = asyncio.Lock()
         self.trouble = self._last_trouble()
         """Why the scene is degraded: the last frame's, or that of the worker or the disk."""
@@ -181,6 +182,7 @@ class Scene:
         assert receipt is not None
         ledger.move(index, FrameState.UPDATING)
         self._at_work = index
+        self.clock.begin(first=not ledger.committed)
         self._worker.send(FrameReady(index, receipt.time, entry.files, receipt.identity, ledger.budget_of(index)))
         self._tell(SceneChanged())
 
@@ -192,6 +194,7 @@ class Scene:
                 self.progress = ProgressModel(
                     stage=message.stage, done=message.done, total=message.total, detail=message.detail
                 )
+                self.clock.progress(message.stage, message.done, message.total)
                 self._tell(SceneChanged())
             case Committed():
                 self.background(self._commit(message))
@@ -202,6 +205,7 @@ class Scene:
                 self.background(self._set_aside(fact))
             case Stalled():
                 self.trouble = f"frame {message.index} waits for room on the disk: {message.reason}"
+                self.clock.stall(message.seconds)
                 self._tell(SceneChanged())
             case Broken():
                 self.ledger.fatal = f"what is committed cannot be gone on from: {message.reason}"
@@ -233,6 +237,7 @@ class Scene:
 
     async def _commit(self, message: Committed) -> None:
         self.supervision.committed()
+        self.clock.end(committed=True)
         self._at_work, self.progress = None, None
         self.ledger.move(message.index, FrameState.COMMITTED)
         self._fill(message.index, message.report)
@@ -252,6 +257,7 @@ class Scene:
     async def _set_aside(self, fact: SetAside) -> None:
         await self._write(fact)
         self.ledger.apply(fact)
+        self.clock.end(committed=False)
         self._at_work, self.progress = None, None
         self.trouble = reports.trouble(self.frames[fact.index].report)
         if fact.fatal:
@@ -275,7 +281,6 @@ class Scene:
         self.frames.set_numbers(index, committed)
         report = self.frames[index].report
         self.gaussians = report.gaussians
-        self.last_seconds = report.seconds.get("total", self.last_seconds)
 
     async def retain(self) -> None:
         """Deletes pictures from the frame log by the scene's rule."""
@@ -311,6 +316,7 @@ class Scene:
 
     def _worker_ended(self, reason: Ended) -> None:
         self._ready, self.progress = False, None
+        self.clock.end(committed=False)
         if self._stopping or self.ledger.fatal is not None:
             return
         metrics.RESTARTS.labels("worker").inc()

@@ -106,6 +106,23 @@ def test_patience_with_a_full_queue_ends():
     assert len(script.requests) == 2
 
 
+@pytest.mark.parametrize(
+    ("answer", "least", "most"),
+    [
+        (problem(429, {"Retry-After": "60"}, retry_after_seconds=0.3), 0.3, 0.33),  # the exact one counts
+        (problem(429, {"Retry-After": "60"}, retry_after_seconds=12.0), 6.0, 6.6),  # long ones are asked about again
+        (problem(429, {"Retry-After": "60"}, retry_after_seconds=3.0), 2.0, 2.2),
+        (problem(429, {"Retry-After": "60"}, retry_after_seconds=500.0), 10.0, 11.0),
+        (problem(429, {"Retry-After": "60"}, retry_after_seconds="soon"), 60.0, 66.0),
+        (problem(429, {"Retry-After": "60"}), 60.0, 66.0),  # no prediction: it is waited for whole
+        (problem(429), 1.0, 1.1),
+    ],
+)
+def test_a_predicted_wait_is_exact_and_a_long_one_is_asked_about_again(answer, least, most):
+    retries = Retries(put_frame("s", 0, frame(0, {"c": b"x"})), "http://nowhere", busy=1e6, outage=1)
+    assert least <= retries.after_answer(answer) <= most
+
+
 def test_an_outage_is_waited_for_until_its_limit_and_no_longer():
     client, script = scripted(*[httpx.ConnectError("down")] * 99, outage=0.5)
     with pytest.raises(errors.ServiceUnreachable, match=r"http://nowhere cannot be reached after \d tries: down"):

@@ -60,6 +60,26 @@ def test_a_full_queue_answers_429_and_takes_the_frame_later(http, sdk, scene):
     assert sdk.wait(scene, 3).state == "committed"
 
 
+def test_a_slow_first_frame_is_not_what_the_queue_takes(http, sdk, scene):
+    sdk.put_frame(scene, 0, pictures(fakes.SLOW))
+    sdk.wait(scene, 0)
+    assert sdk.frame(scene, 0).state == "committed"
+    http.post(f"/v1/scenes/{scene}/pause")
+    sdk.put_frame(scene, 1, pictures())
+    sdk.put_frame(scene, 2, pictures())
+    paused = problem(put(http, scene, 3, pictures()), 429)
+    assert "paused" in paused["detail"]
+    assert paused["remedy"].endswith(f"/v1/scenes/{scene}/resume")
+    http.post(f"/v1/scenes/{scene}/resume")
+    sdk.wait(scene, 2)
+    sdk.put_frame(scene, 3, pictures(fakes.SLOW))
+    sdk.put_frame(scene, 4, pictures())
+    refused = put(http, scene, 5, pictures())
+    # Updates 1 and 2 took a moment, frame 0 took 2 s.
+    assert problem(refused, 429)["retry_after_seconds"] < fakes.SLOW_S / 2
+    assert refused.headers["Retry-After"] == "1"
+
+
 def test_a_render_does_not_wait_for_the_update_at_work(sdk, scene):
     sdk.put_frame(scene, 0, pictures())
     sdk.wait(scene, 0)
