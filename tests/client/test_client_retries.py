@@ -119,7 +119,7 @@ def test_patience_with_a_full_queue_ends():
     ],
 )
 def test_a_predicted_wait_is_exact_and_a_long_one_is_asked_about_again(answer, least, most):
-    retries = Retries(put_frame("s", 0, frame(0, {"c": b"x"})), "http://nowhere", busy=1e6, outage=1)
+    retries = Retries(put_frame("s", 0, {"c": b"x"}), "http://nowhere", busy=1e6, outage=1)
     assert least <= retries.after_answer(answer) <= most
 
 
