@@ -90,14 +90,19 @@ def build_hierarchy(
 
 
 def _kmeans(points: NDArray[np.float64], count: int, seed: int) -> Int:
-    """[M] labels of K-means; empty clusters vanish."""
+    """[M] labels of K-means; empty clusters vanish.
+
+    In float64 about the middle: a point nearly as near to a second cluster goes to the same one on every processor,
+    whatever its linear algebra rounds like.
+    """
+    points = points - points.mean(axis=0)
     limit = KMEANS_SAMPLE_PER_CLUSTER * count
     rng = np.random.default_rng(seed)
     sample = points if len(points) <= limit else points[np.sort(rng.choice(len(points), limit, replace=False))]
     distinct = len(np.unique(sample, axis=0))
     model = KMeans(min(count, distinct), init="random", n_init=1, max_iter=KMEANS_ROUNDS, random_state=seed)
-    model.fit(sample.astype(np.float32))
-    labels: Int = model.predict(points.astype(np.float32)).astype(np.int64)
+    model.fit(sample)
+    labels: Int = model.predict(points).astype(np.int64)
     return np.unique(labels, return_inverse=True)[1]
 
 
