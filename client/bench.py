@@ -7,10 +7,11 @@ from typing import Annotated
 
 import typer
 
-from client import bench_frontier
+from client import bench_frontier, bench_processors
 
 app = typer.Typer(no_args_is_help=True, help="Studies that measure the method.")
 bench_frontier.register(app)
+bench_processors.register(app)
 
 Study = Annotated[Path, typer.Option(help="Folder of the study: rows, pictures, frames 0. Run again to go on.")]
 Again = Annotated[bool, typer.Option("--again", help="Measure anew what is there already (kept frames 0 are used).")]

@@ -7,7 +7,7 @@ import logging
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -44,9 +44,8 @@ def marker() -> Path | None:
 def warm_up_elsewhere() -> None:
     """`warm_up` in a process of its own, unless the cache has the kernels already.
 
-    A kernel that a process has compiled and the same one loaded from the cache differ in the last bits (seen in
-    ``project``: products and sums are fused at other places). Results have to be the same in every process that takes
-    a scene up, so none computes with what it compiled itself: ``Reconstruction`` asks for this before its first frame.
+    Compiling takes a minute and a few hundred megabytes that the process would keep. ``Reconstruction`` asks for this
+    before its first frame. Which process compiled a kernel changes no bit of what it computes.
     """
     global _settled
     if _settled:
@@ -55,46 +54,53 @@ def warm_up_elsewhere() -> None:
     mark = marker()
     if mark is None or mark.exists():
         return
-    with _alone(mark):
-        if not mark.exists():  # another process may have compiled them meanwhile
-            _compile_elsewhere()
-
-
-@contextmanager
-def _alone(mark: Path) -> Iterator[None]:
-    """One process at a time compiles for a target: several would share the cores and do the same."""
-    try:
-        import fcntl
-    except ImportError:  # not on this system: they compile side by side, as harmless as it is slow
-        yield
-        return
-    with mark.with_name(f"{mark.name}.lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
-
-
-def _compile_elsewhere() -> None:
     # The same sources: they may be where only this process looks.
-    program = "import sys; sys.path[:] = sys.argv[1:]; from scas4d_core.warm_up import warm_up; warm_up()"
+    program = "import sys; sys.path[:] = sys.argv[1:]; from scas4d_core.warm_up import warm_up; warm_up(anew=False)"
     command = [sys.executable or "python3", "-c", program, *sys.path]
     try:
         done = subprocess.run(command, stdin=subprocess.DEVNULL).returncode == 0
     except OSError:  # no interpreter to be found from inside another program
         done = False
     if not done:
-        log.warning("kernels could not be compiled beforehand; states may differ in last bits after a restart")
+        log.warning("kernels could not be compiled beforehand; the first frames wait for them")
 
 
-def warm_up() -> None:
+@contextmanager
+def _alone(mark: Path | None) -> Iterator[None]:
+    """One process at a time compiles for a target: several would share the cores and do the same."""
+    with ExitStack() as stack:
+        # Where there is no such lock, or no folder to write to, they compile side by side: as harmless as it is slow.
+        with suppress(ImportError, OSError):
+            import fcntl
+
+            if mark is not None:
+                file = stack.enter_context(mark.with_name(f"{mark.name}.lock").open("w"))
+                fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def warm_up(*, anew: bool = True) -> None:
     """Reconstructs two frames of a ball, 32x32 pixels and a few dozen iterations, once with masks and once without.
 
     Kernels are compiled for types, not for sizes: what this leaves in the cache (`kernels.jit`) serves all scenes. A
-    separate covariance has kernels of its own.
-    """
-    from scas4d_core.reconstruction import Reconstruction
+    separate covariance has kernels of its own. Processes that do so at a time wait for the first.
 
+    Args:
+        anew: also where the cache has the kernels: to have this process load them.
+    """
     global _settled
     _settled = True
+    mark = marker()
+    with _alone(mark):
+        if anew or mark is None or not mark.exists():
+            _reconstruct_a_ball()
+        if mark is not None:
+            mark.touch()
+
+
+def _reconstruct_a_ball() -> None:
+    from scas4d_core.reconstruction import Reconstruction
+
     settings = Settings.model_validate({"static": {"iterations": 30, "densify_from": 5, "densify_every": 10}})
     rig = _rig()
     points = _points()
@@ -108,9 +114,6 @@ def warm_up() -> None:
         reconstruction.render(camera)
         reconstruction.tracks_of_pixels(camera, np.array([[SIZE / 2, SIZE / 2]]), 0, [0, 1])
         reconstruction.parts(2)
-    mark = marker()
-    if mark is not None:
-        mark.touch()
 
 
 def _rig() -> Rig:

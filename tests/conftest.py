@@ -13,7 +13,12 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 @pytest.fixture(scope="session", autouse=True)
 def kernels() -> None:
-    """No test computes with kernels that its own process compiled: their last bits, and its memory, are others."""
+    """Kernels are compiled once, in a process beside: of the tests' processes one asks for it, the others wait."""
     from scas4d_core.warm_up import warm_up_elsewhere
 
     warm_up_elsewhere()
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """Processes for ``-n auto``: many tests wait for a service or a clock, so that two share a core."""
+    return min(8, 2 * len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)))

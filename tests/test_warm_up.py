@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import pytest
@@ -84,9 +86,10 @@ class Reached(Exception):
     """Frame 0 would be fitted now."""
 
 
-def test_a_process_that_compiles_starts_no_other(monkeypatch):
+def test_a_process_that_compiles_starts_no_other(monkeypatch, tmp_path):
     monkeypatch.setattr(warm_up, "_settled", False)
-    monkeypatch.setattr(warm_up, "marker", lambda: pytest.fail("the cache was asked"))
+    monkeypatch.setattr(warm_up, "marker", lambda: tmp_path / "warm")
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("another process was started"))
 
     def first_scene(*_, **__):
         warm_up.warm_up_elsewhere()
@@ -95,6 +98,33 @@ def test_a_process_that_compiles_starts_no_other(monkeypatch):
     monkeypatch.setattr(Reconstruction, "start", first_scene)
     with pytest.raises(Reached):
         warm_up.warm_up()
+
+
+def test_processes_that_compile_at_a_time_wait_for_the_first(monkeypatch, tmp_path):
+    began, ended = [], []
+
+    def compile_them():
+        began.append(len(ended))
+        time.sleep(0.3)
+        ended.append(True)
+
+    monkeypatch.setattr(warm_up, "marker", lambda: tmp_path / "warm")
+    monkeypatch.setattr(warm_up, "_reconstruct_a_ball", compile_them)
+    with ThreadPoolExecutor() as pool:  # flock is of the open file: threads are kept apart as processes are
+        list(pool.map(lambda _: warm_up.warm_up(anew=False), range(3)))
+    assert began == [0]
+    warm_up.warm_up()  # to load them
+    assert began == [0, 1]
+
+
+def test_without_a_folder_to_write_to_kernels_are_compiled_all_the_same(monkeypatch, tmp_path):
+    done = []
+    monkeypatch.setattr(warm_up, "marker", lambda: None)
+    monkeypatch.setattr(warm_up, "_reconstruct_a_ball", lambda: done.append(True))
+    warm_up.warm_up(anew=False)
+    assert done == [True]
+    with warm_up._alone(tmp_path / "nowhere" / "warm"):
+        pass
 
 
 def test_the_kernels_of_either_covariance_are_compiled(monkeypatch, tmp_path):

@@ -19,10 +19,10 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.settings import Settings
 from scas4d_core.static_scene import StaticResult
 
-VERSION = 1
+VERSION = 2
 """Raise this when frame 0 comes out different from the same pictures and settings: what is kept is then fitted anew."""
 
-CLOUD_VERSION = 2
+CLOUD_VERSION = 3
 """The same, where the first cloud is made from the pictures."""
 
 ARRAYS = tuple(field.name for field in fields(Gaussians))
