@@ -22,6 +22,7 @@ from scas4d_core.captures.frame import Frame
 from scas4d_core.history import NEWEST_KEPT
 from scas4d_core.judge import Past
 from scas4d_core.npz import read_npz, write_npz
+from scas4d_core.told import told
 from scas4d_core.trial import Outcome
 from scas4d_core.views import TrainingView, ViewFactory
 from scas4d_core.warm_start import Motion
@@ -119,9 +120,9 @@ class Checkpoints:
             names = {str(name) for name in arrays.pop("names")}
             missing = names ^ set(arrays)
             if missing:
-                raise ValueError(f"{file}: {', '.join(sorted(missing))} went missing")
+                raise ValueError(f"{file.name}: {', '.join(sorted(missing))} went missing")
             if int(arrays["format"]) != FORMAT:
-                raise ValueError(f"{file}: format {int(arrays['format'])}, this version reads {FORMAT}")
+                raise ValueError(f"{file.name}: format {int(arrays['format'])}, this version reads {FORMAT}")
             pictures = {name[5:]: array for name, array in arrays.items() if name.startswith("seen.")}
             seen = factory.views(Frame(index, 0.0, pictures, {}), {}, use_masks=False) if pictures else ()
             motion = _unpacked(arrays) if "motion.seconds" in arrays else None
@@ -129,9 +130,9 @@ class Checkpoints:
             shown = dict(zip(arrays["shown.names"].tolist(), arrays["shown.prints"].tolist(), strict=True))
             return Carried(motion, arrays.get("labels"), seen, int(arrays["structure"]), past, shown)
         except FileNotFoundError:
-            raise CheckpointError(f"{file} is missing") from None
+            raise CheckpointError(f"{file.name} is missing") from None
         except (ValueError, KeyError, TypeError) as error:
-            raise CheckpointError(str(error)) from error
+            raise CheckpointError(told(error)) from error
 
     def clean(self, committed: Sequence[int]) -> None:
         """Removes the checkpoints of all but the newest commits; after a commit.
@@ -149,7 +150,18 @@ class Checkpoints:
         return sorted(int(match[1]) for file in self.directory.iterdir() if (match := _FILE.fullmatch(file.name)))
 
     def _file(self, index: int) -> Path:
-        return self.directory / f"checkpoint_{index:06d}.npz"
+        return self.directory / name_of(index)
+
+
+def name_of(index: int) -> str:
+    """The file of a frame's checkpoint."""
+    return f"checkpoint_{index:06d}.npz"
+
+
+def checkpoint_of(name: str) -> int | None:
+    """The frame that a file is the checkpoint of, by its name."""
+    match = _FILE.fullmatch(name)
+    return int(match[1]) if match else None
 
 
 def _packed(motion: Motion) -> dict[str, Any]:
