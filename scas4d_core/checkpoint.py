@@ -9,7 +9,6 @@ first frame; clusters and neighbours are built again from the first frame, and a
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.captures.frame import Frame
+from scas4d_core.frame_files import checkpoint_file, checkpoint_of
 from scas4d_core.history import NEWEST_KEPT
 from scas4d_core.judge import Past
 from scas4d_core.npz import read_npz, write_npz
@@ -29,8 +29,6 @@ from scas4d_core.warm_start import Motion
 
 FORMAT = 2
 """Of a checkpoint's file; another one is refused."""
-
-_FILE = re.compile(r"checkpoint_(\d{6,})\.npz")
 
 
 class CheckpointError(ValueError):
@@ -147,21 +145,11 @@ class Checkpoints:
 
     def indices(self) -> list[int]:
         """Frames that have a checkpoint, rising."""
-        return sorted(int(match[1]) for file in self.directory.iterdir() if (match := _FILE.fullmatch(file.name)))
+        found = (checkpoint_of(file.name) for file in self.directory.iterdir())
+        return sorted(index for index in found if index is not None)
 
     def _file(self, index: int) -> Path:
-        return self.directory / name_of(index)
-
-
-def name_of(index: int) -> str:
-    """The file of a frame's checkpoint."""
-    return f"checkpoint_{index:06d}.npz"
-
-
-def checkpoint_of(name: str) -> int | None:
-    """The frame that a file is the checkpoint of, by its name."""
-    match = _FILE.fullmatch(name)
-    return int(match[1]) if match else None
+        return self.directory / checkpoint_file(index)
 
 
 def _packed(motion: Motion) -> dict[str, Any]:

@@ -25,6 +25,7 @@ INDEX = "index"
 """In the copy of the first frame: which one that is."""
 
 FIXED_FILE, FIXED_COPY, FIRST_COPY = "fixed.npz", "fixed.copy.npz", "first.copy.npz"
+_CHECKPOINT_FILE = re.compile(r"checkpoint_(\d{6,})\.npz")
 _FRAME_FILE = re.compile(r"frame_(\d{6,})\.npz")
 
 
@@ -206,6 +207,17 @@ def frame_file(index: int) -> str:
 def frame_of(name: str) -> int | None:
     """The frame that a file is of, by its name."""
     match = _FRAME_FILE.fullmatch(name)
+    return int(match[1]) if match else None
+
+
+def checkpoint_file(index: int) -> str:
+    """The name of the file of a frame's checkpoint (``checkpoint``)."""
+    return f"checkpoint_{index:06d}.npz"
+
+
+def checkpoint_of(name: str) -> int | None:
+    """The frame that a file is the checkpoint of, by its name."""
+    match = _CHECKPOINT_FILE.fullmatch(name)
     return int(match[1]) if match else None
 
 

@@ -50,12 +50,13 @@ def read_journal(path: Path) -> JournalRead:
 class Replayed:
     """How a journal was read: the bytes that are whole, and a sentence for each damage.
 
-    `broken`: more than a torn tail is missing; what it said may be lost.
+    `broken`: more than a torn tail is damaged; what it said may be lost. `begun`: its first fact is `Created`.
     """
 
     good: int
     damage: list[str]
     broken: bool = False
+    begun: bool = False
 
 
 def replay(path: Path, take: Callable[[Fact], object]) -> Replayed:
@@ -69,7 +70,7 @@ def replay(path: Path, take: Callable[[Fact], object]) -> Replayed:
     try:
         opened = path.open("rb")
     except FileNotFoundError:
-        return Replayed(0, [f"{path.name} is gone"], broken=True)
+        return Replayed(0, said)
     with opened as file:
         good = os.fstat(file.fileno()).st_size
         for found in streamed(file):
@@ -88,10 +89,7 @@ def replay(path: Path, take: Callable[[Fact], object]) -> Replayed:
                 continue
             begun = isinstance(fact, Created) if begun is None else begun
             take(fact)
-    if not begun:
-        broken = True
-        said.append(f"{path.name} lacks its beginning")
-    return Replayed(good, said, broken)
+    return Replayed(good, said, broken, bool(begun))
 
 
 def bytes_of(facts: Iterable[Fact]) -> bytes:
@@ -269,7 +267,10 @@ class Journal:
             self._flushing = None
 
     def _write(self, facts: Sequence[Fact]) -> str | None:
-        """Appends; what is wrong with the file's place, if anything is."""
+        """Appends; answers what is wrong with the file's place, and then the facts are not where they should be."""
+        watched = self._snapshot is not None
+        if watched and (fault := self.misplaced()) is not None:
+            return fault
         data = bytes_of(facts)
         view = memoryview(data)
         try:
@@ -280,7 +281,7 @@ class Journal:
             os.ftruncate(self._file, self._good)  # half a record must not stand before a whole one
             raise
         self._good += len(data)
-        return self.misplaced() if self._snapshot is not None else None
+        return self.misplaced() if watched else None
 
     async def _renew(self, facts: Sequence[Fact]) -> None:
         """Writes it anew: what the snapshot tells, and behind it what that may lack."""

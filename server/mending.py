@@ -14,8 +14,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol
 
 from client.wire import FrameState
-from scas4d_core.checkpoint import checkpoint_of
-from scas4d_core.frame_files import frame_file, frame_of
+from scas4d_core.frame_files import checkpoint_of, frame_file, frame_of
 from server.damage import DamageKind, DamageLog
 from server.facts import Fact, StatesDeleted
 from server.ledger import Ledger

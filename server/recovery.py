@@ -71,23 +71,28 @@ def recover(folder: Path, scene: str, definition: Mapping[str, Any] | None = Non
     ledger = Ledger(scene)
     told = replay(folder / JOURNAL_FILE, ledger.apply)
     damage = list(told.damage)
+    if not told.begun:  # a scene is made with its journal, which begins with that
+        damage.append(f"{JOURNAL_FILE} {'lacks its beginning' if (folder / JOURNAL_FILE).exists() else 'is gone'}")
+    broken = told.broken or not told.begun
     sizes = stored(frames)
-    states = _states(folder / "states", damage)
+    in_states: list[str] = []
+    states = _states(folder / "states", in_states)
     facts: list[Fact] = []
-    if told.broken:
+    if broken:
         facts.extend(_found_states(states, ledger))
-    if told.damage:
-        facts.extend(_found(frames, sorted(_unnamed(ledger, sizes)), ledger, states, told.broken))
+    if damage:
+        facts.extend(_found(frames, sorted(_unnamed(ledger, sizes)), ledger, states, broken))
     if found := sorted({fact.index for fact in facts if isinstance(fact, Taken | PartTaken)}):
         said = ", ".join(map(str, found))
         damage.append(f"the journal does not name the records of frames {said} any more; taken as they were found")
+    damage += in_states
     debris = _unnamed(ledger, sizes)
-    if told.broken and debris:
+    if broken and debris:
         damage.append(f"{len(debris)} records of pictures belong to nothing that is known; left until the next start")
     elif debris:
         remove(frames, debris)
     sizes = {name: size for name, size in sizes.items() if name not in debris}
-    remake = _remade(ledger, states, told.broken)
+    remake = _remade(ledger, states, broken)
     damage.extend(f"frame {index}: {reason}" for index, reason in remake.items() if index not in states.damaged)
     facts += ledger.reconcile(states.indices, states.damaged, remake)
     if states.newest:
@@ -107,7 +112,7 @@ def recover(folder: Path, scene: str, definition: Mapping[str, Any] | None = Non
             ledger.apply(gone)
             facts.append(gone)
     good = told.good
-    if told.broken and definition is not None:
+    if broken and definition is not None:
         try:
             known = Created(definition=dict(definition))
             good = write_journal(folder / JOURNAL_FILE, iter((known, *facts_of(ledger))))

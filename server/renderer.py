@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.wire import parts_model
+from scas4d_core.frame_files import frame_file
 from scas4d_core.history import DamagedFrameError, History, UnreadableFrameError
 from scas4d_core.told import told
 from server import encode, track_answers
@@ -118,6 +119,16 @@ class Renderer:
         """Files that were found damaged or gone since this was asked last, by name with the reason."""
         return {} if self._history is None else self._history.take_faults()
 
+    def _note_missing(self, query: Query) -> None:
+        """Frames that the service takes for committed and that are not here: it knows whether they were deleted."""
+        frames = query.frames if isinstance(query, TracksQuery) else (getattr(query, "frame", None),)
+        history = self._history
+        if history is not None and history.files is not None:
+            known = set(history.indices)
+            for index in frames:
+                if index is not None and index not in known:
+                    history.files.faults.setdefault(frame_file(index), f"{frame_file(index)} is gone")
+
     def answer(self, ask: Ask) -> Answer | Refused:
         """The encoded answer, or why there is none."""
         asked = type(ask.query).__name__
@@ -131,6 +142,7 @@ class Renderer:
                 return Refused(ask.number, f"{told(error)}; it is mended if it can be", status=503)
             except UnreadableFrameError as error:  # deleted since the door looked
                 log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
+                self._note_missing(ask.query)
                 return Refused(ask.number, told(error), status=404)
             except ValueError as error:
                 log.warning("scene %s refused %s: %s", self.spec.folder.name, asked, error)

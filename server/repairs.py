@@ -6,8 +6,7 @@ import logging
 from collections.abc import Callable, Iterator
 
 from scas4d_core.captures import Frame
-from scas4d_core.checkpoint import checkpoint_of
-from scas4d_core.frame_files import FIRST_COPY, FIXED_COPY, FIXED_FILE, FrameFiles, fault_of, frame_of
+from scas4d_core.frame_files import FIRST_COPY, FIXED_COPY, FIXED_FILE, FrameFiles, checkpoint_of, fault_of, frame_of
 from scas4d_core.history import NEWEST_KEPT, PER_FRAME, History
 from scas4d_core.told import told
 from server.disk import no_room

@@ -17,8 +17,7 @@ from functools import partial
 from pathlib import Path
 
 from client.wire import FrameState
-from scas4d_core.checkpoint import checkpoint_of, name_of
-from scas4d_core.frame_files import FIRST_COPY, FIXED_COPY, FIXED_FILE, FrameFiles
+from scas4d_core.frame_files import FIRST_COPY, FIXED_COPY, FIXED_FILE, FrameFiles, checkpoint_file, checkpoint_of
 from scas4d_core.history import FRAMES_KEPT
 from scas4d_core.npz import verified
 from scas4d_core.told import told
@@ -127,7 +126,7 @@ class Scrub:
         listed = await asyncio.to_thread(_checkpoints, folder)
         for name in listed:
             await self._state(folder / name, lambda: False)
-        newest = name_of(scene.ledger.committed[-1])
+        newest = checkpoint_file(scene.ledger.committed[-1])
         if listed and not scene.at_work() and not await asyncio.to_thread((folder / newest).exists):
             scene.noticed({newest: f"{newest} is gone"})
         files = FrameFiles(folder)

@@ -24,6 +24,8 @@ from server.ledger import RETENTION, Ledger, OpenFrame
 
 TOGETHER = 10_000
 """Frames that one fact names at most: the head of a record is bounded."""
+OWN_ERROR = (FrameState.SET_ASIDE, FrameState.MISSING)
+"""What is noted of such a frame is why it is in that state; of another one, why its state is gone."""
 BEFORE = "before the journal was written anew"
 
 
@@ -39,7 +41,7 @@ def facts_of(ledger: Ledger) -> Iterator[Fact]:
         entry = ledger.frames[index]
         yield from _of_frame(entry, ledger.fatal)
         if entry.deleted:
-            if entry.state == FrameState.COMMITTED and entry.note.error is not None:
+            if entry.state not in OWN_ERROR and entry.note.error is not None:
                 yield StatesDeleted(frames=(index,), reason=entry.note.error)
             else:
                 deleted.append(index)
