@@ -26,29 +26,28 @@ class DamageKind(StrEnum):
 
 
 class DamageLog:
-    """Of one scene. The same sentence is said once.
+    """Of one scene. A sentence that comes again is counted, or left out where it is of the same damage.
 
     Args:
         said: at the start of the service.
     """
 
     def __init__(self, said: Iterable[str] = ()) -> None:
-        self._said: OrderedDict[str, None] = OrderedDict()
+        self._said: OrderedDict[str, int] = OrderedDict()
         self._more = 0
         for sentence in said:
             self._keep(without_paths(sentence))
 
-    def say(self, kind: DamageKind, sentence: str) -> bool:
-        """One more; False where it is known."""
+    def say(self, kind: DamageKind, sentence: str, *, lasting: bool = False) -> None:
+        """One more. `lasting`: nothing mends it, and it is found again each time that it is looked at."""
         sentence = without_paths(sentence)
-        if sentence in self._said:
-            return False
+        if lasting and sentence in self._said:
+            return
         metrics.DAMAGE.labels(kind.value).inc()
         self._keep(sentence)
-        return True
 
     def _keep(self, sentence: str) -> None:
-        self._said[sentence] = None
+        self._said[sentence] = self._said.pop(sentence, 0) + 1
         while len(self._said) > KEPT:
             self._said.popitem(last=False)
             self._more += 1
@@ -57,4 +56,4 @@ class DamageLog:
     def sentences(self) -> list[str]:
         """The newest, in order; the first one says how many came before them."""
         before = [f"{self._more} more before these; the service's log has them"] if self._more else []
-        return [*before, *self._said]
+        return [*before, *(said if count == 1 else f"{said} ({count} times)" for said, count in self._said.items())]

@@ -60,6 +60,7 @@ class Mending:
         self._waiting: dict[int, str] = {}
         self._deaths: dict[int, int] = {}
         self._timers: set[asyncio.TimerHandle] = set()
+        self._full_until = 0.0
         self.at_work: int | None = None
         for index, reason in remake.items():
             self._decide(index, reason)
@@ -114,6 +115,8 @@ class Mending:
 
     def begin(self) -> bool:
         """Gives the worker the next state to make again, if one waits; called when it has nothing else to do."""
+        if self._waiting and asyncio.get_running_loop().time() < self._full_until:
+            return False
         for index in sorted(self._waiting):
             base = self._base(index)
             if base is None:
@@ -145,9 +148,9 @@ class Mending:
             case MendOutcome.DAMAGED if index is not None:
                 self._decide(index, message.reason)
             case MendOutcome.DAMAGED if checkpoint_of(message.name) is not None:
-                self._say(message.name, f"{message.reason}; it is needed by nothing but a second damage")
+                self._say(message.name, f"{message.reason}; it is needed by nothing but a second damage", lasting=True)
             case MendOutcome.DAMAGED:
-                self._say(message.name, f"{message.reason}; it cannot be made again")
+                self._say(message.name, f"{message.reason}; it cannot be made again", lasting=True)
             case MendOutcome.REMADE:
                 assert index is not None
                 reason = self._waiting.pop(index, reason)
@@ -165,6 +168,7 @@ class Mending:
                     self._asked[message.name] = reason
                     self._later(lambda: self._ask([message.name]))
                 else:
+                    self._full_until = asyncio.get_running_loop().time() + AGAIN_S
                     self._later(lambda: self._hooks.states_changed(()))
             case MendOutcome.GONE:
                 pass
@@ -209,11 +213,11 @@ class Mending:
         self._damage.say(DamageKind.STATE, f"{said} ({reason})")
         self._hooks.write_fact(fact)
 
-    def _say(self, name: str, sentence: str) -> None:
+    def _say(self, name: str, sentence: str, *, lasting: bool = False) -> None:
         kind = DamageKind.FIXED
         if frame_of(name) is not None:
             kind = DamageKind.STATE
         elif checkpoint_of(name) is not None:
             kind = DamageKind.CHECKPOINT
-        if self._damage.say(kind, sentence):
-            log.warning("%s", sentence)
+        self._damage.say(kind, sentence, lasting=lasting)
+        log.warning("%s", sentence)

@@ -149,7 +149,7 @@ class Scrub:
         if fault is None or fault == "gone":
             return
         used = "the first frame is committed, and needs it no more" if self._scene.ledger.committed else "put it again"
-        self._scene.damage.say(DamageKind.POINTS, f"{fault}; {used}")
+        self._scene.damage.say(DamageKind.POINTS, f"{fault}; {used}", lasting=True)
 
     async def _frames(self) -> None:
         scene = self._scene

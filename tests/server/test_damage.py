@@ -291,11 +291,13 @@ def test_the_metrics_count_what_is_found_and_read(tmp_path):
         assert counts["scas4d_scrubbed_bytes_total"] > 10_000
 
 
-def test_sentences_are_bounded_and_said_once():
+def test_sentences_are_bounded_and_counted():
     log = DamageLog(["a"])
-    assert log.say(DamageKind.STATE, "b /tmp/x/b.npz")
-    assert not log.say(DamageKind.STATE, "b /tmp/x/b.npz")
+    for _ in range(2):
+        log.say(DamageKind.STATE, "b /tmp/x/b.npz", lasting=True)
     assert log.sentences == ["a", "b b.npz"]
+    log.say(DamageKind.STATE, "b /tmp/x/b.npz")
+    assert log.sentences == ["a", "b b.npz (2 times)"]
     for number in range(KEPT):
         log.say(DamageKind.FRAME, f"{number}")
     assert len(log.sentences) == KEPT + 1
