@@ -145,6 +145,10 @@ class Mending:
                 log.warning("%s could not be read once (%s), and is whole", message.name, reason)
             case MendOutcome.WRITTEN:
                 self._say(message.name, f"{message.reason}; it was written again, and nothing is lost")
+            case MendOutcome.REPORT_LOST:
+                self._say(
+                    message.name, f"{message.reason}; its state is whole and was written again, its report is lost"
+                )
             case MendOutcome.DAMAGED if index is not None:
                 self._decide(index, message.reason)
             case MendOutcome.DAMAGED if checkpoint_of(message.name) is not None:

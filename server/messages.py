@@ -161,6 +161,8 @@ class MendOutcome(StrEnum):
     """It is not: it was written meanwhile, or the disk could not read it once."""
     WRITTEN = "written"
     """It was written again, the same bits."""
+    REPORT_LOST = "report_lost"
+    """The state was written again, the same bits; its report was damaged, and nobody has it in memory."""
     DAMAGED = "damaged"
     """It is, and nothing to write it from is in memory."""
     GONE = "gone"

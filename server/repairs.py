@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Callable, Iterator
+from typing import Any
 
 from scas4d_core.captures import Frame
 from scas4d_core.frame_files import FIRST_COPY, FIXED_COPY, FIXED_FILE, FrameFiles, checkpoint_of, fault_of, frame_of
@@ -60,8 +62,9 @@ def _mend(
     if index is not None:
         if index not in known and index not in history.damaged:
             return MendOutcome.GONE, ""
-        again = history.write_again(index) or _written_in_part(history, files, index, message)
-        return (MendOutcome.WRITTEN if again else MendOutcome.DAMAGED), fault
+        if history.write_again(index):
+            return MendOutcome.WRITTEN, fault
+        return _written_in_part(history, files, index, message), fault
     checkpoint = checkpoint_of(name)
     if checkpoint not in known[-NEWEST_KEPT:]:
         return MendOutcome.GONE, ""
@@ -69,18 +72,29 @@ def _mend(
     return (MendOutcome.WRITTEN if again else MendOutcome.DAMAGED), fault
 
 
-def _written_in_part(history: History, files: FrameFiles, index: int, message: Mend) -> bool:
+def _written_in_part(history: History, files: FrameFiles, index: int, message: Mend) -> MendOutcome:
     """Writes a file again of which only the report or the time is damaged: the state is whole in it."""
     try:
         arrays = files.read(index, PER_FRAME)
         report = message.reports.get(index)
         time = message.times[index] if index in message.times else files.time(index)
     except (ValueError, FileNotFoundError):
-        return False
+        return MendOutcome.DAMAGED
     if index >= max(history.indices, default=-1):
-        return False
+        return MendOutcome.DAMAGED
+    if report is None:
+        report = _report_of(files, index)
     history.replace(index, time, arrays, report or {})
-    return True
+    return MendOutcome.REPORT_LOST if report is None else MendOutcome.WRITTEN
+
+
+def _report_of(files: FrameFiles, index: int) -> dict[str, Any] | None:
+    """The report of a frame, where that is what is whole."""
+    try:
+        report: dict[str, Any] = json.loads(files.read(index, ("report",))["report"].tobytes())
+    except (ValueError, FileNotFoundError):
+        return None
+    return report
 
 
 def remake(engine: Engine, spec: SceneSpec, history: History, message: Remake, decode: Decode) -> Mended:

@@ -163,9 +163,8 @@ class Scrub:
             what = "it is set aside when its turn comes"
             if entry.state == FrameState.COMMITTED:
                 what = "its state is not touched by that"
-            scene.damage.say(
-                DamageKind.FRAME, f"frame {index}: its record in the frame log is damaged: {fault}; {what}"
-            )
+            said = f"frame {index}: its record in the frame log is damaged: {fault}; {what}"
+            scene.damage.say(DamageKind.FRAME, said, lasting=True)
 
 
 def _checkpoints(folder: Path) -> list[str]:

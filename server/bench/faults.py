@@ -248,7 +248,7 @@ def flipped_bits(study: Study, count: int, seed: int, told: Told) -> Outcome:
     counts = Counter(kind.rpartition(" ")[2] for kind in found.counts.elements())
     said = (
         f"{counts['noticed']} noticed, {counts['harmless']} harmless; {len(found.remade)} states made again from "
-        f"pictures, {len(found.lost)} named as lost"
+        f"pictures, {len(found.lost)} named as lost, {len(found.unreported)} without their report"
     )
     bar = "each noticed or harmless; no wrong picture, no 500, the scene goes on"
     return Outcome(f"{count} flipped bits of {', '.join(damage.KINDS)}, half while down", bar, said, found.faults)

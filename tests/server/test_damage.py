@@ -310,3 +310,25 @@ def test_flipped_bits_over_everything(tmp_path):
     study = of.Study(tmp_path, capture, [], {}, fake)
     outcome = faults.flipped_bits(study, 10, 1, lambda said: None)
     assert outcome.faults == []
+
+
+@pytest.mark.parametrize("restart", [False, True])
+def test_where_the_report_alone_is_damaged_the_state_stays(tmp_path, restart):
+    with contextlib.ExitStack() as stack:
+        http, sdk = stack.enter_context(serving(tmp_path, **(NEVER if restart else FAST)))
+        id = filled(http, sdk)
+        before = http.get(f"/v1/scenes/{id}/frames/2").json()
+        if restart:
+            stack.close()
+            http, sdk = stack.enter_context(serving(tmp_path, **NEVER))
+        file = tmp_path / "scenes" / id / "states" / "frame_000002.npz"
+        whole = file.read_bytes()
+        flip(file, whole.index(b'"psnr"') + 2)
+        if restart:
+            http.get(f"/v1/scenes/{id}/frames/2")  # reads the report
+        status_with(http, id, "its report is lost" if restart else "nothing is lost")
+        after = http.get(f"/v1/scenes/{id}/frames/2").json()
+        assert after["remade"] is False
+        assert after["psnr"] == (None if restart else before["psnr"])
+        assert restart or file.read_bytes() == whole
+        assert view(http, id, 2).status_code == 200
