@@ -173,6 +173,9 @@ def faults(
     kills: Annotated[int, typer.Option(min=0, help="kill -9 of the worker or the service, at random moments.")] = 30,
     cuts: Annotated[int, typer.Option(min=0, help="Files of the log that are cut.")] = 20,
     flips: Annotated[int, typer.Option(min=0, help="Files of the log in which a bit is flipped.")] = 1,
+    bits: Annotated[
+        int, typer.Option(min=0, help="Bits flipped one by one in states, checkpoints, journal and frames.")
+    ] = 200,
     seed: Annotated[int, typer.Option(min=0, help="Of the random moments and places.")] = 0,
     work: Annotated[Path, typer.Option(help="Folder for data folders and logs; what is there goes.")] = Path(
         "out/faults"
@@ -203,7 +206,7 @@ def faults(
         overrides(changes or []),
         {} if engine is None else {"SCAS4D_ENGINE": engine},
     )
-    outcomes = of_faults.run(study, moments=kills, cuts=cuts, flips=flips, seed=seed, told=typer.echo)
+    outcomes = of_faults.run(study, moments=kills, cuts=cuts, flips=flips, bits=bits, seed=seed, told=typer.echo)
     text = of_faults.table(outcomes)
     typer.echo(text)
     if out is not None:

@@ -9,7 +9,6 @@ first frame; clusters and neighbours are built again from the first frame, and a
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -19,17 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.captures.frame import Frame
+from scas4d_core.frame_files import checkpoint_file, checkpoint_of
 from scas4d_core.history import NEWEST_KEPT
 from scas4d_core.judge import Past
 from scas4d_core.npz import read_npz, write_npz
+from scas4d_core.told import told
 from scas4d_core.trial import Outcome
 from scas4d_core.views import TrainingView, ViewFactory
 from scas4d_core.warm_start import Motion
 
 FORMAT = 2
 """Of a checkpoint's file; another one is refused."""
-
-_FILE = re.compile(r"checkpoint_(\d{6,})\.npz")
 
 
 class CheckpointError(ValueError):
@@ -119,9 +118,9 @@ class Checkpoints:
             names = {str(name) for name in arrays.pop("names")}
             missing = names ^ set(arrays)
             if missing:
-                raise ValueError(f"{file}: {', '.join(sorted(missing))} went missing")
+                raise ValueError(f"{file.name}: {', '.join(sorted(missing))} went missing")
             if int(arrays["format"]) != FORMAT:
-                raise ValueError(f"{file}: format {int(arrays['format'])}, this version reads {FORMAT}")
+                raise ValueError(f"{file.name}: format {int(arrays['format'])}, this version reads {FORMAT}")
             pictures = {name[5:]: array for name, array in arrays.items() if name.startswith("seen.")}
             seen = factory.views(Frame(index, 0.0, pictures, {}), {}, use_masks=False) if pictures else ()
             motion = _unpacked(arrays) if "motion.seconds" in arrays else None
@@ -129,9 +128,9 @@ class Checkpoints:
             shown = dict(zip(arrays["shown.names"].tolist(), arrays["shown.prints"].tolist(), strict=True))
             return Carried(motion, arrays.get("labels"), seen, int(arrays["structure"]), past, shown)
         except FileNotFoundError:
-            raise CheckpointError(f"{file} is missing") from None
+            raise CheckpointError(f"{file.name} is missing") from None
         except (ValueError, KeyError, TypeError) as error:
-            raise CheckpointError(str(error)) from error
+            raise CheckpointError(told(error)) from error
 
     def clean(self, committed: Sequence[int]) -> None:
         """Removes the checkpoints of all but the newest commits; after a commit.
@@ -146,10 +145,11 @@ class Checkpoints:
 
     def indices(self) -> list[int]:
         """Frames that have a checkpoint, rising."""
-        return sorted(int(match[1]) for file in self.directory.iterdir() if (match := _FILE.fullmatch(file.name)))
+        found = (checkpoint_of(file.name) for file in self.directory.iterdir())
+        return sorted(index for index in found if index is not None)
 
     def _file(self, index: int) -> Path:
-        return self.directory / f"checkpoint_{index:06d}.npz"
+        return self.directory / checkpoint_file(index)
 
 
 def _packed(motion: Motion) -> dict[str, Any]:

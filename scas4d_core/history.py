@@ -17,11 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.frame_files import Arrays, FrameFiles, HistoryError, Stamp, UnreadableFrameError
+from scas4d_core.frame_files import Arrays, DamagedFrameError, FrameFiles, HistoryError, Stamp, UnreadableFrameError
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.npz import clear_parts
 
-__all__ = ["FIXED", "FRAMES_KEPT", "NEWEST_KEPT", "PER_FRAME", "History", "HistoryError", "UnreadableFrameError"]
+__all__ = [
+    "FIXED", "FRAMES_KEPT", "NEWEST_KEPT", "PER_FRAME", "DamagedFrameError", "History", "HistoryError",
+    "UnreadableFrameError",
+]  # fmt: skip
 
 PER_FRAME = ("means", "rotations", "factors", "colours", "foreground")
 """Arrays of ``Gaussians`` that may differ from frame to frame."""
@@ -56,11 +59,15 @@ class History:
         self._times: dict[int, float] = {}
         self._reports: dict[int, dict[str, Any]] = {}
         self._stamps: dict[int, Stamp] = {}
+        self._texts: dict[int, bytes] = {}
+        """Reports on disk of the frames that are in memory."""
         self._frames: OrderedDict[int, Arrays] = OrderedDict()
         if self._files is not None:
             self._files.directory.mkdir(parents=True, exist_ok=True)
             if self._files.listed():
-                raise HistoryError(f"{self.directory} already holds a history; open it with History.load or empty it")
+                raise HistoryError(
+                    f"{self._files.directory.name} already holds a history; open it with History.load or empty it"
+                )
 
     @classmethod
     def load(cls, directory: Path | str, only: Iterable[int] | None = None) -> History:
@@ -76,8 +83,8 @@ class History:
             HistoryError: no history there, or the file that all frames need is damaged.
         """
         files = FrameFiles(Path(directory))
-        if not files.fixed.exists():
-            raise HistoryError(f"{files.directory} holds no history: {files.fixed.name} is missing")
+        if not files.there:
+            raise HistoryError(f"{files.directory.name} holds no history: {files.fixed.name} is missing")
         history = cls()
         history._files = files
         history.refresh(only)
@@ -95,7 +102,7 @@ class History:
         folder = Path(directory)
         folder.mkdir(parents=True, exist_ok=True)
         clear_parts(folder)
-        return cls.load(folder) if FrameFiles(folder).fixed.exists() else cls(folder)
+        return cls.load(folder) if FrameFiles(folder).there else cls(folder)
 
     def save(self, directory: Path | str) -> None:
         """Writes a copy of this history into another directory, one frame at a time."""
@@ -139,12 +146,14 @@ class History:
                 raise HistoryError(f"frame {index}: {name} has {len(arrays[name])} rows; give {count}, one a Gaussian")
         frame = {name: np.array(arrays[name]) for name in PER_FRAME}
         if self._files is not None:
+            text = said.encode()
+            written = _as_written(frame, time, text)
             if not self._fixed:
-                self._files.write_fixed(fixed)
+                self._files.write_fixed(fixed, index, written)
             began = perf_counter()
-            written = {**frame, "time": np.float64(time), "report": np.frombuffer(said.encode(), np.uint8)}
             self._stamps[index] = self._files.write(index, written)
             self.record_seconds += (perf_counter() - began) * len(said) / self._stamps[index][0]
+            self._texts[index] = text
         else:
             self._stamps[index] = (sum(array.nbytes for array in frame.values()), 0)
         self._fixed = fixed
@@ -242,6 +251,63 @@ class History:
         return known
 
     @property
+    def files(self) -> FrameFiles | None:
+        """The files on disk, for who mends them (``scas4d_core.mending``); None in memory."""
+        return self._files
+
+    def take_faults(self) -> dict[str, str]:
+        """Files that were found damaged or gone since this was asked last, by name with the reason."""
+        if self._files is None:
+            return {}
+        faults, self._files.faults = self._files.faults, {}
+        return faults
+
+    def mend_fixed(self) -> dict[str, str]:
+        """Writes anew what every frame needs, and its copy, where they are damaged; for the process that appends.
+
+        Returns:
+            What was wrong with each file that was written, by name.
+        """
+        if self._files is None or not self._times or not self._fixed:
+            return {}
+        first = next(iter(self._times))
+        mended = self._files.mend_copies(first, self._fixed)
+        if self._files.path(first).name in mended:
+            self._stamps.update(self._files.stamped((first,)))
+        return mended
+
+    def write_again(self, index: int) -> bool:
+        """Writes the file of a committed frame anew, the same bits; for the process that appends.
+
+        Returns:
+            False where the frame is not in memory.
+        """
+        frame, text = self._frames.get(index), self._texts.get(index)
+        if self._files is None or frame is None or text is None or index not in self._times:
+            return False
+        self._stamps[index] = self._files.write(index, _as_written(frame, self._times[index], text))
+        return True
+
+    def replace(self, index: int, time: float, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:
+        """Writes the state of a frame whose file is damaged or gone anew; for the process that appends.
+
+        Args:
+            index: of a frame before the newest. time: seconds. arrays: ``PER_FRAME``. report: as for ``append``.
+
+        Raises:
+            HistoryError: the frame is not before the newest, or has another number of Gaussians.
+        """
+        assert self._files is not None
+        if index >= self._newest() or len(arrays["means"]) != len(self._fixed["ids"]):
+            raise HistoryError(f"frame {index} cannot take the place of one that was committed")
+        frame = {name: np.asarray(arrays[name]) for name in PER_FRAME}
+        text = json.dumps(dict(report), allow_nan=False).encode()
+        self._forget(index)
+        self._stamps[index] = self._files.write(index, _as_written(frame, time, text))
+        self.damaged.pop(index, None)
+        self._times = dict(sorted([*self._times.items(), (index, float(time))]))
+
+    @property
     def directory(self) -> Path | None:
         """Where the frames are kept; None in memory."""
         return None if self._files is None else self._files.directory
@@ -276,11 +342,15 @@ class History:
         self._require(index)
         if self._files is None:
             return dict(self._reports[index])
-        text = self._from_file(index, ("report",))["report"].tobytes()
+        text = self._texts.get(index)
+        if text is None:
+            text = self._from_file(index, ("report",))["report"].tobytes()
         try:
             report: dict[str, Any] = json.loads(text)
         except ValueError as error:
-            raise HistoryError(f"{self._files.path(index)}: its report is no JSON ({error})") from error
+            raise HistoryError(f"{self._files.path(index).name}: its report is no JSON ({error})") from error
+        if index in self._frames:
+            self._texts[index] = text
         return report
 
     def gaussians(self, index: int) -> Gaussians:
@@ -335,7 +405,7 @@ class History:
         if index in self._times:
             return
         if index in self.damaged:
-            raise UnreadableFrameError(f"frame {index} cannot be read: {self.damaged[index]}")
+            raise DamagedFrameError(f"frame {index} cannot be read: {self.damaged[index]}")
         held = f"{next(iter(self._times))} to {self._newest()}" if self._times else "none yet"
         raise UnreadableFrameError(f"frame {index} is not in the history; committed frames: {held}")
 
@@ -348,14 +418,23 @@ class History:
         try:
             return self._files.read(index, names)
         except FileNotFoundError:
-            self._forget(index)  # the process that appends has deleted it
+            self._forget(index)  # the process that appends has deleted it, or somebody else has
+            self._files.faults[self._files.path(index).name] = f"{self._files.path(index).name} is gone"
             self._require(index)
             raise
+        except UnreadableFrameError as error:
+            stamp = self._stamps.get(index)
+            self._forget(index)
+            self.damaged[index] = str(error)
+            if stamp is not None:  # until another file is there
+                self._stamps[index] = stamp
+            raise DamagedFrameError(str(error)) from error
 
     def _forget(self, index: int) -> None:
         self._times.pop(index, None)
         self._reports.pop(index, None)
         self._stamps.pop(index, None)
+        self._texts.pop(index, None)
         self._frames.pop(index, None)
 
     def _keep(self, index: int, frame: Arrays) -> None:
@@ -364,3 +443,8 @@ class History:
             newest = self._newest()
             for old in [i for i in self._frames if i != newest][: max(0, len(self._frames) - FRAMES_KEPT)]:
                 del self._frames[old]
+                self._texts.pop(old, None)
+
+
+def _as_written(frame: Arrays, time: float, report: bytes) -> dict[str, Any]:
+    return {**frame, "time": np.float64(time), "report": np.frombuffer(report, np.uint8)}

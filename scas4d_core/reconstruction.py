@@ -7,6 +7,7 @@ before (``checkpoint``), so that ``resume`` goes on after any end of the process
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, replace
 from math import inf, isfinite
 from time import perf_counter
@@ -169,7 +170,18 @@ class Reconstruction(Committed):
         if left is not None and not same:
             faults.append("clusters came out otherwise than before: the next update starts without a motion")
         self.resumed = Resumed(index, history.cut(index), faults, cold=left is None or not same)
+        self._checkpoints.clean(history.indices)
+        if self.resumed.cold:
+            with suppress(OSError):  # for want of room: the next start is as cold as this one
+                self.write_checkpoint(index)
         return self
+
+    def write_checkpoint(self, index: int) -> bool:
+        """Writes the checkpoint of the newest commit again; False for another one, which is not in memory."""
+        if self._checkpoints is None or index != self.history.indices[-1]:
+            return False
+        self._checkpoints.save(index, self._carried)
+        return True
 
     @classmethod
     def aside(cls, rig: Rig, settings: Settings, history: History, index: int) -> Reconstruction:

@@ -14,12 +14,13 @@ from blake3 import blake3
 from client.wire import SceneCreate
 from scas4d_core.npz import sync_folder
 from scas4d_core.settings import Settings
-from server.facts import Created
+from scas4d_core.told import told
+from server.facts import Created, Fact
 from server.journal import replay
 
 FORMAT = 1
 SCENE_FILE, JOURNAL_FILE, FRAMES_FOLDER = "scene.json", "journal.log", "frames"
-STATES_FOLDER = "states"
+STATES_FOLDER, POINTS_FILE = "states", "points.npz"
 
 
 class DefinitionError(ValueError):
@@ -62,7 +63,7 @@ class Definition:
                 Settings.model_validate(data["settings"]),
             )
         except (KeyError, TypeError, ValueError) as error:  # pydantic's error is a ValueError
-            raise DefinitionError(f"the definition cannot be read: {error}") from None
+            raise DefinitionError(f"the definition cannot be read: {told(error)}") from None
 
 
 def write_whole(path: Path, data: bytes) -> None:
@@ -94,27 +95,46 @@ def read_definition(folder: Path) -> tuple[Definition, str | None]:
     Raises:
         DefinitionError: it is in neither of them.
     """
+    found, said = _checked(folder)
+    if isinstance(found, Definition):
+        return found, None
+    created: list[Created] = []
+    replay(folder / JOURNAL_FILE, lambda fact: created.append(fact) if isinstance(fact, Created) else None)
+    if created:
+        return Definition.of_json(created[0].definition), f"{said}; taken from the journal"
+    raise DefinitionError(f"{said}, and the journal does not have it either")
+
+
+def check_definition(folder: Path) -> str | None:
+    """What is wrong with `scene.json`, None: nothing."""
+    return _checked(folder)[1]
+
+
+def _checked(folder: Path) -> tuple[Definition | None, str | None]:
+    """The definition in `scene.json`, or what is wrong with that."""
     try:
         data = json.loads((folder / SCENE_FILE).read_bytes())
         if _digest(json.dumps(data["scene"], indent=1)) != data["blake3"]:
             raise DefinitionError("it fails its checksum")
         return Definition.of_json(data["scene"]), None
     except FileNotFoundError:
-        said = f"{SCENE_FILE} is gone"
+        return None, f"{SCENE_FILE} is gone"
     except (OSError, KeyError, TypeError, ValueError) as error:
-        said = f"{SCENE_FILE} is damaged ({error})"
-    told: list[Created] = []
-    replay(folder / JOURNAL_FILE, lambda fact: told.append(fact) if isinstance(fact, Created) else None)
-    if told:
-        return Definition.of_json(told[0].definition), f"{said}; taken from the journal"
-    raise DefinitionError(f"{said}, and the journal does not have it either")
+        return None, f"{SCENE_FILE} is damaged ({told(error)})"
 
 
 def is_nothing(folder: Path) -> bool:
-    """Whether a folder without `scene.json` is of a scene that was never acknowledged: it has no frame and no state."""
-    if (folder / SCENE_FILE).exists():
+    """Whether a folder without `scene.json` is of a scene that was never acknowledged.
+
+    Then it has no frame, no state, no points, and no fact but that of its making.
+    """
+    if (folder / SCENE_FILE).exists() or (folder / POINTS_FILE).exists():
         return False
-    return not any(any((folder / inside).glob("*")) for inside in (FRAMES_FOLDER, STATES_FOLDER))
+    if any(any((folder / inside).glob("*")) for inside in (FRAMES_FOLDER, STATES_FOLDER)):
+        return False
+    facts: list[Fact] = []
+    replay(folder / JOURNAL_FILE, facts.append)
+    return len(facts) < 2
 
 
 def _digest(text: str) -> str:

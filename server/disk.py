@@ -7,6 +7,7 @@ import fcntl
 import os
 from pathlib import Path
 
+from scas4d_core.told import told
 from server.problems import Problem
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
@@ -26,7 +27,7 @@ def full_disk(error: Exception) -> Problem:
     """The answer where there is no room."""
     return Problem(
         507,
-        f"the disk has no room: {error}",
+        f"the disk has no room: {told(error)}",
         remedy="free room in the service's data folder, or shorten the scene's retention, and send the same again",
         headers={"Retry-After": "5"},
     )

@@ -50,6 +50,9 @@ class Reconstruction(Protocol):
     ) -> None:
         """Another budget from the next step on; what is None is as the scene was made."""
 
+    def write_checkpoint(self, index: int) -> bool:
+        """Writes the checkpoint of the newest commit again; False for another one."""
+
 
 class Reader(Protocol):
     """What the reader process owns: views, tracks and parts of the committed states. Cameras, points: user's world."""
@@ -118,6 +121,20 @@ class Engine(Protocol):
     ) -> Replayed:
         """Updates the frames after a committed one again, in memory, with another number of iterations."""
 
+    def remake(
+        self,
+        rig: Rig,
+        settings: Any,
+        history: History,
+        base: int,
+        frame: Frame,
+        budget: Mapping[str, Any],
+        *,
+        dropped: Mapping[str, str] | None = None,
+        notes: Mapping[str, Any] | None = None,
+    ) -> dict[str, Any]:
+        """Makes a committed state that was damaged again, from that of `base`; answers the report written with it."""
+
     def warm_up(self) -> None:
         """Compiles or loads what the first frames would wait for; called once, in a process of its own."""
 
@@ -173,6 +190,23 @@ class CoreEngine:
 
         _one_thread()
         return replay(rig, settings, history, base, frames, iterations, over)
+
+    def remake(
+        self,
+        rig: Rig,
+        settings: Any,
+        history: History,
+        base: int,
+        frame: Frame,
+        budget: Mapping[str, Any],
+        *,
+        dropped: Mapping[str, str] | None = None,
+        notes: Mapping[str, Any] | None = None,
+    ) -> dict[str, Any]:
+        """`scas4d_core.mending.remake`."""
+        from scas4d_core.mending import remake
+
+        return remake(rig, settings, history, base, frame, budget, dropped=dropped, notes=notes)
 
     def reader(self, rig: Rig, settings: Any, history: History) -> Reader:
         """`Committed`, on one thread: the others belong to the update."""

@@ -96,6 +96,14 @@ class StatesDeleted(_Fact):
     reason: str = "retention"
 
 
+class StateFound(_Fact):
+    """A committed state was found whose acknowledgement the journal has lost; `time` is that of the state."""
+
+    fact: Literal["state_found"] = "state_found"
+    index: int
+    time: float | None
+
+
 class Paused(_Fact):
     """The scene was paused, or told to go on."""
 
@@ -121,6 +129,7 @@ Fact = Annotated[
     | Died
     | FramesDeleted
     | StatesDeleted
+    | StateFound
     | Paused
     | Budgeted,
     Field(discriminator="fact"),

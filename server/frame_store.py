@@ -12,14 +12,14 @@ import fcntl
 import os
 import re
 import secrets
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from client.wire import FileKind, FrameHead
 from scas4d_core.npz import sync_folder
 from server.facts import Hashes
-from server.record_log import BY_FILE, CHECKSUM, Kind, Record, checksum, opening, read_at
+from server.record_log import BY_FILE, CHECKSUM, Kind, Record, checksum, opening, read_at, streamed_record
 
 FILE = re.compile(r"(\d{10})-[0-9a-f]{12}\.frame")
 DIRECT = getattr(os, "O_DIRECT", 0)
@@ -163,6 +163,21 @@ def read_pictures(folder: Path, name: str) -> Pictures:
         return Pictures(found.index, found.head["time"], bool(found.head["part"]), images, masks, hashes)
     except (KeyError, TypeError, ValueError) as error:
         raise FrameDamage(f"{name}: its head is not one of pictures ({error!r})") from None
+
+
+def checked(folder: Path, name: str) -> Iterator[int]:
+    """Reads a record again and yields how many bytes, piece by piece; at its end all of it has been compared.
+
+    Raises:
+        FrameDamage: it is gone, cut, or not what was written.
+    """
+    try:
+        with (folder / name).open("rb") as file:
+            yield from streamed_record(file)
+    except OSError as error:
+        raise FrameDamage(f"{name}: {error.strerror}") from None
+    except ValueError as error:
+        raise FrameDamage(f"{name}: {error}") from None
 
 
 def stored(folder: Path) -> dict[str, int]:

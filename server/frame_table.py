@@ -6,6 +6,7 @@ dictionaries beside, and the numbers of a commit stay with the newest few: those
 
 from __future__ import annotations
 
+import copy
 from array import array
 from bisect import bisect_left
 from collections import OrderedDict
@@ -26,8 +27,9 @@ LOST = "the journal's record of this frame is damaged, and so it is not known wh
 
 STATES = tuple(FrameState)
 CODES = {state: code for code, state in enumerate(STATES)}
-TIME, RECEIPT, DELETED = 1, 2, 4
-"""Flags: it has a time; it was acknowledged, and has an identity; its committed state is gone."""
+TIME, RECEIPT, DELETED, UNREADABLE = 1, 2, 4, 8
+"""Flags: it has a time; it was acknowledged, and has an identity; its committed state is gone; it is damaged, and is
+being made again."""
 IDENTITY = 32
 """Bytes."""
 FEW = 32
@@ -105,6 +107,14 @@ class FrameTable:
         found: NDArray[np.bool_] = (np.frombuffer(bytes(self._flags), np.uint8) & flag) != 0
         return found
 
+    def copy(self) -> FrameTable:
+        """All of it but the numbers of commits, for who goes through it elsewhere."""
+        new = FrameTable(self.scene)
+        for name in ("_states", "_flags", "_times", "_identities", "_skipped_by", "_files", "counts", "committed"):
+            setattr(new, name, copy.copy(getattr(self, name)))
+        new._notes = copy.deepcopy(self._notes)
+        return new
+
     # Changes; `server.ledger` makes them.
 
     def take(self, index: int, time: float, identity: str, files: tuple[str, ...], parts: OpenFrame | None) -> None:
@@ -126,7 +136,21 @@ class FrameTable:
         self.counts[state] += 1
         self._states[index] = CODES[state]
         if FrameState.COMMITTED in (before, state):
-            self._list(index, state == FrameState.COMMITTED and not self._flags[index] & DELETED)
+            self._list(index, state == FrameState.COMMITTED and not self._flags[index] & (DELETED | UNREADABLE))
+
+    def found(self, index: int, time: float | None) -> None:
+        """Its committed state is there, and nothing else is known of it."""
+        if time is not None:
+            self._times[index] = time
+            self._flags[index] |= TIME
+        if index in self._notes:
+            self._notes[index].error = None
+        self.move(index, FrameState.COMMITTED)
+
+    def set_unreadable(self, index: int, unreadable: bool) -> None:
+        """Its committed state is damaged and is being made again; or that is over."""
+        self._flags[index] = self._flags[index] | UNREADABLE if unreadable else self._flags[index] & ~UNREADABLE
+        self.move(index, STATES[self._states[index]])
 
     def skip(self, index: int, by: int) -> None:
         """The frame was skipped for another one."""
@@ -146,9 +170,13 @@ class FrameTable:
             self._list_all()
         return new
 
-    def restore_state(self, index: int) -> None:
-        """The state of a frame that is not committed now may be made again."""
-        self._flags[index] &= ~DELETED
+    def restore_state(self, index: int) -> bool:
+        """The state of a frame that is not committed now may be made again; answers whether it was gone."""
+        gone = bool(self._flags[index] & DELETED)
+        self._flags[index] &= ~(DELETED | UNREADABLE)
+        if index in self._notes:
+            self._notes[index].error = None
+        return gone
 
     def commit_up_to(self, last: int) -> None:
         """All frames up to `last` that are queued or at work are committed: many at once, after a start."""
@@ -189,8 +217,15 @@ class FrameTable:
             self._numbers[index] = committed
             self._numbers.move_to_end(index, last=False)
 
+    def amend(self, index: int, committed: Mapping[str, Any]) -> None:
+        """The same of a frame whose state is another one now."""
+        if index in self._numbers:
+            self._numbers[index] = committed
+        else:
+            self.remember(index, committed)
+
     def _list_all(self) -> None:
-        readable = (self.states() == CODES[FrameState.COMMITTED]) & ~self.flagged(DELETED)
+        readable = (self.states() == CODES[FrameState.COMMITTED]) & ~self.flagged(DELETED | UNREADABLE)
         self.committed = array("q", np.flatnonzero(readable).astype(np.int64).tobytes())
 
     def _list(self, index: int, readable: bool) -> None:
@@ -227,6 +262,11 @@ class FrameEntry:
         return bool(self._table._flags[self.index] & DELETED)
 
     @property
+    def unreadable(self) -> bool:
+        """It was committed, its state is damaged, and it is being made again."""
+        return bool(self._table._flags[self.index] & UNREADABLE)
+
+    @property
     def time(self) -> float | None:
         """Seconds; None where it never came."""
         return self._table._times[self.index] if self._table._flags[self.index] & TIME else None
@@ -247,6 +287,11 @@ class FrameEntry:
         return FrameReceipt(scene=self._table.scene, index=self.index, time=time, identity=identity)
 
     @property
+    def skipped_by(self) -> int:
+        """The frame that it was skipped for, where it was skipped."""
+        return self._table._skipped_by[self.index]
+
+    @property
     def files(self) -> tuple[str, ...]:
         """Its records in the frame log; none once they are deleted."""
         return self._table._files.get(self.index, ())
@@ -262,8 +307,13 @@ class FrameEntry:
         if (error := self.note.error) is not None:
             return error
         if self.state == FrameState.SKIPPED:
-            return f"skipped: frame {self._table._skipped_by[self.index]} came and the queue was full"
+            return f"skipped: frame {self.skipped_by} came and the queue was full"
         return LOST if self.state == FrameState.SET_ASIDE else None
+
+    @property
+    def numbers(self) -> Mapping[str, Any] | None:
+        """What was committed with it, where that is in memory."""
+        return self._table._numbers.get(self.index)
 
     @property
     def measured(self) -> bool:

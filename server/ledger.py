@@ -5,8 +5,9 @@ The running scene and the one that is found again after a restart go through the
 
 from __future__ import annotations
 
+import copy
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,13 +25,16 @@ from server.facts import (
     Paused,
     SetAside,
     Skipped,
+    StateFound,
     StatesDeleted,
     Taken,
 )
-from server.frame_table import CODES, DELETED, LOST, RECEIPT, FrameTable
+from server.frame_table import CODES, DELETED, FEW, LOST, RECEIPT, FrameTable
 
 __all__ = ["LOST", "Ledger", "OpenFrame", "frame_identity"]
 
+RETENTION = "retention"
+"""Why states are deleted, where nothing is wrong with them."""
 HOPELESS = "the scene has failed at a frame before"
 
 
@@ -134,6 +138,12 @@ class Ledger:
             case StatesDeleted():
                 self._have(max(fact.frames, default=-1))
                 self.states_deleted += self.frames.delete_states(fact.frames)
+                if fact.reason != RETENTION and len(fact.frames) < FEW:
+                    for index in fact.frames:
+                        self.frames.note(index).error = fact.reason
+            case StateFound():
+                self._have(fact.index)
+                self.frames.found(fact.index, fact.time)
             case Paused():
                 self.paused = fact.paused
             case Budgeted():
@@ -154,11 +164,12 @@ class Ledger:
         """A frame is in another state."""
         self.frames.move(index, state)
 
-    def reconcile(self, indices: Sequence[int], damaged: Mapping[int, str]) -> list[Fact]:
+    def reconcile(self, indices: Sequence[int], damaged: Mapping[int, str], remake: Collection[int] = ()) -> list[Fact]:
         """Brings the frames in line with the committed states that are there, and tells what the journal lacks.
 
         Args:
             indices: of the states that can be read, rising. damaged: states that cannot, with the reason.
+            remake: of those that are damaged or gone, states that will be made again: nothing is told of them.
 
         Returns:
             Facts, already applied, that have to be appended: states that are gone, frames that have to be done again
@@ -174,7 +185,7 @@ class Ledger:
         codes = frames.states()
         for index in np.flatnonzero(codes[last + 1 :] == CODES[FrameState.COMMITTED]) + last + 1:
             frames.move(int(index), FrameState.QUEUED)
-            frames.restore_state(int(index))
+            self.states_deleted -= frames.restore_state(int(index))
             if not frames[int(index)].files:
                 facts.append(SetAside(index=int(index), reason="its state is damaged, and its pictures are deleted"))
         frames.commit_up_to(last)
@@ -183,13 +194,24 @@ class Ledger:
             frames.note(int(index)).error = None
             frames.move(int(index), FrameState.COMMITTED)
         unreadable = (frames.states() == CODES[FrameState.COMMITTED]) & ~frames.flagged(DELETED) & ~readable
-        gone = tuple(np.flatnonzero(unreadable).tolist())
+        gone = tuple(index for index in np.flatnonzero(unreadable).tolist() if index not in remake)
+        for again in remake:
+            if again < count and unreadable[again]:
+                frames.set_unreadable(again, True)
         if gone:
             said = "; ".join(damaged[index] for index in gone if index in damaged)
             facts.append(StatesDeleted(frames=gone, reason=said or "found gone"))
         for fact in facts:
             self.apply(fact)
         return facts
+
+    def copy(self) -> Ledger:
+        """As it is now, for who goes through it elsewhere; without the numbers of commits."""
+        new = Ledger(self.scene)
+        new.frames, new.open = self.frames.copy(), copy.deepcopy(self.open)
+        new.paused, new.fatal, new.states_deleted = self.paused, self.fatal, self.states_deleted
+        new.budgets = list(self.budgets)
+        return new
 
     def waiting(self) -> list[int]:
         """Frames that are queued and not at work, rising. Only the newest can be."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal
 
@@ -61,6 +62,26 @@ class FrameReady:
     files: tuple[str, ...]
     identity: str
     budget: Budget = field(default_factory=Budget)
+
+
+@dataclass(frozen=True)
+class Mend:
+    """Files of the states' folder that were found damaged or gone: each is looked at, and written again if it can be.
+
+    `times` and `reports` of frames, as far as the service has them in memory.
+    """
+
+    names: tuple[str, ...]
+    times: dict[int, float] = field(default_factory=dict)
+    reports: dict[int, dict[str, Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Remake:
+    """The state of a frame is made again from its pictures, starting from that of the committed frame `base`."""
+
+    frame: FrameReady
+    base: int
 
 
 @dataclass(frozen=True)
@@ -131,6 +152,47 @@ class SetAside:
     reason: str
     dropped: dict[str, str] = field(default_factory=dict)
     fatal: bool = False
+
+
+class MendOutcome(StrEnum):
+    """What came of a file that was found damaged."""
+
+    WHOLE = "whole"
+    """It is not: it was written meanwhile, or the disk could not read it once."""
+    WRITTEN = "written"
+    """It was written again, the same bits."""
+    REPORT_LOST = "report_lost"
+    """The state was written again, the same bits; its report was damaged, and nobody has it in memory."""
+    DAMAGED = "damaged"
+    """It is, and nothing to write it from is in memory."""
+    GONE = "gone"
+    """It was deleted by the rules of the scene."""
+    REMADE = "remade"
+    """The state was made again from pictures."""
+    LOST = "lost"
+    """The state could not be made again."""
+    NO_ROOM = "no_room"
+    """The disk is full; to be tried again."""
+
+
+@dataclass(frozen=True)
+class Mended:
+    """What came of one file (`Mend`) or of one state (`Remake`, with its new report)."""
+
+    name: str
+    outcome: MendOutcome
+    reason: str = ""
+    report: dict[str, Any] = field(default_factory=dict)
+
+
+# Of every process that reads states.
+
+
+@dataclass(frozen=True)
+class Damaged:
+    """Files of the states' folder that could not be read, by name with the reason."""
+
+    files: dict[str, str]
 
 
 # Of the replayer, which has a process for each replay.

@@ -60,6 +60,17 @@ RESTARTS = Counter(
     ["process"],
     registry=registry,
 )
+DAMAGE = Counter(
+    "scas4d_damage",
+    "Damage found on disk while the service ran: state, checkpoint, fixed, journal, frame, definition, points.",
+    ["kind"],
+    registry=registry,
+)
+SCRUBBED = Counter(
+    "scas4d_scrubbed_bytes", "Read again in the background and compared with their checksums.", registry=registry
+)
+for kind in ("state", "checkpoint", "fixed", "journal", "frame", "definition", "points"):
+    DAMAGE.labels(kind)
 for state in ("acknowledged", "committed", "set_aside", "skipped", "missing"):
     FRAMES.labels(state)
 for how in ("held", "in_part"):

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import OrderedDict, deque
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -21,6 +22,7 @@ from server import metrics, renderer, track_answers
 from server.messages import (
     Answer,
     Ask,
+    Damaged,
     LabelsQuery,
     PartsQuery,
     Query,
@@ -42,6 +44,9 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
 COUNTS_KEPT = 8
 """Numbers of parts whose labels are kept."""
 
+Noticed = Callable[[Mapping[str, str]], None]
+"""Told of files of the states' folder that cannot be read, by name with the reason."""
+
 log = logging.getLogger("scas4d.server")
 
 
@@ -59,20 +64,29 @@ class Line:
 
     Args:
         entry: what runs in the process. eager: start it now, not with the first question.
-        grace: seconds, see above.
+        grace: seconds, see above. damaged: told of files that the process found damaged.
 
     Attributes:
         process: or None, before the first question and while it rests.
     """
 
     def __init__(
-        self, entry: Entry, spec: SceneSpec, server: ServerSettings, placement: Placement, *, eager: bool, grace: float
+        self,
+        entry: Entry,
+        spec: SceneSpec,
+        server: ServerSettings,
+        placement: Placement,
+        *,
+        eager: bool,
+        grace: float,
+        damaged: Noticed,
     ) -> None:
         self._entry = entry
         self._spec = spec
         self._server = server
         self._placement = placement
         self._grace = grace
+        self._damaged = damaged
         self._waiting: deque[_Turn] = deque()
         self._at_work: _Turn | None = None
         self.process: Process | None = None
@@ -157,7 +171,10 @@ class Line:
         self._at_work = self._waiting.popleft()
         self.process.send(Ask(self._at_work.number, self._at_work.query))
 
-    def _answered(self, message: Answer | Refused) -> None:
+    def _answered(self, message: Answer | Refused | Damaged) -> None:
+        if isinstance(message, Damaged):
+            self._damaged(message.files)
+            return
         turn = self._at_work
         if turn is None or turn.number != message.number:  # of a process that was given up
             return
@@ -223,10 +240,11 @@ class Readers:
         views, bulk: the two processes.
     """
 
-    def __init__(self, spec: SceneSpec, server: ServerSettings, placement: Placement) -> None:
+    def __init__(self, spec: SceneSpec, server: ServerSettings, placement: Placement, damaged: Noticed) -> None:
         self._spec = spec
-        self.views = Line(renderer.views, spec, server, placement, eager=True, grace=GRACE_VIEWS_S)
-        self.bulk = Line(renderer.bulk, spec, server, placement, eager=False, grace=GRACE_BULK_S)
+        of_all = partial(Line, spec=spec, server=server, placement=placement, damaged=damaged)
+        self.views = of_all(renderer.views, eager=True, grace=GRACE_VIEWS_S)
+        self.bulk = of_all(renderer.bulk, eager=False, grace=GRACE_BULK_S)
         self._commits = 0
         self._labels: OrderedDict[int | None, Labels] = OrderedDict()
         self._finding: dict[int | None, asyncio.Task[Labels]] = {}

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
+from scas4d_core.told import told
 from server.engine import load_engine
 from server.messages import Stop
 from server.placement import Placement, Process
@@ -40,7 +41,7 @@ def main(engine: str, connection: Connection[Any, Any]) -> None:
         connection.send(WarmedUp())
     except Exception as error:
         log.exception("the kernels could not be warmed up")
-        connection.send(WarmedUp(f"{type(error).__name__}: {error}"))
+        connection.send(WarmedUp(f"{type(error).__name__}: {told(error)}"))
     with contextlib.suppress(EOFError, OSError):
         connection.recv()  # until told to end, or until the service is gone: what was sent is read by then
     os._exit(0)

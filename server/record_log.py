@@ -30,7 +30,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from blake3 import blake3
 
@@ -175,7 +175,14 @@ ENOUGH = 2 * (MAX_HEAD + PREFIX + CHECKSUM)
 """So much of a log behind a place tells whether a record without a body, as facts are, is whole there."""
 
 
-def streamed(file: BinaryIO) -> Iterator[Head | Damage]:
+class Readable(Protocol):
+    """What is read piece by piece."""
+
+    def read(self, size: int, /) -> bytes:
+        """At most so many bytes; none at the end."""
+
+
+def streamed(file: Readable) -> Iterator[Head | Damage]:
     """Heads of a log of small records, in order, and what lies between them; the log need not fit in memory."""
     data, start, at, ended = b"", 0, 0, False
     while True:
@@ -238,3 +245,39 @@ def _skip(data: memoryview, at: int, reason: str) -> tuple[Damage, int]:
         if CRC.unpack_from(data, following + HEADER.size)[0] == zlib.crc32(head, zlib.crc32(header)):
             return Damage(at, following, reason), following
     return Damage(at, len(data), reason, torn=True), len(data)
+
+
+COMPARED = 1 << 20
+"""Bytes of a record that `streamed_record` reads at a time."""
+
+
+def streamed_record(file: Readable) -> Iterator[int]:
+    """Reads a file that is one record, and yields how many bytes, piece by piece; it need not fit in memory.
+
+    Raises:
+        ValueError: it is not whole.
+    """
+    header = file.read(PREFIX)
+    if len(header) < PREFIX or header[:4] != MAGIC:
+        raise ValueError("no record begins here")
+    _, version, _, nought, head_length, _, body_length = HEADER.unpack_from(header)
+    if version not in (WHOLE, BY_FILE) or nought or head_length > MAX_HEAD:
+        raise ValueError("the header is of another version, damaged, or cut")
+    head = file.read(head_length)
+    if CRC.unpack_from(header, HEADER.size)[0] != zlib.crc32(head, zlib.crc32(header[: HEADER.size])):
+        raise ValueError("the header or head fails its checksum")
+    sizes = [body_length] if version == WHOLE else [int(said["size"]) for said in json.loads(head)["files"]]
+    whole = blake3(header + head)
+    for size in sizes:
+        digest = whole if version == WHOLE else blake3()
+        while size:
+            piece = file.read(min(size, COMPARED))
+            if not piece:
+                raise ValueError("it is cut")
+            digest.update(piece)
+            size -= len(piece)
+            yield len(piece)
+        if version == BY_FILE:
+            whole.update(digest.digest())
+    if whole.digest(CHECKSUM) != file.read(CHECKSUM) or file.read(1):
+        raise ValueError("the record fails its checksum")

@@ -15,12 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.wire import parts_model
-from scas4d_core.history import History, UnreadableFrameError
+from scas4d_core.frame_files import frame_file
+from scas4d_core.history import DamagedFrameError, History, UnreadableFrameError
+from scas4d_core.told import told
 from server import encode, track_answers
 from server.engine import Reader, load_engine
 from server.messages import (
     Answer,
     Ask,
+    Damaged,
     LabelsQuery,
     PartsQuery,
     PlyQuery,
@@ -36,6 +39,9 @@ from server.part_labels import PartLabels
 
 BULK_NICE = 10
 """Added to the niceness of the process for tracks, parts and exports: views and updates go ahead of them."""
+
+DAMAGED_AT_ONCE = 8
+"""States that may turn out damaged in one search for parts, which is then made without them."""
 
 log = logging.getLogger("scas4d.renderer")
 
@@ -64,7 +70,10 @@ def _serve(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
         if isinstance(message, Refresh):
             renderer.changed(message.frames)
         elif isinstance(message, Ask):
-            connection.send(renderer.answer(message))
+            answer = renderer.answer(message)
+            if found := renderer.take_faults():  # before whoever was refused asks again
+                connection.send(Damaged(found))
+            connection.send(answer)
     logging.shutdown()
     os._exit(0)
 
@@ -106,19 +115,42 @@ class Renderer:
         """Part labels, found once for what is committed now."""
         return self._parts.of(self.reader, self.history, count)
 
+    def take_faults(self) -> dict[str, str]:
+        """Files that were found damaged or gone since this was asked last, by name with the reason."""
+        return {} if self._history is None else self._history.take_faults()
+
+    def _note_missing(self, query: Query) -> None:
+        """Frames that the service takes for committed and that are not here: it knows whether they were deleted."""
+        frames = query.frames if isinstance(query, TracksQuery) else (getattr(query, "frame", None),)
+        history = self._history
+        if history is not None and history.files is not None:
+            known = set(history.indices)
+            for index in frames:
+                if index is not None and index not in known:
+                    history.files.faults.setdefault(frame_file(index), f"{frame_file(index)} is gone")
+
     def answer(self, ask: Ask) -> Answer | Refused:
         """The encoded answer, or why there is none."""
-        try:
-            return self._answer(ask.number, ask.query)
-        except UnreadableFrameError as error:  # deleted since the door looked, or damaged
-            log.warning("scene %s, %s: %s", self.spec.folder.name, type(ask.query).__name__, error)
-            return Refused(ask.number, str(error), status=404)
-        except ValueError as error:
-            log.warning("scene %s refused %s: %s", self.spec.folder.name, type(ask.query).__name__, error)
-            return Refused(ask.number, str(error))
-        except Exception as error:
-            log.exception("scene %s, %s", self.spec.folder.name, type(ask.query).__name__)
-            return Refused(ask.number, f"{type(error).__name__}: {error}", status=500)
+        asked = type(ask.query).__name__
+        for more in range(DAMAGED_AT_ONCE, -1, -1):
+            try:
+                return self._answer(ask.number, ask.query)
+            except DamagedFrameError as error:
+                log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
+                if more and isinstance(ask.query, PartsQuery | LabelsQuery):  # found from all others
+                    continue
+                return Refused(ask.number, f"{told(error)}; it is mended if it can be", status=503)
+            except UnreadableFrameError as error:  # deleted since the door looked
+                log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
+                self._note_missing(ask.query)
+                return Refused(ask.number, told(error), status=404)
+            except ValueError as error:
+                log.warning("scene %s refused %s: %s", self.spec.folder.name, asked, error)
+                return Refused(ask.number, told(error))
+            except Exception as error:
+                log.exception("scene %s, %s", self.spec.folder.name, asked)
+                return Refused(ask.number, f"{type(error).__name__}: {told(error)}", status=500)
+        raise AssertionError("the last turn returns")
 
     def _answer(self, number: int, query: Query) -> Answer:
         match query:

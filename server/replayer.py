@@ -11,9 +11,10 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from scas4d_core.history import History
+from scas4d_core.told import told
 from server.decoding import decode, read
 from server.engine import load_engine
-from server.messages import ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
+from server.messages import Damaged, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
 from server.worker import end_with_parent
 
 NICE = 15
@@ -34,7 +35,7 @@ def main(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
         _replay(spec, connection)
     except Exception as error:  # whatever the engine raises, the service goes on and says so
         log.exception("scene %s: the replay failed", spec.scene.folder.name)
-        fault = f"{type(error).__name__}: {error}"
+        fault = f"{type(error).__name__}: {told(error)}"
     with contextlib.suppress(EOFError, OSError):  # the service is gone
         connection.send(ReplayEnded(fault))
         logging.shutdown()
@@ -47,8 +48,12 @@ def _replay(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
     # Read once: while this goes on, the scene's retention may delete records and states.
     frames = [partial(decode, scene.rig, message, read(scene.frames, message)) for message in spec.frames]
     history = History.load(scene.states, only=(spec.first, spec.base))
-    for index in (spec.first, spec.base):
-        history.gaussians(index)
+    try:
+        for index in (spec.first, spec.base):
+            history.gaussians(index)
+    finally:
+        if faults := history.take_faults():
+            connection.send(Damaged(faults))
     engine = load_engine(scene.engine)
     for iterations in spec.iterations:
         found = engine.replay(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from client.wire import PointKind, ReplayRequest, ReplayState, ReplayStatus, TradeoffPoint
 from server import replayer
 from server.budgets import effective
-from server.messages import FrameReady, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
+from server.messages import Damaged, FrameReady, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
 from server.placement import Ended, Placement, Process
 from server.problems import Problem, counted
 
@@ -144,6 +144,8 @@ class Replays:
         if life is not self._life:
             return
         match message:
+            case Damaged():
+                self._scene.mending.noticed(message.files)
             case ReplayUpdated():
                 self.status.done += 1
             case ReplayPoint():

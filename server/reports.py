@@ -42,6 +42,7 @@ def fill(report: FrameReportModel, committed: Mapping[str, Any]) -> None:
     report.curve = [CurvePointModel(**point) for point in committed.get("curve", [])]
     report.errors = dict(committed.get("errors", {}))
     report.threads = committed.get("threads")
+    report.remade = bool(committed.get("remade"))
     report.write_seconds = committed.get("write_seconds")
     budget = committed.get("budget")
     report.budget = None if budget is None else Budget.model_validate(budget)
@@ -79,3 +80,8 @@ class ReportFiles:
                 return self._history.report(index)
             except HistoryError:
                 return {}
+
+    def take_faults(self) -> dict[str, str]:
+        """Files that were found damaged or gone since this was asked last, by name with the reason."""
+        with self._turn:
+            return {} if self._history is None else self._history.take_faults()

@@ -6,22 +6,26 @@ import asyncio
 import logging
 from collections.abc import Coroutine, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from client.wire import FrameReportModel, FrameState, ProgressModel, SceneState, SceneStatus
 from scas4d_core.cameras import Camera
+from scas4d_core.told import told
 from server import metrics, reports, worker
 from server.background import Background
+from server.damage import DamageKind, DamageLog
 from server.definition import Definition
 from server.disk import no_room
-from server.facts import Died, Fact, FramesDeleted, SetAside, StatesDeleted
+from server.facts import Created, Died, Fact, FramesDeleted, SetAside, StatesDeleted
 from server.frame_store import remove
 from server.frame_table import FrameTable
 from server.hub import Event, FrameFinished, Hub, SceneChanged
 from server.ingest import Ingest
 from server.journal import Journal
-from server.messages import Answer, Broken, Committed, FrameReady, Progressed, Query, Ready, SceneSpec, Stalled
+from server.mending import Mending
+from server.messages import Answer, Broken, Committed, FrameReady, Mended, Progressed, Query, Ready, SceneSpec, Stalled
 from server.messages import SetAside as SetAsideMessage
 from server.placement import Ended, Placement, Process
 from server.readers import Readers
@@ -30,7 +34,9 @@ from server.replays import Replays
 from server.retention import Held, deletable
 from server.scene_lookup import camera_of, committed_frame_of, report_of
 from server.scene_status import state_of, status_of
+from server.scrub import Scrub, Scrubbed
 from server.settings import ServerSettings
+from server.snapshot import facts_of
 from server.supervision import Supervision, given_up
 from server.work_clock import WorkClock
 
@@ -72,8 +78,9 @@ class Scene:
         )
         self.ledger = found.ledger
         self.held = Held(found.sizes)
-        self.damage = found.damage
-        self.journal = Journal(self.spec.journal, found.good)
+        self.damage = DamageLog(found.damage)
+        self._definition = definition
+        self.journal = Journal(self.spec.journal, found.good, self._all_facts, self._journal_renewed)
         self.supervision = Supervision()
         self.progress: ProgressModel | None = None
         self.points_sha256: str | None = None
@@ -92,12 +99,17 @@ class Scene:
         self._hub = hub
         self._files = reports.ReportFiles(self.spec.states)
         self.ingest = Ingest(self)
-        self._questions = Readers(self.spec, server, placement)
+        self._questions = Readers(self.spec, server, placement, lambda files: self.mending.noticed(files))
         self.replays = Replays(self, placement)
+        self.mending = Mending(self.ledger, self.damage, self, found.remake)
         self._worker: Process
         self._start_worker()
         if found.facts:
             self.background(self._write(*found.facts))
+        scrubbed = Scrubbed(
+            definition, self.spec, self.ledger, self.journal, self.damage, self.mending.noticed, lambda: self.at_work
+        )
+        self.background(Scrub(scrubbed, server.scrub_mb_per_second, server.scrub_pause_seconds).run())
 
     def _tell(self, event: Event) -> None:
         """Tells who listens to the scene (`server.hub`); called at every change of its status or of a frame."""
@@ -128,7 +140,7 @@ class Scene:
     @property
     def error(self) -> str | None:
         """Why the scene is failed or degraded."""
-        return self.ledger.fatal or self.trouble
+        return self.ledger.fatal or self.trouble or self.mending.trouble
 
     @property
     def at_work(self) -> bool:
@@ -171,10 +183,11 @@ class Scene:
         """Gives the worker its next frame, if it can take one and one waits; called whenever that may have changed."""
         self._tell(SceneChanged())
         ledger = self.ledger
-        if not self._ready or self._at_work is not None or self._holding or ledger.paused or ledger.fatal is not None:
+        if not self._ready or self._at_work is not None or self._holding or self.mending.at_work is not None:
             return
-        waiting = ledger.waiting()
+        waiting = [] if ledger.paused or ledger.fatal is not None else ledger.waiting()
         if not waiting:
+            self.mending.begin()
             return
         index = waiting[0]
         entry = ledger.frames[index]
@@ -203,6 +216,8 @@ class Scene:
                     index=message.index, reason=message.reason, dropped=message.dropped, fatal=message.fatal
                 )
                 self.background(self._set_aside(fact))
+            case Mended():
+                self.mending.mended(message)
             case Stalled():
                 self.trouble = f"frame {message.index} waits for room on the disk: {message.reason}"
                 self.clock.stall(message.seconds)
@@ -215,10 +230,11 @@ class Scene:
     async def _taken_up(self, ready: Ready) -> None:
         """The worker has taken up what is committed: what it found decides which frames are still to be done."""
         newest = self.committed[-1] if self.committed else -1
-        facts = self.ledger.reconcile(ready.indices, ready.damaged)
+        again = self.mending.frames | {index for index in ready.damaged if index < max(ready.indices, default=-1)}
+        facts = self.ledger.reconcile(ready.indices, ready.damaged, again)
         for fault in ready.faults:
             log.warning("scene %s: %s", self.id, fault)
-            self.damage.append(fault)
+            self.damage.say(DamageKind.STATE, fault)
         if facts:
             await self._write(*facts)
         if ready.indices and ready.report:
@@ -228,6 +244,7 @@ class Scene:
                 self._tell(FrameFinished(self.frames[ready.indices[-1]].report))
         self.trouble = self._last_trouble()
         self._ready = True
+        self.mending.taken_up(ready.damaged)
         self.work()
 
     def _last_trouble(self) -> str | None:
@@ -284,7 +301,8 @@ class Scene:
 
     async def retain(self) -> None:
         """Deletes pictures from the frame log by the scene's rule."""
-        gone = deletable(self.ledger, self.held, self.rules.keep_frames)
+        needed = self.mending.frames
+        gone = [i for i in deletable(self.ledger, self.held, self.rules.keep_frames) if i not in needed]
         if not gone:
             return
         names = [name for index in gone for name in self.frames[index].files]
@@ -304,9 +322,35 @@ class Scene:
             except OSError as error:
                 if not no_room(error):
                     raise
-                self.trouble = f"the journal waits for room on the disk: {error}"
+                self.trouble = f"the journal waits for room on the disk: {told(error)}"
                 self._tell(SceneChanged())
                 await asyncio.sleep(AGAIN_S)
+
+    # What mending needs of it (`server.mending.Hooks`), and the journal.
+
+    def to_worker(self, message: Any) -> bool:
+        """Posts a message; False where there is no worker that takes any."""
+        if self._ready:
+            self._worker.send(message)
+        return self._ready
+
+    def states_changed(self, frames: tuple[int, ...]) -> None:
+        """Files of states were written or lost."""
+        if frames:
+            self._questions.refresh(frames)
+        self.work()
+
+    def write_fact(self, fact: Fact) -> None:
+        """Journals a fact that was applied, in the background."""
+        self.background(self._write(fact))
+
+    def _all_facts(self) -> Iterator[Fact]:
+        """What the journal has to say; see `Journal`."""
+        return chain((Created(definition=self._definition.as_json()),), facts_of(self.ledger.copy()))
+
+    def _journal_renewed(self, fault: str) -> None:
+        self.damage.say(DamageKind.JOURNAL, f"{fault}; it was written anew from what the service knows")
+        self._tell(SceneChanged())
 
     # The worker's life.
 
@@ -363,7 +407,7 @@ class Scene:
         self._background.run(coroutine)
 
     def _failed(self, error: BaseException) -> None:
-        self.ledger.fatal = f"the service failed: {type(error).__name__}: {error}"
+        self.ledger.fatal = f"the service failed: {type(error).__name__}: {told(error)}"
         log.error("scene %s", self.id, exc_info=error)
         self._tell(SceneChanged())
 
@@ -373,6 +417,7 @@ class Scene:
         if self._again is not None:
             self._again.cancel()
         self.ingest.stop()
+        self.mending.stop()
         self._background.cancel()
         seconds = self.server.stop_seconds
         await asyncio.gather(self._worker.stop(seconds), self._questions.stop(seconds), self.replays.stop())

@@ -40,6 +40,17 @@ def committed_frame_of(scene: Scene, index: int | None, field: str) -> int:
     if index is None:
         return scene.committed[-1]
     entry = scene.frames.get(index)
+    if entry is not None and entry.unreadable:
+        raise Problem(
+            503,
+            f"the state of frame {index} was damaged on disk and is being made again",
+            field=field,
+            value=index,
+            remedy="ask again, or for another frame",
+            headers={"Retry-After": "2"},
+        )
+    if entry is not None and entry.deleted and entry.error is not None:
+        raise Problem(404, entry.error, field=field, value=index, remedy=_another(scene))
     if entry is None or entry.state != FrameState.COMMITTED or entry.deleted:
         state = "not here" if entry is None else entry.state.value
         said = "deleted by the scene's retention" if entry is not None and entry.deleted else state
@@ -48,9 +59,13 @@ def committed_frame_of(scene: Scene, index: int | None, field: str) -> int:
             f"frame {index} is {said}; only committed frames that are kept can be read",
             field=field,
             value=index,
-            remedy=f"ask for a committed frame, {scene.committed[0]} to {scene.committed[-1]}",
+            remedy=_another(scene),
         )
     return index
+
+
+def _another(scene: Scene) -> str:
+    return f"ask for a committed frame, {scene.committed[0]} to {scene.committed[-1]}"
 
 
 async def report_of(scene: Scene, files: reports.ReportFiles, index: int) -> FrameReportModel | None:
@@ -66,6 +81,8 @@ async def report_of(scene: Scene, files: reports.ReportFiles, index: int) -> Fra
     found = entry.report
     if found.state == FrameState.COMMITTED and not found.deleted and not entry.measured:
         numbers = await asyncio.to_thread(files.read, index)
+        if faults := await asyncio.to_thread(files.take_faults):
+            scene.mending.noticed(faults)
         reports.fill(found, numbers)
         scene.frames.remember(index, numbers)
     return found

@@ -19,7 +19,7 @@ def state_of(scene: Scene) -> SceneState:
         return SceneState.UPDATING if started else SceneState.INITIALISING
     if scene.ledger.paused:
         return SceneState.PAUSED
-    if scene.trouble is not None:
+    if scene.error is not None:
         return SceneState.DEGRADED
     if not scene.ledger.frames and not scene.ledger.open:
         return SceneState.AWAITING
@@ -45,7 +45,7 @@ def status_of(scene: Scene) -> SceneStatus:
         last_committed=ledger.committed[-1] if ledger.committed else None,
         gaussians=scene.gaussians,
         paused=ledger.paused,
-        degraded=scene.trouble is not None and ledger.fatal is None,
+        degraded=scene.error is not None and ledger.fatal is None,
         open_frames=sorted(ledger.open),
         set_aside=ledger.counts[FrameState.SET_ASIDE],
         missing=ledger.counts[FrameState.MISSING],
@@ -54,7 +54,7 @@ def status_of(scene: Scene) -> SceneStatus:
         frames_held=len(scene.held),
         frame_bytes=scene.held.bytes,
         states_deleted=ledger.states_deleted,
-        damage=scene.damage,
+        damage=scene.damage.sentences,
         created=scene.created.isoformat(),
         ingest=scene.rules,
         settings=scene.spec.settings.model_dump(mode="json"),

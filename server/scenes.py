@@ -9,11 +9,10 @@ import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
-import numpy as np
-
 from client.wire import SceneCreate
-from scas4d_core.npz import sync_folder
+from scas4d_core.npz import read_npz, sync_folder
 from scas4d_core.settings import Settings
+from scas4d_core.told import told
 from server.definition import (
     FRAMES_FOLDER,
     JOURNAL_FILE,
@@ -104,7 +103,7 @@ class Scenes:
             try:
                 await self._restore(self._folder / name)
             except Exception as error:  # a fault of one scene is none of the others
-                self.unreadable[name] = f"the service failed: {type(error).__name__}: {error}"
+                self.unreadable[name] = f"the service failed: {type(error).__name__}: {told(error)}"
                 log.exception("scene %s cannot be taken up", name)
         for path in graves:
             await asyncio.to_thread(shutil.rmtree, path, ignore_errors=True)
@@ -135,12 +134,12 @@ class Scenes:
                 raise DefinitionError(f"it is of scene {definition.id}; the folder was renamed or copied")
             if damage is not None:
                 await asyncio.to_thread(write_definition, folder, definition)
-            found = await asyncio.to_thread(recover, folder, definition.id)
+            found = await asyncio.to_thread(recover, folder, definition.id, definition.as_json())
             found.damage[:0] = [damage] if damage is not None else []
             scene = Scene(definition, folder, found, self.server, self.placement, self.hub)
             scene.points_sha256 = await asyncio.to_thread(points_sha256, scene.spec.points)
         except (DefinitionError, OSError) as error:
-            self.unreadable[folder.name] = str(error)
+            self.unreadable[folder.name] = told(error)
             log.error("folder %s holds no scene that can be read; it is left as it is: %s", folder, error)
             return
         for said in found.damage:
@@ -231,9 +230,8 @@ class Scenes:
 def points_sha256(path: Path) -> str | None:
     """SHA-256 of the body that a scene's points came in, or None where it has none."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return bytes(file["sha256"]).hex()
+        return bytes(read_npz(path, ("sha256",))["sha256"]).hex()
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError):
+    except ValueError:
         return ""

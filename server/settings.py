@@ -146,6 +146,15 @@ class ServerSettings(BaseSettings):
     stop_seconds: float = Field(
         default=5.0, gt=0, description="Grace for a worker to end by itself at shutdown and delete."
     )
+    scrub_mb_per_second: float = Field(
+        default=4.0,
+        ge=0,
+        description="All that a scene has on disk is read again in the background and compared with its checksums, so "
+        "fast, and at a quarter of that while a frame is at work; 0: never. 4 MB/s take half a percent of a core.",
+    )
+    scrub_pause_seconds: float = Field(
+        default=600.0, gt=0, description="Before each such pass over a scene; a flipped bit is found a pass later."
+    )
     warm_up: bool = Field(
         default=True, description="Compile or load the kernels at start, in a process beside; /health/ready waits."
     )

@@ -11,16 +11,30 @@ import time
 from multiprocessing.connection import Connection
 from typing import Any
 
-import numpy as np
-
 from client.wire import Budget
 from scas4d_core.captures import Frame, InitialPoints
 from scas4d_core.history import History, HistoryError
+from scas4d_core.npz import read_npz
+from scas4d_core.told import told
+from server import repairs
 from server.decoding import decode, read
 from server.disk import FolderLock, no_room
 from server.engine import Reconstruction, load_engine
 from server.frame_store import FrameDamage, holds
-from server.messages import Broken, Committed, FrameReady, Progressed, Ready, SceneSpec, SetAside, Stalled, Stop
+from server.messages import (
+    Broken,
+    Committed,
+    FrameReady,
+    Mend,
+    Progressed,
+    Ready,
+    Remake,
+    SceneSpec,
+    SetAside,
+    Stalled,
+    Stop,
+)
+from server.repairs import mend_at_start
 
 PROGRESS_EVERY_S = 0.2
 PARENT_EVERY_S = 0.5
@@ -44,7 +58,13 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     try:
         if worker.open():
             while not isinstance(message := connection.recv(), Stop):
-                worker.take(message)
+                match message:
+                    case FrameReady():
+                        worker.take(message)
+                    case Mend():
+                        worker.mend(message)
+                    case Remake():
+                        worker.remake(message)
     except (EOFError, OSError) as error:
         if no_room(error):
             raise
@@ -99,11 +119,12 @@ class Worker:
                 if self.reconstruction.resumed is not None:
                     undone = tuple(self.reconstruction.resumed.undone)
                     faults = tuple(self.reconstruction.resumed.faults)
+                faults += tuple(mend_at_start(history))
             report = history.report(history.indices[-1]) if history.indices else {}
             self.connection.send(Ready(tuple(history.indices), dict(history.damaged), report, undone, faults))
         except (HistoryError, ValueError) as error:  # what is damaged says so with a ValueError
             log.exception("scene %s cannot be taken up again", self.spec.folder.name)
-            self.connection.send(Broken(f"{type(error).__name__}: {error}"))
+            self.connection.send(Broken(f"{type(error).__name__}: {told(error)}"))
             return False
         return True
 
@@ -121,7 +142,7 @@ class Worker:
                 if not no_room(error):
                     raise
                 log.warning("scene %s, frame %d: %s", self.spec.folder.name, message.index, error)
-                self.connection.send(Stalled(message.index, str(error), stall))
+                self.connection.send(Stalled(message.index, told(error), stall))
             if self.connection.poll(stall):  # nothing else comes while a frame is at work
                 raise _Stopped
             stall = min(2 * stall, LONGEST_STALL_S)
@@ -149,7 +170,23 @@ class Worker:
             log.exception("scene %s, frame %d", self.spec.folder.name, message.index)
             # Without a first frame there is nothing to go on from.
             first = self.reconstruction is None
-            return SetAside(message.index, f"{type(error).__name__}: {error}", dropped, fatal=first)
+            return SetAside(message.index, f"{type(error).__name__}: {told(error)}", dropped, fatal=first)
+
+    def mend(self, message: Mend) -> None:
+        """Looks at files that were found damaged, and says what came of each."""
+        assert self.states is not None
+        for mended in repairs.mend(self.states, self.reconstruction, message):
+            self.connection.send(mended)
+
+    def remake(self, message: Remake) -> None:
+        """Makes a state again from its pictures, and says whether it could be."""
+        assert self.states is not None
+        frame = message.frame
+
+        def pictures() -> tuple[Frame, dict[str, str]]:
+            return decode(self.spec.rig, frame, read(self.spec.frames, frame))
+
+        self.connection.send(repairs.remake(self.engine, self.spec, self.states, message, pictures))
 
     def reconstruct(self, frame: Frame, dropped: dict[str, str], budget: Budget, began: float) -> Committed:
         """Runs the first frame or an update, and commits. `began`: `perf_counter` before decoding."""
@@ -193,9 +230,8 @@ class Worker:
         """The initial cloud that was put before the first frame."""
         if not self.spec.points.exists():
             return None
-        with np.load(self.spec.points, allow_pickle=False) as file:
-            foreground = file["foreground"] if "foreground" in file.files else None
-            return InitialPoints(file["positions"], file["colours"], foreground)
+        arrays = read_npz(self.spec.points)
+        return InitialPoints(arrays["positions"], arrays["colours"], arrays.get("foreground"))
 
     def progress(self, progress: Any) -> None:
         """Passes progress on, a few times a second at most, and the end of a stage always."""

@@ -234,7 +234,8 @@ def test_what_cannot_be_resumed_is_said(undisturbed, tmp_path):
     with pytest.raises(ResumeError, match="no committed frame"):
         resume(kind, tmp_path / "nothing")
     folder = copy_of(base, INDICES[2], tmp_path)
-    SPOILS["cut"](folder / f"frame_{INDICES[0]:06d}.npz")
+    for name in (f"frame_{INDICES[0]:06d}.npz", "first.copy.npz"):
+        SPOILS["cut"](folder / name)
     with pytest.raises(ResumeError, match="first frame"):
         resume(kind, folder)
 

@@ -121,6 +121,11 @@ class FrameReportModel(Model):
         default=None, description="What writing the commit before took; its own is not known when it is written."
     )
     threads: int | None = Field(default=None, description="That the update ran on.")
+    remade: bool = Field(
+        default=False,
+        description="Its state was damaged on disk and was made again from its pictures: it shows the same, and is not "
+        "the same bits.",
+    )
     loss: list[float] = Field(default_factory=list)
     curve: list[CurvePointModel] = Field(default_factory=list, description="Of the last attempt.")
     errors: dict[str, float | None] = Field(

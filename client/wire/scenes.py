@@ -123,7 +123,8 @@ class SceneStatus(Model):
     degraded: bool = Field(
         default=False,
         description="Whatever `state` says: the last frame lost a camera, was held or met only by half, or was set "
-        "aside; the worker is being restarted, or the disk is full. `error` says which.",
+        "aside; the worker is being restarted, the disk is full, or something on it was found damaged and is being "
+        "mended. `error` says which.",
     )
     open_frames: list[int] = Field(
         default_factory=list, description="Frames not closed yet, whose cameras send one by one."
@@ -135,7 +136,11 @@ class SceneStatus(Model):
     frames_held: int = Field(default=0, description="Frames whose pictures are in the frame log.")
     frame_bytes: int = Field(default=0, description="Of the frame log on disk.")
     states_deleted: int = Field(default=0, description="Committed states that retention has deleted.")
-    damage: list[str] = Field(default_factory=list, description="What was dropped as damaged when the service started.")
+    damage: list[str] = Field(
+        default_factory=list,
+        description="What was found damaged on disk, and what came of it, a sentence each: at the start of the service "
+        "and since. The newest 100.",
+    )
     created: str = Field(description="UTC, ISO 8601.")
     ingest: IngestSettings = IngestSettings()
     settings: dict[str, Any]

@@ -16,13 +16,14 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from client.wire import FrameState
+from server.bench import damage
 from server.bench.service import PATIENCE_S, Service, StudyError
-from server.bench.study import AGAIN_S, Sender, Study, compare, digests, undisturbed
+from server.bench.study import AGAIN_S, Sender, Study, compare, digests, encoded_frames, undisturbed
 from server.facts import Taken
 from server.journal import read_journal
 
@@ -240,9 +241,23 @@ def _no_room(pid: int) -> Any:
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (soft, hard))
 
 
+def flipped_bits(study: Study, count: int, seed: int, told: Told) -> Outcome:
+    """Single bits over everything on disk, with and without a restart (`server.bench.damage`)."""
+    longer = replace(study, frames=encoded_frames(study.capture, damage.frames_for(count)))
+    found = damage.flips(longer, count, seed, told)
+    counts = Counter(kind.rpartition(" ")[2] for kind in found.counts.elements())
+    said = (
+        f"{counts['noticed']} noticed, {counts['harmless']} harmless; {len(found.remade)} states made again from "
+        f"pictures, {len(found.lost)} named as lost, {len(found.unreported)} without their report"
+    )
+    bar = "each noticed or harmless; no wrong picture, no 500, the scene goes on"
+    return Outcome(f"{count} flipped bits of {', '.join(damage.KINDS)}, half while down", bar, said, found.faults)
+
+
 def run(
-    study: Study, *, moments: int = 30, cuts: int = 20, flips: int = 1, seed: int = 0, told: Told = print
-) -> list[Outcome]:
+    study: Study, *, moments: int = 30, cuts: int = 20, flips: int = 1, bits: int = 200, seed: int = 0,
+    told: Told = print,
+) -> list[Outcome]:  # fmt: skip
     """All scenarios."""
     expected, update_s = undisturbed(study)
     told(f"undisturbed: {len(expected)} states, {update_s:.2f} s an update")
@@ -250,6 +265,7 @@ def run(
         kills(study, expected, update_s, moments, seed, told),
         damaged_log(study, expected, cuts, flips, seed, told),
         full_disk(study, expected, told),
+        flipped_bits(study, bits, seed, told),
     ]
 
 

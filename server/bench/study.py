@@ -38,12 +38,12 @@ class Study:
     settings: Mapping[str, Any]
     environment: Mapping[str, str]
 
-    def service(self, name: str) -> Service:
-        """Over a new folder."""
+    def service(self, name: str, environment: Mapping[str, str] | None = None) -> Service:
+        """Over a new folder; `environment`: more of it."""
         data = self.folder / name
         shutil.rmtree(data, ignore_errors=True)
         data.mkdir(parents=True)
-        return Service(data, self.environment)
+        return Service(data, {**self.environment, **(environment or {})})
 
     def create(self, service: Service, **more: Any) -> str:
         """A scene that keeps all its pictures."""
@@ -53,15 +53,23 @@ class Study:
 
 def encoded_frames(capture: Capture, count: int) -> list[Files]:
     """So many frames of a capture; where it has fewer, it goes back and forth, so that the motion stays one."""
-    there, frames = capture.frame_count, []
+    there = capture.frame_count
+    read: dict[int, Files] = {}
+    frames = []
     for number in range(count):
         turn = number % max(1, 2 * there - 2)
         index = min(turn, 2 * there - 2 - turn) if there > 1 else 0
-        images = {name: capture.encoded(index, name) for name in capture.full_rig.names}
-        found = {name: capture.encoded_mask(index, name) for name in capture.full_rig.names}
-        masks = {name: mask for name, mask in found.items() if mask is not None}
-        frames.append((images, masks if len(masks) == len(images) else {}))
+        if index not in read:
+            read[index] = _files(capture, index)
+        frames.append(read[index])
     return frames
+
+
+def _files(capture: Capture, index: int) -> Files:
+    images = {name: capture.encoded(index, name) for name in capture.full_rig.names}
+    found = {name: capture.encoded_mask(index, name) for name in capture.full_rig.names}
+    masks = {name: mask for name, mask in found.items() if mask is not None}
+    return images, masks if len(masks) == len(images) else {}
 
 
 def digests(states: Path) -> dict[int, str]:

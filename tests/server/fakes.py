@@ -11,6 +11,7 @@ import numpy as np
 
 from scas4d_core import tracks
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.history import History, HistoryError
 
 SLOW, SLOW_RAISES, RAISES, DIES, HELD, LEAVES_OUT, STANDS = 200, 201, 250, 251, 240, 241, 242
 ITERATIONS = 100
@@ -116,6 +117,9 @@ class FakeReconstruction:
     def spend(self, *, iterations=None, budget_ms=None, stop_gain=None, still=None):
         self.iterations = int(budget_ms / MS_EACH) if budget_ms else iterations or ITERATIONS
 
+    def write_checkpoint(self, index):
+        return False  # it needs none
+
 
 class FakeReader:
     def __init__(self, rig, history):
@@ -168,10 +172,30 @@ class FakeEngine:
         return scene
 
     def resume(self, rig, settings, history, *, held=lambda index: True):
-        first, last = history.indices[0], history.indices[-1]
+        first, faults = history.indices[0], list(history.damaged.values())
+        for last in reversed(history.indices):
+            try:
+                history.gaussians(last)
+                history.report(last)
+                break
+            except HistoryError as error:
+                faults.append(str(error))
         offset = np.array([STEP_M * first, 0, 0])
         points = history.gaussians(first).means - offset
-        return FakeReconstruction(points, history, Resumed(last, [], [], False))
+        return FakeReconstruction(points, history, Resumed(last, history.cut(last), faults, False))
+
+    def remake(self, rig, settings, history, base, frame, budget, *, dropped=None, notes=None):
+        obey(frame)
+        first = history.indices[0]
+        copy = History()
+        copy.append(base, history.time(base), history.gaussians(base), history.report(base))
+        points = history.gaussians(first).means - np.array([STEP_M * first, 0, 0])
+        scene = FakeReconstruction(points, copy)
+        scene.spend(**budget)
+        scene.commit(frame, dropped, {**(notes or {}), "remade": True})
+        report = copy.report(frame.index)
+        history.replace(frame.index, frame.time, copy.gaussians(frame.index).arrays(), report)
+        return report
 
     def replay(self, rig, settings, history, base, frames, iterations, over):
         history.gaussians(base)

@@ -126,10 +126,10 @@ def test_a_journal_that_cannot_be_written_costs_its_scene_only(tmp_path, monkeyp
     with serving(tmp_path) as (http, _):
         bad, good = create(http), create(http)
 
-    def journal(path, good=0):
+    def journal(path, *more):
         if bad in path.parts:
             raise PermissionError(13, "Permission denied", str(path))
-        return Journal(path, good)
+        return Journal(path, *more)
 
     monkeypatch.setattr(scene, "Journal", journal)
     with serving(tmp_path) as (http, _):

@@ -1,0 +1,29 @@
+"""Errors as text for others than the one who runs the service: without paths of this machine. Standard library only."""
+
+from __future__ import annotations
+
+import os
+import re
+
+_PATH = re.compile(r"(?<![\w.:/])/(?:[^\s'\"<>|:;,()\[\]]+/)*[^\s'\"<>|:;,()\[\]/]*")
+"""An absolute path within a sentence; addresses as ``http://…`` do not begin with a slash."""
+
+
+def without_paths(text: str) -> str:
+    """The text with the last part alone of every path that can be one of this machine; ``/v1/scenes`` cannot."""
+    return _PATH.sub(_last_part, text)
+
+
+def told(error: BaseException) -> str:
+    """What an error says; of an ``OSError`` what the system says, because its own text names the file with its path."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return without_paths(str(error)) or type(error).__name__
+
+
+def _last_part(found: re.Match[str]) -> str:
+    path = found[0]
+    first = path.split("/", 2)[1]
+    if not first or not os.path.isdir(f"/{first}"):
+        return path
+    return path.rstrip("/").rsplit("/", 1)[-1]
