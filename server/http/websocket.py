@@ -11,7 +11,7 @@ from websockets.frames import Frame
 from websockets.http11 import Request
 
 from server.auth import HEADERS
-from server.http.guard import Guard
+from server.http.guard import LINGER_S, Guard, Phase
 from server.http.refusals import Refusal, problem, response
 
 EARLY_BYTES = 1 << 16
@@ -40,8 +40,8 @@ class Socket(WebSocketsSansIOProtocol):
 
     @property
     def waits_for_us(self) -> bool:
-        """A WebSocket may be silent for as long as it answers pings."""
-        return True
+        """A WebSocket has no deadline but while it is being closed, and then it reads."""
+        return False
 
     def refuse(self, refusal: Refusal) -> None:
         """Answers a handshake that cannot be read, and ends the connection."""
@@ -52,6 +52,9 @@ class Socket(WebSocketsSansIOProtocol):
     def data_received(self, data: bytes) -> None:
         """Takes what comes; a handshake that cannot be read is refused, where uvicorn would wait for ever."""
         self._record.received += len(data)
+        if self._record.phase is Phase.LINGER:
+            self._record.body += len(data)
+            return
         if self.transport.is_closing():
             return
         super().data_received(data)
@@ -80,11 +83,26 @@ class Socket(WebSocketsSansIOProtocol):
             frames.append(bytearray(event.data))
 
     def handle_parser_exception(self) -> None:
-        """Ends a connection that breaks the protocol, also where its handshake is not answered yet."""
-        if self.conn.close_sent is None:
+        """Ends a connection that breaks the protocol, or whose message is too large (1009).
+
+        What it goes on sending is read and dropped for a while: uvicorn closes at once, which resets the connection,
+        and the peer loses the reason.
+        """
+        sent = self.conn.close_sent
+        if sent is None:  # the handshake is not answered yet
             self.transport.abort()
             return
-        super().handle_parser_exception()
+        self.queue.put_nowait({"type": "websocket.disconnect", "code": sent.code, "reason": sent.reason})
+        self.transport.write(b"".join(self.conn.data_to_send()))
+        self.close_sent = True
+        self.guard.enter(self._record, Phase.LINGER, self.loop.time())
+        # The application ends now; while there is such a timer, uvicorn does not close behind it.
+        self.close_timer = self.loop.call_later(LINGER_S, self.transport.close)
+        if self.transport.can_write_eof():
+            self.transport.write_eof()
+        if self.read_paused:
+            self.read_paused = False
+            self.transport.resume_reading()
 
     def pause_writing(self) -> None:
         """Stops reading where the peer does not read: each of its pings would add an answer to what waits."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from contextlib import ExitStack
 
 import pytest
 from peers import HOST, SHORT, Peer, parsed, stub, until
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 UPGRADE = (
@@ -73,6 +75,17 @@ def test_fragments_are_put_together(app, size):
     with opened(app) as socket:
         socket.send(message[at : at + size] for at in range(0, len(message), size))
         assert socket.recv() == message
+
+
+def test_a_message_that_is_too_large_is_told_so_while_it_is_sent(app):
+    for _ in range(5):
+        with opened(app) as socket:
+            with contextlib.suppress(ConnectionClosed):  # it may hear of it while it sends
+                socket.send(bytes((16 << 20) + 1))
+            with pytest.raises(ConnectionClosed) as closed:
+                socket.recv()
+            assert closed.value.rcvd.code == 1009
+    until(lambda: sum(app.guard.counts().values()) == 0)
 
 
 def test_a_peer_that_sends_pings_and_reads_nothing_is_ended(app):
