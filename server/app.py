@@ -16,7 +16,8 @@ from starlette.routing import Route, WebSocketRoute
 from client import __version__
 from server import handlers, problems
 from server.auth import Door
-from server.http.guard import Guard, Limits
+from server.http.guard import Guard
+from server.http.limits import Limits
 from server.http.proxies import ClientLimit
 from server.hub import Hub
 from server.limits import BodyLimit

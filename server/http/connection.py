@@ -14,7 +14,8 @@ import httptools
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from server.auth import HEADERS
-from server.http.guard import Guard, Phase
+from server.http.guard import Guard
+from server.http.record import Phase
 from server.http.refusals import Refusal, problem, response
 
 END_OF_HEAD = b"\r\n\r\n"

@@ -6,17 +6,14 @@ A connection costs no timer of its own: one sweep, about once a second, looks at
 from __future__ import annotations
 
 import asyncio
-import ipaddress
 import logging
 from collections import Counter
-from dataclasses import dataclass, field
-from enum import Enum, auto
-from typing import Protocol
 
+from server.http.limits import Limits
 from server.http.process import unread_bytes
+from server.http.record import KINDS, Handler, Peer, Phase, Record
 from server.http.refusals import Refusal
 from server.metrics import CONNECTIONS_REFUSED
-from server.settings import ServerSettings
 
 SWEEP_S = 1.0
 PROGRESS_BYTES = 16 << 10
@@ -39,142 +36,6 @@ SUMMARY_S = 10.0
 log = logging.getLogger("scas4d.server")
 
 
-class Phase(Enum):
-    """Where a connection is."""
-
-    NEW = auto()
-    """Nothing has come yet; browsers open connections ahead."""
-    HEAD = auto()
-    """A header is coming."""
-    BODY = auto()
-    ANSWER = auto()
-    """The request is whole, the service is at work."""
-    IDLE = auto()
-    """Kept alive between two requests."""
-    LINGER = auto()
-    """Answered before the body was whole: the rest is dropped."""
-    SOCKET = auto()
-    """A WebSocket. It may idle for ever: pings tell whether its peer is there."""
-    REFUSED = auto()
-
-
-KINDS = {
-    Phase.NEW: "header",
-    Phase.HEAD: "header",
-    Phase.BODY: "body",
-    Phase.ANSWER: "answer",
-    Phase.IDLE: "idle",
-    Phase.LINGER: "closing",
-    Phase.SOCKET: "websocket",
-    Phase.REFUSED: "closing",
-}
-"""The label `kind` of `scas4d_connections`."""
-
-
-class Handler(Protocol):
-    """The protocol at work on a connection."""
-
-    @property
-    def waits_for_us(self) -> bool:
-        """Whether nothing can come because the service does not read now."""
-
-    def refuse(self, refusal: Refusal) -> None:
-        """Answers with the refusal, as far as it can be answered, and ends the connection."""
-
-
-@dataclass(frozen=True)
-class Limits:
-    """The settings of connections; seconds, bytes, counts."""
-
-    header_seconds: float
-    header_bytes: int
-    header_lines: int
-    body_seconds: float
-    keep_alive_seconds: float
-    unread_seconds: float
-    connections: int
-    per_peer: int
-    proxies: tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]
-
-    @classmethod
-    def of(cls, settings: ServerSettings) -> Limits:
-        """Those of a service."""
-        return cls(
-            header_seconds=settings.header_seconds,
-            header_bytes=settings.header_kb << 10,
-            header_lines=settings.header_lines,
-            body_seconds=settings.body_seconds,
-            keep_alive_seconds=settings.keep_alive_seconds,
-            unread_seconds=settings.unread_seconds,
-            connections=settings.max_connections,
-            per_peer=settings.max_connections_per_peer,
-            proxies=tuple(map(ipaddress.ip_network, settings.trusted_proxies)),
-        )
-
-    def of_refusal(self, refusal: Refusal) -> float:
-        """The limit that a refusal names, in the unit of its setting."""
-        return {
-            Refusal.HEAD_SIZE: self.header_bytes / 1024,
-            Refusal.URL_SIZE: self.header_bytes / 1024,
-            Refusal.HEAD_LINES: self.header_lines,
-            Refusal.HEAD_TIME: self.header_seconds,
-            Refusal.BODY_TIME: self.body_seconds,
-            Refusal.PEER_CONNECTIONS: self.per_peer,
-            Refusal.CLIENT_REQUESTS: self.per_peer,
-            Refusal.CONNECTIONS: self.connections,
-        }.get(refusal, 0)
-
-    def is_proxy(self, address: str) -> bool:
-        """Whether the address is one of the trusted proxies."""
-        try:
-            found = ipaddress.ip_address(address)
-        except ValueError:
-            return False
-        return any(found in network for network in self.proxies)
-
-
-@dataclass(eq=False, slots=True)
-class Record:
-    """One open connection.
-
-    Attributes:
-        since: loop time at which the phase, or its present window, began. body: bytes of body in that window.
-        received: bytes since the last sweep. quiet_since: loop time of the last sweep that found any.
-        served: one request was answered. write_paused: more waits to be sent than the transport likes.
-    """
-
-    handler: Handler
-    transport: asyncio.Transport
-    peer: Peer
-    since: float
-    quiet_since: float
-    phase: Phase = Phase.NEW
-    queue: dict[Record, None] | None = None
-    counted: bool = True
-    gone: bool = False
-    body: int = 0
-    received: int = 0
-    served: bool = False
-    write_paused: bool = False
-    unsent: int = 0
-    unsent_since: float = 0.0
-    sent: int = 0
-
-
-@dataclass(eq=False, slots=True)
-class Peer:
-    """The connections of one address; those that may have to give way in queues, the oldest first."""
-
-    address: str
-    proxy: bool
-    count: int = 0
-    strangers: dict[Record, None] = field(default_factory=dict)
-    """No header was ever completed."""
-    idle: dict[Record, None] = field(default_factory=dict)
-    """Between two requests."""
-    bodies: dict[Record, None] = field(default_factory=dict)
-
-
 class Guard:
     """The open connections of one service, its limits, and the sweep that enforces them."""
 
@@ -182,7 +43,7 @@ class Guard:
         self.limits = limits
         self._records: dict[asyncio.BaseTransport, Record] = {}
         self._peers: dict[str, Peer] = {}
-        self._counted = 0
+        self._counted = self._bodies = 0
         self._refused: dict[Record, None] = {}
         self._pending: Counter[str] = Counter()
         self._told = float("-inf")
@@ -231,12 +92,14 @@ class Guard:
         elif phase in (Phase.BODY, Phase.LINGER):
             queue = record.peer.bodies
         if queue is not record.queue:
-            if record.queue is not None:
-                del record.queue[record]
+            self._unqueue(record)
             if queue is not None:
                 queue[record] = None
+                self._bodies += queue is record.peer.bodies
             record.queue = queue
-        if phase is Phase.REFUSED:
+        if phase is Phase.BODY:
+            self._make_room_for_headers(record)
+        elif phase is Phase.REFUSED:
             self._release(record)
             self._refused[record] = None
             if len(self._refused) > REFUSED_AT_ONCE:
@@ -255,9 +118,7 @@ class Guard:
         """Forgets a connection that is gone."""
         record.gone = True
         self._records.pop(record.transport, None)
-        if record.queue is not None:
-            del record.queue[record]
-            record.queue = None
+        self._unqueue(record)
         self._refused.pop(record, None)
         self._release(record)
 
@@ -272,6 +133,35 @@ class Guard:
         for record in self._records.values():
             found[KINDS[record.phase]] += 1
         return found
+
+    def _unqueue(self, record: Record) -> None:
+        if record.queue is not None:
+            del record.queue[record]
+            self._bodies -= record.queue is record.peer.bodies
+            record.queue = None
+
+    def _make_room_for_headers(self, new: Record) -> None:
+        """Keeps uploads that have brought next to nothing to half of a cap, the oldest go.
+
+        The other half is then of connections that give way at once: who has a request finds a place at any moment, and
+        not only when uploads that hang are old enough to be told from those that have just begun.
+        """
+        limits, peer = self.limits, new.peer
+        if peer.proxy or 2 * len(peer.bodies) <= limits.per_peer:
+            if 2 * self._bodies <= limits.connections:
+                return
+            peer = max(self._peers.values(), key=lambda known: len(known.bodies))
+        for record in peer.bodies:
+            begun = record.phase is Phase.LINGER or record.body < PROGRESS_BYTES
+            if record is not new and begun and not record.handler.waits_for_us:
+                self._end(record, new.since)
+                return
+
+    def _end(self, record: Record, now: float) -> None:
+        """Ends a connection that gives way, without an answer."""
+        self.refused(Refusal.DISPLACED)
+        self.enter(record, Phase.REFUSED, now)
+        record.transport.abort()
 
     def _release(self, record: Record) -> None:
         """Makes room: a connection that is refused or gone does not count."""
@@ -295,9 +185,7 @@ class Guard:
                     break
             else:
                 return False
-        self.refused(Refusal.DISPLACED)
-        self.enter(record, Phase.REFUSED, now)
-        record.transport.abort()
+        self._end(record, now)
         return True
 
     def _sweep(self, loop: asyncio.AbstractEventLoop) -> None:

@@ -11,7 +11,8 @@ from websockets.frames import Frame
 from websockets.http11 import Request
 
 from server.auth import HEADERS
-from server.http.guard import LINGER_S, Guard, Phase
+from server.http.guard import LINGER_S, Guard
+from server.http.record import Phase
 from server.http.refusals import Refusal, problem, response
 
 EARLY_BYTES = 1 << 16

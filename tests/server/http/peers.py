@@ -16,7 +16,8 @@ from starlette.responses import JSONResponse, StreamingResponse
 from starlette.routing import Route, WebSocketRoute
 
 from server.http.config import guarded
-from server.http.guard import Guard, Limits
+from server.http.guard import Guard
+from server.http.limits import Limits
 from server.http.proxies import ClientLimit
 from server.http.websocket import limit_messages
 from server.settings import ServerSettings
