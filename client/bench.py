@@ -176,6 +176,12 @@ def faults(
     bits: Annotated[
         int, typer.Option(min=0, help="Bits flipped one by one in states, checkpoints, journal and frames.")
     ] = 200,
+    turns: Annotated[
+        int, typer.Option(min=1, help="Without strangers and with them, each with a token and without.")
+    ] = 3,
+    part: Annotated[
+        list[str] | None, typer.Option(help="Only this: kills, log, disk, bits or strangers. May be repeated.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the random moments and places.")] = 0,
     work: Annotated[Path, typer.Option(help="Folder for data folders and logs; what is there goes.")] = Path(
         "out/faults"
@@ -189,15 +195,20 @@ def faults(
 ) -> None:
     """Kills the service and its workers, cuts and damages its files, fills its disk; compares with an undisturbed run.
 
+    Then strangers without a token hold it up: an endless header, half-sent headers, hanging uploads, during updates.
+
     Example: scas4d bench faults samples/robot --set static.iterations=300 --set update.iterations=20
     """
     from client.extras import need_server
     from client.overrides import overrides
     from scas4d_core.captures import open_capture
     from server.bench import faults as of_faults
+    from server.bench.outcome import table
     from server.bench.study import Study, encoded_frames
 
     need_server()
+    if unknown := set(part or []) - set(of_faults.PARTS):
+        raise typer.BadParameter(f"there is no part {sorted(unknown)[0]!r}; the parts are {', '.join(of_faults.PARTS)}")
     opened = open_capture(capture)
     study = Study(
         work.resolve(),
@@ -206,8 +217,11 @@ def faults(
         overrides(changes or []),
         {} if engine is None else {"SCAS4D_ENGINE": engine},
     )
-    outcomes = of_faults.run(study, moments=kills, cuts=cuts, flips=flips, bits=bits, seed=seed, told=typer.echo)
-    text = of_faults.table(outcomes)
+    parts = part or of_faults.PARTS
+    outcomes = of_faults.run(
+        study, moments=kills, cuts=cuts, flips=flips, bits=bits, seed=seed, turns=turns, parts=parts, told=typer.echo
+    )
+    text = table(outcomes)
     typer.echo(text)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)

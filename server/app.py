@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -10,11 +11,14 @@ from fastapi import APIRouter, Depends, FastAPI
 from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import Request
 from starlette.responses import Response
-from starlette.routing import WebSocketRoute
+from starlette.routing import Route, WebSocketRoute
 
 from client import __version__
 from server import handlers, problems
 from server.auth import Door
+from server.http.guard import Guard
+from server.http.limits import Limits
+from server.http.proxies import ClientLimit
 from server.hub import Hub
 from server.limits import BodyLimit
 from server.logs import AccessLog
@@ -47,7 +51,11 @@ from server.tickets import Tickets
 
 
 def create_app(settings: ServerSettings | None = None, placement: Placement | None = None) -> FastAPI:
-    """The service; `uvicorn --factory server.app:create_app` runs it with settings from the environment."""
+    """The service.
+
+    `server.http.config.guarded` runs it, as `scas4d serve` does. With `uvicorn --factory server.app:create_app` it
+    works too, but nothing bounds what a peer may send before its token is looked at.
+    """
     settings = settings or ServerSettings.from_environment()
     logging.getLogger("scas4d").setLevel(logging.INFO)
 
@@ -71,6 +79,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         responses=problems.RESPONSES,
     )
     app.state.settings = settings
+    app.state.guard = Guard(Limits.of(settings))
     app.state.tickets = Tickets(settings.ticket_seconds, settings.max_tickets)
     handlers.install(app)
     # The last one added is the first that a request meets.
@@ -84,6 +93,8 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
             expose_headers=["*"],
         )
     app.add_middleware(Door, settings=settings, tickets=app.state.tickets)
+    if settings.trusted_proxies:
+        app.add_middleware(ClientLimit, guard=app.state.guard)
     app.add_middleware(AccessLog)
     resources = (
         *(scenes, inspect, points, frames, ingest, render, tracks, parts, stream, budget, tradeoff),
@@ -92,8 +103,21 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     for resource in resources:
         app.include_router(resource.router, dependencies=[] if resource is viewer else [Depends(only_known)])
         _answer_plain_requests(app, resource.router)
-
+    _keep_document(app)
     return app
+
+
+def _keep_document(app: FastAPI) -> None:
+    """Answers /openapi.json from memory: whoever has no token may read it, and writing it anew takes milliseconds."""
+    kept: list[bytes] = []
+
+    async def openapi(request: Request) -> Response:
+        if not kept:
+            kept.append(json.dumps(app.openapi(), ensure_ascii=False, separators=(",", ":")).encode())
+        return Response(kept[0], media_type="application/json")
+
+    assert app.openapi_url is not None
+    app.router.routes.insert(0, Route(app.openapi_url, openapi, methods=["GET"], include_in_schema=False))
 
 
 def _answer_plain_requests(app: FastAPI, router: APIRouter) -> None:

@@ -66,9 +66,11 @@ class Door:
         await self.app(scope, receive, sending)
 
     def _reached(self, scope: Scope) -> None:
-        """However the service was started: without a token, only this machine may reach it."""
-        address = scope["server"][0] if scope.get("server") else "localhost"
-        if self._token is None and not is_loopback(address):
+        """However the service was started: without a token, only this machine may reach it, nor may others through a
+        trusted proxy on this machine.
+        """
+        ends = [scope[end][0] for end in ("server", "client") if scope.get(end)]
+        if self._token is None and not all(map(is_loopback, ends)):
             raise Problem(
                 403,
                 "the service can be reached from other machines and has no token",

@@ -12,6 +12,7 @@ from prometheus_client import CollectorRegistry, Counter, Histogram
 from prometheus_client.core import GaugeMetricFamily, Metric
 
 from client.wire import FrameReportModel, FrameState, SceneState, SceneStatus
+from server.http.refusals import Refusal
 from server.hub import Hub
 from server.messages import Query
 from server.settings import ServerSettings
@@ -71,6 +72,14 @@ SCRUBBED = Counter(
 )
 for kind in ("state", "checkpoint", "fixed", "journal", "frame", "definition", "points"):
     DAMAGE.labels(kind)
+CONNECTIONS_REFUSED = Counter(
+    "scas4d_connections_refused",
+    "Connections and requests that were ended before the application was asked, by reason.",
+    ["reason"],
+    registry=registry,
+)
+for refusal in Refusal:
+    CONNECTIONS_REFUSED.labels(refusal.value)
 for state in ("acknowledged", "committed", "set_aside", "skipped", "missing"):
     FRAMES.labels(state)
 for how in ("held", "in_part"):
@@ -110,12 +119,18 @@ class State:
     """Gauges of a service: scenes, queues, subscribers, disk."""
 
     def __init__(
-        self, settings: ServerSettings, scenes: Mapping[str, HasStatus], hub: Hub, ready_after: float | None
+        self,
+        settings: ServerSettings,
+        scenes: Mapping[str, HasStatus],
+        hub: Hub,
+        ready_after: float | None,
+        connections: Mapping[str, int],
     ) -> None:
         self.settings = settings
         self.scenes = scenes
         self.hub = hub
         self.ready_after = ready_after
+        self.connections = connections
 
     def collect(self) -> Iterator[Metric]:
         """As it is now."""
@@ -134,6 +149,10 @@ class State:
                 gauge.add_metric([status.id], getattr(status, field) or 0)
             yield gauge
         yield GaugeMetricFamily("scas4d_subscribers", "WebSockets that listen to scenes.", value=self.hub.count())
+        by_kind = GaugeMetricFamily("scas4d_connections", "Open connections by what they are at.", labels=["kind"])
+        for kind, count in self.connections.items():
+            by_kind.add_metric([kind], count)
+        yield by_kind
         free = shutil.disk_usage(self.settings.data).free
         yield GaugeMetricFamily("scas4d_disk_free_bytes", "On the disk of the data folder.", value=free)
         if self.ready_after is not None:

@@ -15,7 +15,8 @@ import uvicorn
 
 from server import logs
 from server.app import create_app
-from server.connection import Connection, Socket, keep_freed_memory
+from server.http.config import guarded
+from server.http.process import keep_freed_memory, room_for_connections
 from server.placement.local import LocalPlacement
 from server.scenes import hold
 from server.settings import ServerSettings, unknown
@@ -61,16 +62,11 @@ def serve(settings: ServerSettings) -> None:
         raise RuntimeError(f"data folder {settings.data}: {error.strerror}; name another with --data") from None
     sockets = listen(settings.host, settings.port)
     keep_freed_memory()
-    config = uvicorn.Config(
-        create_app(settings, LocalPlacement(prepare)),
-        http=Connection,
-        ws=Socket,
+    config = guarded(
+        create_app(_with_files(settings), LocalPlacement(prepare)),
         log_config=None,
         access_log=False,
-        server_header=False,
-        proxy_headers=False,  # what a client says about itself is not believed
         timeout_graceful_shutdown=max(1, round(settings.stop_seconds)),
-        ws_per_message_deflate=False,  # pictures are compressed already: a hundred subscribers would cost a core
     )
     # uvicorn ends gracefully and then raises the signal again, for whoever called it: here that is nobody, and the
     # process ends with status 0.
@@ -79,6 +75,19 @@ def serve(settings: ServerSettings) -> None:
     told = f"listening; viewer at {address(settings.host, sockets)}, scenes in {settings.data}; Ctrl-C ends the service"
     Server(config, told).run(sockets)
     log.info("ended")
+
+
+def _with_files(settings: ServerSettings) -> ServerSettings:
+    """The settings with as many connections as files may be open for them."""
+    room = room_for_connections(settings.max_connections)
+    if room < settings.max_connections:
+        log.warning(
+            "SCAS4D_MAX_CONNECTIONS is %d, but files may be open for %d connections only; raise the limit on open "
+            "files (ulimit -n)",
+            settings.max_connections,
+            room,
+        )
+    return settings.model_copy(update={"max_connections": room})
 
 
 def listen(host: str, port: int) -> list[socket.socket]:

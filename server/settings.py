@@ -78,6 +78,65 @@ class ServerSettings(BaseSettings):
     )
     max_tickets: int = Field(default=1024, ge=1, description="Tickets that wait to be used; more get 429.")
 
+    header_seconds: float = Field(
+        default=10.0,
+        gt=0,
+        le=600,
+        description="From the first byte of a request to the end of its header, and from opening a connection to that "
+        "byte, in seconds; later gets 408. A header is one packet or two: ten seconds are three times resent.",
+    )
+    header_kb: int = Field(
+        default=64,
+        ge=8,
+        le=1024,
+        description="Largest header of a request, with its address, in kB of 1024 bytes; more gets 431 or 414. "
+        "Browsers send up to 16 with cookies of other services on this host; a header is read in quadratic time.",
+    )
+    header_lines: int = Field(
+        default=100,
+        ge=20,
+        le=120,
+        description="Lines of a header; more get 431. Proxies add some ten; WebSockets take 128 at most.",
+    )
+    body_seconds: float = Field(
+        default=20.0,
+        gt=0,
+        le=3600,
+        description="Time in which 16 kB of a body, or its end, have to come while the service reads, in seconds; else "
+        "408. A radio link that is lost for a moment comes back within; 0.8 kB/s could not send a picture.",
+    )
+    keep_alive_seconds: float = Field(
+        default=15.0,
+        gt=0,
+        le=3600,
+        description="Life of a connection between two requests, in seconds. Longer than clients keep theirs (httpx 5 "
+        "s), so that none sends into one that is just closed; a proxy needs less than this, or this more.",
+    )
+    unread_seconds: float = Field(
+        default=30.0,
+        gt=0,
+        le=3600,
+        description="Time in which a peer has to read 16 kB of what waits for it, in seconds; else the connection is "
+        "ended, a WebSocket's too. What waits is held in memory.",
+    )
+    max_connections: int = Field(
+        default=1024,
+        ge=8,
+        description="Open connections, at most half of the files that may be open; a further one takes the place of "
+        "one that has sent no whole header, is idle or has stopped sending, or gets 503.",
+    )
+    max_connections_per_peer: int = Field(
+        default=256,
+        ge=4,
+        description="The same for one address, or one client behind a trusted proxy: 64 cameras with a sender each, "
+        "and their viewers; else 429.",
+    )
+    trusted_proxies: Names = Field(
+        default=(),
+        description="Addresses or networks (`10.0.0.2, 10.1.0.0/24`) of proxies whose X-Forwarded-For and "
+        "X-Forwarded-Proto are believed, and whose connections are not counted as one peer's. Nobody else's are.",
+    )
+
     log_format: Literal["auto", "json", "text"] = Field(
         default="auto",
         description="json: one object a line. text: plain lines, without requests that only read and succeed. auto: "
@@ -171,7 +230,7 @@ class ServerSettings(BaseSettings):
         """What is constructed here holds what is given; `from_environment` reads the environment and the file."""
         return (init_settings,)
 
-    @field_validator("allowed_hosts", "allowed_origins", mode="before")
+    @field_validator("allowed_hosts", "allowed_origins", "trusted_proxies", mode="before")
     @classmethod
     def _split(cls, value: Any) -> Any:
         return tuple(name.strip() for name in value.split(",") if name.strip()) if isinstance(value, str) else value
@@ -182,6 +241,16 @@ class ServerSettings(BaseSettings):
         for origin in value:
             if not re.fullmatch(r"https?://[^/\s]+", origin):
                 raise ValueError("an origin is scheme://host or scheme://host:port, without a path")
+        return value
+
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _networks(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for network in value:
+            try:
+                ipaddress.ip_network(network)
+            except ValueError as error:
+                raise ValueError(f"a proxy is an address or a network, as 10.0.0.2 or 10.1.0.0/24 ({error})") from None
         return value
 
     @model_validator(mode="after")

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from test_history import filled, same, state
 
-from scas4d_core import npz
 from scas4d_core.checkpoint import Checkpoints
 from scas4d_core.frame_files import FIRST_COPY, FIXED_COPY, FIXED_FILE, DamagedFrameError
 from scas4d_core.history import History, HistoryError

@@ -1,4 +1,5 @@
-"""What kills, cuts, flipped bits and a full disk cost: nothing acknowledged, and not a bit of the states.
+"""What kills, cuts, flipped bits and a full disk cost: nothing acknowledged, and not a bit of the states. And what
+strangers without a token cost (`server.bench.strangers`).
 
 Each scenario runs the whole service as a process of its own. The undisturbed run comes first; the others are compared
 with it, state by state and bit by bit.
@@ -15,37 +16,27 @@ import signal
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from client.wire import FrameState
 from server.bench import damage
+from server.bench.outcome import Outcome, Told
 from server.bench.service import PATIENCE_S, Service, StudyError
+from server.bench.strangers import Attack, strangers
 from server.bench.study import AGAIN_S, Sender, Study, compare, digests, encoded_frames, undisturbed
 from server.facts import Taken
 from server.journal import read_journal
 
+TURN_S = 15.0
+"""Of updates without strangers; with them, until the last connection is closed."""
 KILLS_OF_A_WORKER_AT_A_FRAME = 4
 """The sixth sets a frame aside, as it should: the study stays below, and kills again when the next is at work."""
 
-Told = Callable[[str], None]
-
-
-@dataclass
-class Outcome:
-    """One row of the table."""
-
-    name: str
-    bar: str
-    found: str
-    faults: list[str] = field(default_factory=list)
-
-    @property
-    def reached(self) -> bool:
-        """Whether nothing went wrong."""
-        return not self.faults
+PARTS = ("kills", "log", "disk", "bits", "strangers")
+"""The scenarios by name."""
 
 
 def kills(study: Study, expected: Mapping[int, str], update_s: float, count: int, seed: int, told: Told) -> Outcome:
@@ -255,24 +246,38 @@ def flipped_bits(study: Study, count: int, seed: int, told: Told) -> Outcome:
 
 
 def run(
-    study: Study, *, moments: int = 30, cuts: int = 20, flips: int = 1, bits: int = 200, seed: int = 0,
+    study: Study,
+    *,
+    moments: int = 30,
+    cuts: int = 20,
+    flips: int = 1,
+    bits: int = 200,
+    seed: int = 0,
+    attack: Attack | None = None,
+    turns: int = 3,
+    parts: Sequence[str] = PARTS,
     told: Told = print,
-) -> list[Outcome]:  # fmt: skip
-    """All scenarios."""
-    expected, update_s = undisturbed(study)
-    told(f"undisturbed: {len(expected)} states, {update_s:.2f} s an update")
-    return [
-        kills(study, expected, update_s, moments, seed, told),
-        damaged_log(study, expected, cuts, flips, seed, told),
-        full_disk(study, expected, told),
-        flipped_bits(study, bits, seed, told),
-    ]
+) -> list[Outcome]:
+    """The scenarios of `parts`.
 
-
-def table(outcomes: Sequence[Outcome]) -> str:
-    """As Markdown."""
-    rows = ["| fault | bar | found | |", "|---|---|---|---|"]
-    for outcome in outcomes:
-        found = "; ".join(outcome.faults) or outcome.found
-        rows.append(f"| {outcome.name} | {outcome.bar} | {found} | {'reached' if outcome.reached else '**missed**'} |")
-    return "\n".join(rows)
+    Args:
+        study: what is sent, and where to. moments: kills. cuts, flips: damaged files.
+        bits: flipped over everything on disk. seed: of the random moments.
+        attack: of the strangers, the whole of it where not given. turns: without and with it.
+    """
+    outcomes = []
+    if set(parts) & {"kills", "log", "disk"}:
+        expected, update_s = undisturbed(study)
+        told(f"undisturbed: {len(expected)} states, {update_s:.2f} s an update")
+        if "kills" in parts:
+            outcomes.append(kills(study, expected, update_s, moments, seed, told))
+        if "log" in parts:
+            outcomes.append(damaged_log(study, expected, cuts, flips, seed, told))
+        if "disk" in parts:
+            outcomes.append(full_disk(study, expected, told))
+    if "bits" in parts:
+        outcomes.append(flipped_bits(study, bits, seed, told))
+    if "strangers" in parts:
+        for token in (False, True):
+            outcomes.append(strangers(study, attack or Attack(), turns=turns, seconds=TURN_S, token=token, told=told))
+    return outcomes

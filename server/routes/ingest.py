@@ -19,8 +19,8 @@ from client.wire import (
 )
 from client.wire.framing import PREFIX
 from server import problems
-from server.connection import limit_messages
 from server.door import take_camera, take_framed
+from server.http.websocket import limit_messages
 from server.pictures import largest_frame
 from server.problems import Problem
 from server.scene import Scene

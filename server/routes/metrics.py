@@ -19,6 +19,7 @@ async def metrics(request: Request, scenes: AllScenes, settings: TheSettings) ->
     """Counters, histograms and gauges in the text format of Prometheus."""
     readiness: Readiness = request.app.state.readiness
     gauges = CollectorRegistry()
-    gauges.register(counted.State(settings, scenes.by_id, request.app.state.hub, readiness.after))
+    state, guard = request.app.state, request.app.state.guard
+    gauges.register(counted.State(settings, scenes.by_id, state.hub, readiness.after, guard.counts()))
     text = generate_latest(counted.registry) + generate_latest(gauges)
     return Response(text, media_type=CONTENT_TYPE_PLAIN_0_0_4)

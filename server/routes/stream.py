@@ -11,7 +11,7 @@ from starlette.websockets import WebSocketDisconnect, WebSocketState
 
 from client.wire.stream import SCENE_GONE, STREAM_PROTOCOL, TOO_BIG
 from server import problems
-from server.connection import limit_messages
+from server.http.websocket import limit_messages
 from server.hub import Hub
 from server.problems import Problem
 from server.scenes import Scenes

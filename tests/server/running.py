@@ -13,7 +13,7 @@ from PIL import Image
 
 from scas4d_core.cameras import Camera, Rig
 from server.app import create_app
-from server.connection import Connection, Socket
+from server.http.config import guarded
 from server.problems import Problem
 from server.settings import ServerSettings
 
@@ -28,7 +28,7 @@ class Running:
             free.bind(("127.0.0.1", 0))
             self.port = port or free.getsockname()[1]
         self.app = create_app(settings)
-        config = uvicorn.Config(self.app, port=self.port, http=Connection, ws=Socket, log_level="error")
+        config = guarded(self.app, port=self.port, log_level="error")
         self.server = uvicorn.Server(config)
         self.thread = threading.Thread(target=self.server.run)
         self.thread.start()

@@ -9,6 +9,7 @@ import pytest
 from scas4d_core.captures import open_capture
 from server.bench import faults
 from server.bench import study as of
+from server.bench.strangers import Attack, strangers
 
 HERE = Path(__file__).parent
 CAPTURE = HERE.parents[1] / "samples" / "robot"
@@ -48,6 +49,14 @@ def test_cuts_and_flipped_bytes(study, expected):
 
 def test_a_full_disk(study, expected):
     assert faults.full_disk(study, expected[0], told=lambda said: None).faults == []
+
+
+@pytest.mark.parametrize("token", [False, True])
+def test_strangers(study, token):
+    attack = Attack(header=20_000_000, halves=150, uploads=150)
+    found = strangers(study, attack, turns=1, seconds=2, token=token, told=lambda said: None)
+    # Times of a busy machine are not judged here.
+    assert not [fault for fault in found.faults if "p99" not in fault and "times" not in fault]
 
 
 def test_kills_with_the_method_itself(tmp_path):
