@@ -11,12 +11,38 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 sys.path.insert(0, str(Path(__file__).parent))
 
 
-@pytest.fixture(scope="session", autouse=True)
-def kernels() -> None:
-    """Kernels are compiled once, in a process beside: of the tests' processes one asks for it, the others wait."""
-    from scas4d_core.warm_up import warm_up_elsewhere
+WITHOUT_KERNELS = (
+    "tests/captures", "tests/importers", "tests/metrics", "tests/server/http", "tests/test_imports.py"
+)  # fmt: skip
+"""Tests that run no kernel, in no process: they go on while another process compiles."""
+LONGEST = (
+    "test_faults.py",
+    "test_damage.py",
+    "test_gradients.py",
+    "test_frames.py",
+    "test_service.py",
+    "test_light.py",
+)
+"""Files that take longest: begun last, they would have the other processes wait for them."""
 
-    warm_up_elsewhere()
+
+@pytest.fixture(autouse=True)
+def kernels(request: pytest.FixtureRequest) -> None:
+    """Kernels are compiled once, in a process beside: of the tests' processes one asks for it, the others wait."""
+    if not request.path.relative_to(request.config.rootpath).as_posix().startswith(WITHOUT_KERNELS):
+        from scas4d_core.warm_up import warm_up_elsewhere
+
+        warm_up_elsewhere()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Puts first what needs no kernels, where they may have to be compiled, then the longest."""
+
+    def turn(item: pytest.Item) -> int:
+        path = item.path.relative_to(item.config.rootpath).as_posix()
+        return 0 if path.startswith("tests/server/http") else 1 if item.path.name in LONGEST else 2
+
+    items.sort(key=turn)  # stable: files stay together
 
 
 def pytest_xdist_auto_num_workers() -> int:

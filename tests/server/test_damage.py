@@ -20,7 +20,7 @@ from server.damage import KEPT, DamageKind, DamageLog
 
 HERE = Path(__file__).parent
 CAPTURE = HERE.parents[1] / "samples" / "robot"
-FAST = {"scrub_mb_per_second": 1e6, "scrub_pause_seconds": 0.05}
+FAST = {"scrub_mb_per_second": 1e6, "scrub_pause_seconds": 0.2}
 NEVER = {"scrub_mb_per_second": 0}
 
 
@@ -73,36 +73,44 @@ def colours(folder, id):
     return of.digests(folder / "scenes" / id / "states")
 
 
-@pytest.mark.parametrize("how", ["flipped", "gone"])
-@pytest.mark.parametrize(
-    "name",
-    ["frame_000007.npz", "frame_000006.npz", "frame_000000.npz", "fixed.npz", "fixed.copy.npz", "first.copy.npz"],
-)
-def test_what_is_in_memory_or_has_a_copy_is_written_again_with_the_same_bits(tmp_path, name, how):
+NEEDED = ("frame_000007.npz", "frame_000006.npz", "frame_000000.npz", "fixed.npz", "fixed.copy.npz", "first.copy.npz")
+
+
+def test_what_is_in_memory_or_has_a_copy_is_written_again_with_the_same_bits(tmp_path):
     with serving(tmp_path, **FAST) as (http, sdk):
         id = filled(http, sdk)
-        file = tmp_path / "scenes" / id / "states" / name
-        whole = file.read_bytes()
-        flip(file) if how == "flipped" else file.unlink()
-        status = status_with(http, id, name)
-        assert status["state"] == "ready"
-        assert str(tmp_path) not in str(status)
-        assert file.read_bytes() == whole
+
+        def mended(file, whole, before):
+            status = http.get(f"/v1/scenes/{id}").json()
+            told = status["damage"] != before and not status["degraded"]
+            return status if told and file.exists() and file.read_bytes() == whole else None
+
+        for name in NEEDED:
+            for how in ("flipped", "gone"):
+                file = tmp_path / "scenes" / id / "states" / name
+                whole = file.read_bytes()
+                before = http.get(f"/v1/scenes/{id}").json()["damage"]
+                flip(file) if how == "flipped" else file.unlink()
+                status = eventually(lambda: mended(file, whole, before))  # noqa: B023 (it is called here)
+                assert status["state"] == "ready"
+                assert name in status["damage"][-1]
+                assert len(status["damage"]) == len(before) + 1
+                assert str(tmp_path) not in str(status)
         assert all(view(http, id, index).status_code == 200 for index in range(8))
         assert http.get(f"/v1/scenes/{id}").json()["damage"] == status["damage"]  # said once
     with serving(tmp_path, **NEVER) as (http, _):
         assert http.get(f"/v1/scenes/{id}").json()["damage"] == []
 
 
-@pytest.mark.parametrize("name", ["frame_000007.npz", "frame_000000.npz", "fixed.npz"])
-def test_the_same_is_mended_at_a_start(tmp_path, name):
+def test_the_same_is_mended_at_a_start(tmp_path):
     with serving(tmp_path, **NEVER) as (http, sdk):
         id = filled(http, sdk)
     before = colours(tmp_path, id)
-    file = tmp_path / "scenes" / id / "states" / name
-    flip(file)
+    for name in ("frame_000007.npz", "frame_000000.npz", "fixed.npz"):
+        flip(tmp_path / "scenes" / id / "states" / name)
     with serving(tmp_path, **NEVER) as (http, sdk):
-        status_with(http, id, name)
+        for name in ("frame_000007.npz", "frame_000000.npz", "fixed.npz"):
+            status_with(http, id, name)
         eventually(lambda: http.get(f"/v1/scenes/{id}").json()["committed"] == 8)
         assert colours(tmp_path, id) == before
         put(http, id, 8)
@@ -111,8 +119,9 @@ def test_the_same_is_mended_at_a_start(tmp_path, name):
         assert http.get(f"/v1/scenes/{id}").json()["damage"] == []
 
 
-@pytest.mark.parametrize("found_by", ["reading", "scrub", "restart"])
-@pytest.mark.parametrize("how", ["flipped", "gone"])
+@pytest.mark.parametrize(
+    ("found_by", "how"), [("reading", "flipped"), ("scrub", "gone"), ("restart", "flipped"), ("restart", "gone")]
+)
 def test_a_state_in_the_middle_is_made_again_from_its_pictures(tmp_path, found_by, how):
     with contextlib.ExitStack() as stack:
         http, sdk = stack.enter_context(serving(tmp_path, **(FAST if found_by == "scrub" else NEVER)))
@@ -189,8 +198,7 @@ def test_frames_go_ahead_of_what_is_made_again(tmp_path, monkeypatch):
         eventually(lambda: view(http, id, 2).status_code == 200)
 
 
-@pytest.mark.parametrize("how", ["flipped", "gone", "empty"])
-@pytest.mark.parametrize("restart", [False, True])
+@pytest.mark.parametrize(("how", "restart"), [("flipped", False), ("gone", False), ("gone", True), ("empty", True)])
 def test_a_journal_is_written_anew(tmp_path, how, restart):
     with contextlib.ExitStack() as stack:
         http, sdk = stack.enter_context(serving(tmp_path, **FAST))
@@ -245,15 +253,16 @@ def test_a_frame_is_acknowledged_into_a_journal_that_has_its_name(tmp_path):
         assert (status["damage"], status["next_frame"], status["committed"]) == ([], 4, 4)
 
 
-@pytest.mark.parametrize("how", ["flipped", "gone"])
-def test_a_definition_is_written_again(tmp_path, how):
+def test_a_definition_is_written_again(tmp_path):
     with serving(tmp_path, **FAST) as (http, sdk):
         id = filled(http, sdk, 2)
         file = tmp_path / "scenes" / id / "scene.json"
         text = file.read_bytes()
-        flip(file, text.index(b'"id"') + 1) if how == "flipped" else file.unlink()
+        flip(file, text.index(b'"id"') + 1)
         status_with(http, id, "scene.json")
         assert file.read_bytes() == text
+        file.unlink()
+        eventually(lambda: file.exists() and file.read_bytes() == text)
 
 
 def test_a_scene_whose_definition_is_gone_is_not_taken_for_none(tmp_path):
@@ -308,7 +317,7 @@ def test_flipped_bits_over_everything(tmp_path):
     capture = open_capture(CAPTURE)
     fake = {"SCAS4D_ENGINE": "fakes:engine", "PYTHONPATH": f"{HERE}:{HERE.parents[1]}"}
     study = of.Study(tmp_path, capture, [], {}, fake)
-    outcome = faults.flipped_bits(study, 10, 1, lambda said: None)
+    outcome = faults.flipped_bits(study, 5, 1, lambda said: None)
     assert outcome.faults == []
 
 

@@ -278,8 +278,16 @@ def test_only_what_stays_may_be_kept_by_a_browser(still):
     assert "max-age" in http.get(f"/v1/scenes/{id}/render?frame=0").headers["cache-control"]
 
 
-def test_a_state_that_went_missing_is_not_found(scene, impatient):
+def test_a_state_that_went_missing_is_answered_from_a_copy_or_asked_for_later(scene, impatient):
     id, _, http = scene
-    (impatient.app.state.scenes[id].spec.states / "frame_000000.npz").unlink()
-    assert "frame 0" in problem(http.get(f"/v1/scenes/{id}/render?frame=0"), 404)["detail"]
-    assert http.get(f"/v1/scenes/{id}/render?frame=1").status_code == 200
+    states = impatient.app.state.scenes[id].spec.states
+    (states / "frame_000000.npz").unlink()
+    assert http.get(f"/v1/scenes/{id}/render?frame=0").status_code == 200
+    (states / "frame_000001.npz").unlink()
+    answer = http.get(f"/v1/scenes/{id}/render?frame=1")
+    assert "frame 1" in problem(answer, answer.status_code)["detail"]
+    assert answer.status_code in (404, 503)
+    until = time.monotonic() + 20
+    while http.get(f"/v1/scenes/{id}/render?frame=1").status_code != 200:
+        assert time.monotonic() < until
+        time.sleep(0.05)

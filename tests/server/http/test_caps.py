@@ -57,9 +57,10 @@ def test_uploads_that_hang_from_the_start_take_half_of_the_places(caps):
         until(lambda: app.guard.counts()["body"] == 1)
         for _ in range(4):
             held(stack, app, 20, put(b"/echo", 1000), b"abc")
+            sending.send(bytes(1000))  # on a busy machine the rounds take so long that it would be quiet
             assert get(app).status_code == 200
         assert app.guard.counts()["body"] <= 8
-        sending.send(bytes(80_000))
+        sending.send(bytes(76_000))
         assert sending.answer()[0] == 200
 
 
