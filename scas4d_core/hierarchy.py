@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.cluster import AgglomerativeClustering, KMeans
 from threadpoolctl import threadpool_limits
 
 Int = NDArray[np.int64]
@@ -95,6 +94,8 @@ def _kmeans(points: NDArray[np.float64], count: int, seed: int) -> Int:
     In float64 about the middle: a point nearly as near to a second cluster goes to the same one on every processor,
     whatever its linear algebra rounds like.
     """
+    from sklearn.cluster import KMeans  # takes a second, and views and frame 0 begin without it
+
     points = points - points.mean(axis=0)
     limit = KMEANS_SAMPLE_PER_CLUSTER * count
     rng = np.random.default_rng(seed)
@@ -113,6 +114,8 @@ def _merge(points: NDArray[np.float64], labels: Int, count: int) -> Int:
     a cluster at the border of two parents to the nearer one. Still nested, and rounder: what was merged first stays
     merged otherwise, however badly the rest then fits.
     """
+    from sklearn.cluster import AgglomerativeClustering, KMeans
+
     present = int(labels.max()) + 1
     if count >= present:
         return labels

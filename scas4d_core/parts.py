@@ -16,8 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.optimize import linear_sum_assignment
-from sklearn.cluster import KMeans
-from sklearn.metrics import silhouette_score
 from threadpoolctl import threadpool_limits
 
 from scas4d_core.gaussians import Gaussians, moving_extent, quaternions_to_matrices
@@ -206,7 +204,7 @@ def _cluster(
     settings: PartsSettings,
     rng: np.random.Generator,
     previous: NDArray[Any] | None,
-) -> KMeans:
+) -> Any:
     known = np.empty(0, np.int64) if previous is None else np.unique(previous[previous >= 0])
     if count is None:
         # Drawn by weight, so that the silhouette sees what the pictures see.
@@ -216,12 +214,14 @@ def _cluster(
     if previous is None or len(known) != count:
         return fresh
     centres = np.stack([np.average(features[previous == k], axis=0, weights=weights[previous == k]) for k in known])
-    kept = KMeans(n_clusters=count, init=centres, n_init=1).fit(features, sample_weight=weights)
+    kept = _kmeans(count, settings, init=centres, n_init=1).fit(features, sample_weight=weights)
     return kept if kept.inertia_ <= (1 + settings.stay) * fresh.inertia_ else fresh
 
 
 def _best_count(features: Features, settings: PartsSettings, known: int) -> int:
     """The count of the largest mean silhouette; ``known``, that of the parts before, has an advantage (0: none)."""
+    from sklearn.metrics import silhouette_score
+
     best, best_score = 1, 0.0
     for count in range(2, min(settings.most_parts, len(features) - 1) + 1):
         labels = _kmeans(count, settings).fit_predict(features)
@@ -231,5 +231,8 @@ def _best_count(features: Features, settings: PartsSettings, known: int) -> int:
     return best
 
 
-def _kmeans(count: int, settings: PartsSettings) -> KMeans:
-    return KMeans(n_clusters=count, n_init=settings.restarts, random_state=settings.seed)
+def _kmeans(count: int, settings: PartsSettings, **given: Any) -> Any:
+    """scikit-learn's, whose import takes a second: whoever renders views does without."""
+    from sklearn.cluster import KMeans
+
+    return KMeans(n_clusters=count, **{"n_init": settings.restarts, "random_state": settings.seed, **given})

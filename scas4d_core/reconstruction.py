@@ -102,6 +102,7 @@ class Reconstruction(Committed):
         static: StaticResult | None = None,
         dropped: Mapping[str, str] | None = None,
         notes: Mapping[str, Any] | None = None,
+        started: float | None = None,
     ) -> Reconstruction:
         """Reconstruct the first frame and commit it.
 
@@ -112,7 +113,7 @@ class Reconstruction(Committed):
             progress: told of each stage.
             history: where to commit to; in memory when left out.
             static: a frame 0 that was fitted before, taken as it is.
-            dropped, notes: see ``step``.
+            dropped, notes, started: see ``step``; the stage "load" is what went before: decoding, loading the kernels.
 
         Raises:
             DeviceError: the settings' device cannot be had here.
@@ -131,7 +132,8 @@ class Reconstruction(Committed):
         self._fixed = Fixed(len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians))
         self._updater, structure = self._prepared(result.gaussians, None)
         seen = () if self._fixed.masked else self._factory.views(self._scaled(frame), {}, use_masks=False)
-        seconds = {"fit": fitted - began, "prepare": perf_counter() - fitted}
+        load = {} if started is None else {"load": began - started}
+        seconds = {**load, "fit": fitted - began, "prepare": perf_counter() - fitted}
         report = report_of_first(frame, result, self.rig.names, len(self._updater.hierarchy.rows), seconds, dropped)
         psnr = {name: fit.psnr for name, fit in result.cameras.items()}
         past = replace(judge.Past.of_first(psnr, judge.brightness(frame.images)), fitted=frame.time)

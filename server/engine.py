@@ -100,8 +100,12 @@ class Engine(Protocol):
         history: History,
         dropped: Mapping[str, str] | None = None,
         notes: Mapping[str, Any] | None = None,
+        started: float | None = None,
     ) -> Reconstruction:
-        """Reconstructs the first frame and commits it to the history, with its report and what is given here."""
+        """Reconstructs the first frame and commits it to the history, with its report and what is given here.
+
+        `started`: as for `Reconstruction.step`.
+        """
 
     def resume(self, rig: Rig, settings: Any, history: History, *, held: Callable[[int], bool] = ...) -> Reconstruction:
         """Goes on from the last commit of a history; `held`: whether a frame's pictures can be given again."""
@@ -153,13 +157,15 @@ class CoreEngine:
         history: History,
         dropped: Mapping[str, str] | None = None,
         notes: Mapping[str, Any] | None = None,
+        started: float | None = None,
     ) -> Reconstruction:
         """`Reconstruction.start`."""
         from scas4d_core.reconstruction import Reconstruction
 
         return Reconstruction.start(
-            rig, frame, settings, points=points, progress=progress, history=history, dropped=dropped, notes=notes
-        )
+            rig, frame, settings, points=points, progress=progress, history=history, dropped=dropped, notes=notes,
+            started=started,
+        )  # fmt: skip
 
     def resume(
         self, rig: Rig, settings: Any, history: History, *, held: Callable[[int], bool] = lambda index: True

@@ -200,6 +200,7 @@ class Worker:
                 progress=self.progress,
                 history=self.states,
                 dropped=dropped,
+                started=began,
             )
         else:
             if budget != self._budget:

@@ -162,7 +162,8 @@ class FakeReader:
 
 
 class FakeEngine:
-    def start(self, rig, frame, settings, *, points, progress, history, dropped=None, notes=None):
+    def start(self, rig, frame, settings, *, points, progress, history, dropped=None, notes=None, started=None):
+        assert started is None or started <= time.perf_counter()
         obey(frame)
         for done in range(3):
             progress(Progress("fitting", done + 1, 3, {"psnr": 30.0}))
