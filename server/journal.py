@@ -17,6 +17,7 @@ from typing import BinaryIO
 from pydantic import ValidationError
 
 from scas4d_core.npz import sync_folder
+from server.disk import no_room
 from server.facts import Created, Died, Fact, no_fact, parse_fact
 from server.problems import Problem
 from server.record_log import Damage, Kind, encoded, streamed
@@ -193,6 +194,11 @@ class Journal:
         self._flushing: asyncio.Task[None] | None = None
 
     @property
+    def place(self) -> tuple[int, int]:
+        """Which file it is written to, and the bytes of it that are whole: whether it was written anew meanwhile."""
+        return os.fstat(self._file).st_ino, self._good
+
+    @property
     def good(self) -> int:
         """Bytes of it that are written and synced."""
         return self._good
@@ -243,13 +249,13 @@ class Journal:
             while self._waiting or self._fault is not None:
                 batch, self._waiting = self._waiting, []
                 facts = [fact for some, _ in batch for fact in some]
-                fault: OSError | None = None
+                fault: Exception | None = None
                 try:
                     if self._fault is None:
                         self._fault = await asyncio.to_thread(self._write, facts)
                     if self._fault is not None:
-                        await self._renew(facts)
-                except OSError as error:
+                        await self._renew_or_append(facts)
+                except Exception as error:  # whatever it is, those who wait are told
                     fault = error
                 else:
                     self._last = facts or self._last
@@ -261,7 +267,7 @@ class Journal:
                     else:
                         done.set_exception(fault)
                         done.exception()  # whoever asked may have gone: not a fault of the event loop
-                if fault is not None and not batch:
+                if fault is not None and not batch and not self._waiting:
                     break  # the next fact tries again
         finally:
             self._flushing = None
@@ -283,14 +289,29 @@ class Journal:
         self._good += len(data)
         return self.misplaced() if watched else None
 
+    async def _renew_or_append(self, facts: Sequence[Fact]) -> None:
+        """Writes it anew; where there is no room for that and the file is in its place, what comes goes behind.
+
+        A damaged record costs what it said, a refused frame costs the frame; the next scrub finds the damage again.
+        """
+        try:
+            await self._renew(facts)
+        except OSError as error:
+            if not no_room(error) or self.misplaced() is not None:
+                raise
+            self._fault = None
+            if facts and (fault := await asyncio.to_thread(self._write, facts)) is not None:
+                self._fault = fault
+                raise
+
     async def _renew(self, facts: Sequence[Fact]) -> None:
         """Writes it anew: what the snapshot tells, and behind it what that may lack."""
         assert self._snapshot is not None
         assert self._fault is not None
         told = self._snapshot()
-        # A death is counted before it is written, and would count twice; all others may be told again.
-        behind = [fact for fact in (*self._last, *facts) if not isinstance(fact, Died)]
-        self._good = await asyncio.to_thread(self._replace, told, behind)
+        # Facts may be told twice, but for a death, which would be counted twice: whoever appended it takes it in after.
+        last = [fact for fact in self._last if not isinstance(fact, Died)]
+        self._good = await asyncio.to_thread(self._replace, told, [*last, *facts])
         fault, self._fault = self._fault, None
         self._renewed(fault)
 

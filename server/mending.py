@@ -22,6 +22,8 @@ from server.messages import FrameReady, Mend, Mended, MendOutcome, Remake
 
 AGAIN_S = 5.0
 """What the disk had no room for is tried again after so long."""
+OF_REMAKE = frozenset({MendOutcome.REMADE, MendOutcome.LOST, MendOutcome.LATER, MendOutcome.NO_ROOM})
+"""Answers that end the making of a state; others may be of the same file, asked about before."""
 DEATHS = 2
 """A state at whose making the worker dies so often is given up."""
 
@@ -59,7 +61,7 @@ class Mending:
         self._asked: dict[str, str] = {}
         self._waiting: dict[int, str] = {}
         self._deaths: dict[int, int] = {}
-        self._timers: set[asyncio.TimerHandle] = set()
+        self._timers: dict[str, asyncio.TimerHandle] = {}
         self._full_until = 0.0
         self.at_work: int | None = None
         for index, reason in remake.items():
@@ -138,7 +140,7 @@ class Mending:
         """What the worker says of a file or of a state."""
         index = frame_of(message.name)
         reason = self._asked.pop(message.name, message.reason)
-        if index is not None and index == self.at_work:
+        if index is not None and index == self.at_work and message.outcome in OF_REMAKE:
             self.at_work = None
         match message.outcome:
             case MendOutcome.WHOLE:
@@ -170,21 +172,30 @@ class Mending:
             case MendOutcome.NO_ROOM:
                 if index is None or index not in self._waiting:
                     self._asked[message.name] = reason
-                    self._later(lambda: self._ask([message.name]))
+                    self._later(message.name, lambda: self._ask({message.name} & self._asked.keys()))
                 else:
                     self._full_until = asyncio.get_running_loop().time() + AGAIN_S
-                    self._later(lambda: self._hooks.states_changed(()))
-            case MendOutcome.GONE:
+                    self._later(message.name, lambda: self._hooks.states_changed(()))
+            case MendOutcome.GONE | MendOutcome.LATER:
                 pass
         self._hooks.states_changed(() if index is None else (index,))
 
-    def _later(self, call: Callable[[], None]) -> None:
-        self._timers = {timer for timer in self._timers if timer.when() > asyncio.get_running_loop().time()}
-        self._timers.add(asyncio.get_running_loop().call_later(AGAIN_S, call))
+    def _later(self, name: str, call: Callable[[], None]) -> None:
+        """Tries again after a while; one such timer a file, however often it is asked about."""
+        if (timer := self._timers.pop(name, None)) is not None:
+            timer.cancel()
+        self._timers[name] = asyncio.get_running_loop().call_later(AGAIN_S, call)
+
+    def retired(self, frames: Iterable[int]) -> None:
+        """The scene's rule has deleted these states: there is nothing to mend of them any more."""
+        for index in frames:
+            self._asked.pop(frame_file(index), None)
+            if self._waiting.pop(index, None) is not None:
+                self._ledger.frames.set_unreadable(index, False)
 
     def stop(self) -> None:
         """Nothing is tried again."""
-        for timer in self._timers:
+        for timer in self._timers.values():
             timer.cancel()
 
     def _decide(self, index: int, reason: str) -> None:

@@ -171,6 +171,8 @@ class MendOutcome(StrEnum):
     """The state was made again from pictures."""
     LOST = "lost"
     """The state could not be made again."""
+    LATER = "later"
+    """The state is to be made again once the one before it is."""
     NO_ROOM = "no_room"
     """The disk is full; to be tried again."""
 

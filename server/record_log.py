@@ -266,7 +266,10 @@ def streamed_record(file: Readable) -> Iterator[int]:
     head = file.read(head_length)
     if CRC.unpack_from(header, HEADER.size)[0] != zlib.crc32(head, zlib.crc32(header[: HEADER.size])):
         raise ValueError("the header or head fails its checksum")
-    sizes = [body_length] if version == WHOLE else [int(said["size"]) for said in json.loads(head)["files"]]
+    try:
+        sizes = [body_length] if version == WHOLE else [int(said["size"]) for said in json.loads(head)["files"]]
+    except (KeyError, TypeError) as error:  # whole, but written by something else
+        raise ValueError(f"the head is not one of a record ({error!r})") from None
     whole = blake3(header + head)
     for size in sizes:
         digest = whole if version == WHOLE else blake3()

@@ -92,7 +92,7 @@ def recover(folder: Path, scene: str, definition: Mapping[str, Any] | None = Non
     elif debris:
         remove(frames, debris)
     sizes = {name: size for name, size in sizes.items() if name not in debris}
-    remake = _remade(ledger, states, broken)
+    remake = _remade(ledger, states, broken, _deletes_states(definition or {}))
     damage.extend(f"frame {index}: {reason}" for index, reason in remake.items() if index not in states.damaged)
     facts += ledger.reconcile(states.indices, states.damaged, remake)
     if states.newest:
@@ -131,11 +131,19 @@ def _unnamed(ledger: Ledger, sizes: dict[str, int]) -> set[str]:
     return set(sizes) - named
 
 
-def _remade(ledger: Ledger, states: _States, broken: bool) -> dict[int, str]:
+def _deletes_states(definition: Mapping[str, Any]) -> bool:
+    """Whether the scene has a rule by which old states go."""
+    rule = definition.get("request", {}).get("ingest", {}).get("keep_states") or {}
+    return any(value is not None for value in rule.values())
+
+
+def _remade(ledger: Ledger, states: _States, broken: bool, deletes: bool) -> dict[int, str]:
     """Frames that were committed, whose states cannot be read, and whose pictures are held: they can be made again.
 
-    Where facts are lost, a frame without a state may never have been committed.
+    Where facts are lost, a frame without a state may never have been committed. Where old states are deleted by a rule,
+    those before the oldest (but the first, which stays) are not missed: the journal may not have heard of it.
     """
+    oldest = min(sorted(states.times)[1:], default=0) if deletes else 0
     return {
         entry.index: states.damaged.get(entry.index, "its state is gone from the disk")
         for entry in ledger.frames.held()
@@ -143,7 +151,7 @@ def _remade(ledger: Ledger, states: _States, broken: bool) -> dict[int, str]:
         and entry.index < states.last
         and entry.index not in states.times
         and not entry.deleted
-        and (entry.index in states.damaged or not broken)
+        and (entry.index in states.damaged or (not broken and entry.index >= oldest))
     }
 
 

@@ -24,9 +24,8 @@ def mend_at_start(history: History) -> list[str]:
     """What every frame needs, and its copies, written again where they are damaged; a sentence for each."""
     try:
         mended = history.mend_fixed()
-    except OSError as error:
-        if not no_room(error):
-            raise
+    except OSError as error:  # states can be read all the same: a disk that takes nothing must not keep them away
+        log.warning("what every frame needs cannot be mended: %s", error)
         return []
     history.take_faults()  # of files that were just written again, or that `History.damaged` names
     return [
@@ -97,8 +96,32 @@ def _report_of(files: FrameFiles, index: int) -> dict[str, Any] | None:
     return report
 
 
-def remake(engine: Engine, spec: SceneSpec, history: History, message: Remake, decode: Decode) -> Mended:
-    """Makes a state again from its pictures; whatever comes of it, the scene goes on as before."""
+def remake(engine: Engine, spec: SceneSpec, history: History, message: Remake, decode: Decode) -> Iterator[Mended]:
+    """Makes a state again from its pictures; whatever comes of it, the scene goes on as before.
+
+    Damage often has neighbours: where the state before it is damaged too, and nobody has noticed, that comes first.
+    """
+    index = message.frame.index
+    assert history.files is not None
+    name = history.files.path(index).name
+    base = history.files.path(message.base).name
+    if (fault := fault_of(history.files.directory / base)) is not None:
+        for mended in mend(history, None, Mend((base,), {}, {})):
+            yield mended
+            match mended.outcome:
+                case MendOutcome.WRITTEN | MendOutcome.WHOLE | MendOutcome.REPORT_LOST:
+                    continue
+                case MendOutcome.DAMAGED:
+                    yield Mended(name, MendOutcome.LATER, fault)
+                case MendOutcome.NO_ROOM:
+                    yield Mended(name, MendOutcome.NO_ROOM, mended.reason)
+                case _:
+                    yield Mended(name, MendOutcome.LOST, "the state before it is gone")
+            return
+    yield _remade(engine, spec, history, message, decode)
+
+
+def _remade(engine: Engine, spec: SceneSpec, history: History, message: Remake, decode: Decode) -> Mended:
     index = message.frame.index
     assert history.files is not None
     name = history.files.path(index).name

@@ -264,6 +264,7 @@ class Scene:
         self._tell(FrameFinished(report))
         self.work()
         if message.deleted:
+            self.mending.retired(message.deleted)
             deleted = StatesDeleted(frames=message.deleted)
             self.ledger.apply(deleted)
             self._tell(SceneChanged())
@@ -374,8 +375,8 @@ class Scene:
         if index is not None and self.frames[index].state == FrameState.UPDATING:
             self.ledger.move(index, FrameState.QUEUED)
             death = Died(index=index, reason=reason, own=own)
-            self.ledger.apply(death)
             await self._write(death)
+            self.ledger.apply(death)
             # It may have died between its commit and saying so: the next worker tells, and only then is it given up.
             fact = given_up(self.frames[index], death)
             if fact is not None and not await asyncio.to_thread(self._is_committed, index):

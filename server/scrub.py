@@ -112,8 +112,9 @@ class Scrub:
     async def _journal(self) -> None:
         journal = self._scene.journal
         journal.look()
-        fault = await self._read(checked_journal(journal.path, journal.good), FACTS_WEIGH)
-        if fault is not None and fault != "gone":
+        file, good = journal.place
+        fault = await self._read(checked_journal(journal.path, good), FACTS_WEIGH)
+        if fault is not None and fault != "gone" and journal.place[0] == file:  # else it was written anew meanwhile
             journal.renew(f"{journal.path.name} is damaged ({fault})")
 
     async def _states(self) -> None:

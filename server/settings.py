@@ -83,14 +83,16 @@ class ServerSettings(BaseSettings):
         gt=0,
         le=600,
         description="From the first byte of a request to the end of its header, and from opening a connection to that "
-        "byte, in seconds; later gets 408, or is closed where nothing has come. A header is one packet or two: ten seconds are three times resent.",
+        "byte, in seconds; later gets 408, or is closed where nothing has come. A header is one packet or two: ten "
+        "seconds are three times resent.",
     )
     header_kb: int = Field(
         default=64,
         ge=8,
         le=1024,
         description="Largest header of a request, with its address, in kB of 1024 bytes; more gets 431 or 414. "
-        "Browsers send up to 16 with cookies of other services on this host; reading one takes time by the square of its size.",
+        "Browsers send up to 16 with cookies of other services on this host; reading one takes time by the square of "
+        "its size.",
     )
     header_lines: int = Field(
         default=100,
@@ -110,7 +112,8 @@ class ServerSettings(BaseSettings):
         gt=0,
         le=3600,
         description="Life of a connection between two requests, in seconds. Longer than clients keep theirs (httpx 5 "
-        "s), so that none sends into one that is just closed; a proxy has to close its idle connections sooner than this.",
+        "s), so that none sends into one that is just closed; a proxy has to close its idle connections sooner than "
+        "this.",
     )
     unread_seconds: float = Field(
         default=30.0,
@@ -211,7 +214,8 @@ class ServerSettings(BaseSettings):
         default=4.0,
         ge=0,
         description="All that a scene has on disk is read again in the background and compared with its checksums, so "
-        "fast for each scene, and at a quarter of that while a frame of it is at work; 0: never. 4 MB/s take half a percent of a core.",
+        "fast for each scene, and at a quarter of that while a frame of it is at work; 0: never. 4 MB/s take half a "
+        "percent of a core.",
     )
     scrub_pause_seconds: float = Field(
         default=600.0, gt=0, description="Before each such pass over a scene; a flipped bit is found a pass later."

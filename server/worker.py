@@ -8,6 +8,7 @@ import os
 import signal
 import threading
 import time
+from collections import deque
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -57,7 +58,7 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     worker = Worker(spec, connection)
     try:
         if worker.open():
-            while not isinstance(message := connection.recv(), Stop):
+            while not isinstance(message := worker.next(), Stop):
                 match message:
                     case FrameReady():
                         worker.take(message)
@@ -105,6 +106,7 @@ class Worker:
         self._budget = Budget()
         self._write_seconds: float | None = None
         self._publish_seconds = 0.0
+        self._later: deque[Any] = deque()
 
     def open(self) -> bool:
         """Takes up what is committed and says so; False where it cannot be gone on from."""
@@ -143,9 +145,25 @@ class Worker:
                     raise
                 log.warning("scene %s, frame %d: %s", self.spec.folder.name, message.index, error)
                 self.connection.send(Stalled(message.index, told(error), stall))
-            if self.connection.poll(stall):  # nothing else comes while a frame is at work
-                raise _Stopped
+            self._await_room(stall)
             stall = min(2 * stall, LONGEST_STALL_S)
+
+    def next(self) -> Any:
+        """The next message; those that came while a frame waited for room first."""
+        return self._later.popleft() if self._later else self.connection.recv()
+
+    def _await_room(self, seconds: float) -> None:
+        """Waits; only being told to stop ends it early, everything else is for later.
+
+        Raises:
+            _Stopped: it was.
+        """
+        until = time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0 and self.connection.poll(left):
+            message = self.connection.recv()
+            if isinstance(message, Stop):
+                raise _Stopped
+            self._later.append(message)
 
     def finish(self, message: FrameReady) -> Committed | SetAside:
         """Commits a frame, or says why not.
@@ -186,7 +204,8 @@ class Worker:
         def pictures() -> tuple[Frame, dict[str, str]]:
             return decode(self.spec.rig, frame, read(self.spec.frames, frame))
 
-        self.connection.send(repairs.remake(self.engine, self.spec, self.states, message, pictures))
+        for mended in repairs.remake(self.engine, self.spec, self.states, message, pictures):
+            self.connection.send(mended)
 
     def reconstruct(self, frame: Frame, dropped: dict[str, str], budget: Budget, began: float) -> Committed:
         """Runs the first frame or an update, and commits. `began`: `perf_counter` before decoding."""

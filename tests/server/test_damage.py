@@ -341,3 +341,15 @@ def test_where_the_report_alone_is_damaged_the_state_stays(tmp_path, restart):
         assert after["psnr"] == (None if restart else before["psnr"])
         assert restart or file.read_bytes() == whole
         assert view(http, id, 2).status_code == 200
+
+
+def test_neighbours_that_are_damaged_are_all_made_again(tmp_path):
+    with serving(tmp_path, **NEVER) as (http, sdk):
+        id = filled(http, sdk)
+        before = colours(tmp_path, id)
+        for index in (2, 3):
+            flip(tmp_path / "scenes" / id / "states" / f"frame_00000{index}.npz")
+        assert view(http, id, 3).status_code in (404, 503)  # nobody has looked at 2
+        eventually(lambda: all(view(http, id, index).status_code == 200 for index in (2, 3)))
+        assert colours(tmp_path, id) == before  # the fake's depend on the state before alone
+        assert all(http.get(f"/v1/scenes/{id}/frames/{index}").json()["remade"] for index in (2, 3))

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
+import threading
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_ledger import identity
@@ -214,3 +217,48 @@ def test_every_flipped_byte_of_a_journal_and_a_cut_beginning_are_damage(tmp_path
         assert not replay(path, lambda fact: None).begun
     path.unlink()
     assert not replay(path, lambda fact: None).begun
+
+
+def no_space(*_):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_fact_that_comes_while_a_renewal_fails_is_not_forgotten(tmp_path, monkeypatch):
+    async def job():
+        journal = Journal(tmp_path / "journal.log", 0, lambda: iter(()))
+        began, go = asyncio.Event(), threading.Event()
+        loop = asyncio.get_running_loop()
+
+        def slow(*_):
+            loop.call_soon_threadsafe(began.set)
+            go.wait(10)
+            no_space()
+
+        monkeypatch.setattr(journal, "_replace", slow)
+        journal.renew("it is damaged")
+        await began.wait()
+        appended = asyncio.create_task(journal.append(Missing(index=0, reason="r")))
+        await asyncio.sleep(0)
+        go.set()
+        # There is no room for a journal anew, and the file is in its place: the fact goes behind what is there.
+        await asyncio.wait_for(appended, 10)
+        await journal.close()
+
+    asyncio.run(job())
+    assert [fact.index for fact in read_journal(tmp_path / "journal.log").facts] == [0]
+
+
+def test_whoever_waits_for_a_renewal_that_breaks_is_told(tmp_path, monkeypatch):
+    async def job():
+        journal = Journal(tmp_path / "journal.log", 0, lambda: iter(()))
+
+        def broken(*_):
+            raise ValueError("a fact that cannot be written")
+
+        monkeypatch.setattr(journal, "_replace", broken)
+        (tmp_path / "journal.log").unlink()
+        with pytest.raises(ValueError, match="cannot be written"):
+            await asyncio.wait_for(journal.append(Missing(index=0, reason="r")), 10)
+        await journal.close()
+
+    asyncio.run(job())
