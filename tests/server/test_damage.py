@@ -317,7 +317,7 @@ def test_flipped_bits_over_everything(tmp_path):
     capture = open_capture(CAPTURE)
     fake = {"SCAS4D_ENGINE": "fakes:engine", "PYTHONPATH": f"{HERE}:{HERE.parents[1]}"}
     study = of.Study(tmp_path, capture, [], {}, fake)
-    outcome = faults.flipped_bits(study, 5, 1, lambda said: None)
+    outcome = faults.flipped_bits(study, 3, 1, lambda said: None)
     assert outcome.faults == []
 
 
