@@ -19,9 +19,10 @@ from server.metrics import CONNECTIONS_REFUSED
 
 SWEEP_S = 1.0
 LINGER_S = 5.0
+LINGER_LONGEST_S = 60.0
 LINGER_BYTES = 64 << 20
-"""A body that goes on after its answer is read and dropped so long, so far: closed at once, the connection would be
-reset, and the sender would lose the answer."""
+"""A body that goes on after its answer is read and dropped while `PROGRESS_BYTES` come in `LINGER_S`, so long in all,
+so far: closed at once, the connection would be reset, and the sender would lose the answer."""
 REFUSED_S = 2.0
 """The same for a connection that was refused itself."""
 REFUSED_AT_ONCE = 64
@@ -99,7 +100,7 @@ class Guard:
         """Takes note that a connection is in another phase, from `now` (loop time) on."""
         if record.gone:
             return
-        record.phase, record.since, record.body = phase, now, 0
+        record.phase, record.since, record.entered, record.body, record.dropped = phase, now, now, 0, 0
         queue = None
         if phase in (Phase.NEW, Phase.HEAD, Phase.IDLE):
             queue = record.peer.idle if record.served else record.peer.strangers
@@ -247,7 +248,11 @@ class Guard:
                 record.transport.close()
             case Phase.HEAD if waited > limits.header_seconds:
                 record.handler.refuse(Refusal.HEAD_TIME)
-            case Phase.LINGER if waited > LINGER_S or record.body > LINGER_BYTES:
+            case Phase.LINGER if now - record.entered > LINGER_LONGEST_S or record.body > LINGER_BYTES:
+                record.transport.close()
+            case Phase.LINGER if record.body - record.dropped >= PROGRESS_BYTES:
+                record.since, record.dropped = now, record.body
+            case Phase.LINGER if waited > LINGER_S:
                 record.transport.close()
             case Phase.BODY if record.body >= PROGRESS_BYTES:
                 record.since, record.body = now, 0

@@ -61,7 +61,8 @@ class Record:
     """One open connection.
 
     Attributes:
-        since: loop time at which the phase, or its present window, began. body: bytes of body in that window.
+        since: loop time at which the phase, or its present window, began. entered: that of the phase.
+        body: bytes of body in that window; in all, and dropped those of windows before, where the body is dropped.
         moved: so much of the present body came that it is no pretence, in whatever windows.
         received: bytes since the last sweep. quiet_since: loop time of the last sweep that found any.
         served: one request was answered. write_paused: more waits to be sent than the transport likes.
@@ -76,7 +77,9 @@ class Record:
     queue: dict[Record, None] | None = None
     counted: bool = True
     gone: bool = False
+    entered: float = 0.0
     body: int = 0
+    dropped: int = 0
     moved: bool = False
     received: int = 0
     served: bool = False
