@@ -15,7 +15,7 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from server.auth import HEADERS
 from server.http.guard import Guard
-from server.http.record import Phase
+from server.http.record import PROGRESS_BYTES, Phase
 from server.http.refusals import Refusal, problem, response
 
 END_OF_HEAD = b"\r\n\r\n"
@@ -180,7 +180,10 @@ class Connection(HttpToolsProtocol):
         if self._fault is not None:
             return
         self._delivered += len(body)
-        self._record.body += len(body)
+        record = self._record
+        record.body += len(body)
+        if record.body >= PROGRESS_BYTES:
+            record.moved = True
         if self._left is not None:
             self._left -= len(body)
         cycle = self.cycle

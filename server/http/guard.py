@@ -6,22 +6,23 @@ A connection costs no timer of its own: one sweep, about once a second, looks at
 from __future__ import annotations
 
 import asyncio
+import ipaddress
 import logging
 from collections import Counter
+from collections.abc import Collection, Iterable
 
 from server.http.limits import Limits
 from server.http.process import unread_bytes
-from server.http.record import KINDS, Handler, Peer, Phase, Record
+from server.http.record import KINDS, PROGRESS_BYTES, Handler, Peer, Phase, Record
 from server.http.refusals import Refusal
 from server.metrics import CONNECTIONS_REFUSED
 
 SWEEP_S = 1.0
-PROGRESS_BYTES = 16 << 10
-"""What a window of `body_seconds` or `unread_seconds` has to move: less holds a connection open on purpose."""
 LINGER_S = 5.0
+LINGER_LONGEST_S = 60.0
 LINGER_BYTES = 64 << 20
-"""A body that goes on after its answer is read and dropped so long, so far: closed at once, the connection would be
-reset, and the sender would lose the answer."""
+"""A body that goes on after its answer is read and dropped while `PROGRESS_BYTES` come in `LINGER_S`, so long in all,
+so far: closed at once, the connection would be reset, and the sender would lose the answer."""
 REFUSED_S = 2.0
 """The same for a connection that was refused itself."""
 REFUSED_AT_ONCE = 64
@@ -34,6 +35,19 @@ SUMMARY_S = 10.0
 """Between two lines of the log about refused connections: a line each would be another flood."""
 
 log = logging.getLogger("scas4d.server")
+
+
+def peer_key(address: str) -> str:
+    """Under which connections count as one peer's: an IPv6 address by its /64, all of which is one customer's."""
+    try:
+        found = ipaddress.ip_address(address)
+    except ValueError:
+        return address
+    if isinstance(found, ipaddress.IPv4Address):
+        return address
+    if found.ipv4_mapped is not None:
+        return str(found.ipv4_mapped)
+    return f"{ipaddress.IPv6Address(int(found) >> 64 << 64)}/64"
 
 
 class Guard:
@@ -58,21 +72,22 @@ class Guard:
         """A new connection: its record, and why it has to be refused where it has to be.
 
         Where a cap is reached it takes the place of the oldest connection that has not sent a whole header, is idle, or
-        has stopped sending its body: whoever hangs about must not keep out who has a request.
+        has stopped sending its body: whoever hangs about must not keep out who has a request. Where all places are
+        taken, any peer's may give way: who has many addresses has few connections from each.
         """
         now = loop.time()
-        peer = self._peers.get(address)
+        proxy = self.limits.is_proxy(address)
+        key = address if proxy else peer_key(address)  # a proxy's neighbours are no proxies
+        peer = self._peers.get(key)
         if peer is None:
-            peer = self._peers[address] = Peer(address, self.limits.is_proxy(address))
+            peer = self._peers[key] = Peer(key, proxy)
         refusal = None
-        if not peer.proxy and peer.count >= self.limits.per_peer and not self._displace(peer, now):
+        if not proxy and peer.count >= self.limits.per_peer and not self._displace([peer], now):
             refusal = Refusal.PEER_CONNECTIONS
-        elif self._counted >= self.limits.connections:
-            largest = max(self._peers.values(), key=lambda known: known.count)
-            if not self._displace(largest, now):
-                refusal = Refusal.CONNECTIONS
+        elif self._counted >= self.limits.connections and not self._displace(self._peers.values(), now):
+            refusal = Refusal.CONNECTIONS
         record = self._records[transport] = Record(handler, transport, peer, now, now)
-        self._peers[address] = peer  # it went where its last connection gave way
+        self._peers[key] = peer  # it went where its last connection gave way
         peer.count += 1
         self._counted += 1
         self.enter(record, Phase.NEW, now)
@@ -85,7 +100,7 @@ class Guard:
         """Takes note that a connection is in another phase, from `now` (loop time) on."""
         if record.gone:
             return
-        record.phase, record.since, record.body = phase, now, 0
+        record.phase, record.since, record.entered, record.body, record.dropped = phase, now, now, 0, 0
         queue = None
         if phase in (Phase.NEW, Phase.HEAD, Phase.IDLE):
             queue = record.peer.idle if record.served else record.peer.strangers
@@ -98,6 +113,7 @@ class Guard:
                 self._bodies += queue is record.peer.bodies
             record.queue = queue
         if phase is Phase.BODY:
+            record.moved = False
             self._make_room_for_headers(record)
         elif phase is Phase.REFUSED:
             self._release(record)
@@ -146,16 +162,18 @@ class Guard:
         The other half is then of connections that give way at once: who has a request finds a place at any moment, and
         not only when uploads that hang are old enough to be told from those that have just begun.
         """
-        limits, peer = self.limits, new.peer
-        if peer.proxy or 2 * len(peer.bodies) <= limits.per_peer:
-            if 2 * self._bodies <= limits.connections:
+        peers: Iterable[Peer] = [new.peer]
+        if new.peer.proxy or 2 * len(new.peer.bodies) <= self.limits.per_peer:
+            if 2 * self._bodies <= self.limits.connections:
                 return
-            peer = max(self._peers.values(), key=lambda known: len(known.bodies))
-        for record in peer.bodies:
-            begun = record.phase is Phase.LINGER or record.body < PROGRESS_BYTES
-            if record is not new and begun and not record.handler.waits_for_us:
-                self._end(record, new.since)
-                return
+            peers = self._peers.values()
+        begun = (
+            [other for other in peer.bodies if other is not new and other.is_begun and not other.handler.waits_for_us]
+            for peer in peers
+        )
+        most = max(begun, key=len, default=[])
+        if most:
+            self._end(most[0], new.since)
 
     def _end(self, record: Record, now: float) -> None:
         """Ends a connection that gives way, without an answer."""
@@ -174,18 +192,24 @@ class Guard:
         if peer.count == 0:
             self._peers.pop(peer.address, None)
 
-    def _displace(self, peer: Peer, now: float) -> bool:
-        """Ends the connection of a peer that can be spared; False where none can."""
-        record = next(iter(peer.strangers), None) or next(iter(peer.idle), None)
-        if record is None:
-            for uploading in peer.bodies:
-                quiet = uploading.received == 0 and now - max(uploading.since, uploading.quiet_since) > QUIET_S
-                if quiet and not uploading.handler.waits_for_us:
-                    record = uploading
-                    break
-            else:
-                return False
-        self._end(record, now)
+    def _displace(self, peers: Collection[Peer], now: float) -> bool:
+        """Ends the connection of these peers that can be spared best; False where none can."""
+        for queues in ([peer.strangers for peer in peers], [peer.idle for peer in peers]):
+            found = [(len(queue), next(iter(queue))) for queue in queues if queue]
+            if found:
+                # Of many peers with as many it is the one that has waited longest: who has just come has a request.
+                _, record = max(found, key=lambda one: (one[0], -one[1].since))
+                self._end(record, now)
+                return True
+        quiet = [
+            record
+            for peer in peers
+            for record in peer.bodies
+            if record.received == 0 and now - record.heard > QUIET_S and not record.handler.waits_for_us
+        ]
+        if not quiet:
+            return False
+        self._end(min(quiet, key=lambda record: record.heard), now)
         return True
 
     def _sweep(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -224,7 +248,11 @@ class Guard:
                 record.transport.close()
             case Phase.HEAD if waited > limits.header_seconds:
                 record.handler.refuse(Refusal.HEAD_TIME)
-            case Phase.LINGER if waited > LINGER_S or record.body > LINGER_BYTES:
+            case Phase.LINGER if now - record.entered > LINGER_LONGEST_S or record.body > LINGER_BYTES:
+                record.transport.close()
+            case Phase.LINGER if record.body - record.dropped >= PROGRESS_BYTES:
+                record.since, record.dropped = now, record.body
+            case Phase.LINGER if waited > LINGER_S:
                 record.transport.close()
             case Phase.BODY if record.body >= PROGRESS_BYTES:
                 record.since, record.body = now, 0

@@ -9,6 +9,9 @@ from typing import Protocol
 
 from server.http.refusals import Refusal
 
+PROGRESS_BYTES = 16 << 10
+"""What a window of `body_seconds` or `unread_seconds` has to move: less holds a connection open on purpose."""
+
 
 class Phase(Enum):
     """Where a connection is."""
@@ -58,7 +61,9 @@ class Record:
     """One open connection.
 
     Attributes:
-        since: loop time at which the phase, or its present window, began. body: bytes of body in that window.
+        since: loop time at which the phase, or its present window, began. entered: that of the phase.
+        body: bytes of body in that window; in all, and dropped those of windows before, where the body is dropped.
+        moved: so much of the present body came that it is no pretence, in whatever windows.
         received: bytes since the last sweep. quiet_since: loop time of the last sweep that found any.
         served: one request was answered. write_paused: more waits to be sent than the transport likes.
     """
@@ -72,13 +77,26 @@ class Record:
     queue: dict[Record, None] | None = None
     counted: bool = True
     gone: bool = False
+    entered: float = 0.0
     body: int = 0
+    dropped: int = 0
+    moved: bool = False
     received: int = 0
     served: bool = False
     write_paused: bool = False
     unsent: int = 0
     unsent_since: float = 0.0
     sent: int = 0
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether its body has brought next to nothing, or nothing that anybody needs."""
+        return self.phase is Phase.LINGER or not self.moved
+
+    @property
+    def heard(self) -> float:
+        """Loop time at which the last of its body may have come."""
+        return max(self.since, self.quiet_since)
 
 
 @dataclass(eq=False, slots=True)

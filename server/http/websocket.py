@@ -11,13 +11,15 @@ from websockets.frames import Frame
 from websockets.http11 import Request
 
 from server.auth import HEADERS
-from server.http.guard import LINGER_S, Guard
+from server.http.guard import LINGER_LONGEST_S, Guard
 from server.http.record import Phase
 from server.http.refusals import Refusal, problem, response
 
 EARLY_BYTES = 1 << 16
 """Largest message of a WebSocket before its handshake is answered: nobody has to send one then."""
 SMALL_FRAGMENT = 4096
+PONG = b"\x8a"
+"""First byte of such a frame."""
 LIMIT = "scas4d.message_limit"
 
 
@@ -32,6 +34,10 @@ class Socket(WebSocketsSansIOProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Takes the connection over from the HTTP request that asked for the upgrade."""
         super().connection_made(transport)
+        self._pong = b""
+        """The answer to the newest ping, while the peer does not read."""
+        self._fell_behind = False
+        """Whether more waited than the transport likes, at some time since the last ping was sent."""
         self._record = self.guard.hand_over(transport, self, self.loop.time())
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -97,27 +103,57 @@ class Socket(WebSocketsSansIOProtocol):
         self.transport.write(b"".join(self.conn.data_to_send()))
         self.close_sent = True
         self.guard.enter(self._record, Phase.LINGER, self.loop.time())
-        # The application ends now; while there is such a timer, uvicorn does not close behind it.
-        self.close_timer = self.loop.call_later(LINGER_S, self.transport.close)
+        # The application ends now; while there is such a timer, uvicorn does not close behind it. The
+        # guard does, sooner.
+        self.close_timer = self.loop.call_later(LINGER_LONGEST_S, self.transport.close)
         if self.transport.can_write_eof():
             self.transport.write_eof()
         if self.read_paused:
             self.read_paused = False
             self.transport.resume_reading()
 
+    def handle_ping(self) -> None:
+        """Answers a ping; while the peer does not read, only the newest is remembered, as RFC 6455 (5.5.3) allows: each
+        would add an answer to what waits. What the peer sends is read all the same: its pongs tell that it is there.
+        """
+        if not self._record.write_paused:
+            super().handle_ping()
+            return
+        for frame in self.conn.data_to_send():
+            if frame[:1] == PONG:
+                self._pong = frame
+            else:  # the answer to a close that came behind the pings; nothing may follow it
+                self._pong = b""
+                self.transport.write(frame)
+
     def pause_writing(self) -> None:
-        """Stops reading where the peer does not read: each of its pings would add an answer to what waits."""
+        """Notes that the peer does not read as fast as it is written."""
         super().pause_writing()
-        self._record.write_paused = True
-        if not self.read_paused and not self.transport.is_closing():
-            self.transport.pause_reading()
+        self._record.write_paused = self._fell_behind = True
 
     def resume_writing(self) -> None:
-        """Reads on."""
+        """Notes that the peer has read, and answers its newest ping."""
         super().resume_writing()
         self._record.write_paused = False
-        if not self.read_paused and not self.transport.is_closing():
-            self.transport.resume_reading()
+        pong, self._pong = self._pong, b""
+        if pong and self.conn.close_sent is None and not self.transport.is_closing():
+            self.transport.write(pong)
+
+    def send_keepalive_ping(self) -> None:
+        """Asks whether the peer is there."""
+        self._fell_behind = self._record.write_paused
+        super().send_keepalive_ping()
+
+    def keepalive_timeout(self) -> None:
+        """Ends a connection that has not answered a ping, unless the ping may not have been read yet.
+
+        Megabytes may wait before it, in the kernel too. Where the peer does not read them, the guard ends it.
+        """
+        if self._fell_behind and self.ping_timeout is not None:
+            self._fell_behind = self._record.write_paused
+            self.pong_timer = self.loop.call_later(self.ping_timeout, self.keepalive_timeout)
+            return
+        super().keepalive_timeout()
 
 
 def limit_messages(scope: Scope, size: int) -> None:

@@ -31,8 +31,10 @@ HOST = b"Host: 127.0.0.1\r\n"
 class Peer:
     """A connection of which every byte is ours."""
 
-    def __init__(self, port, receive_buffer=None):
+    def __init__(self, port, receive_buffer=None, source=None):
         self.socket = socket.socket()
+        if source is not None:
+            self.socket.bind((source, 0))
         if receive_buffer is not None:
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
         self.socket.settimeout(PATIENCE_S)
@@ -152,6 +154,21 @@ class Stub:
 
         return StreamingResponse(pieces())
 
+    async def feed(self, websocket):
+        """Sends faster than anybody reads, and takes note of what comes."""
+
+        async def send():
+            while True:
+                await websocket.send_bytes(bytes(16 << 10))
+
+        await websocket.accept()
+        sending = asyncio.create_task(send())
+        try:
+            async for text in websocket.iter_text():
+                self.seen.append(text)
+        finally:
+            sending.cancel()
+
     async def socket(self, websocket):
         limit_messages(websocket.scope, 1 << 24)
         await websocket.accept()
@@ -160,20 +177,21 @@ class Stub:
 
 
 @contextmanager
-def stub(**changes):
+def stub(uvicorn_options=None, **changes):
     """A small application under the guard: its port, what it saw, its guard."""
     settings = ServerSettings(**{**SHORT, **changes})
     seen = Stub()
     names = ("echo", "late", "wait", "early", "large")
     routes = [Route(f"/{name}", getattr(seen, name), methods=["GET", "PUT", "POST"]) for name in names]
-    app = Starlette(routes=[*routes, WebSocketRoute("/socket", seen.socket)])
+    sockets = [WebSocketRoute(f"/{name}", getattr(seen, name)) for name in ("socket", "feed")]
+    app = Starlette(routes=[*routes, *sockets])
     app.state.guard = Guard(Limits.of(settings))
     if settings.trusted_proxies:
         app.add_middleware(ClientLimit, guard=app.state.guard)
     with socket.create_server(("127.0.0.1", 0)) as listening:
         seen.port = listening.getsockname()[1]
         seen.guard = app.state.guard
-        config = guarded(app, log_level="error", timeout_graceful_shutdown=1)
+        config = guarded(app, log_level="error", timeout_graceful_shutdown=1, **(uvicorn_options or {}))
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, args=([listening],))
         thread.start()

@@ -10,7 +10,9 @@ import pytest
 from peers import HOST, LARGE_MB, SHORT, Peer, refused, stub, until
 from test_headers import GET, drip
 
+from server.http import guard
 from server.http.connection import Connection
+from server.http.guard import LINGER_S
 
 
 def put(path, length=None, *more):
@@ -133,6 +135,31 @@ def test_an_answer_before_the_end_of_the_body_is_read(app, more):
         peer.send(put(b"/early", len(body), *more), body[:1000])
         assert peer.answer()[0] == 401
         assert peer.closed_after() < 15
+
+
+def test_a_slow_body_behind_its_answer_is_dropped_to_its_end(app):
+    pieces = 14
+    with Peer(app.port) as peer:
+        peer.send(put(b"/early", pieces * 20_000))
+        for _ in range(pieces):  # in all longer than without progress
+            peer.send(bytes(20_000))
+            time.sleep(LINGER_S / 10)
+        assert peer.answer()[0] == 401
+        peer.send(GET + b"\r\n")
+        assert peer.answer()[0] == 200
+
+
+def test_a_body_behind_its_answer_does_not_go_on_for_ever(app, monkeypatch):
+    monkeypatch.setattr(guard, "LINGER_LONGEST_S", 2.0)
+    with Peer(app.port) as peer:
+        peer.send(put(b"/early", 10_000_000))
+        peer.socket.settimeout(None)
+        began = time.monotonic()
+        while time.monotonic() - began < 15:
+            if not peer.flood(bytes(20_000), 20_000):
+                break
+            time.sleep(0.1)
+        assert time.monotonic() - began < 10
 
 
 def test_a_body_without_end_behind_its_answer_is_ended(app):

@@ -14,6 +14,7 @@ from test_bodies import put
 from test_headers import GET
 
 from server.http import process
+from server.http.guard import peer_key
 
 LONG = dict(header_seconds=60, body_seconds=60, keep_alive_seconds=60)
 
@@ -22,8 +23,8 @@ def get(app, path="echo", **headers):
     return httpx.get(f"http://127.0.0.1:{app.port}/{path}", headers=headers, timeout=30)
 
 
-def held(stack, app, count, *pieces):
-    peers = [stack.enter_context(Peer(app.port)) for _ in range(count)]
+def held(stack, app, count, *pieces, sources=(None,)):
+    peers = [stack.enter_context(Peer(app.port, source=source)) for _ in range(count) for source in sources]
     for peer in peers:
         with suppress(OSError):  # it may have given way
             peer.send(*pieces)
@@ -62,6 +63,66 @@ def test_uploads_that_hang_from_the_start_take_half_of_the_places(caps):
         assert app.guard.counts()["body"] <= 8
         sending.send(bytes(76_000))
         assert sending.answer()[0] == 200
+
+
+OTHERS = [f"127.0.0.{2 + number}" for number in range(24)]
+
+
+@pytest.mark.parametrize("pieces", [(), (GET,), (put(b"/echo", 1000), b"abc")])
+def test_who_has_many_addresses_neither_keeps_a_rig_out_nor_ends_its_connections(pieces):
+    with stub(**LONG, max_connections=24) as app, ExitStack() as stack:
+        idle = held(stack, app, 3, GET + b"\r\n")
+        for peer in idle:
+            assert peer.answer()[0] == 200
+        uploads = held(stack, app, 3, put(b"/echo", 100_000), bytes(20_000))
+        until(lambda: app.guard.counts()["body"] == 3)
+        for _ in range(3):
+            held(stack, app, 1, *pieces, sources=OTHERS)
+            for peer in uploads:
+                peer.send(bytes(1000))
+            assert get(app).status_code == 200
+        with Peer(app.port, source="127.0.0.99") as newcomer:
+            newcomer.send(GET + b"\r\n")
+            assert newcomer.answer()[0] == 200
+        for peer in uploads:
+            peer.send(bytes(77_000))
+            assert peer.answer()[0] == 200
+        for peer in idle:
+            peer.send(GET + b"\r\n")
+            assert peer.answer()[0] == 200
+
+
+def test_uploads_that_are_quiet_give_way_whoever_has_most_connections():
+    with stub(**LONG, max_connections=8) as app, ExitStack() as stack:
+        rig = held(stack, app, 5, b"GET /wait HTTP/1.1\r\n" + HOST + b"\r\n")
+        held(stack, app, 1, put(b"/echo", 100_000), bytes(20_000), sources=OTHERS[:3])
+        until(lambda: app.guard.counts()["body"] == 3)
+        time.sleep(4)
+        assert get(app).status_code == 200
+        app.go.set()
+        for peer in rig:
+            assert peer.answer()[0] == 200
+
+
+def test_a_network_of_ipv6_is_one_peer():
+    assert peer_key("2001:db8:1:2::3") == peer_key("2001:db8:1:2:ffff::4") == "2001:db8:1:2::/64"
+    assert peer_key("2001:db8:1:3::3") != peer_key("2001:db8:1:2::3")
+    assert peer_key("::ffff:192.0.2.1") == peer_key("192.0.2.1") == "192.0.2.1"
+    assert peer_key("") == ""
+
+
+@pytest.mark.parametrize("caps", [{"max_connections_per_peer": 16}, {"max_connections": 16}])
+def test_a_slow_upload_that_goes_on_stays_where_others_hang(caps):
+    with stub(**LONG, **caps) as app, ExitStack() as stack:
+        slow = held(stack, app, 1, put(b"/echo", 40_000), bytes(20_000))[0]
+        until(lambda: app.guard.counts()["body"] == 1)
+        time.sleep(1.5)  # a window ends
+        for _ in range(3):
+            slow.send(bytes(1000))
+            held(stack, app, 20, put(b"/echo", 1000), b"abc")
+            assert get(app).status_code == 200
+        slow.send(bytes(17_000))
+        assert slow.answer()[0] == 200
 
 
 @pytest.mark.parametrize(("caps", "status"), [({"max_connections_per_peer": 8}, 429), ({"max_connections": 8}, 503)])

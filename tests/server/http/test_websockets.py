@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import socket
 import time
 from contextlib import ExitStack
 
@@ -22,11 +23,11 @@ def opened(app):
 
 
 def test_a_websocket_may_idle_longer_than_anything_else(app):
-    with opened(app) as socket:
+    with opened(app) as client:
         until(lambda: app.guard.counts()["websocket"] == 1)
         time.sleep(2.5 * max(SHORT["header_seconds"], SHORT["body_seconds"], SHORT["keep_alive_seconds"]))
-        socket.send("still here")
-        assert socket.recv() == "still here"
+        client.send("still here")
+        assert client.recv() == "still here"
     until(lambda: app.guard.counts()["websocket"] == 0)
 
 
@@ -72,18 +73,18 @@ def test_a_handshake_behind_an_unanswered_request_is_refused(app):
 @pytest.mark.parametrize("size", [1, 100, 10_000])
 def test_fragments_are_put_together(app, size):
     message = "".join(chr(97 + number % 26) for number in range(40 * size))
-    with opened(app) as socket:
-        socket.send(message[at : at + size] for at in range(0, len(message), size))
-        assert socket.recv() == message
+    with opened(app) as client:
+        client.send(message[at : at + size] for at in range(0, len(message), size))
+        assert client.recv() == message
 
 
 def test_a_message_that_is_too_large_is_told_so_while_it_is_sent(app):
     for _ in range(5):
-        with opened(app) as socket:
+        with opened(app) as client:
             with contextlib.suppress(ConnectionClosed):  # it may hear of it while it sends
-                socket.send(bytes((16 << 20) + 1))
+                client.send(bytes((16 << 20) + 1))
             with pytest.raises(ConnectionClosed) as closed:
-                socket.recv()
+                client.recv()
             assert closed.value.rcvd.code == 1009
     until(lambda: sum(app.guard.counts().values()) == 0)
 
@@ -95,3 +96,43 @@ def test_a_peer_that_sends_pings_and_reads_nothing_is_ended(app):
         ping = b"\x89\xfd" + bytes(4) + b"p" * 125
         assert peer.flood(ping * 500, 256 << 20) < 256 << 20
         until(lambda: app.guard.counts()["websocket"] == 0)
+
+
+def test_a_viewer_slower_than_its_feed_stays_and_is_heard():
+    pings = {"ws_ping_interval": 0.3, "ws_ping_timeout": 0.5}
+    with stub(pings, unread_seconds=2) as app, socket.socket() as raw:
+        raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 16 << 10)
+        raw.connect(("127.0.0.1", app.port))
+        address = f"ws://127.0.0.1:{app.port}/feed"
+        with connect(address, sock=raw, compression=None, max_queue=1, ping_interval=None) as viewer:
+            began, said = time.monotonic(), 0
+            while time.monotonic() - began < 5:  # six times a ping's interval and its timeout
+                viewer.recv()
+                viewer.ping()
+                if time.monotonic() - began > said:
+                    viewer.send(str(said))
+                    said += 1
+                time.sleep(0.02)
+            until(lambda: app.seen == [str(number) for number in range(said)])
+            assert said >= 4
+
+
+def test_of_many_pings_the_newest_is_answered_once_the_peer_reads(app):
+    with Peer(app.port, receive_buffer=4096) as peer:
+        peer.send(b"GET /feed HTTP/1.1\r\n" + HOST + UPGRADE + b"\r\n")
+        assert peer.answer()[0] == 101
+        time.sleep(0.3)  # its writing is paused
+        peer.send(b"".join(b"\x89\x84" + bytes(4) + b"%04d" % number for number in range(5000)))
+        found, limit = b"", time.monotonic() + 20
+        while b"\x8a\x044999" not in found and time.monotonic() < limit:
+            found += peer.socket.recv(1 << 16)
+        assert b"\x8a\x044999" in found
+        assert found.count(b"\x8a\x04") < 50
+
+
+def test_a_peer_that_is_gone_is_found_by_its_pings():
+    pings = {"ws_ping_interval": 0.3, "ws_ping_timeout": 0.5}
+    with stub(pings) as app, Peer(app.port) as peer:
+        peer.send(b"GET /socket HTTP/1.1\r\n" + HOST + UPGRADE + b"\r\n")
+        assert peer.answer()[0] == 101
+        assert peer.closed_after() < 5
