@@ -156,14 +156,6 @@ class FrameFiles:
             except FileNotFoundError:
                 raise UnreadableFrameError(reason) from error
 
-    def verify(self, index: int) -> None:
-        """Reads all of a frame's own file.
-
-        Raises:
-            FileNotFoundError: it is not there. ValueError: it is damaged.
-        """
-        verify(self.path(index))
-
     def mend_copies(self, first: int, fixed: Arrays) -> dict[str, str]:
         """Writes ``fixed.npz``, the first frame and their copies anew where they are damaged or gone.
 

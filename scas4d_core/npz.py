@@ -14,6 +14,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from tokenize import TokenError
 from typing import IO, Any, BinaryIO
@@ -37,10 +38,16 @@ PIECE = 1 << 20
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
     """Writes an npz that is either whole at ``path`` or not there: temporary file, sync, rename, sync of the folder."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    with written_whole(path, path.with_name(f".{path.name}.{os.getpid()}.part")) as file:
+        _save(file, arrays)
+
+
+@contextmanager
+def written_whole(path: Path, beside: Path) -> Iterator[BinaryIO]:
+    """A file to write to that is whole and on disk at ``path`` in the end, or not there; until then at ``beside``."""
     try:
         with beside.open("wb") as file:
-            _save(file, arrays)
+            yield file
             file.flush()
             os.fsync(file.fileno())
         beside.replace(path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 from blake3 import blake3
 
 from client.wire import SceneCreate
-from scas4d_core.npz import sync_folder
+from scas4d_core.npz import written_whole
 from scas4d_core.settings import Settings
 from scas4d_core.told import told
 from server.facts import Created, Fact
@@ -66,27 +65,12 @@ class Definition:
             raise DefinitionError(f"the definition cannot be read: {told(error)}") from None
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """A file that is whole and on disk at `path`, or not there: temporary file, sync, rename, sync of the folder."""
-    beside = path.with_suffix(".part")
-    try:
-        with beside.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-    except BaseException:
-        beside.unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
-
-
 def write_definition(folder: Path, definition: Definition) -> None:
     """Writes `scene.json`: from here on the scene exists."""
     text = json.dumps(definition.as_json(), indent=1)
-    write_whole(
-        folder / SCENE_FILE, json.dumps({"blake3": _digest(text), "scene": json.loads(text)}, indent=1).encode()
-    )
+    path = folder / SCENE_FILE
+    with written_whole(path, path.with_suffix(".part")) as file:
+        file.write(json.dumps({"blake3": _digest(text), "scene": json.loads(text)}, indent=1).encode())
 
 
 def read_definition(folder: Path) -> tuple[Definition, str | None]:

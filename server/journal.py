@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 from pydantic import ValidationError
 
-from scas4d_core.npz import sync_folder
+from scas4d_core.npz import sync_folder, written_whole
 from server.disk import no_room
 from server.facts import Created, Died, Fact, no_fact, parse_fact
 from server.problems import Problem
@@ -109,21 +109,13 @@ def write_journal(path: Path, facts: Iterator[Fact]) -> int:
     """
     beside = path.with_name(f".{path.name}.part")
     size, batch = 0, []
-    try:
-        with beside.open("wb") as file:
-            for fact in facts:
-                batch.append(fact)
-                if len(batch) == TOGETHER:
-                    size += file.write(bytes_of(batch))
-                    batch = []
-            size += file.write(bytes_of(batch))
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-    except BaseException:
-        beside.unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
+    with written_whole(path, beside) as file:
+        for fact in facts:
+            batch.append(fact)
+            if len(batch) == TOGETHER:
+                size += file.write(bytes_of(batch))
+                batch = []
+        size += file.write(bytes_of(batch))
     return size
 
 
@@ -197,11 +189,6 @@ class Journal:
     def place(self) -> tuple[int, int]:
         """Which file it is written to, and the bytes of it that are whole: whether it was written anew meanwhile."""
         return os.fstat(self._file).st_ino, self._good
-
-    @property
-    def good(self) -> int:
-        """Bytes of it that are written and synced."""
-        return self._good
 
     async def append(self, *facts: Fact) -> None:
         """Returns when the facts are on disk, all or none of them.
