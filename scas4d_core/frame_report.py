@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from scas4d_core import judge
 from scas4d_core.captures.frame import Frame
-from scas4d_core.static_scene import StaticResult
-from scas4d_core.trial import Outcome
-from scas4d_core.updated import REPORT, CameraFit, Stopwatch
-from scas4d_core.witness import mean_error
+from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.robust import outliers as judge
+from scas4d_core.robust.solve_frame import Outcome
+from scas4d_core.update.probe_views import mean_error
+from scas4d_core.update.result import REPORT, CameraFit, Stopwatch
 
 REPORTED_ITERATIONS = 24
 """The report's training loss is a mean over this many last iterations: about one round of a rig's cameras."""

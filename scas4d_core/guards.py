@@ -4,7 +4,7 @@ Two tables. A *guard* acts where the arithmetic would leave the finite numbers, 
 that it cannot hide a fault. A *convention* is part of what is computed: it acts all the time, its count would say
 nothing, and its row says so. Kernels import the values; ``kernels.cache`` compiles anew when they change.
 
-``scas4d bench stability`` prints both tables with what they did in the catalogue of hard cases, and takes each one
+``scripts/bench stability`` prints both tables with what they did in the catalogue of hard cases, and takes each one
 away to see which case then fails.
 """
 
@@ -92,14 +92,14 @@ GRADIENT_NOT_FINITE = _guard(
 
 HELD_BACK = _guard(
     "held_back", 0.0, NAN,
-    unit="–", where="deformation_cpu.py",
+    unit="–", where="update/deformation.py",
     reason="A Gaussian that is not finite as an update begins is left as it is: the pivot of its cluster, a mean, "
     "would be NaN, and so all that the cluster holds. It weighs nothing in pivots and neighbour terms.",
     counted="Gaussians held back in an update",
 )  # fmt: skip
 EMPTY_CLUSTER = _guard(
     "empty_cluster", 1.0, 0.0,
-    unit="Gaussians", where="kernels/cascade.py, deformation.py",
+    unit="Gaussians", where="kernels/cascade.py, torch_backend/deformation.py",
     reason="Least number that a pivot's sum is divided by: a cluster whose Gaussians are all held back has the pivot 0 "
     "instead of NaN, which its gradient would carry on.",
     counted="clusters without a Gaussian in an update",
@@ -113,7 +113,7 @@ EXPONENT = _guard(
 )  # fmt: skip
 HALF_TURN = _guard(
     "half_turn", 1e-12, 0.0,
-    unit="1", where="kernels/cascade.py, deformation.py",
+    unit="1", where="kernels/cascade.py, torch_backend/deformation.py",
     reason="Floor of the polar rotation's cosine part, and of the radius it is divided by: a map that folds space "
     "straight back has no rotation of its own; it counts as none instead of 0/0.",
     counted="Gaussians in a layer, forward",
@@ -147,7 +147,7 @@ QUATERNION_FLOOR = _guard(
 )  # fmt: skip
 LEFT_OUT = _guard(
     "left_out_of_hierarchy", 0.0, NAN,
-    unit="–", where="hierarchy.py",
+    unit="–", where="structure/hierarchy.py",
     reason="A moving Gaussian that is not finite belongs to no cluster and stands: K-means would refuse all others.",
     counted="Gaussians in a clustering",
 )  # fmt: skip
@@ -201,7 +201,7 @@ COVER_SLACK = _convention(
 )  # fmt: skip
 ROOT_FLOOR = _convention(
     "root_floor", 1e-20, 0.0,
-    unit="m²", where="kernels/neighbour_terms.py, losses.py",
+    unit="m²", where="kernels/neighbour_terms.py, torch_backend/losses.py",
     reason="Under the roots of the neighbour terms, as in Dynamic3DGaussians: where nothing has moved the gradient is "
     "0, not NaN.",
     counted="part of every pair's term",
@@ -214,19 +214,19 @@ ADAM_EPSILON = _convention(
 )  # fmt: skip
 SSIM_C1 = _convention(
     "ssim_c1", 0.01**2, 0.0,
-    unit="1", where="kernels/image_loss.py, losses.py",
+    unit="1", where="kernels/image_loss.py, torch_backend/losses.py",
     reason="SSIM's own (Wang et al. 2004): means that are both black compare as equal.",
     counted="part of every window",
 )  # fmt: skip
 SSIM_C2 = _convention(
     "ssim_c2", 0.03**2, 0.0,
-    unit="1", where="kernels/image_loss.py, losses.py",
+    unit="1", where="kernels/image_loss.py, torch_backend/losses.py",
     reason="SSIM's own: windows that are both flat compare as equal.",
     counted="part of every window",
 )  # fmt: skip
 SMALLEST_SQUARE = _convention(
     "smallest_square", 1e-9, 0.0,
-    unit="1", where="losses.py, picture_loss.py",
+    unit="1", where="torch_backend/losses.py, update/picture_loss.py",
     reason="Sum of squared differences below which two pictures count as equal: PSNR stays finite.",
     counted="acts on a figure that is told, not on the state",
 )  # fmt: skip

@@ -17,31 +17,31 @@ import numpy as np
 from numba import get_num_threads
 from numpy.typing import NDArray
 
-from scas4d_core import judge
-from scas4d_core.attempts import axis_lengths
-from scas4d_core.budget import Budget
 from scas4d_core.cameras import Rig, WorldFrame, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
-from scas4d_core.checkpoint import Carried, Checkpoints
-from scas4d_core.committed import Committed, View
-from scas4d_core.device import require_device
-from scas4d_core.first_frame import Fixed, fit_first
+from scas4d_core.first_frame.start import Fixed, fit_first
+from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.frame_report import FrameReport, Progress, report_of_first, report_of_update
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.history import History, HistoryError
-from scas4d_core.motion_labels import labelled, labels_learnt, settled
-from scas4d_core.picture_loss import PictureLoss
-from scas4d_core.prepare import prepare
+from scas4d_core.query.committed import Committed, View
 from scas4d_core.rasterize.limits import scene_limits
-from scas4d_core.repeats import fingerprints, same_again
-from scas4d_core.resuming import Resumed, ResumeError, find_commit
+from scas4d_core.robust import outliers as judge
+from scas4d_core.robust.attempts import axis_lengths
+from scas4d_core.robust.repeats import fingerprints, same_again
+from scas4d_core.robust.solve_frame import Given, Trial
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.static_scene import StaticResult
-from scas4d_core.trial import Given, Trial
-from scas4d_core.update import Updater
-from scas4d_core.update_plan import mask_weight
-from scas4d_core.updated import REPORT, Stopwatch
-from scas4d_core.views import TrainingView, ViewFactory, scaled_to
+from scas4d_core.storage.checkpoint import Carried, Checkpoints
+from scas4d_core.storage.history import History, HistoryError
+from scas4d_core.storage.resuming import Resumed, ResumeError, find_commit
+from scas4d_core.structure.motion_mask import labelled, labels_learnt, settled
+from scas4d_core.torch_backend.device import require_device
+from scas4d_core.update.budget import Budget
+from scas4d_core.update.frame_update import Updater
+from scas4d_core.update.picture_loss import PictureLoss
+from scas4d_core.update.prepare import prepare
+from scas4d_core.update.result import REPORT, Stopwatch
+from scas4d_core.update.schedule import mask_weight
+from scas4d_core.update.views import TrainingView, ViewFactory, scaled_to
 from scas4d_core.warm_up import warm_up_elsewhere
 
 __all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "Resumed", "StepError", "View"]

@@ -1,4 +1,4 @@
-"""Measures the peak memory of a reconstruction against the estimate of the service (server/estimate.py).
+"""Measures the peak memory of a reconstruction against the estimate of the service (server/health/estimate.py).
 
     python scripts/measure_memory.py --cameras 24 --size 512 --gaussians 40000 --masks
 
@@ -14,13 +14,13 @@ import json
 import numpy as np
 
 from client.wire import RigModel
-from scas4d_core.bench.quality import peak_megabytes
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import Frame, InitialPoints
 from scas4d_core.presets import preset
 from scas4d_core.settings import Settings
-from server.estimate import estimate
+from server.health.estimate import estimate
 from server.settings import ServerSettings
+from studies.quality.quality import peak_megabytes
 
 
 def ring(count: int, size: int) -> Rig:

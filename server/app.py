@@ -14,19 +14,20 @@ from starlette.responses import Response
 from starlette.routing import Route, WebSocketRoute
 
 from client import __version__
-from server import handlers, problems
-from server.auth import Door
-from server.http.guard import Guard
-from server.http.limits import Limits
-from server.http.proxies import ClientLimit
-from server.hub import Hub
-from server.limits import BodyLimit
-from server.logs import AccessLog
-from server.parameters import only_known
-from server.placement import Placement
-from server.placement.local import LocalPlacement
+from server import problems
+from server.connections.guard import Guard
+from server.connections.limits import Limits
+from server.connections.proxies import ClientLimit
+from server.health.logs import AccessLog
+from server.health.readiness import Readiness
+from server.http import handlers
+from server.http.auth import Door
+from server.http.body_limit import BodyLimit
+from server.http.parameters import only_known
+from server.http.tickets import Tickets
 from server.problems import Problem
-from server.readiness import Readiness
+from server.processes.local_placement import LocalPlacement
+from server.processes.placement import Placement
 from server.routes import (
     budget,
     estimate,
@@ -45,16 +46,17 @@ from server.routes import (
     tradeoff,
     viewer,
 )
-from server.scenes import Scenes
+from server.scene.scenes import Scenes
 from server.settings import ServerSettings
-from server.tickets import Tickets
+from server.stream.hub import Hub
 
 
 def create_app(settings: ServerSettings | None = None, placement: Placement | None = None) -> FastAPI:
     """The service.
 
-    `server.http.config.guarded` runs it, as `scas4d serve` does. With `uvicorn --factory server.app:create_app` it
-    works too, but nothing bounds what a peer may send before its token is looked at.
+    `server.connections.config.guarded` runs it, as `scas4d serve` does. With
+    `uvicorn --factory server.app:create_app` it works too, but nothing bounds what a peer may send before
+    its token is looked at.
     """
     settings = settings or ServerSettings.from_environment()
     logging.getLogger("scas4d").setLevel(logging.INFO)

@@ -13,12 +13,12 @@ from typing import Any
 
 import uvicorn
 
-from server import logs
 from server.app import create_app
-from server.http.config import guarded
-from server.http.process import keep_freed_memory, room_for_connections
-from server.placement.local import LocalPlacement
-from server.scenes import hold
+from server.connections.config import guarded
+from server.connections.process import keep_freed_memory, room_for_connections
+from server.health import logs
+from server.processes.local_placement import LocalPlacement
+from server.scene.scenes import hold
 from server.settings import ServerSettings, unknown
 
 log = logging.getLogger("scas4d.server")

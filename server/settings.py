@@ -46,7 +46,7 @@ class ServerSettings(BaseSettings):
 
     data: Path = Field(default=Path("data"), description="Folder of the scenes; made when missing.")
     engine: str = Field(
-        default="server.engine:core_engine",
+        default="server.processes.engine:core_engine",
         description="module:function that makes the engine of a scene, called once in each of its processes.",
     )
 

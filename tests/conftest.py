@@ -1,4 +1,4 @@
-"""Tests share scenes: this folder is on the path."""
+"""Tests share scenes, fakes and peers: `tests/helpers` is on the path, of their processes too."""
 
 import os
 import sys
@@ -8,11 +8,15 @@ import pytest
 
 # Before torch loads OpenMP, which reads it once: threads that spin while they wait cost multiples on busy cores.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path.append(str(Path(__file__).parent / "helpers"))
+SHARED = ("core/storage", "server/connections", "server/ingest", "server/routes", "server/scene", "server/storage")
+for shared in SHARED:
+    sys.path.append(str(Path(__file__).parent / shared))  # tests that others take functions from
 
 
 WITHOUT_KERNELS = (
-    "tests/captures", "tests/importers", "tests/metrics", "tests/server/http", "tests/test_imports.py"
+    "tests/core/captures", "tests/client/importers", "tests/core/metrics", "tests/server/connections",
+    "tests/test_imports.py"
 )  # fmt: skip
 """Tests that run no kernel, in no process: they go on while another process compiles."""
 LONGEST = (
@@ -20,7 +24,7 @@ LONGEST = (
     "test_damage.py",
     "test_gradients.py",
     "test_frames.py",
-    "test_service.py",
+    "test_hard_frames.py",
     "test_light.py",
 )
 """Files that take longest: begun last, they would have the other processes wait for them."""
@@ -40,7 +44,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     def turn(item: pytest.Item) -> int:
         path = item.path.relative_to(item.config.rootpath).as_posix()
-        return 0 if path.startswith("tests/server/http") else 1 if item.path.name in LONGEST else 2
+        return 0 if path.startswith("tests/server/connections") else 1 if item.path.name in LONGEST else 2
 
     items.sort(key=turn)  # stable: files stay together
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[1]
 PACKAGES = ("scas4d_core", "server", "client")
 HEAVY = ("torch", "numba", "scipy", "sklearn", "pycolmap", "fastapi", "uvicorn")
 
@@ -60,8 +60,8 @@ def within(name: str, packages: tuple[str, ...]) -> bool:
 
 
 def test_the_tree_was_read() -> None:
-    assert {"scas4d_core.update", "server.app", "client.wire", "scas4d_core.captures"} <= set(MODULES)
-    assert "scas4d_core.kernels.image_loss" in imports("scas4d_core.picture_loss", lazy=False)
+    assert {"scas4d_core.update.frame_update", "server.app", "client.wire", "scas4d_core.captures"} <= set(MODULES)
+    assert "scas4d_core.kernels.image_loss" in imports("scas4d_core.update.picture_loss", lazy=False)
     assert "numpy" in imports("scas4d_core.cameras", lazy=False)
 
 
@@ -110,7 +110,7 @@ def test_numpy_only_rooms_load_nothing_heavy() -> None:
 
 
 def test_reconstructing_on_the_cpu_needs_no_torch() -> None:
-    loaded = loaded_by("scas4d_core.reconstruction", "scas4d_core.initial_points")
+    loaded = loaded_by("scas4d_core.reconstruction", "scas4d_core.first_frame.initial_points")
     assert "numba" in loaded
     assert "torch" not in loaded
 

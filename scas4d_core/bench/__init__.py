@@ -1,1 +1,1 @@
-"""Studies that measure the method; ``scas4d bench`` runs them."""
+"""Studies that measure the method; ``scripts/bench`` runs them."""

@@ -1,1 +1,1 @@
-"""Hard cases, and what must hold in each; ``scas4d bench stability`` runs them."""
+"""Hard cases, and what must hold in each; ``scripts/bench stability`` runs them."""

@@ -1,1 +1,1 @@
-"""Connections: what one peer may hold open, send slowly or send too much of, before the application is asked."""
+"""Requests and answers: authentication, origins, body limits, validation, problem documents."""

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from fastapi import Depends, Path, Request
 
-from server.scenes import Scene, Scenes
+from server.scene.scenes import Scene, Scenes
 from server.settings import ServerSettings
 
 

@@ -7,9 +7,9 @@ import contextlib
 
 from fastapi import Request
 
-from server.messages import Answer, Query
 from server.problems import Problem
-from server.scenes import Scene
+from server.processes.messages import Answer, Query
+from server.scene.scenes import Scene
 
 
 async def ask(request: Request, scene: Scene, query: Query) -> Answer:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from fastapi import APIRouter
 
 from client.wire import Budget, SceneBudget
-from server.budgets import scene_budget
 from server.routes.access import TheScene
+from server.scene.budgets import scene_budget
 
 router = APIRouter(prefix="/v1/scenes", tags=["budget"])
 

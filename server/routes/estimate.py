@@ -6,7 +6,7 @@ from fastapi import APIRouter
 
 from client.wire import SceneCreate
 from client.wire.estimate import SceneEstimate
-from server.estimate import estimate
+from server.health.estimate import estimate
 from server.routes.access import TheSettings
 from server.routes.scenes import scene_settings
 

@@ -16,9 +16,9 @@ from client.wire import (
     MissingRequest,
     PartReceipt,
 )
-from server.door import take_camera, take_file, take_form, take_framed
-from server.messages import PlyQuery
+from server.ingest.receive import take_camera, take_file, take_form, take_framed
 from server.problems import Problem
+from server.processes.messages import PlyQuery
 from server.routes.access import FrameIndex, TheScene
 from server.routes.asking import ask
 

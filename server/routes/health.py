@@ -6,7 +6,7 @@ from fastapi import APIRouter, Request
 
 from client import __version__
 from client.wire import Health
-from server.readiness import Readiness
+from server.health.readiness import Readiness
 from server.routes.access import AllScenes
 
 router = APIRouter(prefix="/health", tags=["service"])

@@ -19,14 +19,14 @@ from client.wire import (
 )
 from client.wire.framing import PREFIX
 from server import problems
-from server.door import take_camera, take_framed
-from server.http.websocket import limit_messages
-from server.pictures import largest_frame
+from server.connections.websocket import limit_messages
+from server.ingest.pictures import largest_frame
+from server.ingest.receive import take_camera, take_framed
+from server.ingest.upload import framing_problem
 from server.problems import Problem
-from server.scene import Scene
-from server.scenes import Scenes
+from server.scene.scene import Scene
+from server.scene.scenes import Scenes
 from server.settings import ServerSettings
-from server.upload import framing_problem
 
 router = APIRouter(prefix="/v1/scenes", tags=["frames"])
 

@@ -7,8 +7,8 @@ from fastapi.responses import PlainTextResponse, Response
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 
-from server import metrics as counted
-from server.readiness import Readiness
+from server.health import metrics as counted
+from server.health.readiness import Readiness
 from server.routes.access import AllScenes, TheSettings
 
 router = APIRouter(tags=["service"])

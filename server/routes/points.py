@@ -13,10 +13,10 @@ from fastapi import APIRouter, Request
 from numpy.typing import NDArray
 
 from client.wire import PointsReceipt
-from scas4d_core.npz import write_npz
-from server.disk import full_disk, no_room
+from scas4d_core.storage.npz import write_npz
 from server.problems import Problem, counted
 from server.routes.access import TheScene, TheSettings
+from server.storage.disk import full_disk, no_room
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 

@@ -8,11 +8,11 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 
 from client.wire import MAX_PIXELS_A_SIDE, RenderFormat, RenderKind, RenderRequest
-from server.messages import RenderQuery
 from server.problems import Problem, counted
+from server.processes.messages import RenderQuery
 from server.routes.access import TheScene, TheSettings
 from server.routes.asking import ask
-from server.scenes import Scene
+from server.scene.scenes import Scene
 from server.settings import ServerSettings
 
 router = APIRouter(prefix="/v1/scenes", tags=["views"])

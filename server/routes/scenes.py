@@ -11,7 +11,8 @@ from client.wire import SceneCreate, SceneList, SceneStatus
 from scas4d_core.cameras import CameraError
 from scas4d_core.presets import PRESETS
 from scas4d_core.settings import Settings
-from server import devices, estimate, validation
+from server.health import devices, estimate
+from server.http import validation
 from server.problems import Problem
 from server.routes.access import AllScenes, TheScene, TheSettings
 

@@ -11,12 +11,12 @@ from starlette.websockets import WebSocketDisconnect, WebSocketState
 
 from client.wire.stream import SCENE_GONE, STREAM_PROTOCOL, TOO_BIG
 from server import problems
-from server.http.websocket import limit_messages
-from server.hub import Hub
+from server.connections.websocket import limit_messages
 from server.problems import Problem
-from server.scenes import Scenes
+from server.scene.scenes import Scenes
 from server.settings import ServerSettings
-from server.subscriber import Subscriber
+from server.stream.hub import Hub
+from server.stream.subscriber import Subscriber
 
 router = APIRouter(prefix="/v1/scenes")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter, Request
 
 from client.wire import Ticket
-from server.tickets import SUBPROTOCOL, Tickets
+from server.http.tickets import SUBPROTOCOL, Tickets
 
 router = APIRouter(prefix="/v1/tickets", tags=["service"])
 

@@ -11,12 +11,12 @@ from fastapi import APIRouter, Query, Request, Response
 
 from client.wire import CameraModel, TracksModel, TracksRequest
 from scas4d_core.cameras import Camera
-from server import track_answers
-from server.messages import TracksQuery
 from server.problems import Problem, counted
+from server.processes import track_answers
+from server.processes.messages import TracksQuery
 from server.routes.access import TheScene, TheSettings
 from server.routes.asking import ask
-from server.scenes import Scene
+from server.scene.scenes import Scene
 from server.settings import ServerSettings
 
 router = APIRouter(prefix="/v1/scenes", tags=["tracks"])

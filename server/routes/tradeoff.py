@@ -5,10 +5,10 @@ from __future__ import annotations
 from fastapi import APIRouter
 
 from client.wire import ReplayRequest, TradeoffModel
-from server import tradeoff
-from server.budgets import scene_budget
 from server.routes.access import TheScene
-from server.scenes import Scene
+from server.scene import tradeoff
+from server.scene.budgets import scene_budget
+from server.scene.scenes import Scene
 
 router = APIRouter(prefix="/v1/scenes", tags=["budget"])
 

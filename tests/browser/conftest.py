@@ -4,14 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
-from pathlib import Path
 
 import pytest
-
-sys.path.append(str(Path(__file__).parents[1] / "server"))
-sys.path.append(str(Path(__file__).parent))
-
 from running import Running, fake_settings
 from stage import FRAMES, push, start_scene
 

@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
-
-sys.path.append(str(Path(__file__).parents[1] / "server"))
-
 from running import HEIGHT, WIDTH, Running, fake_settings, make_rig
 
 FRAMES = 4

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from client.extras import CUDA, SERVER
+from client.cli.extras import CUDA, SERVER
 
-FAKES = str(Path(__file__).parents[1] / "server")
+FAKES = str(Path(__file__).parents[1] / "helpers")
 ALONE = f"""
 import sys
 
@@ -27,7 +27,7 @@ sys.meta_path.insert(0, Missing())
 def scas4d(*arguments, before=(), **environment):
     path = os.pathsep.join([*map(str, before), FAKES, os.getcwd()])
     return subprocess.run(
-        [sys.executable, "-m", "client.cli", *map(str, arguments)],
+        [sys.executable, "-m", "client.cli.main", *map(str, arguments)],
         capture_output=True,
         text=True,
         timeout=60,

@@ -5,25 +5,20 @@ from __future__ import annotations
 import io
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from box_scene import SHIFT, make_box, make_rig, moved, take_frame
 from PIL import Image
+from running import Running
 from scipy.spatial.transform import Rotation
 
+from client.sdk import Client
+from scas4d_core.storage.history import History
+from server.settings import ServerSettings
+
 HERE = Path(__file__).parent
-sys.path.append(str(HERE.parent))
-sys.path.append(str(HERE.parent / "server"))
-
-from box_scene import SHIFT, make_box, make_rig, moved, take_frame  # noqa: E402
-from running import Running  # noqa: E402
-
-from client.sdk import Client  # noqa: E402
-from scas4d_core.history import History  # noqa: E402
-from server.settings import ServerSettings  # noqa: E402
-
 EXPECTED = json.loads((HERE / "expected.json").read_text())
 ID = EXPECTED["id"]
 ARRAYS = ("means", "factors", "rotations", "colours")

@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import httpx
 import pytest
-
-sys.path.append(str(Path(__file__).parent))
-
 from running import Running, fake_settings, make_rig
 
 from client.sdk import Client

@@ -15,14 +15,25 @@ import time
 import httpx
 import pytest
 
-from server.disk import FolderLock
 from server.serve import address, listen
+from server.storage.disk import FolderLock
 
 ENVIRONMENT = {**os.environ, "SCAS4D_WARM_UP": "false", "SCAS4D_ENGINE": "fakes:engine"}
 
 
 def command(folder, port, host="127.0.0.1"):
-    return [sys.executable, "-m", "client.cli", "serve", "--host", host, "--port", str(port), "--data", str(folder)]
+    return [
+        sys.executable,
+        "-m",
+        "client.cli.main",
+        "serve",
+        "--host",
+        host,
+        "--port",
+        str(port),
+        "--data",
+        str(folder),
+    ]
 
 
 def refused(folder, port, host="127.0.0.1"):

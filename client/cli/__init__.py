@@ -1,0 +1,1 @@
+"""The `scas4d` command."""

@@ -1,0 +1,265 @@
+"""`scas4d push`, `import`, `scenes`, `watch`, `budget`: what talks to a service, or makes a capture ready for it."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from client import rig
+from client.cli.overrides import overrides
+from client.cli.progress import Bars, console
+from client.importers.open_source import open_source
+from client.importers.source import Source
+from client.sdk import DEFAULT_URL, Client
+from client.wire import FINISHED, FrameReportModel, IngestSettings
+
+PUSH_OUTAGE_S = 600.0
+"""A rig goes on trying for so long: a restart of the service is no reason to end a day's capture."""
+
+
+class PicturesFrom(StrEnum):
+    """Where the pictures of a capture are."""
+
+    IMAGES = "images"
+    VIDEOS = "videos"
+    NAMED = "named"
+
+
+class Encoding(StrEnum):
+    """How pictures are encoded anew."""
+
+    JPEG = "jpeg"
+    PNG = "png"
+
+
+class WhenFull(StrEnum):
+    """What happens to a frame when the queue is full."""
+
+    REFUSE = "refuse"
+    SKIP = "skip"
+
+
+CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; docs/captures.md.")]
+Url = Annotated[str, typer.Option(envvar="SCAS4D_URL", help="Of the service.")]
+Token = Annotated[str | None, typer.Option(envvar="SCAS4D_TOKEN", help="Of the service; better in SCAS4D_TOKEN.")]
+Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene.")]
+Calibration = Annotated[
+    Path | None, typer.Option(help="A transforms.json or the folder of a COLMAP model, if not in CAPTURE.")
+]
+From = Annotated[PicturesFrom | None, typer.Option("--pictures", help="Which, where there are several kinds.")]
+CaptureFps = Annotated[
+    float | None, typer.Option(min=0.001, help="Frames a second of the capture, where its files do not say.")
+]
+Masks = Annotated[bool, typer.Option(help="Send the masks that are there.")]
+Encode = Annotated[Encoding, typer.Option(help="Of undistorted pictures and frames of video; jpeg has quality 95.")]
+
+
+def push(
+    capture: CaptureFolder,
+    url: Url = DEFAULT_URL,
+    token: Token = None,
+    scene: Annotated[str | None, typer.Option(help="Go on with this scene, from its next frame.")] = None,
+    fps: Annotated[
+        float | None, typer.Option(min=0.001, help="Frames a second, as a rig would; as fast as taken where not given.")
+    ] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="So many frames in all.")] = None,
+    start: Annotated[int, typer.Option(min=0, help="The frame of the capture to begin with.")] = 0,
+    loop: Annotated[bool, typer.Option("--loop", help="Back and forth, until --frames or Ctrl-C.")] = False,
+    jitter: Annotated[float, typer.Option(min=0, help="Each frame leaves up to so many seconds late.")] = 0.0,
+    drop: Annotated[float, typer.Option(min=0, max=0.99, help="Share of frames that the rig loses.")] = 0.0,
+    seed: Annotated[int, typer.Option(help="Of what is random: jitter and drop.")] = 0,
+    per_camera: Annotated[
+        bool, typer.Option("--per-camera", help="Each camera sends its own pictures; --drop loses single ones.")
+    ] = False,
+    websocket: Annotated[bool, typer.Option("--websocket", help="Send over one WebSocket.")] = False,
+    when_full: Annotated[
+        WhenFull, typer.Option(help="refuse: wait for a full queue; skip: the newest frame takes its place.")
+    ] = WhenFull.REFUSE,
+    outage: Annotated[float, typer.Option(min=0, help="Seconds to wait for a service that is away.")] = PUSH_OUTAGE_S,
+    calibration: Calibration = None,
+    pictures: From = None,
+    capture_fps: CaptureFps = None,
+    masks: Masks = True,
+    encoding: Encode = Encoding.JPEG,
+    preset: Annotated[str, typer.Option(help="Named settings: scas4d, adaptive or dynamic3dgs.")] = "scas4d",
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="As update.iterations=200.")
+    ] = None,
+) -> None:
+    """Sends a capture to a running service as its rig would, and waits for the last frame."""
+    settings = overrides(changes or [])
+    source = _opened(capture, calibration, pictures, capture_fps, masks, encoding)
+    with Client(url, token=token, outage=0) as client:
+        client.live()  # a wrong address is said at once, an outage later is waited for
+    with Client(url, token=token, outage=outage) as client, Bars() as bars:
+        delivery = rig.push(
+            source,
+            client,
+            scene=scene,
+            pace=rig.Pace(fps, jitter, drop, seed),
+            frames=frames,
+            start=start,
+            loop=loop,
+            per_camera=per_camera,
+            websocket=websocket,
+            preset=preset,
+            settings=settings,
+            ingest=IngestSettings(when_full=when_full.value),
+            told=bars,
+            said=lambda sentence: console.print(sentence, style="yellow", highlight=False),
+        )
+        status = client.scene(delivery.scene)
+    console.print(delivery.lateness.summary(fps), highlight=False, soft_wrap=True)
+    console.print(f"scene {status.id}: {status.committed} of {status.next_frame} frames committed, {status.state}")
+    console.print(f"{url.rstrip('/')}/#scene={status.id}", soft_wrap=True)
+    if status.error:
+        raise SystemExit(f"scas4d: {status.error}")
+
+
+def scenes(url: Url = DEFAULT_URL, token: Token = None) -> None:
+    """Lists the scenes of a running service."""
+    rows: list[tuple[str, ...]] = [("scene", "name", "state", "cameras", "next frame", "queued", "committed", "error")]
+    with Client(url, token=token, outage=0) as client:
+        for status in client.scenes():
+            numbers = (len(status.cameras), status.next_frame, status.queued, status.committed)
+            rows.append((status.id, status.name, status.state, *map(str, numbers), status.error or ""))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:  # whole words, however narrow the terminal: they are read by programs too
+        line = "  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True))
+        console.print(line.rstrip(), highlight=False, markup=False, soft_wrap=True)
+    if len(rows) == 1:
+        console.print("no scene yet; make one with: scas4d push CAPTURE", highlight=False, soft_wrap=True)
+
+
+def watch(scene: Scene, url: Url = DEFAULT_URL, token: Token = None) -> None:
+    """Prints what becomes of a scene's frames, as it happens, until Ctrl-C or the scene is deleted."""
+    from client.stream import Stream, finished_frames, scene_changes
+    from client.wire.stream import FrameMessage, SceneMessage
+
+    state: str | None = None
+    with Client(url, token=token, outage=0) as client:
+        client.scene(scene)  # a wrong id is said at once
+    try:
+        with Stream(url, scene, token=token) as stream:
+            stream.subscribe("frames", finished_frames())
+            stream.subscribe("scene", scene_changes())
+            for event in stream:
+                if isinstance(event, FrameMessage) and event.report.state in FINISHED:
+                    console.print(frame_line(event.report, event.missed), highlight=False, soft_wrap=True)
+                elif isinstance(event, SceneMessage) and event.status.state != state:
+                    state = event.status.state
+                    console.print(f"scene is {state}" + (f": {event.status.error}" if event.status.error else ""))
+    except KeyboardInterrupt:
+        return
+
+
+def budget(
+    scene: Scene,
+    iterations: Annotated[int | None, typer.Option(min=1, help="A frame.")] = None,
+    milliseconds: Annotated[
+        float | None, typer.Option(min=0.001, help="A frame, decoding and commit included: as many iterations as fit.")
+    ] = None,
+    stop_gain: Annotated[
+        float | None,
+        typer.Option(min=0, max=0.999, help="Ten iterations that bring less than this share end an update."),
+    ] = None,
+    still: Annotated[
+        float | None,
+        typer.Option(
+            min=-1, help="No iteration where the frame before shows it within 1 + this times the usual error."
+        ),
+    ] = None,
+    as_made: Annotated[bool, typer.Option("--as-made", help="As the scene was made.")] = False,
+    url: Url = DEFAULT_URL,
+    token: Token = None,
+) -> None:
+    """Tells what a scene's updates may cost; with options, sets it from the next frame on."""
+    given = (iterations, milliseconds, stop_gain, still)
+    if as_made and any(value is not None for value in given):
+        raise ValueError("--as-made stands for no other budget; leave it out, or the others")
+    with Client(url, token=token, outage=0) as client:
+        if as_made or any(value is not None for value in given):
+            found = client.set_budget(
+                scene, iterations=iterations, budget_ms=milliseconds, stop_gain=stop_gain, still=still
+            )
+        else:
+            found = client.budget(scene)
+    now = found.effective
+    many = (
+        f"{now.iterations} iterations"
+        if now.budget_ms is None
+        else f"as many iterations as fit into {now.budget_ms:g} ms"
+    )
+    stops = f", or fewer: stop gain {now.stop_gain:g}" if now.stop_gain else ""
+    console.print(f"{many} a frame{stops}; still {now.still:g}; from frame {found.since} on", highlight=False)
+
+
+def import_(
+    capture: CaptureFolder,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="New folder.")],
+    frames: Annotated[int | None, typer.Option(min=1, help="Only so many frames.")] = None,
+    test: Annotated[list[str] | None, typer.Option(help="A camera to hold out, for measuring; repeatable.")] = None,
+    calibration: Calibration = None,
+    pictures: From = None,
+    capture_fps: CaptureFps = None,
+    masks: Masks = True,
+    encoding: Encode = Encoding.JPEG,
+) -> None:
+    """Undistorts a capture once and for all, into a folder that every command reads without OpenCV or PyAV."""
+    from client.importers.write import write_dynamic3dgs
+
+    source = _opened(capture, calibration, pictures, capture_fps, masks, encoding)
+    with Bars() as bars:
+        write_dynamic3dgs(source, out, frames=frames, test=test or (), told=bars)
+    console.print(f"{out}: {len(source.rig)} cameras; try: scas4d push {out}", highlight=False, soft_wrap=True)
+
+
+def frame_line(report: FrameReportModel, missed: int = 0) -> str:
+    """What became of a frame, for a person."""
+    parts = [f"frame {report.index}: {report.state}"]
+    if report.psnr is not None:
+        parts.append(f"{report.psnr:.1f} dB")
+    if "total" in report.seconds:
+        parts.append(f"{report.seconds['total']:.2f} s")
+    if report.degraded:
+        parts.append(report.degraded)
+    if report.dropped_cameras:
+        parts.append(f"without {', '.join(report.dropped_cameras)}")
+    if report.error:
+        parts.append(report.error)
+    if missed:
+        parts.append(f"({missed} before it not shown)")
+    return "  ".join(parts)
+
+
+def _opened(
+    capture: Path,
+    calibration: Path | None,
+    pictures: PicturesFrom | None,
+    fps: float | None,
+    masks: bool,
+    encoding: Encoding,
+) -> Source:
+    source = open_source(
+        capture,
+        calibration=calibration,
+        pictures=None if pictures is None else pictures.value,
+        fps=fps,
+        encoding=encoding.value,
+        use_masks=masks,
+    )
+    for remark in source.remarks:
+        console.print(f"[yellow]{remark}")
+    return source
+
+
+def register(app: typer.Typer) -> None:
+    """Adds these commands."""
+    app.command()(push)
+    app.command(name="import")(import_)
+    app.command()(scenes)
+    app.command()(watch)
+    app.command()(budget)

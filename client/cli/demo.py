@@ -1,0 +1,160 @@
+"""The main job in one command: a service, a capture streamed through it, pictures."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from client import rig
+from client.cli import pictures
+from client.cli.extras import need_server
+from client.cli.progress import Bars, console
+from client.errors import ServiceError, ServiceUnreachable
+from client.sdk import Client
+from scas4d_core.captures import Capture
+
+POLL_S = 1.0
+"""Between two questions whether the service is ready."""
+
+
+@contextmanager
+def running_service(data: Path, log: Path, port: int = 8000) -> Iterator[str]:
+    """A service of its own on the loopback, at `port` or where that is taken at a free one; its address.
+
+    The first start of all compiles the kernels: it is waited for as long as the process lives.
+
+    Raises:
+        RuntimeError: it ended, or cannot become ready; the message says why, and names its log.
+        ModuleNotFoundError: the service is not installed.
+    """
+    need_server()
+    port = port if _free(port) else _free(0)
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("w") as file:
+        command = [sys.executable, "-m", "client.cli.main", "serve", "--port", str(port), "--data", str(data)]
+        process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
+    try:
+        url = f"http://127.0.0.1:{port}"
+        with Bars() as bars:
+            while not _ready(url, log):
+                if process.poll() is not None:
+                    raise RuntimeError(f"the service has ended: {_last_words(log)}; its log is {log}")
+                bars("making the kernels ready", 0, 1)
+                time.sleep(POLL_S)
+            bars("making the kernels ready", 1, 1)
+        yield url
+    finally:
+        process.terminate()
+        try:
+            process.wait(20)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _free(port: int) -> int:
+    """The port (any for 0) if nobody listens there, else 0."""
+    with socket.socket() as probe:
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            return 0
+        return int(probe.getsockname()[1])
+
+
+def _ready(url: str, log: Path) -> bool:
+    try:
+        with Client(url, token=_token(), outage=0) as client:
+            client.ready()
+    except ServiceUnreachable:
+        return False
+    except ServiceError as error:
+        if (error.problem.model_extra or {}).get("warming_up"):
+            return False
+        raise RuntimeError(f"the service cannot become ready: {error}; its log is {log}") from None
+    return True
+
+
+def _token() -> str | None:
+    """The service that was started here reads it too."""
+    return os.environ.get("SCAS4D_TOKEN")
+
+
+def _last_words(log: Path) -> str:
+    """The last line that a person wrote for people, of a log that is JSON otherwise."""
+    said = [line for line in log.read_text(errors="replace").splitlines() if line and not line.startswith("{")]
+    return said[-1].removeprefix("scas4d: ") if said else "it says no reason"
+
+
+def run(capture: Capture, url: str, out: Path, *, frames: int | None, preset: str, settings: Mapping[str, Any]) -> str:
+    """Streams the capture through the service at `url` and saves what comes back; the scene's id.
+
+    `out` gets truth | render | difference of every test camera and frame (of one training camera where there are no
+    test cameras), and depth and parts of the last frame.
+    """
+    name = f"demo of {capture.name}"
+    with Client(url, token=_token()) as client:
+        for earlier in client.scenes():
+            if earlier.name == name:  # each would be one of the few that the service takes
+                client.delete_scene(earlier.id)
+        with Bars() as bars:
+            delivery = rig.push(capture, client, name=name, frames=frames, preset=preset, settings=settings, told=bars)
+        status = client.scene(delivery.scene)
+        if status.last_committed is None:
+            raise RuntimeError(f"no frame was committed: {status.error}")
+        _report(client, status.id, status.next_frame)
+        scores = save_views(capture, client, status.id, status.next_frame, out)
+    mean = np.mean(scores[1:]) if len(scores) > 1 else scores[0]
+    kind = "held-out test" if capture.full_test_rig is not None else "training"
+    console.print(f"{kind} cameras: frame 0 {scores[0]:.2f} dB, mean of the updates {mean:.2f} dB PSNR")
+    return status.id
+
+
+def _report(client: Client, id: str, frames: int) -> None:
+    """One line on time; frames set aside by name."""
+    reports = [client.frame(id, index) for index in range(frames)]
+    for report in reports:
+        if report.state != "committed":
+            console.print(f"[red]frame {report.index} was set aside: {report.error}")
+    done = [report for report in reports if report.state == "committed"]
+    first, updates = done[0], [report.seconds["total"] for report in done[1:]]
+    later = f", updates {np.median(updates):.2f} s each (median of {len(updates)})" if updates else ""
+    console.print(f"frame {first.index} took {first.seconds['total']:.1f} s{later}; {first.gaussians} Gaussians")
+
+
+def save_views(capture: Capture, client: Client, id: str, frames: int, out: Path) -> list[float]:
+    """The pictures of every committed frame; mean PSNR by frame over the cameras."""
+    cameras = capture.full_test_rig.cameras if capture.full_test_rig is not None else capture.full_rig.cameras[:1]
+    scores = []
+    with Bars() as bars:
+        for index in range(frames):
+            if client.frame(id, index).state != "committed":
+                continue
+            truth = capture.test_frame(index) if capture.full_test_rig is not None else capture.frame(index)
+            by_camera = []
+            for camera in cameras:
+                render = client.render(id, camera, index)
+                true = truth.images[camera.name]
+                by_camera.append(pictures.psnr(true, render))
+                pictures.save(out / f"camera_{camera.name}" / f"{index:06d}.png", pictures.comparison(true, render))
+            scores.append(float(np.mean(by_camera)))
+            bars("pictures", index + 1, frames)
+        bars("depth and parts", 0, 1)
+        try:
+            views = client.render_arrays(id, cameras[0], None, kinds=["depth", "parts"])
+        except ServiceError as error:
+            console.print(f"[red]no depth and parts: {error}")
+        else:
+            pictures.save(out / "depth.png", pictures.brightness(views["depth"]))
+            pictures.save(out / "parts.png", pictures.coloured(views["parts"]))
+            bars("depth and parts", 1, 1)
+    return scores

@@ -1,0 +1,156 @@
+"""The `scas4d` command. Sub-commands that need the core or the server import them when they run."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from pydantic import ValidationError
+
+from client import __version__
+from client.cli import commands, extras
+from client.cli.overrides import overrides, refusal
+from client.cli.progress import console
+from client.errors import ServiceError, ServiceUnreachable
+from client.importers.open_source import open_prepared
+from client.sdk import DEFAULT_URL
+from scas4d_core.captures import CaptureError, ImageError
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="Online 4D reconstruction of multi-camera rigs.")
+commands.register(app)
+
+CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture.")]
+Preset = Annotated[str, typer.Option(help="Named settings: scas4d, adaptive or dynamic3dgs.")]
+Changes = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="As update.iterations=200.")]
+Frames = Annotated[int | None, typer.Option(min=1, help="Only so many frames.")]
+Out = Annotated[Path, typer.Option(help="Where pictures go.")]
+
+
+@app.command()
+def serve(
+    host: Annotated[
+        str | None, typer.Option(help="Address to listen at; beyond the loopback only with a token (SCAS4D_TOKEN).")
+    ] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="8000 where not set otherwise.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of the scenes; ./data where not set otherwise.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="TOML file of settings; docs/operations.md lists them. The environment wins.")
+    ] = None,
+) -> None:
+    """Starts the service. What is not given here is read from the environment (SCAS4D_...), then from the file."""
+    if config is not None:
+        os.environ["SCAS4D_CONFIG"] = str(config)
+    from server.serve import serve as run
+    from server.settings import ServerSettings
+
+    run(ServerSettings.from_environment(host=host, port=port, data=data))
+
+
+@app.command()
+def demo(
+    capture: Annotated[Path, typer.Option(help="Folder of a capture.")] = Path("samples/robot"),
+    out: Out = Path("out/demo"),
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Another is taken where this is in use.")] = 8000,
+    stay: Annotated[
+        bool | None,
+        typer.Option(help="Leave the service running until Ctrl-C; the default in a terminal, and only there."),
+    ] = None,
+    frames: Frames = None,
+    preset: Preset = "scas4d",
+    changes: Changes = None,
+) -> None:
+    """Starts a service, streams the sample capture through it, and leaves renders beside the truth."""
+    from client.cli import demo as main_job
+
+    opened, settings = open_prepared(capture), overrides(changes or [])
+    stays = sys.stdout.isatty() if stay is None else stay
+    data, log = out / "data", out / "service.log"
+    with main_job.running_service(data, log, port) as url:
+        console.print(f"service at {url}, its log in {log}", soft_wrap=True)
+        id = main_job.run(opened, url, out, frames=frames, preset=preset, settings=settings)
+        console.print(f"pictures (truth | render | difference x4): {out}", soft_wrap=True)
+        if stays:
+            console.print(f"open {url}/#scene={id} (the API: {url}/docs); Ctrl-C ends the service", soft_wrap=True)
+            try:
+                while True:
+                    time.sleep(3600)
+            except KeyboardInterrupt:
+                console.print("ending the service")
+    console.print("the service has ended (--stay leaves it running); to look at the scene:", soft_wrap=True)
+    console.print(f"scas4d serve --data {data}, and open {DEFAULT_URL}/#scene={id}", highlight=False, soft_wrap=True)
+
+
+@app.command()
+def reconstruct(
+    capture: CaptureFolder,
+    out: Out = Path("out/reconstruct"),
+    frames: Frames = None,
+    preset: Preset = "scas4d",
+    device: Annotated[str | None, typer.Option(help="cpu or cuda.")] = None,
+    changes: Changes = None,
+) -> None:
+    """Reconstructs a capture in this process, without a service: pictures, states, and a .ply of the last frame."""
+    from client.cli.reconstruct import reconstruct as run
+
+    given = [*(changes or []), *([f"device={device}"] if device else [])]
+    run(capture, out, frames=frames, preset=preset, changes=given)
+
+
+@app.command()
+def evaluate(
+    capture: CaptureFolder,
+    out: Out = Path("out/evaluate"),
+    frames: Frames = None,
+    preset: Preset = "scas4d",
+    changes: Changes = None,
+    again: Annotated[bool, typer.Option("--again", help="Measure anew what is there already.")] = False,
+) -> None:
+    """Prints a capture's scores on its test cameras and ground truth; reconstructs it unless `out` has them already."""
+    if open_prepared(capture).full_test_rig is None:
+        raise CaptureError(
+            f"{capture}: no test cameras (test_meta.json) to measure on; `scas4d reconstruct` needs none"
+        )
+    from studies.commands import quality  # a checkout has it; the wheel does not
+
+    quality([capture], out=out, frames=frames, preset=[preset], changes=changes, again=again)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        console.print(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def options(version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True)] = False) -> None:
+    """Runs before every command."""
+
+
+def main() -> None:
+    """The entry point."""
+    run(app)
+
+
+def run(commands: typer.Typer) -> None:
+    """Runs a command line: errors that a user can mend are one line, not a traceback."""
+    try:
+        commands()
+    except ModuleNotFoundError as error:
+        remedy = extras.remedy(error)
+        if remedy is None:
+            raise
+        raise SystemExit(f"scas4d: {remedy}") from None
+    except ValidationError as error:
+        raise SystemExit(f"scas4d: {refusal(error)}") from None
+    except ServiceUnreachable as error:
+        raise SystemExit(f"scas4d: {error}; start one with: scas4d serve") from None
+    except (ServiceError, CaptureError, ImageError, RuntimeError, ValueError, OSError) as error:
+        raise SystemExit(f"scas4d: {error}") from None
+
+
+if __name__ == "__main__":
+    main()

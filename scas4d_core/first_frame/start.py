@@ -1,0 +1,91 @@
+"""Frame 0: fitted, and what it leaves to every update."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import WorldFrame
+from scas4d_core.captures.frame import Frame, InitialPoints
+from scas4d_core.first_frame.initial_points import initial_points
+from scas4d_core.first_frame.static_scene import StaticResult, fit_static_scene
+from scas4d_core.frame_report import Progress
+from scas4d_core.robust.attempts import axis_lengths
+from scas4d_core.settings import Settings
+from scas4d_core.storage.history import History
+from scas4d_core.update.views import ViewFactory
+
+
+@dataclass(frozen=True, eq=False)
+class Fixed:
+    """What frame 0 leaves to every update.
+
+    Attributes:
+        masked: whether it had masks. exposures: [3, 2] gain and offset by camera.
+        lengths: [N, 3] metres, of the axes of the Gaussians.
+    """
+
+    masked: bool
+    exposures: dict[str, NDArray[np.float32]]
+    lengths: NDArray[np.float32]
+
+    def record(self) -> dict[str, Any]:
+        """What the state of frame 0 does not tell of it, as JSON; committed with the report."""
+        return {
+            "masked": self.masked,
+            "exposures": {name: exposure.tolist() for name, exposure in self.exposures.items()},
+        }
+
+    @classmethod
+    def of(cls, history: History) -> Fixed:
+        """What the first frame of a history left.
+
+        Raises:
+            HistoryError: it cannot be read. KeyError: its report lacks something.
+        """
+        first = history.indices[0]
+        report = history.report(first)
+        masked = bool(report["masked"])
+        exposures = {name: np.array(exposure, np.float32) for name, exposure in report["exposures"].items()}
+        return cls(masked, exposures, axis_lengths(history.gaussians(first)))
+
+
+def fit_first(
+    frame: Frame,
+    points: InitialPoints | None,
+    factory: ViewFactory,
+    settings: Settings,
+    world: WorldFrame,
+    tell: Callable[[Progress], None],
+) -> StaticResult:
+    """Frame 0 from a first cloud, which is made from the pictures where none is given.
+
+    It is made inside: the same wherever the user's origin is and whatever the unit.
+
+    Args:
+        frame: with pictures of the size of the factory's rig. points: in the user's world. world: user's to inside.
+        tell: is told of each stage.
+    """
+    static = settings.static
+    if points is None:
+        points = initial_points(
+            factory.rig, frame.images, frame.masks, None,
+            lambda stage, done, total: tell(Progress(stage, done, total)),
+        )  # fmt: skip
+        positions = points.positions
+    else:
+        positions = world.to_inside(points.positions)
+    return fit_static_scene(
+        factory,
+        factory.views(frame, {}),
+        positions,
+        points.colours,
+        points.foreground,
+        settings.scene,
+        static,
+        lambda done, loss: tell(Progress("fitting frame 0", done, static.iterations, {"loss": loss})),
+    )

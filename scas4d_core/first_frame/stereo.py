@@ -1,0 +1,198 @@
+"""Dense points by stereo, kept only where the depths of several cameras meet and no camera looks through them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter
+
+from scas4d_core.first_frame.patch_match import patch_match
+from scas4d_core.first_frame.posed_pictures import Bool, Float, View, pixels_inside
+from scas4d_core.first_frame.visual_hull import VisualHull
+
+MAX_COST = 0.35
+"""1 − NCC of a match that is believed (before the cameras are compared)."""
+REPROJECTION = 1.0
+"""Pixels from a point to where another camera's depth sends it back."""
+DEPTH_AGREEMENT = 0.01
+"""Relative difference of two cameras' depths of one point."""
+MIN_ANGLE_DEG, MAX_ANGLE_DEG = 4.0, 50.0
+"""Between the axes' rays to the middle of the scene: below, depth is vague; above, patches look different."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthMap:
+    """What stereo says about one picture.
+
+    Attributes:
+        view: camera and picture, at the size stereo worked at.
+        depth: [H, W] along z, world units, 0 where nothing is known.
+        agreeing: [H, W] other cameras whose depth agrees.
+    """
+
+    view: View
+    depth: Float
+    agreeing: NDArray[np.intp]
+
+    def trusted(self, others: int) -> Float:
+        """The depth where at least ``others`` other cameras agree, else 0."""
+        result: Float = np.where(self.agreeing >= others, self.depth, 0.0)
+        return result
+
+
+def halved(view: View, width: int) -> View:
+    """The view at half, a quarter … of its size, until it is no wider than ``width`` pixels."""
+    image, mask, camera = view.image.astype(np.float32), view.mask, view.camera
+    while camera.width > width and camera.width >= 2 and camera.height >= 2:
+        h, w = camera.height // 2 * 2, camera.width // 2 * 2
+        image = image[:h, :w].reshape(h // 2, 2, w // 2, 2, 3).mean((1, 3))
+        if mask is not None:
+            mask = np.asarray(mask[:h, :w].reshape(h // 2, 2, w // 2, 2).any((1, 3)), dtype=np.bool_)
+        # Blocks of 2 × 2 with pixel centres at +0.5: every pixel coordinate is halved exactly, odd sizes or not.
+        matrix = camera.intrinsics * np.array([[0.5], [0.5], [1.0]])
+        camera = type(camera)(camera.name, matrix, camera.world_to_camera, w // 2, h // 2)
+    return View(camera, np.rint(image).astype(np.uint8), mask)
+
+
+def neighbours_of(views: Sequence[View], index: int, middle: Float, count: int) -> list[int]:
+    """The views to compare one with: nearest in angle about ``middle`` [3], but not too near."""
+    rays = np.array([view.camera.centre - middle for view in views])
+    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+    angle = np.degrees(np.arccos(np.clip(rays @ rays[index], -1, 1)))
+    fit = [i for i in np.argsort(angle, kind="stable") if i != index and MIN_ANGLE_DEG <= angle[i] <= MAX_ANGLE_DEG]
+    return [int(i) for i in fit[:count]]
+
+
+def depth_maps(
+    views: Sequence[View],
+    ranges: Sequence[tuple[float, float]],
+    priors: Sequence[Float],
+    active: Sequence[Bool],
+    middle: Float,
+    *,
+    neighbours: int = 4,
+    iterations: int = 4,
+    seed: int = 0,
+    hull: VisualHull | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[DepthMap]:
+    """PatchMatch of every view against its neighbours, then the comparison of all depths.
+
+    Args:
+        views: all of one size or not; see ``halved``.
+        ranges: (near, far) of each view, world units.
+        priors: [H, W] depth of each view to try first, 0 where unknown.
+        active: [H, W] pixels wanted of each view.
+        middle: [3] about which angles between cameras are measured.
+        neighbours: views each is compared with.
+        iterations: rounds of PatchMatch.
+        seed: of the random planes.
+        hull: of the masks: depths of masked pixels that lie outside it are false.
+        progress: told (views done, views).
+    """
+    greys = [
+        np.ascontiguousarray(v.image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32) / np.float32(255))
+        for v in views
+    ]
+    tall, wide = max(g.shape[0] for g in greys), max(g.shape[1] for g in greys)
+    depths = []
+    for i, view in enumerate(views):
+        chosen = [j for j in neighbours_of(views, i, middle, neighbours) if greys[j].shape == (tall, wide)]
+        camera = view.camera
+        if len(chosen) < 2:
+            depths.append(np.zeros(greys[i].shape))
+            continue
+        matrices, shifts = [], []
+        for j in chosen:
+            other = views[j].camera
+            rotation = other.rotation @ camera.rotation.T
+            matrices.append(other.intrinsics @ rotation)
+            shifts.append(other.intrinsics @ (other.translation - rotation @ camera.translation))
+        depth, _, cost = patch_match(
+            greys[i],
+            active[i],
+            priors[i],
+            np.array([1 / camera.fx, -camera.cx / camera.fx, 1 / camera.fy, -camera.cy / camera.fy]),
+            np.stack([greys[j] for j in chosen]),
+            np.stack(matrices),
+            np.stack(shifts),
+            near=ranges[i][0],
+            far=ranges[i][1],
+            iterations=iterations,
+            best=2,
+            seed=seed * 1009 + i,
+        )
+        depths.append(np.where(cost <= MAX_COST, depth, 0.0))
+        if hull is not None and len(hull.cells) and view.mask is not None:
+            _confine(view, depths[-1], hull)
+        if progress is not None:
+            progress(i + 1, len(views))
+    return [DepthMap(view, depths[i], _agreement(views, depths, i)) for i, view in enumerate(views)]
+
+
+def _confine(view: View, depth: Float, hull: VisualHull) -> None:
+    """Forget, in place, the depths of masked pixels that lie off the hull: no foreground is there."""
+    rows, columns = np.nonzero((depth > 0) & np.asarray(view.mask))
+    if len(rows) == 0:
+        return
+    points = view.camera.unproject(np.stack([columns + 0.5, rows + 0.5], -1), depth[rows, columns])
+    off = ~hull.about(points)
+    depth[rows[off], columns[off]] = 0.0
+
+
+def _agreement(views: Sequence[View], depths: Sequence[Float], index: int) -> NDArray[np.intp]:
+    """[H, W] how many other cameras' depths send a pixel's point back to it."""
+    camera, depth = views[index].camera, depths[index]
+    rows, columns = np.nonzero(depth > 0)
+    uv = np.stack([columns + 0.5, rows + 0.5], axis=-1)
+    points = camera.unproject(uv, depth[rows, columns])
+    count = np.zeros(depth.shape, dtype=np.intp)
+    for j, view in enumerate(views):
+        if j == index:
+            continue
+        column, line, there, inside = pixels_inside(view.camera, points)
+        found = depths[j][line, column]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            good = inside & (found > 0) & (np.abs(found - there) <= DEPTH_AGREEMENT * there)
+        seen, _ = view.camera.project(points[good])
+        back = view.camera.unproject(seen, found[good])
+        again, _ = camera.project(back)
+        close = np.linalg.norm(again - uv[good], axis=-1) <= REPROJECTION
+        count[rows[good][close], columns[good][close]] += 1
+    return count
+
+
+def fused_points(maps: Sequence[DepthMap], min_views: int, max_violations: float = 0.5) -> Float:
+    """[P, 3] the points of all depth maps on which ``min_views`` cameras agree and through which few look.
+
+    A camera whose trusted depth lies clearly behind a point looks through it. A point is a floater if the cameras that
+    look through it are more than ``max_violations`` times those that agree on it (after Merrell et al. 2007).
+    """
+    fused = [np.zeros((0, 3))]
+    for index, one in enumerate(maps):
+        trusted = one.trusted(min_views - 1)
+        rows, columns = np.nonzero(trusted > 0)
+        points = one.view.camera.unproject(np.stack([columns + 0.5, rows + 0.5], -1), trusted[rows, columns])
+        through = looked_through(maps, points, min_views, skip=index)
+        fused.append(points[through <= max_violations * (1 + one.agreeing[rows, columns])])
+    return np.concatenate(fused)
+
+
+def looked_through(
+    maps: Sequence[DepthMap], points: Float, min_views: int, margin: float = 0.03, skip: int = -1
+) -> NDArray[np.intp]:
+    """[P] cameras whose trusted depth lies more than ``margin`` (relative) behind each point [P, 3].
+
+    All 3 × 3 pixels about the point must say so: at an outline, the pixel beside it looks past the point.
+    """
+    through = np.zeros(len(points), dtype=np.intp)
+    for index, one in enumerate(maps):
+        if index == skip:
+            continue
+        column, line, depth, inside = pixels_inside(one.view.camera, points)
+        certain = minimum_filter(one.trusted(min_views - 1), size=3)
+        through += inside & (certain[line, column] > depth * (1.0 + margin))
+    return through

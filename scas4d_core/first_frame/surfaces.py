@@ -1,0 +1,298 @@
+"""Large smooth surfaces (walls, floors, domes) as planes and spheres, where the triangulated points support them.
+
+Smooth walls give few features, and stereo on them finds floaters. A plane or sphere that many triangulated points lie
+on says where the wall is between them. Fitted by RANSAC (Fischler & Bolles 1981), refined by least squares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial import cKDTree
+
+from scas4d_core.first_frame.posed_pictures import Bool, Float, View
+
+TRIALS = 1500
+MIN_SHARE = 0.1
+"""Of the triangulated points, that a surface must explain."""
+MIN_INLIERS = 30
+CAMERA_SLACK = 1.25
+"""A dome holds all cameras within this many radii: they are often mounted in it."""
+MAX_BEHIND = 0.15
+"""Share of the triangulated points that may lie behind a surface: what bounds a room has next to nothing behind it."""
+MAX_RADIUS = 2.0
+"""Radius of a dome in radii of the rig; a larger one is a wall, and a plane says that with less freedom."""
+GAP_PLANE = 0.5
+GAP_SPHERE = 1.5
+"""Radii of the rig from a sample of the surface to the nearest triangulated point on it, at most."""
+
+
+class Surface(Protocol):
+    """A surface seen from within the room it bounds."""
+
+    def offsets(self, points: Float) -> Float:
+        """[P] signed distance of points [P, 3] along ``normals``."""
+
+    def normals(self, points: Float) -> Float:
+        """[P, 3] unit normals where the points are nearest."""
+
+    def hit(self, origin: Float, directions: Float) -> Float:
+        """[R] ray parameter at which rays meet the surface from within the room; infinity where they do not."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """normal · x = offset, |normal| = 1."""
+
+    normal: Float
+    offset: float
+
+    def offsets(self, points: Float) -> Float:
+        """[P] signed distance."""
+        result: Float = points @ self.normal - self.offset
+        return result
+
+    def normals(self, points: Float) -> Float:
+        """[P, 3] the normal."""
+        return np.broadcast_to(self.normal, points.shape)
+
+    def hit(self, origin: Float, directions: Float) -> Float:
+        """[R] ray parameter, infinity where the ray leads away."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = (self.offset - origin @ self.normal) / (directions @ self.normal)
+        result: Float = np.where(along > 0, along, np.inf)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere:
+    """A dome about the cameras; rays meet its far side."""
+
+    centre: Float
+    radius: float
+
+    def offsets(self, points: Float) -> Float:
+        """[P] signed distance, positive outside."""
+        result: Float = np.linalg.norm(points - self.centre, axis=-1) - self.radius
+        return result
+
+    def normals(self, points: Float) -> Float:
+        """[P, 3] outward."""
+        outward = points - self.centre
+        result: Float = outward / np.maximum(np.linalg.norm(outward, axis=-1, keepdims=True), 1e-12)
+        return result
+
+    def hit(self, origin: Float, directions: Float) -> Float:
+        """[R] ray parameter of the far hit, infinity where the ray passes by."""
+        offset = origin - self.centre
+        a = (directions**2).sum(-1)
+        b = directions @ offset
+        c = offset @ offset - self.radius**2
+        inside = b**2 - a * c
+        far = (-b + np.sqrt(np.maximum(inside, 0.0))) / a
+        result: Float = np.where((inside >= 0) & (far > 0), far, np.inf)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """A surface and the points [S, 3] that lie on it."""
+
+    surface: Surface
+    points: Float
+
+
+def fit_plane(points: Float) -> Plane | None:
+    """Least-squares plane of points [P, 3], P ≥ 3; None where they are collinear."""
+    middle = points.mean(0)
+    _, values, axes = np.linalg.svd(points - middle, full_matrices=False)
+    if len(points) < 3 or values[1] < 1e-9 * max(values[0], 1e-300):
+        return None
+    normal = axes[2]
+    return Plane(normal, float(normal @ middle))
+
+
+def fit_sphere(points: Float) -> Sphere | None:
+    """Sphere of points [P, 3], P ≥ 4: |x|² = 2 x·c + (r² − |c|²), linear in c; None where they are coplanar."""
+    middle = points.mean(0)
+    local = points - middle
+    matrix = np.hstack([2.0 * local, np.ones((len(points), 1))])
+    answer, _, rank, _ = np.linalg.lstsq(matrix, (local**2).sum(-1), rcond=1e-9)
+    square = answer[3] + answer[:3] @ answer[:3]
+    if rank < 4 or square <= 0:
+        return None
+    return Sphere(answer[:3] + middle, float(np.sqrt(square)))
+
+
+def fit_surfaces(points: Float, centres: Float, tolerance: float, *, most: int, seed: int) -> list[Support]:
+    """Planes and spheres that bound the room of the cameras, the best supported first.
+
+    Args:
+        points: [P, 3] triangulated, without the foreground where it is known.
+        centres: [V, 3] camera centres: all on one side of a plane, all within ``CAMERA_SLACK`` radii of a sphere.
+        tolerance: distance of an inlier, world units.
+        most: surfaces at most.
+        seed: of the samples.
+    """
+    rng = np.random.default_rng(seed)
+    rest = points
+    found: list[Support] = []
+    needed = max(MIN_INLIERS, int(MIN_SHARE * len(points)))
+    while len(found) < most and len(rest) >= needed:
+        best: Surface | None = None
+        most_inliers = 0
+        for trial in range(TRIALS):
+            kind = trial % 2
+            sample = rest[rng.choice(len(rest), 3 + kind, replace=False)]
+            candidate = fit_sphere(sample) if kind else fit_plane(sample)
+            if candidate is None or not _bounds(candidate, points, centres, tolerance):
+                continue
+            inliers = int((np.abs(candidate.offsets(rest)) <= tolerance).sum())
+            if inliers > most_inliers:
+                best, most_inliers = candidate, inliers
+        if best is None:
+            break
+        for _ in range(5):
+            near = rest[np.abs(best.offsets(rest)) <= tolerance]
+            again = _refined(best, near, tolerance)
+            if again is None or not _bounds(again, points, centres, tolerance):
+                break
+            best = again
+        on = np.abs(best.offsets(rest)) <= tolerance
+        if on.sum() < needed:
+            break
+        found.append(Support(best, rest[on]))
+        # What lies close to a surface already found supports no second one beside it.
+        rest = rest[np.abs(best.offsets(rest)) > 2.0 * tolerance]
+    return found
+
+
+def _bounds(surface: Surface, points: Float, centres: Float, tolerance: float) -> bool:
+    """Whether the cameras are on one side of the surface and nearly all the points on the same."""
+    cameras, behind = surface.offsets(centres), surface.offsets(points)
+    if isinstance(surface, Sphere):
+        reach = np.linalg.norm(centres - surface.centre, axis=1).max()
+        radius = np.linalg.norm(centres - centres.mean(0), axis=1).max()
+        if reach > CAMERA_SLACK * surface.radius or surface.radius > MAX_RADIUS * radius:
+            return False
+    else:
+        if not ((cameras > -tolerance).all() or (cameras < tolerance).all()):
+            return False
+        if cameras.mean() > 0:
+            behind = -behind
+    return bool((behind > 3.0 * tolerance).mean() <= MAX_BEHIND)
+
+
+def _sphere_residuals(parameters: Float, near: Float) -> Float:
+    result: Float = np.linalg.norm(near - parameters[:3], axis=1) - parameters[3]
+    return result
+
+
+def _refined(surface: Surface, near: Float, tolerance: float) -> Surface | None:
+    if isinstance(surface, Plane):
+        return fit_plane(near) if len(near) >= 3 else None
+    assert isinstance(surface, Sphere)
+    if len(near) < 4:
+        return None
+    answer = least_squares(
+        _sphere_residuals,
+        np.array([*surface.centre, surface.radius]),
+        args=(near,),
+        loss="soft_l1",
+        f_scale=tolerance / 2,
+    )
+    return Sphere(np.asarray(answer.x[:3]), float(answer.x[3]))
+
+
+def surface_depth(view: View, supports: Sequence[Support], uv: Float) -> tuple[Float, Float]:
+    """Where the rays through pixels [R, 2] first meet the surfaces.
+
+    Returns:
+        points [R, 3] (NaN where no surface is met) and depths along z [R] (infinity there).
+    """
+    camera = view.camera
+    ones = np.ones(len(uv))
+    directions = camera.unproject(uv, ones) - camera.centre
+    depth = np.full(len(uv), np.inf)
+    for support in supports:
+        depth = np.minimum(depth, support.surface.hit(camera.centre, directions))
+    met = np.isfinite(depth)
+    points = np.full((len(uv), 3), np.nan)
+    points[met] = camera.centre + directions[met] * depth[met, None]
+    return points, depth
+
+
+def sample_surfaces(views: Sequence[View], supports: Sequence[Support], stride: int, scale: float) -> Float:
+    """[P, 3] points of the surfaces where the cameras look, one for each ``stride``-th pixel outside the masks.
+
+    Args:
+        views: the cameras; masked pixels show something else.
+        supports: fitted surfaces.
+        stride: pixels.
+        scale: radius of the rig: samples far from every triangulated point of the surface (``GAP_…``) are left out,
+            unless they lie within a dome that was found.
+    """
+    if not supports:
+        return np.zeros((0, 3))
+    domes = [s.surface for s in supports if isinstance(s.surface, Sphere)]
+    samples = []
+    for view in views:
+        across, down = (np.arange(stride / 2, size, stride) for size in (view.camera.width, view.camera.height))
+        uv = np.stack(np.meshgrid(across, down, indexing="xy"), axis=-1).reshape(-1, 2)
+        if view.mask is not None:
+            uv = uv[~view.mask[uv[:, 1].astype(int), uv[:, 0].astype(int)]]
+        points, depth = surface_depth(view, supports, uv)
+        points = points[np.isfinite(depth)]
+        if len(points) == 0:
+            continue
+        distance = np.stack([np.abs(s.surface.offsets(points)) for s in supports])
+        nearest = distance.argmin(0)
+        keep = np.zeros(len(points), dtype=bool)
+        for index, support in enumerate(supports):
+            mine = nearest == index
+            if not mine.any():
+                continue
+            gap = GAP_SPHERE if isinstance(support.surface, Sphere) else GAP_PLANE
+            near: Bool = np.asarray(cKDTree(support.points).query(points[mine])[0]) <= gap * scale
+            within = np.zeros(len(near), dtype=bool)
+            for dome in domes:
+                within |= np.linalg.norm(points[mine] - dome.centre, axis=1) < 0.999 * dome.radius
+            keep[mine] = near | within
+        samples.append(points[keep])
+    return np.concatenate(samples) if samples else np.zeros((0, 3))
+
+
+def settle(points: Float, supports: Sequence[Support], seen: Float, reach: float) -> Float:
+    """Samples moved along the normal of their surface to where measured points about them lie.
+
+    A dome is made of panels and a floor is not quite flat: the measured offsets are averaged over the neighbours of
+    each sample, with the fitted surface itself as one more measurement.
+
+    Args:
+        points: [P, 3] on the surfaces.
+        supports: fitted surfaces.
+        seen: [M, 3] measured points.
+        reach: world units; measured points farther from the sample count little, farther from the surface not at all.
+    """
+    if len(points) == 0 or len(seen) == 0:
+        return points
+    moved = points.copy()
+    distance = np.stack([np.abs(s.surface.offsets(points)) for s in supports])
+    nearest = distance.argmin(0)
+    for index, support in enumerate(supports):
+        mine = np.flatnonzero(nearest == index)
+        offsets = support.surface.offsets(seen)
+        close = np.abs(offsets) <= reach
+        if not close.any() or len(mine) == 0:
+            continue
+        count = min(16, int(close.sum()))
+        gap, who = cKDTree(seen[close]).query(points[mine], k=count)
+        gap, who = np.reshape(gap, (len(mine), count)), np.reshape(who, (len(mine), count))
+        weight = np.exp(-0.5 * (gap / reach) ** 2)
+        shift = (weight * offsets[close][who]).sum(1) / (weight.sum(1) + 1.0)
+        moved[mine] += support.surface.normals(points[mine]) * shift[:, None]
+    return moved

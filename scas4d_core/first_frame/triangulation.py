@@ -1,0 +1,187 @@
+"""Points where the same SIFT feature is seen by several calibrated cameras (known-pose triangulation, pycolmap).
+
+The poses are known, so a match is looked for along its epipolar line only: far fewer wrong candidates pass the ratio
+test than in a search over the whole picture, and wide baselines keep their matches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from scas4d_core.cameras import Camera
+from scas4d_core.first_frame.posed_pictures import Float, View
+
+RATIO = 0.8
+"""Best over second-best descriptor distance among the candidates on the epipolar line (Lowe 2004, section 7.1)."""
+MAX_DESCRIPTOR_DISTANCE = 0.7
+"""COLMAP's bound on the distance of two unit descriptors."""
+MIN_ANGLE_DEG = 2.0
+"""Rays that meet under less say little about depth."""
+
+
+@dataclass(frozen=True, eq=False)
+class Triangulated:
+    """Points and who saw them.
+
+    Attributes:
+        positions: [P, 3] float64 world.
+        views: [P, V] bool, the inlier views of each point.
+        error: [P] mean reprojection error, pixels.
+    """
+
+    positions: Float
+    views: NDArray[np.bool_]
+    error: Float
+
+
+def features(views: Sequence[View], max_features: int) -> list[tuple[Float, NDArray[np.float32]]]:
+    """SIFT of every view: keypoints [K, 2] (pixel centres at +0.5, as in COLMAP) and unit descriptors [K, 128]."""
+    import pycolmap
+
+    options: Any = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.num_threads = 1
+    options.sift.max_num_features = max_features
+    # A quarter of COLMAP's contrast: smooth walls have little, and the known poses throw wrong matches out.
+    options.sift.peak_threshold = 0.0017
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = max(level, 1)  # a line of news a picture is too much
+    try:
+        sift = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+        found = []
+        for view in views:
+            grey = view.image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
+            keypoints, raw = sift.extract_from_float32_array(np.ascontiguousarray(grey / np.float32(255)))
+            descriptors = np.asarray(raw.data, dtype=np.float32).reshape(-1, 128)
+            descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-12)
+            found.append((np.array([(point.x, point.y) for point in keypoints]).reshape(-1, 2), descriptors))
+    finally:
+        pycolmap.logging.minloglevel = level
+    return found
+
+
+def fundamental_matrix(first: Camera, second: Camera) -> Float:
+    """[3, 3] F with x₂ᵀ F x₁ = 0 for pixels x₁, x₂ (Hartley & Zisserman 2004, equation 9.1 with known poses)."""
+    rotation = second.rotation @ first.rotation.T
+    x, y, z = second.translation - rotation @ first.translation
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    result: Float = np.linalg.inv(second.intrinsics).T @ cross @ rotation @ np.linalg.inv(first.intrinsics)
+    return result
+
+
+def guided_matches(
+    first: tuple[Camera, Float, NDArray[np.float32]],
+    second: tuple[Camera, Float, NDArray[np.float32]],
+    epipolar_error: float,
+) -> NDArray[np.intp]:
+    """[M, 2] mutually best pairs of features within ``epipolar_error`` pixels of each other's epipolar lines."""
+    (camera_a, uv_a, descriptors_a), (camera_b, uv_b, descriptors_b) = first, second
+    if len(uv_a) == 0 or len(uv_b) == 0:
+        return np.zeros((0, 2), dtype=np.intp)
+    matrix = fundamental_matrix(camera_a, camera_b)
+    ones_a, ones_b = np.ones((len(uv_a), 1)), np.ones((len(uv_b), 1))
+    lines_b = np.hstack([uv_a, ones_a]) @ matrix.T
+    lines_a = np.hstack([uv_b, ones_b]) @ matrix
+    residual = np.abs(lines_b @ np.hstack([uv_b, ones_b]).T).astype(np.float32)
+    slope = np.minimum(np.linalg.norm(lines_b[:, :2], axis=1)[:, None], np.linalg.norm(lines_a[:, :2], axis=1)[None, :])
+    distance = np.sqrt(np.maximum(2.0 - 2.0 * (descriptors_a @ descriptors_b.T), 0.0))
+    distance[residual > epipolar_error * slope] = 2.0
+    best_b, best_a = distance.argmin(1), distance.argmin(0)
+    rows = np.arange(len(uv_a))
+    value = distance[rows, best_b]
+
+    def runner_up(block: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.partition(block, 1, axis=1)[:, 1] if block.shape[1] > 1 else np.full(len(block), 2.0, np.float32)
+
+    good = (best_a[best_b] == rows) & (value < MAX_DESCRIPTOR_DISTANCE) & (value < RATIO * runner_up(distance))
+    good &= value < RATIO * runner_up(distance.T)[best_b]
+    return np.stack([rows[good], best_b[good]], axis=1)
+
+
+def triangulate(
+    views: Sequence[View], *, max_features: int = 4096, epipolar_error: float = 2.0, min_views: int = 3, seed: int = 0
+) -> Triangulated:
+    """Match SIFT features over all pairs of views and triangulate each track robustly (LO-RANSAC), poses fixed.
+
+    Args:
+        views: pictures of one moment.
+        max_features: SIFT features a picture.
+        epipolar_error: pixels a match may lie off its line; the same bound holds for the reprojection error.
+        min_views: inlier views a point needs.
+        seed: of RANSAC.
+    """
+    import pycolmap
+
+    found = [
+        (view.camera, uv, descriptors)
+        for view, (uv, descriptors) in zip(views, features(views, max_features), strict=True)
+    ]
+    offsets = np.concatenate([[0], np.cumsum([len(uv) for _, uv, _ in found])])
+    owner = np.repeat(np.arange(len(views)), np.diff(offsets))
+    pixels = np.concatenate([uv for _, uv, _ in found]) if len(owner) else np.zeros((0, 2))
+    pairs = [
+        guided_matches(found[a], found[b], epipolar_error) + offsets[[a, b]]
+        for a in range(len(views))
+        for b in range(a + 1, len(views))
+    ]
+    edges = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.intp)
+    graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(owner), len(owner)))
+    _, track = connected_components(graph, directed=False)
+    order = np.argsort(track, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(track[order])) + 1) if len(order) else []
+
+    cameras = [
+        pycolmap.Camera(
+            model="PINHOLE",
+            width=view.camera.width,
+            height=view.camera.height,
+            params=[view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy],
+        )
+        for view in views
+    ]
+    poses = [
+        pycolmap.Rigid3d(pycolmap.Rotation3d(view.camera.rotation), view.camera.translation[:, None]) for view in views
+    ]
+    options: Any = pycolmap.EstimateTriangulationOptions()
+    options.min_tri_angle = np.deg2rad(MIN_ANGLE_DEG)
+    options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
+    options.ransac.max_error = epipolar_error
+    options.ransac.random_seed = seed
+    options.ransac.max_num_trials = 500
+
+    positions, seen, errors = [], [], []
+    for group in groups:
+        if len(np.unique(owner[group])) < min_views:
+            continue
+        who = owner[group]
+        answer = pycolmap.estimate_triangulation(
+            pixels[group], [poses[w] for w in who], [cameras[w] for w in who], options
+        )
+        if answer is None:
+            continue
+        inlier = np.asarray(answer["inlier_mask"] if "inlier_mask" in answer else answer["inliers"], dtype=bool)
+        row = np.zeros(len(views), dtype=bool)
+        row[who[inlier]] = True
+        if row.sum() < min_views:
+            continue
+        point = np.asarray(answer["xyz"], dtype=np.float64).reshape(3)
+        residuals = [
+            np.linalg.norm(views[w].camera.project(point)[0] - uv)
+            for w, uv in zip(who[inlier], pixels[group][inlier], strict=True)
+        ]
+        error = float(np.mean(residuals))
+        if not error <= epipolar_error:  # NaN: behind a camera
+            continue
+        positions.append(point)
+        seen.append(row)
+        errors.append(error)
+    return Triangulated(
+        np.array(positions).reshape(-1, 3), np.array(seen, dtype=bool).reshape(-1, len(views)), np.array(errors)
+    )

@@ -1,0 +1,189 @@
+"""The visual hull: the largest shape whose silhouettes are the masks (Laurentini 1994), by an octree of voxels.
+
+A camera in whose picture a voxel does not fall says nothing about it; a voxel counts only where ``min_views`` cameras
+see it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt
+
+from scas4d_core.first_frame.posed_pictures import Bool, Float, View, front_depth, look_at_point, pixels_inside
+
+SEEN_SHARE = 0.35
+"""Share of the masked cameras that must see a voxel: at the edges of the stage few do, and ghosts stay uncarved."""
+COARSE = 32
+"""Voxels along an edge of the first, coarsest grid."""
+MAX_VOXELS = 4_000_000
+"""Bound on memory: a level that would hold more is not entered."""
+
+
+@dataclass(frozen=True, eq=False)
+class VisualHull:
+    """Voxels inside every silhouette that may judge them.
+
+    Attributes:
+        cells: [M, 3] integer indices on the grid.
+        origin: [3] centre of the voxel with index 0.
+        voxel: edge, world units.
+    """
+
+    cells: NDArray[np.int64]
+    origin: Float
+    voxel: float
+
+    @property
+    def centres(self) -> Float:
+        """[M, 3] centres of the voxels in the world."""
+        result: Float = self.origin + self.cells * self.voxel
+        return result
+
+    @property
+    def volume(self) -> float:
+        """Volume in cubic world units."""
+        return len(self.cells) * self.voxel**3
+
+    def about(self, points: Float) -> Bool:
+        """[P] points [P, 3] within the hull or nearer to it than two voxels (and some a little farther)."""
+        pairs = np.unique(self.cells // 2, axis=0)
+        low = pairs.min(0) - 2
+        size = pairs.max(0) + 3 - low
+        strides = np.array([size[1] * size[2], size[2], 1])
+        keys = np.sort((pairs - low) @ strides)
+        at = np.floor((points - self.origin) / self.voxel + 0.5).astype(np.int64) // 2
+        near = ((at > low) & (at < low + size - 1)).all(axis=1)
+        mine = (at - low) @ strides
+        found = np.zeros(len(points), dtype=bool)
+        for step in np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) @ strides:
+            found |= keys[np.searchsorted(keys, mine + step).clip(max=len(keys) - 1)] == mine + step
+        result: Bool = found & near
+        return result
+
+    def surface(self) -> Bool:
+        """[M] voxels with at least one of their six neighbours empty."""
+        if len(self.cells) == 0:
+            return np.zeros(0, dtype=bool)
+        low = self.cells.min(0) - 1
+        size = self.cells.max(0) + 2 - low
+        steps = np.array([size[1] * size[2], size[2], 1])
+        keys = np.sort((self.cells - low) @ steps)
+        mine = (self.cells - low) @ steps
+        bare = np.zeros(len(mine), dtype=bool)
+        for step in (*steps, *-steps):
+            at = np.searchsorted(keys, mine + step).clip(max=len(keys) - 1)
+            bare |= keys[at] != mine + step
+        return bare
+
+
+def pixel_at(views: Sequence[View], point: Float) -> float:
+    """World units across one pixel at ``point``, median over the cameras before which it lies (1 where none)."""
+    sizes = [
+        float(view.camera.project(point)[1]) / view.camera.fx for view in views if view.camera.project(point)[1] > 0
+    ]
+    return float(np.median(sizes)) if sizes else 1.0
+
+
+def carve(views: Sequence[View], *, voxel_pixels: float = 1.0, misses: float = 0.0, min_views: int = 3) -> VisualHull:
+    """Carve the hull of the masks.
+
+    Args:
+        views: those without a mask are ignored.
+        voxel_pixels: edge of the smallest voxel, in pixels at the middle of the stage (halved from the coarsest until
+            it is no larger).
+        misses: share of the cameras seeing a voxel whose mask may miss it.
+        min_views: cameras that must see a voxel, and at least ``SEEN_SHARE`` of those with a mask.
+    """
+    masked = [view for view in views if view.mask is not None]
+    middle = look_at_point(views)
+    reach = max(float(np.linalg.norm(view.camera.centre - middle)) for view in views)
+    voxel = 2.0 * reach / COARSE
+    origin = middle - reach + voxel / 2
+    cells = np.stack(np.meshgrid(*[np.arange(COARSE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.int64)
+    if len(masked) < 2:
+        return VisualHull(cells[:0], origin, voxel)
+    distances = [_distance(np.asarray(view.mask)) for view in masked]
+    min_views = max(min_views, int(SEEN_SHARE * len(masked)))
+    target = voxel_pixels * pixel_at(views, middle)
+    while True:
+        last = voxel <= target or 8 * len(cells) > MAX_VOXELS
+        cells = cells[_kept(masked, distances, origin + cells * voxel, voxel, misses, min_views, last)]
+        if last or len(cells) == 0:
+            return VisualHull(cells, origin, voxel)
+        children = np.stack(np.meshgrid(*[np.arange(2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        cells = (2 * cells[:, None, :] + children).reshape(-1, 3)
+        origin = origin - voxel / 4
+        voxel /= 2
+
+
+def contradicted(views: Sequence[View], hull: VisualHull, points: Float, misses: float) -> NDArray[np.intp]:
+    """[P] masks that speak against each point [P, 3].
+
+    A point within the silhouettes is foreground, and nothing speaks against it. Any other is background: it must not
+    lie before the hull where a camera sees foreground. Stereo makes such points beside outlines, where a patch covers
+    both.
+
+    Args:
+        views: those without a mask are ignored.
+        hull: of the masks.
+        points: world.
+        misses: share of the masks that may miss a point of the foreground.
+    """
+    surface = hull.centres[hull.surface()]
+    against, missed, seen = (np.zeros(len(points), dtype=np.intp) for _ in range(3))
+    for view in views:
+        if view.mask is None:
+            continue
+        column, line, depth, inside = pixels_inside(view.camera, points)
+        seen += inside
+        missed += inside & ~binary_dilation(view.mask, iterations=1)[line, column]
+        before = depth < front_depth(view.camera, surface, hull.voxel, points) - 2.0 * hull.voxel
+        against += inside & before & binary_erosion(view.mask, iterations=1)[line, column]
+    against[missed <= np.floor(misses * seen)] = 0
+    return against
+
+
+def _distance(mask: Bool) -> Float:
+    """[H, W] pixels to the nearest pixel of the silhouette; infinity where the picture has none."""
+    if not mask.any():
+        return np.full(mask.shape, np.inf)
+    result: Float = distance_transform_edt(~mask)
+    return result
+
+
+def _kept(
+    views: Sequence[View],
+    distances: Sequence[Float],
+    centres: Float,
+    voxel: float,
+    misses: float,
+    min_views: int,
+    last: bool,
+) -> Bool:
+    """[M] voxels that no more than a share ``misses`` of their cameras see off the silhouette."""
+    missed = np.zeros(len(centres), dtype=np.int32)
+    seen = np.zeros(len(centres), dtype=np.int32)
+    may_see = np.zeros(len(centres), dtype=np.int32)
+    for view, distance in zip(views, distances, strict=True):
+        camera = view.camera
+        column, line, depth, inside = pixels_inside(camera, centres)
+        # Before the last level a cell stays if any part of it may be in the silhouette: its half diagonal and a pixel.
+        # On the last its centre decides, to within half a voxel and half the diagonal of a pixel: masks are sampled at
+        # pixel centres, and where many of them must all agree, every rounding would take something away.
+        half = 0.5 * voxel if last else 0.5 * np.sqrt(3.0) * voxel
+        slack = camera.fx * half / np.maximum(depth, 1e-9) + (0.71 if last else 1.5)
+        judged = inside & (depth > half)
+        missed += judged & (distance[line, column] > slack)
+        seen += judged
+        if not last:
+            uv, _ = camera.project(centres)
+            with np.errstate(invalid="ignore"):
+                near = (uv > -slack[:, None]) & (uv < np.array([camera.width, camera.height]) + slack[:, None])
+            may_see += near.all(axis=1) | (np.abs(depth) <= half)
+    enough = seen if last else may_see
+    kept: Bool = (missed <= np.floor(misses * seen)) & (enough >= min_views)
+    return kept

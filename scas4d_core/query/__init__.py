@@ -1,0 +1,1 @@
+"""Reads what was committed: views, tracks, parts, exports."""

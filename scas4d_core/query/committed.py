@@ -1,0 +1,145 @@
+"""Reading what was committed: novel views, tracks, parts and exports of any frame of a history."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Camera, WorldFrame
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.kernels.blend import GROUP
+from scas4d_core.query import parts as parts_of_history
+from scas4d_core.query import ply
+from scas4d_core.query import tracks as tracks_of_history
+from scas4d_core.query.tracks import ALPHA_OF_A_SURFACE, Tracks
+from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
+from scas4d_core.rasterize.limits import DEFAULT, Limits
+from scas4d_core.storage.history import History
+
+Array = NDArray[np.float32]
+
+MOST_LABEL = 254
+"""Parts are painted into 8 bits, 0 being nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A rendered picture.
+
+    Attributes:
+        colour: [H, W, 3] float32, nominally 0…1, over the background. alpha: [H, W] float32.
+        depth: [H, W] float32, alpha-weighted mean z along the camera's axis in the user's units; NaN where less than
+            half of the pixel is covered.
+        parts: [H, W] uint8 or None: 0 nothing or standing, else 1 + the label that covers the pixel most.
+    """
+
+    colour: Array
+    alpha: Array
+    depth: Array
+    parts: NDArray[np.uint8] | None = None
+
+
+class Committed:
+    """Reads a history. Cameras and points are in the user's world; ``index`` None is the newest frame."""
+
+    def __init__(self, history: History, world: WorldFrame, limits: Limits = DEFAULT) -> None:
+        self.history = history
+        self.world = world
+        self._limits = limits
+        self._rasterizer = CpuRasterizer(limits)
+
+    def render(
+        self,
+        camera: Camera,
+        index: int | None = None,
+        *,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        labels: NDArray[Any] | None = None,
+    ) -> View:
+        """A novel view.
+
+        Args:
+            camera: user's world. index: a committed frame.
+            background: RGB in 0…1 behind everything.
+            labels: [N] part of each Gaussian, −1 for none; asks for ``View.parts``.
+
+        Raises:
+            HistoryError: the frame was not committed.
+        """
+        gaussians = self._state(index)
+        inside = self.world.camera_to_inside(camera)
+        features = np.concatenate([gaussians.colours, np.zeros((len(gaussians), 1), np.float32)], axis=1)
+        picture = self._rasterizer.forward(
+            gaussians.means, gaussians.factors, gaussians.opacities, features, CameraArrays.of(inside),
+            np.array([*background, 0.0], np.float32), depth_channel=3,
+        )  # fmt: skip
+        colour = np.moveaxis(picture.features[:3], 0, -1).copy()
+        alpha = 1 - picture.rest
+        with np.errstate(invalid="ignore", divide="ignore"):
+            depth = picture.features[3] / alpha / np.float32(self.world.metres_per_unit)
+        depth[alpha < ALPHA_OF_A_SURFACE] = np.nan
+        parts = None if labels is None else self._parts_picture(gaussians, np.asarray(labels), inside)
+        return View(colour, alpha, depth, parts)
+
+    def _parts_picture(self, gaussians: Gaussians, labels: NDArray[Any], inside: Camera) -> NDArray[np.uint8]:
+        """[H, W] the label whose Gaussians weigh most in the pixel, plus 1; as many labels a pass as colours have."""
+        if labels.shape != (len(gaussians),) or not ((labels >= -1) & (labels <= MOST_LABEL)).all():
+            raise ValueError(
+                f"labels {labels.shape} must be [{len(gaussians)}], one a Gaussian, each in -1...{MOST_LABEL}"
+            )
+        found = np.zeros((inside.height, inside.width), np.uint8)
+        most = np.full(found.shape, -1.0, np.float32)
+        black = np.zeros(GROUP, np.float32)
+        for first in range(-1, int(labels.max(initial=-1)) + 1, GROUP):
+            weights = (labels[:, None] == np.arange(first, first + GROUP)).astype(np.float32)
+            picture = self._rasterizer.forward(
+                gaussians.means, gaussians.factors, gaussians.opacities, weights, CameraArrays.of(inside), black
+            )
+            best = picture.features.max(axis=0)
+            wins = best > most
+            found[wins] = (first + 1 + picture.features.argmax(axis=0))[wins]
+            most[wins] = best[wins]
+        found[picture.rest > 1 - ALPHA_OF_A_SURFACE] = 0
+        return found
+
+    def _state(self, index: int | None) -> Gaussians:
+        return self.history.gaussians(self.history.indices[-1] if index is None else index)
+
+    def _depth(self, camera: Camera, index: int) -> tuple[NDArray[Any], NDArray[Any]]:
+        view = self.render(camera, index)
+        return view.depth, view.alpha
+
+    def tracks_of_points(self, points: NDArray[Any], index: int, indices: Sequence[int]) -> Tracks:
+        """Trajectories of points [Q, 3] of frame ``index`` over ``indices``."""
+        return tracks_of_history.tracks_of_points(self.history, self.world, points, index, indices)
+
+    def tracks_of_pixels(self, camera: Camera, uv: NDArray[Any], index: int, indices: Sequence[int]) -> Tracks:
+        """Trajectories of the surface points at pixels [Q, 2] of frame ``index``."""
+        return tracks_of_history.tracks_of_pixels(
+            self.history, self.world, camera, uv, index, indices, self._depth, limits=self._limits
+        )
+
+    def tracks_of_ids(self, ids: NDArray[Any], indices: Sequence[int]) -> Tracks:
+        """Trajectories of Gaussians by id."""
+        return tracks_of_history.tracks_of_ids(self.history, self.world, ids, indices)
+
+    def with_visibility(self, tracks: Tracks, camera: Camera, index: int) -> Tracks:
+        """The same tracks, asked for at frame ``index``, with their visibility in one more camera."""
+        tolerance = tracks_of_history.depth_tolerance(self.history, self.world, index)
+        return tracks.with_visibility(camera, self._depth, tolerance)
+
+    def parts(self, count: int | None = None, previous: NDArray[Any] | None = None) -> NDArray[np.int64]:
+        """[N] part labels, the largest part 0; −1 for what does not move. ``count`` None: chosen by silhouette.
+
+        With ``previous``, labels found from fewer frames, parts that go on keep their labels.
+        """
+        return parts_of_history.parts(self.history, count, previous=previous)
+
+    def write_ply(self, path: Path, index: int | None = None) -> None:
+        """A committed frame as a standard 3DGS .ply."""
+        ply.write_ply(path, self._state(index), self.world)

@@ -1,0 +1,56 @@
+"""A committed state that was damaged on disk, made again from the pictures of its frame.
+
+It starts from the state before it, cold: it shows the same, but not with the same bits, and its report says
+``remade``. What comes after it was made from the state as it was, and stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from scas4d_core.cameras import Rig
+from scas4d_core.captures.frame import Frame
+from scas4d_core.reconstruction import Reconstruction, StepError
+from scas4d_core.settings import Settings
+from scas4d_core.storage.history import PER_FRAME, History
+
+REMADE = "remade"
+"""In the report of a state that was made again: true."""
+
+
+def remake(
+    rig: Rig,
+    settings: Settings,
+    history: History,
+    base: int,
+    frame: Frame,
+    budget: Mapping[str, Any],
+    *,
+    dropped: Mapping[str, str] | None = None,
+    notes: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Makes the state of a frame again and writes it in its place.
+
+    Args:
+        rig: training cameras, user's world. settings: of the scene.
+        history: of the scene, of the process that appends.
+        base: the committed frame before it. frame: its pictures. budget: that held for it (``Reconstruction.spend``).
+        dropped, notes: see ``Reconstruction.step``.
+
+    Returns:
+        The report that was written with it.
+
+    Raises:
+        HistoryError: the first frame or ``base`` cannot be read.
+        StepError: the frame does not follow ``base``, or does not fit it.
+    """
+    aside = Reconstruction.aside(rig, settings, history, base)
+    aside.spend(**budget)
+    aside.step(frame, dropped=dropped, notes={**(notes or {}), REMADE: True})
+    report = aside.history.report(frame.index)
+    if str(report["degraded"] or "").startswith("held"):  # nothing was learnt from the pictures
+        raise StepError(f"frame {frame.index} does not fit the frame before it: {report['degraded']}")
+    arrays = aside.history.gaussians(frame.index).arrays()
+    history.replace(frame.index, frame.time, {name: arrays[name] for name in PER_FRAME}, report)
+    return report

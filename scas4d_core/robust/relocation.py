@@ -1,0 +1,104 @@
+"""Where an object is that jumped: the update follows what moves by less than itself, and finds nothing beyond.
+
+Each camera compares its picture with the scene without what moves: what differs is the object. The rays through the
+middle of the object now, and through the middle of what was rendered of it, meet in two points; their difference is how
+far it went. Turns are left to the update that follows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Camera, Rig
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.update.picture_loss import PictureLoss
+from scas4d_core.update.views import LABEL, TrainingView
+
+Float = NDArray[np.float64]
+
+DIFFERENT = 0.1
+"""Of a colour channel, 0…1, from which a pixel shows what moves and not what stands."""
+SMALLEST_AREA = 0.25
+"""Of the object's area in a picture that has to be seen now for the camera to have a say; at most its inverse."""
+CAMERAS = 3
+"""With a say that are needed."""
+AGREE = 0.25
+"""Of the distance found that the rays may miss each other by, root mean square: else they saw different things."""
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Where the object went.
+
+    Attributes:
+        shift: [3] metres. cameras: that saw it there. miss: metres by which their rays miss each other.
+    """
+
+    shift: Float
+    cameras: int
+    miss: float
+
+
+def reacquire(gaussians: Gaussians, views: Sequence[TrainingView], picture: PictureLoss, rig: Rig) -> Found | None:
+    """Find how far what moves has jumped; None where the cameras do not agree on it.
+
+    Args:
+        gaussians: Θ_{t−1}. views: of frame t. picture: renders. rig: the cameras inside.
+    """
+    rows = gaussians.moving
+    if not rows.any():
+        return None
+    alone = np.where(rows, np.float32(0), gaussians.opacities)
+    features = np.concatenate([gaussians.colours, gaussians.foreground[:, None]], axis=1)
+    rays_before: list[tuple[Float, Float]] = []
+    rays_now: list[tuple[Float, Float]] = []
+    for view in views:
+        height, width = view.camera.height, view.camera.width
+        picture.measure(gaussians.means, gaussians.factors, gaussians.opacities, features, view)
+        before = picture.rasterizer.planes[LABEL, :height, :width] > 0.5
+        picture.measure(gaussians.means, gaussians.factors, alone, features, view)
+        behind = picture.rasterizer.planes[:3, :height, :width]
+        shown = view.exposure[:3, 0, None, None] * behind + view.exposure[:3, 1, None, None]
+        now = np.abs(view.target[:3] - shown).max(axis=0) > DIFFERENT
+        if not before.any() or not SMALLEST_AREA <= now.sum() / before.sum() <= 1 / SMALLEST_AREA:
+            continue
+        camera = rig[view.name]
+        rays_before.append(_ray(camera, before))
+        rays_now.append(_ray(camera, now))
+    if len(rays_now) < CAMERAS:
+        return None
+    start, _ = _meeting(rays_before)
+    end, miss = _meeting(rays_now)
+    shift = end - start
+    if miss > AGREE * float(np.linalg.norm(shift)):
+        return None
+    return Found(shift, len(rays_now), miss)
+
+
+def shifted(gaussians: Gaussians, shift: Float) -> Gaussians:
+    """What moves, moved as a whole."""
+    means = gaussians.means.copy()
+    means[gaussians.moving] += shift.astype(np.float32)
+    return gaussians.replace(means=means)
+
+
+def _ray(camera: Camera, pixels: NDArray[np.bool_]) -> tuple[Float, Float]:
+    """Centre of a camera and [3] unit direction through the middle of marked pixels; centres lie at +0.5."""
+    rows, columns = np.nonzero(pixels)
+    middle = np.array([columns.mean() + 0.5, rows.mean() + 0.5, 1.0])
+    direction = camera.world_to_camera[:3, :3].T @ np.linalg.solve(camera.intrinsics, middle)
+    return camera.centre, direction / np.linalg.norm(direction)
+
+
+def _meeting(rays: Sequence[tuple[Float, Float]]) -> tuple[Float, float]:
+    """[3] the point nearest to all rays, and its root mean square distance from them."""
+    across = [np.eye(3) - np.outer(direction, direction) for _, direction in rays]
+    left = np.sum(across, axis=0)
+    right = np.sum([matrix @ origin for matrix, (origin, _) in zip(across, rays, strict=True)], axis=0)
+    point: Float = np.linalg.lstsq(left, right, rcond=None)[0]
+    off = [np.linalg.norm(matrix @ (point - origin)) for matrix, (origin, _) in zip(across, rays, strict=True)]
+    return point, float(np.sqrt(np.mean(np.square(off))))

@@ -1,0 +1,237 @@
+"""The files of a history: ``fixed.npz``, written once, and one ``frame_<index>.npz`` a committed frame. Numpy only.
+
+Every file is written beside its place, synced and renamed: a file with its final name is whole, and the listing of the
+directory is the only index there is. Of ``fixed.npz`` and of the first frame, which everything needs, there is a copy:
+a reader that finds the one damaged or gone reads the other.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.storage.npz import read_npz, sync_folder, verify, write_npz
+
+Arrays = dict[str, NDArray[Any]]
+Stamp = tuple[int, int]
+"""Bytes and time of change of a file, in ns: whether it is the one that was read."""
+INDEX = "index"
+"""In the copy of the first frame: which one that is."""
+
+FIXED_FILE, FIXED_COPY, FIRST_COPY = "fixed.npz", "fixed.copy.npz", "first.copy.npz"
+_CHECKPOINT_FILE = re.compile(r"checkpoint_(\d{6,})\.npz")
+_FRAME_FILE = re.compile(r"frame_(\d{6,})\.npz")
+
+
+class HistoryError(ValueError):
+    """A history that cannot be extended or read: the message names the frame or file, the fault and the remedy."""
+
+
+class UnreadableFrameError(HistoryError):
+    """A frame that is not in the history, or whose file is damaged."""
+
+
+class DamagedFrameError(UnreadableFrameError):
+    """A frame whose file is damaged: it is not gone because it was deleted."""
+
+
+class FrameFiles:
+    """The files in one directory.
+
+    Attributes:
+        faults: files that could not be read, by name with the reason; whoever tells of them empties it.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self.fixed = directory / FIXED_FILE
+        self.fixed_copy = directory / FIXED_COPY
+        self.first_copy = directory / FIRST_COPY
+        self.faults: dict[str, str] = {}
+        self._copied: tuple[Stamp, int] | None = None
+
+    @property
+    def there(self) -> bool:
+        """Whether the directory holds a history, maybe one that lost a file."""
+        return self.fixed.exists() or self.fixed_copy.exists()
+
+    def path(self, index: int) -> Path:
+        """The file of a frame."""
+        return self.directory / frame_file(index)
+
+    def listed(self) -> dict[int, Stamp]:
+        """The frames in the directory, rising; the first one too where only its copy is there and later ones are."""
+        found: dict[int, Stamp] = {}
+        with os.scandir(self.directory) as entries:
+            for entry in entries:
+                if (index := frame_of(entry.name)) is not None:
+                    try:
+                        found[index] = _stamp(entry.stat())
+                    except FileNotFoundError:  # deleted meanwhile
+                        continue
+        first = self._first()
+        if found and first is not None and first[1] < min(found):
+            found[first[1]] = first[0]
+        return dict(sorted(found.items()))
+
+    def stamped(self, indices: Iterable[int]) -> dict[int, Stamp]:
+        """The same of some frames, without looking at the others."""
+        found: dict[int, Stamp] = {}
+        for index in sorted(indices):
+            try:
+                found[index] = _stamp(self.path(index).stat())
+            except FileNotFoundError:
+                first = self._first()
+                if first is not None and first[1] == index:
+                    found[index] = first[0]
+        return found
+
+    def _first(self) -> tuple[Stamp, int] | None:
+        """Stamp and frame of the copy of the first frame, if there is one that can be read."""
+        try:
+            stamp = _stamp(self.first_copy.stat())
+            if self._copied is None or self._copied[0] != stamp:
+                self._copied = stamp, int(read_npz(self.first_copy, (INDEX,))[INDEX])
+        except (FileNotFoundError, ValueError):
+            return None
+        return self._copied
+
+    def write(self, index: int, arrays: Mapping[str, Any]) -> Stamp:
+        """Commits a frame, or writes it anew."""
+        file = self.path(index)
+        write_npz(file, arrays)
+        return _stamp(file.stat())
+
+    def write_fixed(self, arrays: Arrays, index: int, first: Mapping[str, Any]) -> None:
+        """Writes what all frames need, and both copies; before the first of them, frame ``index``, is committed."""
+        write_npz(self.fixed, arrays)
+        write_npz(self.fixed_copy, arrays)
+        write_npz(self.first_copy, {**first, INDEX: np.int64(index)})
+
+    def time(self, index: int) -> float:
+        """Seconds of a frame.
+
+        Raises:
+            FileNotFoundError: it is not there. UnreadableFrameError: it is damaged.
+        """
+        return float(self.read(index, ("time",))["time"])
+
+    def read(self, index: int, names: Sequence[str]) -> Arrays:
+        """Named arrays of a frame; of the first one from its copy, where that alone can be read.
+
+        Raises:
+            FileNotFoundError: it is not there. UnreadableFrameError: it is damaged.
+        """
+        try:
+            return _read(self.path(index), names)
+        except (FileNotFoundError, UnreadableFrameError) as error:
+            first = self._first()
+            if first is None or first[1] != index:
+                if isinstance(error, UnreadableFrameError):
+                    self.faults[self.path(index).name] = str(error)
+                raise
+            found = _read(self.first_copy, names)
+            self.faults[self.path(index).name] = _reason(self.path(index), error)
+            return found
+
+    def read_fixed(self, names: Sequence[str]) -> Arrays:
+        """Named arrays of what all frames need.
+
+        Raises:
+            UnreadableFrameError: it is damaged or gone, and its copy too.
+        """
+        try:
+            return _read(self.fixed, names)
+        except (FileNotFoundError, UnreadableFrameError) as error:
+            reason = _reason(self.fixed, error)
+            self.faults[self.fixed.name] = reason
+            try:
+                return _read(self.fixed_copy, names)
+            except FileNotFoundError:
+                raise UnreadableFrameError(reason) from error
+
+    def mend_copies(self, first: int, fixed: Arrays) -> dict[str, str]:
+        """Writes ``fixed.npz``, the first frame and their copies anew where they are damaged or gone.
+
+        Args:
+            first: the first committed frame. fixed: what all frames need, as it was read.
+
+        Returns:
+            What was wrong with each file that was written, by name. Where nothing can be taken from, nothing is.
+        """
+        mended: dict[str, str] = {}
+        for file in (self.fixed, self.fixed_copy):
+            if reason := fault_of(file):
+                write_npz(file, fixed)
+                mended[file.name] = reason
+        own, copy = self.path(first), self.first_copy
+        own_fault, copy_fault = fault_of(own), fault_of(copy)
+        if copy_fault and not own_fault:
+            write_npz(copy, {**read_npz(own), INDEX: np.int64(first)})
+            mended[copy.name] = copy_fault
+        elif own_fault and not copy_fault:
+            arrays = read_npz(copy)
+            if int(arrays.pop(INDEX)) == first:
+                write_npz(own, arrays)
+                mended[own.name] = own_fault
+        return mended
+
+    def remove(self, index: int) -> None:
+        """Deletes a frame, if it is there."""
+        self.path(index).unlink(missing_ok=True)
+
+    def sync(self) -> None:
+        """What was deleted stays so after a power cut."""
+        sync_folder(self.directory)
+
+
+def frame_file(index: int) -> str:
+    """The name of a frame's file."""
+    return f"frame_{index:06d}.npz"
+
+
+def frame_of(name: str) -> int | None:
+    """The frame that a file is of, by its name."""
+    match = _FRAME_FILE.fullmatch(name)
+    return int(match[1]) if match else None
+
+
+def checkpoint_file(index: int) -> str:
+    """The name of the file of a frame's checkpoint (``checkpoint``)."""
+    return f"checkpoint_{index:06d}.npz"
+
+
+def checkpoint_of(name: str) -> int | None:
+    """The frame that a file is the checkpoint of, by its name."""
+    match = _CHECKPOINT_FILE.fullmatch(name)
+    return int(match[1]) if match else None
+
+
+def fault_of(file: Path) -> str | None:
+    """Reads all of a file; what is wrong with it, None: nothing."""
+    try:
+        verify(file)
+    except (FileNotFoundError, ValueError) as error:
+        return _reason(file, error)
+    return None
+
+
+def _reason(file: Path, error: Exception) -> str:
+    return f"{file.name} is gone" if isinstance(error, FileNotFoundError) else str(error)
+
+
+def _stamp(status: os.stat_result) -> Stamp:
+    return status.st_size, status.st_mtime_ns
+
+
+def _read(path: Path, names: Sequence[str]) -> Arrays:
+    try:
+        return read_npz(path, names)
+    except ValueError as error:
+        raise UnreadableFrameError(str(error)) from error

@@ -1,0 +1,1 @@
+"""The structure of what moves: clusters, neighbours, the motion mask."""

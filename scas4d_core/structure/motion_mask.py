@@ -1,0 +1,104 @@
+"""Which Gaussians move: read from the pictures where no mask says it, and settled where the masks leave a few standing.
+
+A pixel has changed where it differs from the frame before. A Gaussian moves when most of the cameras that see it see it
+in changed pixels: the background behind the new place of an object has changed for some cameras, but not for most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.update.picture_loss import PictureLoss
+from scas4d_core.update.views import TrainingView
+
+Array = NDArray[np.float32]
+
+CHANGE = 0.04
+"""Difference of a colour channel, 0…1, from which a pixel has changed: above the noise of a sensor and of JPEG."""
+REACH_PIXELS = 5
+"""Side of the square that a changed pixel marks: the inside of a plain surface moves without changing."""
+SEEN_PIXELS = 0.02
+"""Pixels' worth of blending weight from which a camera has a say."""
+IN_CHANGE = 0.5
+"""Share of a Gaussian's weight in changed pixels from which a camera says that it moves."""
+MAJORITY = 0.5
+"""Share of the cameras with a say that have to say so; and at least two."""
+
+STANDING_SHARE = 0.1
+"""Share of standing Gaussians from which a scene has something that stands; below, their labels are noise."""
+
+NEW_LABELS = 0.01
+"""Share of all Gaussians that must be found moving anew before the hierarchy is built again."""
+
+
+def settled(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians of frame 0 with labels that can be relied on.
+
+    The few Gaussians of an object that no mask taught would stay behind when it moves, and hide it. In a cluster that
+    does not move they stand just as well.
+    """
+    standing = int((~gaussians.moving).sum())
+    if not 0 < standing < STANDING_SHARE * len(gaussians):
+        return gaussians
+    return gaussians.replace(foreground=np.where(gaussians.moving, gaussians.foreground, np.float32(1)))
+
+
+def changed_pixels(before: Array, now: Array) -> Array:
+    """[H, W] 1 where the planes [3, H, W] of two frames differ, and around; else 0."""
+    changed = (np.abs(now - before).max(axis=0) > CHANGE).astype(np.float32)
+    marked: Array = maximum_filter(changed, size=REACH_PIXELS)
+    return marked
+
+
+def moving_between(
+    gaussians: Gaussians, before: Sequence[TrainingView], now: Sequence[TrainingView], picture: PictureLoss
+) -> NDArray[np.bool_]:
+    """[N] whether each Gaussian, as it stood in the frame before, is seen to move.
+
+    Args:
+        gaussians: Θ_{t−1}. before, now: the views of both frames; cameras that only one has are left out.
+    """
+    features = np.concatenate([gaussians.colours, gaussians.foreground[:, None]], axis=1)
+    earlier = {view.name: view for view in before}
+    says = np.zeros(len(gaussians), np.int64)
+    asked = np.zeros(len(gaussians), np.int64)
+    state = (gaussians.means, gaussians.factors, gaussians.opacities, features)
+    for view in now:
+        if view.name not in earlier:
+            continue
+        changed = changed_pixels(earlier[view.name].target[:3], view.target[:3])
+        total = picture.coverage(*state, view)
+        inside = picture.coverage(*state, view, changed)
+        sees = total > SEEN_PIXELS
+        asked += sees
+        says += sees & (inside > IN_CHANGE * total)
+    moving: NDArray[np.bool_] = (says >= 2) & (says > MAJORITY * asked)
+    return moving
+
+
+def labels_learnt(
+    gaussians: Gaussians,
+    known: NDArray[np.bool_] | None,
+    before: Sequence[TrainingView],
+    now: Sequence[TrainingView],
+    picture: PictureLoss,
+) -> NDArray[np.bool_] | None:
+    """[N] what has been seen to move by now, or None where that is no more than before, or hardly.
+
+    Args:
+        gaussians: Θ_{t−1}. known: [N] what had been seen to move before, or None.
+        before, now: see ``moving_between``.
+    """
+    found = moving_between(gaussians, before, now, picture)
+    known = np.zeros(len(gaussians), np.bool_) if known is None else known
+    return None if (found & ~known).sum() <= NEW_LABELS * len(gaussians) else found | known
+
+
+def labelled(gaussians: Gaussians, labels: NDArray[np.bool_] | None) -> Gaussians:
+    """The Gaussians with the labels [N] learnt from motion, where there are any."""
+    return gaussians if labels is None else gaussians.replace(foreground=labels.astype(np.float32))

@@ -1,0 +1,157 @@
+"""The losses of an update in plain torch; the twins of the fused CPU kernels, and the CUDA path.
+
+Weights and forms follow the SCas4D paper (equation (8): scale loss) and Dynamic3DGaussians, whose local rigidity,
+isometry and rotation terms it takes over. Every function returns a scalar of its inputs' dtype, unweighted.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from scas4d_core.guards import ROOT_FLOOR, SMALLEST_SQUARE, SSIM_C1, SSIM_C2
+from scas4d_core.torch_backend.deformation import quaternion_matrices
+
+SSIM_WINDOW = 11
+"""Pixels across the Gaussian window (Wang et al. 2004)."""
+SSIM_SIGMA = 1.5
+"""Pixels, standard deviation of the window."""
+SSIM_SHARE = 0.2
+"""Share of 1 − SSIM in the image loss; the rest is L1 (Kerbl et al. 2023)."""
+
+
+@functools.cache
+def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """[11] normalized Gaussian."""
+    x = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
+    weights = torch.exp(-(x**2) / (2 * SSIM_SIGMA**2))
+    return (weights / weights.sum()).to(dtype=dtype, device=device)
+
+
+def _blurred(pictures: Tensor) -> Tensor:
+    """[B, 1, H, W] pictures under the SSIM window, zero beyond the border."""
+    window = _window(pictures.dtype, pictures.device)
+    half = SSIM_WINDOW // 2
+    across = functional.conv2d(pictures, window.view(1, 1, 1, -1), padding=(0, half))
+    return functional.conv2d(across, window.view(1, 1, -1, 1), padding=(half, 0))
+
+
+def ssim_map(image: Tensor, target: Tensor) -> Tensor:
+    """SSIM of every pixel and channel, [H, W, C], of two pictures [H, W, C] in 0…1; zero padding at the border."""
+    channels = image.shape[-1]
+    x, y = (picture.permute(2, 0, 1)[:, None] for picture in (image, target))
+    blurred = _blurred(torch.cat([x, y, x * x, y * y, x * y]))
+    mean_x, mean_y, xx, yy, xy = torch.split(blurred, channels)
+    variance_x, variance_y, covariance = xx - mean_x**2, yy - mean_y**2, xy - mean_x * mean_y
+    numerator = (2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)
+    denominator = (mean_x**2 + mean_y**2 + SSIM_C1) * (variance_x + variance_y + SSIM_C2)
+    similarity: Tensor = (numerator / denominator)[:, 0].permute(1, 2, 0)
+    return similarity
+
+
+def image_loss(image: Tensor, target: Tensor) -> Tensor:
+    """0.8·mean|I − Î| + 0.2·(1 − mean SSIM) over pixels and channels.
+
+    Args:
+        image: [H, W, C] rendered; a mask is a picture of one channel.
+        target: [H, W, C] observed, 0…1.
+    """
+    l1 = (image - target).abs().mean()
+    return (1 - SSIM_SHARE) * l1 + SSIM_SHARE * (1 - ssim_map(image, target).mean())
+
+
+def psnr(image: Tensor, target: Tensor) -> Tensor:
+    """Peak signal-to-noise ratio, dB, of two pictures [H, W, C] in 0…1."""
+    squares = ((image - target) ** 2).sum().clamp_min(SMALLEST_SQUARE)
+    return 10 * torch.log10(image.numel() / squares)
+
+
+def _pairs(neighbours: Tensor, weights: Tensor, rows: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows [m], their neighbours [m, k] and weights [m, k]; all rows where none are named."""
+    if rows is None:
+        return torch.arange(len(neighbours), device=neighbours.device), neighbours, weights
+    return rows, neighbours[rows], weights[rows]
+
+
+def rigidity_loss(
+    means: Tensor, turns: Tensor, previous: Tensor, neighbours: Tensor, weights: Tensor, rows: Tensor | None = None
+) -> Tensor:
+    """Mean over pairs of sqrt(w·|R_iᵀ(μ_j − μ_i) − (μ_j − μ_i)_previous|² + 1e-20), metres.
+
+    Args:
+        means: [M, 3] metres, of this frame.
+        turns: [M, 4] unit quaternions, rotation since the previous frame.
+        previous: [M, 3] metres, means of the previous frame.
+        neighbours: [M, k] int64 rows.
+        weights: [M, k].
+        rows: [m] int64, the i to sum over; None for all.
+    """
+    i, j, w = _pairs(neighbours, weights, rows)
+    now = means[j] - means[i][:, None]
+    before = previous[j] - previous[i][:, None]
+    back = now @ quaternion_matrices(turns[i])  # row vectors: vᵀ R is (Rᵀ v)ᵀ
+    return torch.sqrt(w * ((back - before) ** 2).sum(-1) + ROOT_FLOOR).mean()
+
+
+def isometry_loss(
+    means: Tensor, distances: Tensor, neighbours: Tensor, weights: Tensor, rows: Tensor | None = None
+) -> Tensor:
+    """Mean over pairs of sqrt(w·(|μ_j − μ_i| − d_0)² + 1e-20), metres.
+
+    Args:
+        means: [M, 3] metres, of this frame.
+        distances: [M, k] metres, d_0: the pairs' distances when the graph was built.
+        neighbours: [M, k] int64 rows.
+        weights: [M, k].
+        rows: [m] int64, the i to sum over; None for all.
+    """
+    i, j, w = _pairs(neighbours, weights, rows)
+    d0 = distances if rows is None else distances[rows]
+    now = torch.sqrt(((means[j] - means[i][:, None]) ** 2).sum(-1) + ROOT_FLOOR)
+    return torch.sqrt(w * (now - d0) ** 2 + ROOT_FLOOR).mean()
+
+
+def rotation_loss(turns: Tensor, neighbours: Tensor, weights: Tensor, rows: Tensor | None = None) -> Tensor:
+    """Mean over pairs of sqrt(w·|q_j − q_i|² + 1e-20), of the rotations since the previous frame.
+
+    Args:
+        turns: [M, 4] unit quaternions with w ≥ 0.
+        neighbours: [M, k] int64 rows.
+        weights: [M, k].
+        rows: [m] int64, the i to sum over; None for all.
+    """
+    i, j, w = _pairs(neighbours, weights, rows)
+    return torch.sqrt(w * ((turns[j] - turns[i][:, None]) ** 2).sum(-1) + ROOT_FLOOR).mean()
+
+
+def axis_lengths(factors: Tensor) -> Tensor:
+    """[M, 3] metres: lengths of the columns of the factors [M, 3, 3], the transported axes."""
+    lengths: Tensor = torch.linalg.vector_norm(factors, dim=-2)
+    return lengths
+
+
+def scale_loss(factors: Tensor, first_lengths: Tensor, max_scale: float) -> Tensor:
+    """Equation (8), over axes too and against each Gaussian's own size where that is larger; metres.
+
+    Mean over Gaussians and axes of max(0, |column a of F| − max(max_scale, |column a of F at frame 0|)).
+
+    Args:
+        factors: [M, 3, 3] of this frame.
+        first_lengths: [M, 3] metres, ``axis_lengths`` at frame 0.
+        max_scale: metres.
+    """
+    return (axis_lengths(factors) - first_lengths.clamp_min(max_scale)).clamp_min(0).mean()
+
+
+def floor_loss(means: Tensor, plane: Sequence[float]) -> Tensor:
+    """Mean metres of ``means`` [M, 3] below the plane (a, b, c, d): where a·x + b·y + c·z + d is positive."""
+    return (means @ means.new_tensor(plane[:3]) + plane[3]).clamp(min=0).mean()
+
+
+def soft_colour_loss(colours: Tensor, previous: Tensor) -> Tensor:
+    """Mean |colour − colour of the previous frame| over Gaussians and channels; both [N, 3]."""
+    return (colours - previous).abs().mean()

@@ -1,0 +1,217 @@
+"""D_t on the CPU: the parameters of one frame's deformation, and the fused kernels that apply and differentiate it.
+
+Twin: ``deformation``. Buffers are allocated once per hierarchy.
+
+A Gaussian that is not finite when an update starts is held back: it stays as it is, weighs nothing in the pivots of its
+clusters and in the neighbour terms, and is counted.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.guards import GuardCounts
+from scas4d_core.kernels import neighbour_terms
+from scas4d_core.kernels.cascade import ACTED, PARAMETERS, RECORD, TABLE
+from scas4d_core.kernels.deform import BLOCKS, block_sums, deform, deform_backward
+from scas4d_core.kernels.deltas import PREVIOUS, STATE, TIED, TURN
+from scas4d_core.kernels.lanes import COUNT
+from scas4d_core.structure.hierarchy import Hierarchy
+from scas4d_core.structure.neighbours import Neighbours
+
+Array = NDArray[np.float32]
+
+
+class CpuDeformation:
+    """The cascade of a hierarchy, what each Gaussian adds, and the terms that tie neighbours together.
+
+    Args:
+        bounds: [M, 3] metres, the length each axis may have before the scale loss. cluster_map, covariance: see
+            ``deformation``.
+
+    Attributes:
+        clusters: per layer [K, 10], columns r, t, c, s. deltas: [M, 9], columns Δp, Δr, Δs.
+        cluster_gradients, delta_gradients: the same shapes, filled by ``backward``.
+        means [N, 3], factors [N, 3, 3]: of all Gaussians, filled by ``forward``.
+        turns: [M, 4], rotation since the frame before, filled by ``forward``.
+        held_back: [held] int64, rows of Θ_{t−1} that are not finite, found by ``start``.
+        guards: how often each guard acted since the last ``reset`` of the counts: those of ``cascade.ACTED`` each
+            ``forward``, the others each ``start``.
+    """
+
+    def __init__(
+        self,
+        hierarchy: Hierarchy,
+        neighbours: Neighbours | None,
+        bounds: Array,
+        cluster_map: Literal["centred", "published"],
+        covariance: Literal["entangled", "separate"] = "entangled",
+    ) -> None:
+        self.hierarchy = hierarchy
+        self.neighbours = neighbours
+        self._bounds = bounds
+        self._about_origin = np.float32(cluster_map == "published")
+        self._separate = True if covariance == "separate" else None
+        count = len(hierarchy.rows)
+        layers = len(hierarchy.sizes)
+        blocks = Blocks.of(hierarchy)
+        self._offsets, self._ranges, self._clusters_of = blocks.offsets, blocks.ranges, blocks.clusters
+        self._entries, self._rows, self._present = blocks.entries, hierarchy.rows[blocks.entries], blocks.present
+        self._all_present, self._all_ranges = blocks.present, blocks.ranges
+        self._weights = np.zeros((count, 0), np.float32) if neighbours is None else neighbours.weights
+        self._parameters = np.zeros((blocks.offsets[-1], PARAMETERS), np.float32)
+        self._gradients = np.zeros_like(self._parameters)
+        self._tables = np.zeros((len(self._parameters), TABLE), np.float32)
+        ends = blocks.offsets[1:-1]
+        self.clusters, self.cluster_gradients = (
+            np.split(table, ends)[:layers] for table in (self._parameters, self._gradients)
+        )
+        self.deltas = np.zeros((count, 9), np.float32)
+        self.delta_gradients = np.zeros_like(self.deltas)
+        held = len(blocks.entries)
+        self._points = np.zeros((max(layers, 1), held, 3, COUNT), np.float32)
+        self._sums = np.zeros((max(layers, 1), held, 3), np.float32)
+        self._before = np.zeros((held, 9, COUNT), np.float32)
+        self._records = np.zeros((held, layers, RECORD), np.float32)
+        self._excess = np.zeros(held, np.float32)
+        self._state = cache_lines(count)
+        self.turns = self._state[:, TURN : TURN + 4]
+        self._accumulators = np.zeros((neighbour_terms.TASKS, count, TIED), np.float32)
+        self._tied = self._accumulators[0]
+        self._neighbour_sums = np.zeros((neighbour_terms.TASKS, 3), np.float32)
+        self.means = np.zeros((0, 3), np.float32)
+        self.factors = np.zeros((0, 3, 3), np.float32)
+        self.guards = GuardCounts(*ACTED, "held_back", "empty_cluster")
+        self._acted = np.zeros((-(-held // BLOCKS), len(ACTED)), np.int64)
+        self.held_back = np.zeros(0, np.int64)
+        self._held: tuple[Array, Array] = self.means, self.factors
+
+    def start(self, previous: Gaussians) -> None:
+        """Take Θ_{t−1} to deform; standing Gaussians stay as they are in it."""
+        moving = self.hierarchy.rows
+        held = np.concatenate([previous.means[moving], previous.factors[moving].reshape(-1, 9)], axis=1)
+        sound: NDArray[np.bool_] = np.isfinite(held).all(axis=1)
+        self.held_back = moving[~sound]
+        self._held = previous.means[self.held_back], previous.factors[self.held_back]
+        means, factors = previous.means, previous.factors
+        if len(self.held_back):
+            means, factors = means.copy(), factors.copy()
+            means[self.held_back] = means[moving[sound]].mean(axis=0) if sound.any() else 0
+            factors[self.held_back] = 0
+        self._hold_back(sound)
+        self._state[:, PREVIOUS : PREVIOUS + 3] = means[moving]
+        self._points[0] = np.swapaxes(means[self._rows], 1, 2)
+        self._before[:] = np.swapaxes(factors[self._rows].reshape(*self._rows.shape, 9), 1, 2)
+        block_sums(self._points, self._present, self._sums)
+        self.means = previous.means.copy()
+        self.factors = previous.factors.copy()
+
+    def _hold_back(self, sound: NDArray[np.bool_]) -> None:
+        """Pivots and neighbour terms without the entries [M] that are not sound; count them."""
+        self._present, self._ranges = self._all_present, self._all_ranges
+        if self.neighbours is not None:
+            self._weights = self.neighbours.weights
+        if not sound.all():
+            self._present = self._all_present * sound[self._entries]
+            self._ranges = self._all_ranges.copy()
+            for layer, starts in enumerate(self.hierarchy.starts):
+                held = np.concatenate([[0], np.cumsum(~sound)])
+                self._ranges[self._offsets[layer] : self._offsets[layer + 1], 2] -= held[starts[1:]] - held[starts[:-1]]
+            if self.neighbours is not None:
+                pairs = sound[:, None] & sound[self.neighbours.index]
+                self._weights = np.where(pairs, self.neighbours.weights, np.float32(0))
+        empty = int(np.count_nonzero(self._ranges[:, 2] == 0))
+        self.guards.add(("held_back", "empty_cluster"), np.array([len(self.held_back), empty]))
+
+    def forward(self) -> None:
+        """Equations (5) to (7): fill ``means``, ``factors`` and ``turns``."""
+        deform(
+            self._parameters, self._offsets, self._ranges, self._clusters_of, self._entries, self._rows, self._present,
+            self._before, self.deltas, self._about_origin, self._separate, self._points, self._sums, self._tables,
+            self.means, self.factors, self._state, self._acted,
+        )  # fmt: skip
+        self.means[self.held_back], self.factors[self.held_back] = self._held
+        self.guards.add(ACTED, self._acted)
+
+    def neighbour_losses(self, sample: NDArray[np.int64], weights: tuple[float, float, float]) -> Array:
+        """Means over the sampled pairs of rigidity, isometry and rotation; ``backward`` adds their gradients.
+
+        Args:
+            sample: [S] entries of the hierarchy's order. weights: of the three terms.
+        """
+        if self.neighbours is None or len(sample) == 0:
+            self._tied[:] = 0
+            return np.zeros(3, np.float32)
+        pairs = max(1, len(sample) * self.neighbours.index.shape[1])
+        neighbour_terms.neighbour_terms(
+            self._state, sample, self.neighbours.index, self._weights, self.neighbours.distances,
+            np.array(weights, np.float32) / np.float32(pairs), self._accumulators, self._neighbour_sums,
+        )  # fmt: skip
+        means: Array = self._neighbour_sums.sum(axis=0) / pairs
+        return means
+
+    def backward(self, g_means: Array, g_factors: Array, scale_weight: float) -> float:
+        """Fill ``cluster_gradients`` and ``delta_gradients``; returns the scale loss (metres, mean over axes).
+
+        Args:
+            g_means [N, 3], g_factors [N, 3, 3]: gradients of what ``forward`` filled.
+        """
+        axes = max(1, 3 * len(self.hierarchy.rows))
+        deform_backward(
+            self._offsets, self._ranges, self._clusters_of, self._entries, self._rows, self._present, self._before,
+            self.deltas, self._about_origin, self._separate, self._points, self._tables,
+            np.float32(scale_weight / axes), self._bounds, g_means, g_factors, self._tied, self._records,
+            self._gradients, self.delta_gradients, self._excess,
+        )  # fmt: skip
+        return float(self._excess.sum(dtype=np.float64)) / axes
+
+
+def cache_lines(count: int) -> Array:
+    """[count, 16] zeros, each row a cache line of 64 bytes."""
+    flat = np.zeros((count + 1) * STATE, np.float32)
+    first = -(flat.ctypes.data // 4) % STATE
+    return flat[first : first + count * STATE].reshape(count, STATE)
+
+
+class Blocks(NamedTuple):
+    """The Gaussians of a hierarchy sixteen at a time, each block of one cluster in every layer: B blocks.
+
+    Attributes:
+        entries: [B, 16] int64 entries of the hierarchy's order; a block that is not full repeats its last.
+        present: [B, 16] float32, 0 where an entry is repeated, else 1.
+        clusters: [B, L] int64, the clusters of each block, numbered through all layers.
+        offsets: [L + 1] int64, the number of each layer's first cluster.
+        ranges: [clusters of all layers, 3] int64, each one's first block, its last and one more, and its entries.
+    """
+
+    entries: NDArray[np.int64]
+    present: Array
+    clusters: NDArray[np.int64]
+    offsets: NDArray[np.int64]
+    ranges: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, hierarchy: Hierarchy) -> Blocks:
+        """The blocks of a hierarchy."""
+        count, layers = len(hierarchy.rows), len(hierarchy.sizes)
+        finest = hierarchy.starts[-1] if layers else np.array([0, count])
+        per_cluster = -(-np.diff(finest) // COUNT)
+        ends = np.repeat(finest[1:], per_cluster)
+        nth = np.arange(len(ends)) - np.repeat(np.cumsum(per_cluster) - per_cluster, per_cluster)
+        begins = np.repeat(finest[:-1], per_cluster) + COUNT * nth
+        wanted = begins[:, None] + np.arange(COUNT)
+        entries = np.minimum(wanted, ends[:, None] - 1)
+        offsets = np.concatenate([[0], np.cumsum(hierarchy.sizes)]).astype(np.int64)
+        clusters = np.zeros((len(begins), layers), np.int64)
+        ranges = np.zeros((offsets[-1], 3), np.int64)
+        for layer, (labels, starts) in enumerate(zip(hierarchy.labels, hierarchy.starts, strict=True)):
+            clusters[:, layer] = offsets[layer] + labels[begins]
+            of_layer = ranges[offsets[layer] : offsets[layer + 1]]
+            of_layer[:, 0] = np.searchsorted(begins, starts[:-1])
+            of_layer[:, 1] = np.searchsorted(begins, starts[1:])
+            of_layer[:, 2] = np.diff(starts)
+        return cls(np.ascontiguousarray(entries), (wanted == entries).astype(np.float32), clusters, offsets, ranges)

@@ -1,0 +1,122 @@
+"""The start of an update: the motion of the frame before goes on (paper, Optimization Pipeline).
+
+A cluster keeps its twist in its own axes: what turns carries its displacement and its axis of rotation along, so that
+a point on a circle goes on along the circle, and so do the clusters of finer layers inside it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.settings import UpdateSettings
+from scas4d_core.structure.hierarchy import Hierarchy
+
+Array = NDArray[np.float32]
+Float = NDArray[np.float64]
+
+
+LONGEST_PREDICTION = 3.0
+"""Times the interval it was found in that a motion is carried on for: after a longer gap it says little."""
+
+
+def quaternion_products(a: Array, b: Array) -> Array:
+    """[M, 4] a∘b (w, x, y, z): first b, then a."""
+    aw, ax, ay, az = a.T
+    bw, bx, by, bz = b.T
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=1,
+    )
+
+
+def rotate(r: NDArray[np.floating], vectors: NDArray[np.floating]) -> Float:
+    """[K, 3] vectors turned by the quaternions (1, r)/|(1, r)|, r [K, 3] = axis · tan(angle/2)."""
+    cross = np.cross(r, vectors)
+    turned: Float = vectors + 2 * (cross + np.cross(r, cross)) / (1 + np.square(r).sum(axis=1, keepdims=True))
+    return turned
+
+
+class Parameters(Protocol):
+    """What a deformation learns, wherever: ``clusters`` per layer [K, 10], columns r, t, c, s; ``deltas`` [M, 9]."""
+
+    hierarchy: Hierarchy
+    clusters: list[Array]
+    deltas: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A motion that was found, to start the next from.
+
+    Attributes:
+        turns: per layer [K, 3] axis · tan(angle/2). shifts: per layer [K, 3] metres, relative to the layer above; both
+            in the axes that the cluster has turned to.
+        rest: [M, 3] metres, Δp less what the finest clusters have taken of it. own_turns: [M, 3] Δr. seconds: it took.
+    """
+
+    turns: list[Float]
+    shifts: list[Float]
+    rest: Float
+    own_turns: Float
+    seconds: float
+
+    @property
+    def finite(self) -> bool:
+        """Whether all of it is: else it would spoil the next start."""
+        return all(np.isfinite(array).all() for array in (*self.turns, *self.shifts, self.rest, self.own_turns))
+
+    def after(self, first: Motion) -> Motion:
+        """Both, one after the other in the same interval; small turns add up."""
+        return replace(
+            self,
+            turns=[a + b for a, b in zip(first.turns, self.turns, strict=True)],
+            shifts=[a + b for a, b in zip(first.shifts, self.shifts, strict=True)],
+            rest=first.rest + self.rest,
+            own_turns=first.own_turns + self.own_turns,
+        )
+
+    @classmethod
+    def of(cls, deformation: Parameters, seconds: float) -> Motion:
+        """Read what a deformation found. What the Gaussians of a finest cluster add in common becomes its own shift."""
+        hierarchy = deformation.hierarchy
+        turns = [values[:, :3].astype(np.float64) for values in deformation.clusters]
+        shifts = [values[:, 3:6].astype(np.float64) for values in deformation.clusters]
+        rest = deformation.deltas[:, :3].astype(np.float64)
+        if turns:
+            starts = hierarchy.starts[-1]
+            common = np.add.reduceat(rest, starts[:-1]) / np.diff(starts)[:, None]
+            shifts[-1] += common
+            rest -= common[hierarchy.labels[-1]]
+        # Into the axes that the clusters turned to, from the finest layer up: each layer turns what is below it.
+        for k in reversed(range(len(turns))):
+            labels = hierarchy.labels[k]
+            rest = rotate(turns[k][labels], rest)
+            for below in range(k + 1, len(turns)):
+                parents = labels[hierarchy.starts[below][:-1]]
+                turns[below] = rotate(turns[k][parents], turns[below])
+                shifts[below] = rotate(turns[k][parents], shifts[below])
+            shifts[k] = rotate(turns[k], shifts[k])
+        return cls(turns, shifts, rest, deformation.deltas[:, 3:6].astype(np.float64), seconds)
+
+
+def warm_start(deformation: Parameters, motion: Motion | None, seconds: float, settings: UpdateSettings) -> None:
+    """Set the parameters to the motion before, per unit of time; scaling (c, s) and Δs start at the identity."""
+    for values in [*deformation.clusters, deformation.deltas]:
+        values[:] = 0
+    if motion is None:
+        return
+    share = settings.warm_start * min(seconds / motion.seconds, LONGEST_PREDICTION)
+    for values, turns, shifts in zip(deformation.clusters, motion.turns, motion.shifts, strict=True):
+        values[:, :3] = share * turns
+        values[:, 3:6] = share * shifts
+    deformation.deltas[:, :3] = share * settings.momentum * motion.rest
+    deformation.deltas[:, 3:6] = share * settings.momentum * motion.own_turns

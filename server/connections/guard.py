@@ -1,0 +1,287 @@
+"""What every open connection is at, and what ends it: deadlines, caps, answers that nobody reads.
+
+A connection costs no timer of its own: one sweep, about once a second, looks at all of them while there are any.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import logging
+from collections import Counter
+from collections.abc import Collection, Iterable
+
+from server.connections.limits import Limits
+from server.connections.process import unread_bytes
+from server.connections.record import KINDS, PROGRESS_BYTES, Handler, Peer, Phase, Record
+from server.connections.refusals import Refusal
+from server.health.metrics import CONNECTIONS_REFUSED
+
+SWEEP_S = 1.0
+LINGER_S = 5.0
+LINGER_LONGEST_S = 60.0
+LINGER_BYTES = 64 << 20
+"""A body that goes on after its answer is read and dropped while `PROGRESS_BYTES` come in `LINGER_S`, so long in all,
+so far: closed at once, the connection would be reset, and the sender would lose the answer."""
+REFUSED_S = 2.0
+"""The same for a connection that was refused itself."""
+REFUSED_AT_ONCE = 64
+"""Refused connections that wait for their peers to read why; the oldest go first."""
+CLOSING_SOCKET_S = 5.0
+"""A WebSocket that is closed and whose peer reads nothing."""
+QUIET_S = 2.0
+"""An upload that brought nothing for so long gives way where a cap is reached."""
+SUMMARY_S = 10.0
+"""Between two lines of the log about refused connections: a line each would be another flood."""
+
+log = logging.getLogger("scas4d.server")
+
+
+def peer_key(address: str) -> str:
+    """Under which connections count as one peer's: an IPv6 address by its /64, all of which is one customer's."""
+    try:
+        found = ipaddress.ip_address(address)
+    except ValueError:
+        return address
+    if isinstance(found, ipaddress.IPv4Address):
+        return address
+    if found.ipv4_mapped is not None:
+        return str(found.ipv4_mapped)
+    return f"{ipaddress.IPv6Address(int(found) >> 64 << 64)}/64"
+
+
+class Guard:
+    """The open connections of one service, its limits, and the sweep that enforces them."""
+
+    def __init__(self, limits: Limits) -> None:
+        self.limits = limits
+        self._records: dict[asyncio.BaseTransport, Record] = {}
+        self._peers: dict[str, Peer] = {}
+        self._counted = self._bodies = 0
+        self._refused: dict[Record, None] = {}
+        self._pending: Counter[str] = Counter()
+        self._told = float("-inf")
+        self._timer: asyncio.TimerHandle | None = None
+        self._swept = 0.0
+        shortest = min(limits.header_seconds, limits.body_seconds, limits.keep_alive_seconds, limits.unread_seconds)
+        self._every = min(SWEEP_S, shortest / 4)
+
+    def admit(
+        self, handler: Handler, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop, address: str
+    ) -> tuple[Record, Refusal | None]:
+        """A new connection: its record, and why it has to be refused where it has to be.
+
+        Where a cap is reached it takes the place of the oldest connection that has not sent a whole header, is idle, or
+        has stopped sending its body: whoever hangs about must not keep out who has a request. Where all places are
+        taken, any peer's may give way: who has many addresses has few connections from each.
+        """
+        now = loop.time()
+        proxy = self.limits.is_proxy(address)
+        key = address if proxy else peer_key(address)  # a proxy's neighbours are no proxies
+        peer = self._peers.get(key)
+        if peer is None:
+            peer = self._peers[key] = Peer(key, proxy)
+        refusal = None
+        if not proxy and peer.count >= self.limits.per_peer and not self._displace([peer], now):
+            refusal = Refusal.PEER_CONNECTIONS
+        elif self._counted >= self.limits.connections and not self._displace(self._peers.values(), now):
+            refusal = Refusal.CONNECTIONS
+        record = self._records[transport] = Record(handler, transport, peer, now, now)
+        self._peers[key] = peer  # it went where its last connection gave way
+        peer.count += 1
+        self._counted += 1
+        self.enter(record, Phase.NEW, now)
+        if self._timer is None:
+            self._swept = now
+            self._timer = loop.call_later(self._every, self._sweep, loop)
+        return record, refusal
+
+    def enter(self, record: Record, phase: Phase, now: float) -> None:
+        """Takes note that a connection is in another phase, from `now` (loop time) on."""
+        if record.gone:
+            return
+        record.phase, record.since, record.entered, record.body, record.dropped = phase, now, now, 0, 0
+        queue = None
+        if phase in (Phase.NEW, Phase.HEAD, Phase.IDLE):
+            queue = record.peer.idle if record.served else record.peer.strangers
+        elif phase in (Phase.BODY, Phase.LINGER):
+            queue = record.peer.bodies
+        if queue is not record.queue:
+            self._unqueue(record)
+            if queue is not None:
+                queue[record] = None
+                self._bodies += queue is record.peer.bodies
+            record.queue = queue
+        if phase is Phase.BODY:
+            record.moved = False
+            self._make_room_for_headers(record)
+        elif phase is Phase.REFUSED:
+            self._release(record)
+            self._refused[record] = None
+            if len(self._refused) > REFUSED_AT_ONCE:
+                oldest = next(iter(self._refused))
+                del self._refused[oldest]
+                oldest.transport.abort()
+
+    def hand_over(self, transport: asyncio.BaseTransport, handler: Handler, now: float) -> Record:
+        """The record of a connection that is a WebSocket from now on."""
+        record = self._records[transport]
+        record.handler = handler
+        self.enter(record, Phase.SOCKET, now)
+        return record
+
+    def leave(self, record: Record) -> None:
+        """Forgets a connection that is gone."""
+        record.gone = True
+        self._records.pop(record.transport, None)
+        self._unqueue(record)
+        self._refused.pop(record, None)
+        self._release(record)
+
+    def refused(self, refusal: Refusal) -> None:
+        """Counts a refusal; the sweep logs a summary."""
+        CONNECTIONS_REFUSED.labels(refusal.value).inc()
+        self._pending[refusal.value] += 1
+
+    def counts(self) -> dict[str, int]:
+        """Open connections by kind."""
+        found = dict.fromkeys(KINDS.values(), 0)
+        for record in self._records.values():
+            found[KINDS[record.phase]] += 1
+        return found
+
+    def _unqueue(self, record: Record) -> None:
+        if record.queue is not None:
+            del record.queue[record]
+            self._bodies -= record.queue is record.peer.bodies
+            record.queue = None
+
+    def _make_room_for_headers(self, new: Record) -> None:
+        """Keeps uploads that have brought next to nothing to half of a cap, the oldest go.
+
+        The other half is then of connections that give way at once: who has a request finds a place at any moment, and
+        not only when uploads that hang are old enough to be told from those that have just begun.
+        """
+        peers: Iterable[Peer] = [new.peer]
+        if new.peer.proxy or 2 * len(new.peer.bodies) <= self.limits.per_peer:
+            if 2 * self._bodies <= self.limits.connections:
+                return
+            peers = self._peers.values()
+        begun = (
+            [other for other in peer.bodies if other is not new and other.is_begun and not other.handler.waits_for_us]
+            for peer in peers
+        )
+        most = max(begun, key=len, default=[])
+        if most:
+            self._end(most[0], new.since)
+
+    def _end(self, record: Record, now: float) -> None:
+        """Ends a connection that gives way, without an answer."""
+        self.refused(Refusal.DISPLACED)
+        self.enter(record, Phase.REFUSED, now)
+        record.transport.abort()
+
+    def _release(self, record: Record) -> None:
+        """Makes room: a connection that is refused or gone does not count."""
+        if not record.counted:
+            return
+        record.counted = False
+        self._counted -= 1
+        peer = record.peer
+        peer.count -= 1
+        if peer.count == 0:
+            self._peers.pop(peer.address, None)
+
+    def _displace(self, peers: Collection[Peer], now: float) -> bool:
+        """Ends the connection of these peers that can be spared best; False where none can."""
+        for queues in ([peer.strangers for peer in peers], [peer.idle for peer in peers]):
+            found = [(len(queue), next(iter(queue))) for queue in queues if queue]
+            if found:
+                # Of many peers with as many it is the one that has waited longest: who has just come has a request.
+                _, record = max(found, key=lambda one: (one[0], -one[1].since))
+                self._end(record, now)
+                return True
+        quiet = [
+            record
+            for peer in peers
+            for record in peer.bodies
+            if record.received == 0 and now - record.heard > QUIET_S and not record.handler.waits_for_us
+        ]
+        if not quiet:
+            return False
+        self._end(min(quiet, key=lambda record: record.heard), now)
+        return True
+
+    def _sweep(self, loop: asyncio.AbstractEventLoop) -> None:
+        now = loop.time()
+        passed, self._swept = now - self._swept, now
+        for record in list(self._records.values()):
+            if record.received:
+                record.received, record.quiet_since = 0, now
+            if not self._unread(record, now):
+                self._overdue(record, now, passed)
+        if self._pending and now - self._told >= SUMMARY_S:
+            reasons = ", ".join(f"{count} {reason}" for reason, count in self._pending.most_common())
+            log.warning("refused connections: %s (docs/operations.md, `reason`)", reasons)
+            self._pending.clear()
+            self._told = now
+        go_on = bool(self._records or self._pending)
+        self._timer = loop.call_later(self._every, self._sweep, loop) if go_on else None
+
+    def _overdue(self, record: Record, now: float, passed: float) -> None:
+        """Ends a connection whose phase has taken too long."""
+        limits, phase = self.limits, record.phase
+        if phase is Phase.REFUSED:
+            if now - record.since > REFUSED_S:
+                record.transport.abort()
+            return
+        if phase in (Phase.ANSWER, Phase.SOCKET) or record.transport.is_closing():
+            return
+        if record.handler.waits_for_us:
+            record.since += passed
+            return
+        waited = now - record.since
+        match phase:
+            case Phase.NEW if waited > limits.header_seconds:
+                record.transport.close()
+            case Phase.IDLE if waited > limits.keep_alive_seconds:
+                record.transport.close()
+            case Phase.HEAD if waited > limits.header_seconds:
+                record.handler.refuse(Refusal.HEAD_TIME)
+            case Phase.LINGER if now - record.entered > LINGER_LONGEST_S or record.body > LINGER_BYTES:
+                record.transport.close()
+            case Phase.LINGER if record.body - record.dropped >= PROGRESS_BYTES:
+                record.since, record.dropped = now, record.body
+            case Phase.LINGER if waited > LINGER_S:
+                record.transport.close()
+            case Phase.BODY if record.body >= PROGRESS_BYTES:
+                record.since, record.body = now, 0
+            case Phase.BODY if waited > limits.body_seconds:
+                record.handler.refuse(Refusal.BODY_TIME)
+
+    def _unread(self, record: Record, now: float) -> bool:
+        """Ends a connection whose peer does not read what it asked for.
+
+        Only where nothing is written meanwhile, so that what is unread less than before was read: the application
+        waits for room, or the connection is being closed.
+        """
+        closing = record.transport.is_closing()
+        size = unread_bytes(record.transport) if closing or record.write_paused else 0
+        if size == 0:
+            record.unsent = 0
+            return False
+        if record.unsent == 0:
+            record.unsent, record.unsent_since, record.sent = size, now, 0
+            return False
+        record.sent += max(0, record.unsent - size)
+        record.unsent = size
+        if record.sent >= PROGRESS_BYTES:
+            record.unsent_since, record.sent = now, 0
+        limit = self.limits.unread_seconds
+        if closing and record.phase is Phase.SOCKET:
+            limit = min(limit, CLOSING_SOCKET_S)
+        if now - record.unsent_since <= limit:
+            return False
+        self.refused(Refusal.UNREAD)
+        record.transport.abort()
+        return True

@@ -1,0 +1,113 @@
+"""What is known of one open connection, and of all those of an address."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from typing import Protocol
+
+from server.connections.refusals import Refusal
+
+PROGRESS_BYTES = 16 << 10
+"""What a window of `body_seconds` or `unread_seconds` has to move: less holds a connection open on purpose."""
+
+
+class Phase(Enum):
+    """Where a connection is."""
+
+    NEW = auto()
+    """Nothing has come yet; browsers open connections ahead."""
+    HEAD = auto()
+    """A header is coming."""
+    BODY = auto()
+    ANSWER = auto()
+    """The request is whole, the service is at work."""
+    IDLE = auto()
+    """Kept alive between two requests."""
+    LINGER = auto()
+    """Answered before the body was whole: the rest is dropped."""
+    SOCKET = auto()
+    """A WebSocket. It may idle for ever: pings tell whether its peer is there."""
+    REFUSED = auto()
+
+
+KINDS = {
+    Phase.NEW: "header",
+    Phase.HEAD: "header",
+    Phase.BODY: "body",
+    Phase.ANSWER: "answer",
+    Phase.IDLE: "idle",
+    Phase.LINGER: "closing",
+    Phase.SOCKET: "websocket",
+    Phase.REFUSED: "closing",
+}
+"""The label `kind` of `scas4d_connections`."""
+
+
+class Handler(Protocol):
+    """The protocol at work on a connection."""
+
+    @property
+    def waits_for_us(self) -> bool:
+        """Whether nothing can come because the service does not read now."""
+
+    def refuse(self, refusal: Refusal) -> None:
+        """Answers with the refusal, as far as it can be answered, and ends the connection."""
+
+
+@dataclass(eq=False, slots=True)
+class Record:
+    """One open connection.
+
+    Attributes:
+        since: loop time at which the phase, or its present window, began. entered: that of the phase.
+        body: bytes of body in that window; in all, and dropped those of windows before, where the body is dropped.
+        moved: so much of the present body came that it is no pretence, in whatever windows.
+        received: bytes since the last sweep. quiet_since: loop time of the last sweep that found any.
+        served: one request was answered. write_paused: more waits to be sent than the transport likes.
+    """
+
+    handler: Handler
+    transport: asyncio.Transport
+    peer: Peer
+    since: float
+    quiet_since: float
+    phase: Phase = Phase.NEW
+    queue: dict[Record, None] | None = None
+    counted: bool = True
+    gone: bool = False
+    entered: float = 0.0
+    body: int = 0
+    dropped: int = 0
+    moved: bool = False
+    received: int = 0
+    served: bool = False
+    write_paused: bool = False
+    unsent: int = 0
+    unsent_since: float = 0.0
+    sent: int = 0
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether its body has brought next to nothing, or nothing that anybody needs."""
+        return self.phase is Phase.LINGER or not self.moved
+
+    @property
+    def heard(self) -> float:
+        """Loop time at which the last of its body may have come."""
+        return max(self.since, self.quiet_since)
+
+
+@dataclass(eq=False, slots=True)
+class Peer:
+    """The connections of one address; those that may have to give way in queues, the oldest first."""
+
+    address: str
+    proxy: bool
+    count: int = 0
+    strangers: dict[Record, None] = field(default_factory=dict)
+    """No header was ever completed."""
+    idle: dict[Record, None] = field(default_factory=dict)
+    """Between two requests."""
+    bodies: dict[Record, None] = field(default_factory=dict)

@@ -1,0 +1,96 @@
+"""What a scene will take, by a formula whose constants were measured (`scripts/measure_memory.py`; a test holds it)."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from client.wire import RigModel
+from client.wire.estimate import SceneEstimate
+from scas4d_core.settings import Settings
+from server.problems import Problem, counted
+from server.settings import ServerSettings
+
+PROCESS = 280e6
+"""Interpreter, libraries and compiled kernels of a process that reconstructs or reads."""
+PIXEL = 8
+"""Bytes for each pixel as it is sent: decoded with its mask, of the frame at work and the one before."""
+SCALED_PIXEL = 80
+"""Bytes for each pixel after scaling: 3 or 4 channels of float32 in the target and SSIM's two moments; where there are
+no masks, of two frames."""
+GAUSSIAN = 1800
+"""Bytes for each Gaussian in the worker: state, layers, Adam, neighbours, and what a render needs."""
+READ_GAUSSIAN = 500
+"""The same in a reader."""
+STATE = 81
+"""Bytes on disk for each Gaussian and frame."""
+HISTORY = 28
+"""Bytes for each Gaussian and frame of a query: position and material rotation."""
+LARGEST_BUDGET, MOST_PER_PIXEL = 100_000, 0.61
+"""Of `scas4d_core.first_frame.static_scene.budget`, a picture without background."""
+SCALES = (0.75, 0.5, 0.35, 0.25, 0.125)
+
+CGROUP = Path("/sys/fs/cgroup/memory.max")
+
+
+def machine_mb() -> float:
+    """Memory of the machine, or of the container where that is less."""
+    total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    try:
+        return min(total, int(CGROUP.read_text())) / 1e6
+    except (OSError, ValueError):
+        return total / 1e6
+
+
+def estimate(rig: RigModel, settings: Settings, server: ServerSettings, scale: float | None = None) -> SceneEstimate:
+    """Of a scene with this rig and these settings; `scale` in place of their image_scale."""
+    scale = settings.scene.image_scale if scale is None else scale
+    sizes = [camera.width * camera.height for camera in rig.cameras]
+    pixels = sum(sizes)
+    scaled = round(pixels * scale * scale)
+    most = max(1, round(MOST_PER_PIXEL * scaled / len(sizes)))
+    gaussians = settings.static.max_gaussians or min(LARGEST_BUDGET, most)
+    pictures = pixels * PIXEL + scaled * SCALED_PIXEL
+    worker = PROCESS + pictures + gaussians * GAUSSIAN
+    readers = 2 * (PROCESS + gaussians * READ_GAUSSIAN)
+    limit = machine_mb() if server.max_scene_memory_mb is None else server.max_scene_memory_mb
+    in_mb = {
+        "pictures_mb": pictures,
+        "gaussians_mb": gaussians * GAUSSIAN,
+        "worker_mb": worker,
+        "readers_mb": readers,
+        "memory_mb": worker + readers,
+        "state_mb": gaussians * STATE,
+        "history_mb": gaussians * HISTORY,
+    }
+    return SceneEstimate(
+        pixels=pixels,
+        scaled_pixels=scaled,
+        gaussians=gaussians,
+        limit_mb=round(limit, 1),
+        **{name: round(value / 1e6, 3) for name, value in in_mb.items()},
+    )
+
+
+def check(rig: RigModel, settings: Settings, server: ServerSettings) -> None:
+    """Refuses what will not fit.
+
+    Raises:
+        Problem: 422, with the scale of the pictures that would.
+    """
+    found = estimate(rig, settings, server)
+    if found.memory_mb <= found.limit_mb:
+        return
+    smaller = [scale for scale in SCALES if scale < settings.scene.image_scale]
+    fits = next((s for s in smaller if estimate(rig, settings, server, s).memory_mb <= found.limit_mb), None)
+    remedy = "send fewer or smaller pictures, lower settings.static.max_gaussians, or raise SCAS4D_MAX_SCENE_MEMORY_MB"
+    if fits is not None:
+        remedy = f"set settings.scene.image_scale to {fits:g}; or {remedy}"
+    raise Problem(
+        422,
+        f"the scene is estimated to take {found.memory_mb:.0f} MB, more than {found.limit_mb:.0f} MB",
+        field="rig.cameras",
+        value=f"{counted(len(rig.cameras), 'camera')}, {found.scaled_pixels} pixels, {found.gaussians} Gaussians",
+        remedy=remedy,
+        estimate=found.model_dump(),
+    )

@@ -1,0 +1,160 @@
+"""What Prometheus reads at /metrics. Counters are counted where the thing happens; gauges are read when asked."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Protocol
+
+from prometheus_client import CollectorRegistry, Counter, Histogram
+from prometheus_client.core import GaugeMetricFamily, Metric
+
+from client.wire import FrameReportModel, FrameState, SceneState, SceneStatus
+from server.connections.refusals import Refusal
+from server.processes.messages import Query
+from server.settings import ServerSettings
+from server.stream.hub import Hub
+
+SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 4, 8, 16, 32, 64, 128, 256)
+
+registry = CollectorRegistry()
+"""Of this process, without the interpreter's own metrics."""
+
+FRAMES = Counter(
+    "scas4d_frames",
+    "Frames by what became of them: acknowledged, committed, set_aside, skipped, missing.",
+    ["state"],
+    registry=registry,
+)
+INGEST_BYTES = Counter("scas4d_ingest_bytes", "Encoded pictures and masks of acknowledged frames.", registry=registry)
+DEGRADED = Counter(
+    "scas4d_degraded_frames",
+    "Committed frames whose state is not theirs: held (the state before stands) or in part.",
+    ["how"],
+    registry=registry,
+)
+LEFT_OUT = Counter(
+    "scas4d_cameras_left_out",
+    "Cameras of committed frames that were not learnt from: nothing came, or it did not fit.",
+    registry=registry,
+)
+UPDATE_SECONDS = Histogram(
+    "scas4d_update_seconds", "A committed frame, by stage.", ["stage"], buckets=SECONDS, registry=registry
+)
+ANSWER_SECONDS = Histogram(
+    "scas4d_answer_seconds",
+    "From the question to the answer of a scene's reader, by kind (render, tracks, parts, ply) and outcome.",
+    ["kind", "outcome"],
+    buckets=SECONDS,
+    registry=registry,
+)
+STREAM_MISSED = Counter(
+    "scas4d_stream_missed",
+    "Messages that slow subscribers missed because a newer one took their place.",
+    registry=registry,
+)
+RESTARTS = Counter(
+    "scas4d_process_restarts",
+    "Processes of scenes that ended by themselves and were replaced.",
+    ["process"],
+    registry=registry,
+)
+DAMAGE = Counter(
+    "scas4d_damage",
+    "Damage found on disk while the service ran: state, checkpoint, fixed, journal, frame, definition, points.",
+    ["kind"],
+    registry=registry,
+)
+SCRUBBED = Counter(
+    "scas4d_scrubbed_bytes", "Read again in the background and compared with their checksums.", registry=registry
+)
+for kind in ("state", "checkpoint", "fixed", "journal", "frame", "definition", "points"):
+    DAMAGE.labels(kind)
+CONNECTIONS_REFUSED = Counter(
+    "scas4d_connections_refused",
+    "Connections and requests that were ended before the application was asked, by reason.",
+    ["reason"],
+    registry=registry,
+)
+for refusal in Refusal:
+    CONNECTIONS_REFUSED.labels(refusal.value)
+for state in ("acknowledged", "committed", "set_aside", "skipped", "missing"):
+    FRAMES.labels(state)
+for how in ("held", "in_part"):
+    DEGRADED.labels(how)
+
+
+def finished(report: FrameReportModel) -> None:
+    """Counts a frame that ended, and what its update took."""
+    FRAMES.labels(report.state.value).inc()
+    if report.state == FrameState.COMMITTED:
+        LEFT_OUT.inc(len(report.dropped_cameras))
+        if report.degraded is not None:
+            DEGRADED.labels("held" if report.degraded.startswith("held") else "in_part").inc()
+    for stage, seconds in report.seconds.items():
+        UPDATE_SECONDS.labels(stage).observe(seconds)
+
+
+@contextmanager
+def answering(query: Query) -> Iterator[None]:
+    """Times a question to a scene's reader."""
+    kind, began, outcome = type(query).__name__.removesuffix("Query").lower(), time.perf_counter(), "failed"
+    try:
+        yield
+        outcome = "answered"
+    finally:
+        ANSWER_SECONDS.labels(kind, outcome).observe(time.perf_counter() - began)
+
+
+class HasStatus(Protocol):
+    """A scene, as far as it is looked at here."""
+
+    def status(self) -> SceneStatus:
+        """As it is now."""
+
+
+class State:
+    """Gauges of a service: scenes, queues, subscribers, disk."""
+
+    def __init__(
+        self,
+        settings: ServerSettings,
+        scenes: Mapping[str, HasStatus],
+        hub: Hub,
+        ready_after: float | None,
+        connections: Mapping[str, int],
+    ) -> None:
+        self.settings = settings
+        self.scenes = scenes
+        self.hub = hub
+        self.ready_after = ready_after
+        self.connections = connections
+
+    def collect(self) -> Iterator[Metric]:
+        """As it is now."""
+        statuses = [scene.status() for scene in list(self.scenes.values())]
+        by_state = GaugeMetricFamily("scas4d_scenes", "Scenes by state.", labels=["state"])
+        for state in SceneState:
+            by_state.add_metric([state.value], sum(status.state == state for status in statuses))
+        yield by_state
+        for name, help, field in (
+            ("scas4d_queue_frames", "Frames acknowledged and not finished.", "queued"),
+            ("scas4d_committed_frames", "Frames that can be rendered and tracked.", "committed"),
+            ("scas4d_gaussians", "Gaussians.", "gaussians"),
+        ):
+            gauge = GaugeMetricFamily(name, help, labels=["scene"])
+            for status in statuses:
+                gauge.add_metric([status.id], getattr(status, field) or 0)
+            yield gauge
+        yield GaugeMetricFamily("scas4d_subscribers", "WebSockets that listen to scenes.", value=self.hub.count())
+        by_kind = GaugeMetricFamily("scas4d_connections", "Open connections by what they are at.", labels=["kind"])
+        for kind, count in self.connections.items():
+            by_kind.add_metric([kind], count)
+        yield by_kind
+        free = shutil.disk_usage(self.settings.data).free
+        yield GaugeMetricFamily("scas4d_disk_free_bytes", "On the disk of the data folder.", value=free)
+        if self.ready_after is not None:
+            help = "From the start of the service until its kernels were warmed up."
+            yield GaugeMetricFamily("scas4d_ready_after_seconds", help, value=self.ready_after)

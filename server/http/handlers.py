@@ -1,0 +1,100 @@
+"""Every error of the application answered as a problem document: ours, the framework's, and faults."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Mapping
+from http import HTTPStatus
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+from starlette.routing import compile_path
+
+from client.wire import ProblemDetails
+from server.http import validation
+from server.problems import Problem, answer, document, quoted
+
+JSON = re.compile(r"application/([\w.-]+\+)?json")
+
+log = logging.getLogger("scas4d.server")
+
+
+def install(app: FastAPI) -> None:
+    """Makes the application answer every error as a problem document."""
+
+    async def from_problem(request: Request, error: Exception) -> Response:
+        assert isinstance(error, HTTPException)
+        if isinstance(error, Problem):
+            return answer(error.document, error.headers)
+        headers = dict(error.headers or {})
+        if error.status_code == 405:  # Starlette names the methods of the first route at this address only
+            headers["Allow"] = ", ".join(methods(request.app, request.url.path)) or headers.get("Allow", "")
+        return answer(_of_framework(request, error.status_code, str(error.detail), headers), headers)
+
+    async def from_validation(request: Request, error: Exception) -> Response:
+        assert isinstance(error, RequestValidationError)
+        first = error.errors()[0]
+        given = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+        if first["loc"][0] == "body" and given and not JSON.fullmatch(given):
+            problem = Problem(
+                415, f"the body is {given}", field="Content-Type", value=given, remedy="send application/json"
+            )
+            return answer(problem.document)
+        route = request.scope.get("route")
+        body = getattr(getattr(route, "body_field", None), "field_info", None)
+        problem = validation.invalid(
+            first,
+            model=getattr(body, "annotation", None),
+            others=len(error.errors()) - 1,
+            text=error.body if isinstance(error.body, str) else None,
+        )
+        return answer(problem.document)
+
+    async def from_fault(request: Request, error: Exception) -> Response:
+        log.exception("%s %s failed", request.method, request.url.path, exc_info=error)
+        document = ProblemDetails(
+            title=HTTPStatus.INTERNAL_SERVER_ERROR.phrase,
+            status=500,
+            detail=f"the service failed: {type(error).__name__}",
+            remedy="this is a fault of the service; its log has the traceback",
+        )
+        return answer(document)
+
+    app.openapi = lambda: document(app)  # type: ignore[method-assign]
+    app.add_exception_handler(HTTPException, from_problem)
+    app.add_exception_handler(RequestValidationError, from_validation)
+    app.add_exception_handler(Exception, from_fault)
+
+
+def methods(app: FastAPI, path: str) -> list[str]:
+    """The methods that the document has for an address."""
+    return sorted(
+        {
+            method.upper()
+            for template, operations in document(app)["paths"].items()
+            if compile_path(template)[0].match(path)
+            for method in operations
+        }
+    )
+
+
+def _of_framework(request: Request, status: int, detail: str, headers: Mapping[str, str]) -> ProblemDetails:
+    """What Starlette and FastAPI refuse by themselves: no such path, no such method, a body that is no form."""
+    field = value = remedy = None
+    if status == 404:
+        field, value, remedy = "path", quoted(request.url.path), "GET /openapi.json lists all paths"
+    elif status == 405:
+        field, value, remedy = "method", request.method, f"use {headers.get('Allow') or 'another'}"
+    elif status == 400:
+        field, remedy = "body", "send the body that Content-Type says; the schema is at /openapi.json"
+    return ProblemDetails(
+        title=HTTPStatus(status).phrase,
+        status=status,
+        detail=detail,
+        field=field,
+        value=value,
+        remedy=remedy,
+    )

@@ -1,0 +1,1 @@
+"""Accepts frames: receives, checks, writes, orders, acknowledges."""

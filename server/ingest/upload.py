@@ -1,0 +1,231 @@
+"""Pictures on their way from the wire to disk: each is checked, hashed and written while the next comes in."""
+
+from __future__ import annotations
+
+import asyncio
+import mmap
+from collections.abc import AsyncIterator, Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from blake3 import blake3
+
+from client.wire import FrameFile, FrameHead, FramingError, head_length, parse_head
+from client.wire.framing import PREFIX
+from server.problems import Problem
+from server.storage.disk import full_disk, no_room
+from server.storage.events import Hashes
+from server.storage.frame_store import BLOCK, Upload
+
+BATCH = 4_000_000
+"""Bytes of files that are checked, hashed and written at once, where a file is not larger itself."""
+SPARE_BUFFERS = 8
+"""Buffers of that size that are kept for the next uploads: fresh memory costs as much time as filling it."""
+
+Check = Callable[[FrameFile, memoryview], None]
+"""Raises Problem for a file that is not what the scene takes."""
+
+_spare: list[mmap.mmap] = []
+
+
+@dataclass(eq=False)
+class Received:
+    """A frame's files, or one camera's, on disk. `file` is None where they were only compared with what is known."""
+
+    hashes: Hashes
+    file: str | None
+    size: int
+    kept: bool = False
+    """A fact names the record: it is not debris."""
+
+
+class Receiving:
+    """One record that is being received, batch by batch: each is filled while a thread has the one before.
+
+    Args:
+        folder: of the frame log. head: what comes. seconds: time of the frame, where it is known.
+        check: of each file. keep: whether to write; otherwise the files are only hashed.
+
+    Attributes:
+        missing: bytes of its files that have not come yet.
+    """
+
+    def __init__(self, folder: Path, head: FrameHead, seconds: float | None, check: Check, *, keep: bool) -> None:
+        self._check = check
+        self._hashes: Hashes = {}
+        self._digests: list[bytes] = []
+        self._upload = Upload(folder, head, seconds) if keep else None
+        self._at_work: asyncio.Future[None] | None = None
+        self._batches = in_batches(head.files)
+        # Memory and file are alike modulo the size of a block: so it can be written without the page cache.
+        self._at = self._begin = 0 if self._upload is None else self._upload.begin % BLOCK
+        self.missing = sum(map(_bytes, self._batches))
+        size = BLOCK + max(map(_bytes, self._batches))
+        self._buffers = [_buffer(size) for _ in self._batches[:2]]
+
+    async def take(self, data: memoryview) -> None:
+        """Takes what comes next, not more than is missing; returns when there is room for more.
+
+        Raises:
+            Problem, OSError: of files that came before.
+        """
+        while self._batches:
+            end = self._begin + _bytes(self._batches[0])
+            piece = data[: end - self._at]
+            self._buffers[0][self._at : self._at + len(piece)] = piece
+            self._at += len(piece)
+            self.missing -= len(piece)
+            data = data[len(piece) :]
+            if self._at < end:
+                return
+            await self._settle()
+            block = memoryview(self._buffers[0])[:end]
+            self._start(self._write, self._batches.pop(0), block, self._begin)
+            self._buffers.reverse()
+            self._at = self._begin = 0 if self._upload is None else end % BLOCK
+
+    def _write(self, files: Sequence[FrameFile], block: memoryview, begin: int) -> None:
+        at = begin
+        for file in files:
+            piece = block[at : at + file.size]
+            at += file.size
+            self._check(file, piece)
+            digest = blake3(piece)
+            self._digests.append(digest.digest())
+            self._hashes.setdefault(file.camera, {})[file.kind] = digest.hexdigest()
+        if self._upload is not None:
+            self._upload.write(block, begin)
+
+    async def finish(self) -> Received:
+        """All files are on disk.
+
+        Raises:
+            Problem, OSError: they are not.
+        """
+        await self._settle()
+        upload = self._upload
+        if upload is not None:
+            self._start(upload.finish, self._digests)
+            await self._settle()
+        self._give_back()
+        return Received(self._hashes, None, 0) if upload is None else Received(self._hashes, upload.name, upload.size)
+
+    async def abort(self) -> None:
+        """Removes what was written, whoever is cancelled meanwhile."""
+        await asyncio.shield(asyncio.ensure_future(self._abort()))
+
+    async def _abort(self) -> None:
+        if self._at_work is not None:
+            await asyncio.wait([self._at_work])  # nothing may be closed or used again under a thread that writes
+        self._give_back()
+        if self._upload is not None:
+            await asyncio.to_thread(self._upload.abort)
+
+    def _start(self, function: Callable[..., None], *arguments: object) -> None:
+        self._at_work = asyncio.ensure_future(asyncio.to_thread(function, *arguments))
+
+    async def _settle(self) -> None:
+        """Waits for the thread; that goes on where whoever waits is cancelled."""
+        if self._at_work is not None:
+            try:
+                await asyncio.shield(self._at_work)
+            except FileNotFoundError:  # its folder is gone
+                remedy = "GET /v1/scenes lists the scenes"
+                raise Problem(404, "the scene was deleted meanwhile", field="id", remedy=remedy) from None
+            self._at_work = None
+
+    def _give_back(self) -> None:
+        _spare.extend(buffer for buffer in self._buffers if len(buffer) == _STANDARD)
+        del _spare[SPARE_BUFFERS:]
+        self._buffers = []
+
+
+async def receive_framed(
+    chunks: AsyncIterator[bytes], head_of: Callable[[FrameHead], Receiving], total: int | None
+) -> tuple[FrameHead, Receiving]:
+    """Reads a frame as `client.wire.framing` writes it, batch by batch; nothing is held but two batches of them.
+
+    Args:
+        chunks: the bytes as they come. head_of: told the head once it is here; refuses or begins. total: bytes
+            announced, where they are.
+
+    Raises:
+        Problem: 422, no frame, or not what its head says; or what `head_of` and the checks raise.
+    """
+    start = bytearray()
+    head: FrameHead | None = None
+    receiving: Receiving | None = None
+    try:
+        async for chunk in chunks:
+            view = memoryview(chunk)
+            if head is None or receiving is None:
+                view = _fill(start, view, PREFIX.size)
+                if len(start) < PREFIX.size:
+                    continue
+                end = PREFIX.size + head_length(start)
+                view = _fill(start, view, end)
+                if len(start) < end:
+                    continue
+                head = parse_head(start[PREFIX.size :])
+                _check_length(head, end, total)
+                receiving = head_of(head)
+            if len(view) > receiving.missing:
+                over = len(view) - receiving.missing
+                raise FramingError(f"goes on for {over} bytes and more behind its files; send none there")
+            await receiving.take(view)
+        if head is None or receiving is None:
+            raise FramingError(f"ends after {len(start)} bytes, within its head; send the whole frame")
+        if receiving.missing:
+            raise FramingError(f"ends {receiving.missing} bytes before its last file does; send the whole frame")
+        return head, receiving
+    except BaseException as error:
+        if receiving is not None:
+            await receiving.abort()
+        if isinstance(error, FramingError):
+            raise framing_problem(error) from None
+        if isinstance(error, OSError) and no_room(error):
+            raise full_disk(error) from None
+        raise
+
+
+def _fill(start: bytearray, view: memoryview, size: int) -> memoryview:
+    """Takes from `view` what is missing of the first `size` bytes; what is left."""
+    missing = size - len(start)
+    start += view[:missing]
+    return view[missing:]
+
+
+def framing_problem(error: FramingError) -> Problem:
+    """The answer to bytes that are no frame."""
+    fault, _, remedy = str(error).rpartition("; ")
+    return Problem(422, f"the frame {fault}", field="body", value=fault, remedy=remedy)
+
+
+def _check_length(head: FrameHead, start: int, total: int | None) -> None:
+    expected = start + sum(file.size for file in head.files)
+    if total is not None and total != expected:
+        raise FramingError(f"has {total} bytes where its head says {expected}; send what the head says")
+
+
+def in_batches(files: Sequence[FrameFile]) -> list[list[FrameFile]]:
+    """Consecutive files that are given to a thread together: each time costs more than a small file is worth."""
+    batches: list[list[FrameFile]] = []
+    for file in files:
+        if not batches or _bytes(batches[-1]) + file.size > BATCH:
+            batches.append([])
+        batches[-1].append(file)
+    return batches
+
+
+def _bytes(files: Sequence[FrameFile]) -> int:
+    return sum(file.size for file in files)
+
+
+_STANDARD = -(-(BATCH + BLOCK) // mmap.PAGESIZE) * mmap.PAGESIZE
+
+
+def _buffer(size: int) -> mmap.mmap:
+    """Memory that begins at a page."""
+    if size <= _STANDARD and _spare:
+        return _spare.pop()
+    return mmap.mmap(-1, max(size, _STANDARD))

@@ -1,0 +1,335 @@
+"""All that crosses the pipes between the service and the two processes of a scene. Small; bulk goes by file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.wire import Budget, Retention
+from scas4d_core.cameras import Camera, Rig
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSpec:
+    """What both processes of a scene are started with. `settings` is the engine's own object."""
+
+    engine: str
+    folder: Path
+    rig: Rig
+    settings: Any
+    minimum_cameras: int = 1
+    keep_states: Retention = field(default_factory=Retention)
+
+    @property
+    def states(self) -> Path:
+        """The folder of the committed states (`scas4d_core.storage.history.History`)."""
+        return self.folder / "states"
+
+    @property
+    def frames(self) -> Path:
+        """The folder of the frame log (`server.storage.frame_store`)."""
+        return self.folder / "frames"
+
+    @property
+    def journal(self) -> Path:
+        """Of the scene's facts (`server.storage.journal`)."""
+        return self.folder / "journal.log"
+
+    @property
+    def points(self) -> Path:
+        """The initial cloud, where one was given."""
+        return self.folder / "points.npz"
+
+
+# To the worker.
+
+
+@dataclass(frozen=True)
+class FrameReady:
+    """The pictures of a frame lie in records of the frame log (`server.storage.frame_store`).
+
+    `identity` is checked where one record holds the whole frame; of several, one a camera, a damaged one is left out.
+    `budget` is the one that holds for this frame, whenever it is reconstructed.
+    """
+
+    index: int
+    time: float
+    files: tuple[str, ...]
+    identity: str
+    budget: Budget = field(default_factory=Budget)
+
+
+@dataclass(frozen=True)
+class Mend:
+    """Files of the states' folder that were found damaged or gone: each is looked at, and written again if it can be.
+
+    `times` and `reports` of frames, as far as the service has them in memory.
+    """
+
+    names: tuple[str, ...]
+    times: dict[int, float] = field(default_factory=dict)
+    reports: dict[int, dict[str, Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Remake:
+    """The state of a frame is made again from its pictures, starting from that of the committed frame `base`."""
+
+    frame: FrameReady
+    base: int
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Finish what is at work and end."""
+
+
+# From the worker.
+
+
+@dataclass(frozen=True)
+class Ready:
+    """The worker takes frames. What it found committed: `indices`, those it could not read, and the newest's report.
+
+    `undone`: frames whose commit was taken back, to be given again. `faults`: why, a sentence each.
+    """
+
+    indices: tuple[int, ...] = ()
+    damaged: dict[int, str] = field(default_factory=dict)
+    report: dict[str, Any] = field(default_factory=dict)
+    undone: tuple[int, ...] = ()
+    faults: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Broken:
+    """What is committed cannot be gone on from."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Stalled:
+    """The frame cannot be committed for want of room on the disk; it is tried again in `seconds`."""
+
+    index: int
+    reason: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Progressed:
+    """The first frame is this far."""
+
+    stage: str
+    done: int
+    total: int
+    detail: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Committed:
+    """The frame's state is on disk, with `report` (as `History.report` gives it back).
+
+    `deleted`: states that retention deleted after it.
+    """
+
+    index: int
+    report: dict[str, Any]
+    deleted: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class SetAside:
+    """The frame was not committed; the state is that of the frame before. `fatal`: the scene cannot go on."""
+
+    index: int
+    reason: str
+    dropped: dict[str, str] = field(default_factory=dict)
+    fatal: bool = False
+
+
+class MendOutcome(StrEnum):
+    """What came of a file that was found damaged."""
+
+    WHOLE = "whole"
+    """It is not: it was written meanwhile, or the disk could not read it once."""
+    WRITTEN = "written"
+    """It was written again, the same bits."""
+    REPORT_LOST = "report_lost"
+    """The state was written again, the same bits; its report was damaged, and nobody has it in memory."""
+    DAMAGED = "damaged"
+    """It is, and nothing to write it from is in memory."""
+    GONE = "gone"
+    """It was deleted by the rules of the scene."""
+    REMADE = "remade"
+    """The state was made again from pictures."""
+    LOST = "lost"
+    """The state could not be made again."""
+    LATER = "later"
+    """The state is to be made again once the one before it is."""
+    NO_ROOM = "no_room"
+    """The disk is full; to be tried again."""
+
+
+@dataclass(frozen=True)
+class Mended:
+    """What came of one file (`Mend`) or of one state (`Remake`, with its new report)."""
+
+    name: str
+    outcome: MendOutcome
+    reason: str = ""
+    report: dict[str, Any] = field(default_factory=dict)
+
+
+# Of every process that reads states.
+
+
+@dataclass(frozen=True)
+class Damaged:
+    """Files of the states' folder that could not be read, by name with the reason."""
+
+    files: dict[str, str]
+
+
+# Of the replayer, which has a process for each replay.
+
+
+@dataclass(frozen=True)
+class ReplaySpec:
+    """Frames to be updated again in memory, with each of `iterations`; `base` is the commit before them.
+
+    `first`: the scene's first frame, which every update needs.
+    """
+
+    scene: SceneSpec
+    first: int
+    base: int
+    frames: tuple[FrameReady, ...]
+    iterations: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class ReplayUpdated:
+    """One update is over."""
+
+
+@dataclass(frozen=True)
+class ReplayPoint:
+    """What one number of iterations costs and brings (`scas4d_core.replay.Replayed`)."""
+
+    iterations: int
+    milliseconds: float
+    error: float | None
+    psnr: float | None
+    frames: int
+
+
+@dataclass(frozen=True)
+class ReplayEnded:
+    """Nothing more comes; `fault` is None where all were measured."""
+
+    fault: str | None = None
+
+
+# To the readers.
+
+
+@dataclass(frozen=True)
+class Refresh:
+    """Frames were committed, deleted or taken back: these, or None where every file has to be looked at."""
+
+    frames: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RenderQuery:
+    """A view of a committed frame.
+
+    `parts` is the number of parts where they are asked for and it is given; `labels` [N] are then the parts themselves.
+    """
+
+    camera: Camera
+    frame: int
+    kinds: tuple[str, ...]
+    format: Literal["png", "jpeg", "webp", "npz", "float32"]
+    background: tuple[float, float, float]
+    parts: int | None = None
+    quality: int | None = None
+    labels: NDArray[np.int16] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class TracksQuery:
+    """Trajectories over `frames` of ids, of pixels [Q, 2] of a camera, or of points [Q, 3], the latter two at `at`.
+
+    `project` are the cameras into which the trajectories are projected, with visibility.
+    """
+
+    frames: tuple[int, ...]
+    at: int
+    ids: tuple[int, ...] | None = None
+    camera: Camera | None = None
+    pixels: NDArray[np.float64] | None = None
+    points: NDArray[np.float64] | None = None
+    project: tuple[Camera, ...] = ()
+    format: Literal["json", "npz"] = "json"
+
+
+@dataclass(frozen=True)
+class PartsQuery:
+    """Labels of all Gaussians."""
+
+    count: int | None
+
+
+@dataclass(frozen=True)
+class LabelsQuery:
+    """Labels of all Gaussians as little-endian int16, in the order of the states."""
+
+    count: int | None
+
+
+@dataclass(frozen=True)
+class PlyQuery:
+    """A committed frame as a 3DGS .ply."""
+
+    frame: int
+
+
+Query = RenderQuery | TracksQuery | PartsQuery | LabelsQuery | PlyQuery
+
+
+@dataclass(frozen=True)
+class Ask:
+    """A query with a number to find its answer by."""
+
+    number: int
+    query: Query
+
+
+# From the readers.
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The body of an HTTP answer, encoded."""
+
+    number: int
+    body: bytes
+    media_type: str
+    headers: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Refused:
+    """The query cannot be answered; `status` is that of the HTTP answer."""
+
+    number: int
+    detail: str
+    status: int = 422

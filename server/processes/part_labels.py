@@ -1,0 +1,87 @@
+"""Part labels that last: each count's are kept beside the states, so that parts found later keep their labels.
+
+They are a derived thing: a lost or damaged file means that labels are numbered anew, by size.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.storage.history import History
+from server.processes.engine import Reader
+
+log = logging.getLogger("scas4d.renderer")
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Labels [N] and the newest frame that they were found from."""
+
+    labels: NDArray[np.int64]
+    frame: int
+
+
+class PartLabels:
+    """The labels of one scene by count; None is the count that is chosen.
+
+    Args:
+        folder: where they are kept; made when needed.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._known: dict[int | None, Known] = {}
+
+    def of(self, reader: Reader, history: History, count: int | None) -> NDArray[np.int64]:
+        """[N] labels from all that is committed, found once for each newest frame.
+
+        Raises:
+            ValueError: as ``Reader.parts``.
+        """
+        newest = history.indices[-1]
+        known = self._known.get(count) or self._read(count)
+        if known is None or known.frame != newest:
+            before = None if known is None else known.labels
+            if before is not None and len(before) != len(history.gaussians(newest)):
+                before = None
+            known = Known(reader.parts(count, before), newest)
+            self._write(count, known)
+        self._known[count] = known
+        return known.labels
+
+    def _file(self, count: int | None) -> Path:
+        return self._folder / f"{'chosen' if count is None else count}.npz"
+
+    def _read(self, count: int | None) -> Known | None:
+        file = self._file(count)
+        try:
+            with file.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
+                return Known(arrays["labels"].astype(np.int64), int(arrays["frame"]))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            log.warning("%s cannot be read (%s): parts are numbered anew", file, error)
+            return None
+
+    def _write(self, count: int | None, known: Known) -> None:
+        arrays: dict[str, Any] = {"labels": known.labels.astype(np.int16), "frame": np.int64(known.frame)}
+        file = self._file(count)
+        beside = file.with_name(f".{file.name}.{os.getpid()}.part")
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            with beside.open("wb") as opened:
+                np.savez(opened, **arrays)
+            beside.replace(file)
+        except OSError as error:  # a full disk costs the numbering after a restart, not the answer
+            log.warning("%s cannot be written (%s): after a restart parts are numbered anew", file, error)
+            with contextlib.suppress(OSError):
+                beside.unlink()

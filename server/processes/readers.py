@@ -1,0 +1,343 @@
+"""The processes of a scene that answer from what is committed, and the queues before them.
+
+Views have a process of their own: a track query over a long history, or a search for parts, never stands before them.
+That other process starts with the first such question, runs at a lower priority, and is ended where nobody waits for
+what it is busy with any more: nothing in it can be interrupted in any other way, and it holds nothing that is not on
+disk. A process that ends by itself is started again, each time after a longer pause.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import OrderedDict, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from server.health import metrics
+from server.problems import Problem, counted
+from server.processes import renderer, track_answers
+from server.processes.messages import (
+    Answer,
+    Ask,
+    Damaged,
+    LabelsQuery,
+    PartsQuery,
+    Query,
+    Refresh,
+    Refused,
+    RenderQuery,
+    SceneSpec,
+    TracksQuery,
+)
+from server.processes.placement import Entry, Placement, Process
+from server.settings import ServerSettings
+
+GRACE_VIEWS_S, GRACE_BULK_S = 10.0, 1.0
+"""How long a process may go on with a question that nobody waits for any more. Views are short, and a new process takes
+a second or two to start."""
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
+"""Before a process that ended by itself is started again; twice as long after each further end without an answer."""
+COUNTS_KEPT = 8
+"""Numbers of parts whose labels are kept."""
+
+Noticed = Callable[[Mapping[str, str]], None]
+"""Told of files of the states' folder that cannot be read, by name with the reason."""
+
+log = logging.getLogger("scas4d.server")
+
+
+@dataclass(eq=False)
+class _Turn:
+    """A question and who waits for its answer."""
+
+    number: int
+    query: Query
+    answer: asyncio.Future[Answer | Refused]
+
+
+class Line:
+    """A process and the queue before it. One question is with the process; whoever leaves the queue is never begun.
+
+    Args:
+        entry: what runs in the process. eager: start it now, not with the first question.
+        grace: seconds, see above. damaged: told of files that the process found damaged.
+
+    Attributes:
+        process: or None, before the first question and while it rests.
+    """
+
+    def __init__(
+        self,
+        entry: Entry,
+        spec: SceneSpec,
+        server: ServerSettings,
+        placement: Placement,
+        *,
+        eager: bool,
+        grace: float,
+        damaged: Noticed,
+    ) -> None:
+        self._entry = entry
+        self._spec = spec
+        self._server = server
+        self._placement = placement
+        self._grace = grace
+        self._damaged = damaged
+        self._waiting: deque[_Turn] = deque()
+        self._at_work: _Turn | None = None
+        self.process: Process | None = None
+        self._life: object = None
+        self._ending: set[asyncio.Task[None]] = set()
+        self._failures = 0
+        self._pause: asyncio.TimerHandle | None = None
+        self._asked = 0
+        self._closed = False
+        if eager:
+            self._start()
+
+    async def ask(self, query: Query) -> Answer | Refused:
+        """Waits for a turn and for the answer.
+
+        Raises:
+            Problem: 503, too many wait, or no answer within the time that the service allows.
+        """
+        if len(self._waiting) >= self._server.waiting_questions:
+            raise Problem(
+                503,
+                f"{counted(len(self._waiting), 'question')} of this scene waiting for an answer already",
+                field="SCAS4D_WAITING_QUESTIONS",
+                value=self._server.waiting_questions,
+                remedy="ask less often, or subscribe (WS …/stream): it sends the newest only",
+                headers={"Retry-After": "1"},
+            )
+        if self._closed:
+            return Refused(0, "the scene has ended", status=503)
+        self._asked += 1
+        turn = _Turn(self._asked, query, asyncio.get_running_loop().create_future())
+        self._waiting.append(turn)
+        self._next()
+        try:
+            return await asyncio.wait_for(turn.answer, self._server.answer_seconds)
+        except TimeoutError:
+            raise Problem(
+                503,
+                f"no answer within {self._server.answer_seconds:g} s",
+                field="SCAS4D_ANSWER_SECONDS",
+                value=self._server.answer_seconds,
+                remedy="ask for less at once, or again later",
+                headers={"Retry-After": "5"},
+            ) from None
+        finally:
+            if turn in self._waiting:
+                self._waiting.remove(turn)
+            if turn is self._at_work:  # the asker has gone
+                asyncio.get_running_loop().call_later(self._grace, self._give_up, turn)
+
+    def refresh(self, frames: tuple[int, ...] | None) -> None:
+        """There is more to read, or less."""
+        if self.process is not None:
+            self.process.send(Refresh(frames))
+
+    async def stop(self, seconds: float) -> None:
+        """Ends the process, at once where it is busy; whoever waits is refused, and whoever asks later."""
+        self._closed = True
+        if self._pause is not None:
+            self._pause.cancel()
+        turns = [*self._waiting, *([self._at_work] if self._at_work else [])]
+        process, self.process = self.process, None
+        busy, self._at_work = self._at_work is not None, None
+        if process is not None:
+            await process.stop(0 if busy else seconds)
+        await asyncio.gather(*self._ending)
+        for turn in turns:
+            _answer(turn, Refused(turn.number, "the scene has ended", status=503))
+
+    def _start(self) -> None:
+        self._life = life = object()
+        ended = partial(self._process_ended, life)
+        self.process = self._placement.start(self._entry, self._spec, self._answered, ended)
+
+    def _next(self) -> None:
+        """Gives the process the next question, where it is free."""
+        if self._at_work is not None or self._pause is not None or self._closed or not self._waiting:
+            return
+        if self.process is None:
+            self._start()
+        assert self.process is not None
+        self._at_work = self._waiting.popleft()
+        self.process.send(Ask(self._at_work.number, self._at_work.query))
+
+    def _answered(self, message: Answer | Refused | Damaged) -> None:
+        if isinstance(message, Damaged):
+            self._damaged(message.files)
+            return
+        turn = self._at_work
+        if turn is None or turn.number != message.number:  # of a process that was given up
+            return
+        self._failures = 0
+        self._at_work = None
+        _answer(turn, message)
+        self._next()
+
+    def _give_up(self, turn: _Turn) -> None:
+        """Ends the process if it is still busy with what nobody waits for."""
+        if self._at_work is not turn or self.process is None:
+            return
+        log.warning(
+            "scene %s: nobody waits for %s any more; its reader starts anew",
+            self._spec.folder.name, type(turn.query).__name__,
+        )  # fmt: skip
+        task = asyncio.ensure_future(self.process.stop(0))
+        self._ending.add(task)
+        task.add_done_callback(self._ending.discard)
+        self.process = self._at_work = self._life = None
+        self._next()
+
+    def _process_ended(self, life: object, reason: str) -> None:
+        if life is not self._life or self._closed:
+            return
+        metrics.RESTARTS.labels("reader").inc()
+        turn, self.process, self._at_work = self._at_work, None, None
+        pause = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2**self._failures)
+        self._failures += 1
+        log.error("scene %s: a reader is gone (%s); the next in %g s", self._spec.folder.name, reason, pause)
+        if turn is not None:
+            detail = f"the reader ended while it was busy with this: {reason}"
+            _answer(turn, Refused(turn.number, detail, status=500))
+        self._pause = asyncio.get_running_loop().call_later(pause, self._go_on)
+
+    def _go_on(self) -> None:
+        self._pause = None
+        self._next()
+
+
+def _answer(turn: _Turn, answer: Answer | Refused) -> None:
+    if not turn.answer.done():
+        turn.answer.set_result(answer)
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Parts as they were found from the frames up to one.
+
+    Attributes:
+        commits: how many commits the reader had been told of. frame: the last one read, as text.
+    """
+
+    commits: int
+    frame: str
+    labels: NDArray[np.int16]
+
+
+class Readers:
+    """All that answers questions about a scene's committed frames.
+
+    Attributes:
+        views, bulk: the two processes.
+    """
+
+    def __init__(self, spec: SceneSpec, server: ServerSettings, placement: Placement, damaged: Noticed) -> None:
+        self._spec = spec
+        of_all = partial(Line, spec=spec, server=server, placement=placement, damaged=damaged)
+        self.views = of_all(renderer.views, eager=True, grace=GRACE_VIEWS_S)
+        self.bulk = of_all(renderer.bulk, eager=False, grace=GRACE_BULK_S)
+        self._commits = 0
+        self._labels: OrderedDict[int | None, Labels] = OrderedDict()
+        self._finding: dict[int | None, asyncio.Task[Labels]] = {}
+
+    async def ask(self, query: Query) -> Answer:
+        """The answer to a question. If the asker is cancelled, so is the question.
+
+        Raises:
+            Problem: 4xx where the question cannot be answered, 503 where it takes too long or too many wait, 500 for a
+                fault of the reader.
+        """
+        if isinstance(query, TracksQuery):
+            return await self._tracks(query)
+        if not isinstance(query, RenderQuery):
+            return _checked(await self.bulk.ask(query), query)
+        if "parts" not in query.kinds:
+            return _checked(await self.views.ask(query), query)
+        labels = await self._labels_of(query.parts)
+        answer = _checked(await self.views.ask(replace(query, labels=labels.labels)), query)
+        return replace(answer, headers={**answer.headers, "X-Parts-Frame": labels.frame})
+
+    def refresh(self, frames: tuple[int, ...] | None = None) -> None:
+        """Frames were committed, deleted or taken back: these, or any where not told."""
+        self._commits += 1
+        self.views.refresh(frames)
+        self.bulk.refresh(frames)
+
+    async def stop(self, seconds: float) -> None:
+        """Ends the processes; whoever waits is refused."""
+        for task in self._finding.values():
+            task.cancel()
+        await asyncio.gather(self.views.stop(seconds), self.bulk.stop(seconds))
+
+    async def _tracks(self, query: TracksQuery) -> Answer:
+        """Trajectories; a long question in pieces, so that others come in between."""
+        pieces = track_answers.pieces(query)
+        if len(pieces) * len(pieces[0]) == 1:
+            return _checked(await self.bulk.ask(query), query)
+        answers = [[_checked(await self.bulk.ask(piece), piece).body for piece in row] for row in pieces]
+        return Answer(0, *await asyncio.to_thread(track_answers.together, answers, query, self._spec))
+
+    async def _labels_of(self, count: int | None) -> Labels:
+        """The labels for a view: never waited for but the first time, then those found last.
+
+        They are found from the whole history, which takes longer than a view. After a commit they are found anew while
+        views go on with those before.
+        """
+        known = self._labels.get(count)
+        if known is not None and known.commits == self._commits:
+            return known
+        if count not in self._finding:
+            task = asyncio.ensure_future(self._find(count))
+            self._finding[count] = task
+            task.add_done_callback(partial(self._found, count))
+        return await asyncio.shield(self._finding[count]) if known is None else known
+
+    async def _find(self, count: int | None) -> Labels:
+        commits = self._commits
+        answer = _checked(await self.bulk.ask(LabelsQuery(count)), LabelsQuery(count))
+        labels = np.frombuffer(answer.body, "<i2")
+        return Labels(commits, answer.headers["X-Parts-Frame"], labels)
+
+    def _found(self, count: int | None, task: asyncio.Task[Labels]) -> None:
+        del self._finding[count]
+        if task.cancelled() or task.exception() is not None:
+            return
+        self._labels[count] = task.result()
+        self._labels.move_to_end(count)
+        while len(self._labels) > COUNTS_KEPT:
+            self._labels.popitem(last=False)
+
+
+def _checked(answer: Answer | Refused, query: Query) -> Answer:
+    if isinstance(answer, Answer):
+        return answer
+    if answer.status != 422:
+        remedies = {404: "ask for a frame that the scene's status counts as committed", 503: "ask again later"}
+        remedy = remedies.get(answer.status, "this is a fault of the service; its log has the traceback")
+        raise Problem(
+            answer.status, answer.detail, remedy=remedy, headers={"Retry-After": "1"} if answer.status == 503 else None
+        )
+    field, value = _asked(query)
+    fault, _, remedy = answer.detail.rpartition("; ")
+    raise Problem(
+        422, fault or answer.detail, field=field, value=value, remedy=remedy if fault else f"give another {field}"
+    )
+
+
+def _asked(query: Query) -> tuple[str, object]:
+    """What of a question the reader can find wrong that the door cannot: its field and value."""
+    if isinstance(query, TracksQuery):
+        return ("ids", list(query.ids)) if query.ids is not None else ("at", query.at)
+    if isinstance(query, LabelsQuery | PartsQuery):
+        return "count", query.count if query.count is not None else "chosen by rule"
+    return "frame", query.frame

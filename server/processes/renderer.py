@@ -1,0 +1,176 @@
+"""The processes that answer from committed states: views, and in another one tracks, parts, exports.
+
+Neither waits for an update; how questions come to them is told in ``readers``.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.wire import parts_model
+from scas4d_core.storage.error_text import told
+from scas4d_core.storage.frame_files import frame_file
+from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFrameError
+from server.processes import encode, track_answers
+from server.processes.engine import Reader, load_engine
+from server.processes.messages import (
+    Answer,
+    Ask,
+    Damaged,
+    LabelsQuery,
+    PartsQuery,
+    PlyQuery,
+    Query,
+    Refresh,
+    Refused,
+    RenderQuery,
+    SceneSpec,
+    Stop,
+    TracksQuery,
+)
+from server.processes.part_labels import PartLabels
+
+BULK_NICE = 10
+"""Added to the niceness of the process for tracks, parts and exports: views and updates go ahead of them."""
+
+DAMAGED_AT_ONCE = 8
+"""States that may turn out damaged in one search for parts, which is then made without them."""
+
+log = logging.getLogger("scas4d.renderer")
+
+
+def views(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
+    """The process for views. Runs until told to stop, or until the service is gone."""
+    _serve(spec, connection)
+
+
+def bulk(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
+    """The process for all that may take long."""
+    os.nice(BULK_NICE)
+    _serve(spec, connection)
+
+
+def _serve(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    renderer = Renderer(spec)
+    while True:
+        try:
+            message = connection.recv()
+        except (EOFError, OSError):
+            break
+        if isinstance(message, Stop):
+            break
+        if isinstance(message, Refresh):
+            renderer.changed(message.frames)
+        elif isinstance(message, Ask):
+            answer = renderer.answer(message)
+            if found := renderer.take_faults():  # before whoever was refused asks again
+                connection.send(Damaged(found))
+            connection.send(answer)
+    logging.shutdown()
+    os._exit(0)
+
+
+class Renderer:
+    """Answers queries one after the other."""
+
+    def __init__(self, spec: SceneSpec) -> None:
+        self.spec = spec
+        self.engine = load_engine(spec.engine)
+        self._stale: set[int] | None = set()
+        self._history: History | None = None
+        self._reader: Reader | None = None
+        self._parts = PartLabels(spec.folder / "parts")
+
+    @property
+    def history(self) -> History:
+        """What is committed now: opened once, then kept up to date by what is new in its folder."""
+        if self._history is None:
+            self._history = History.load(self.spec.states)
+        elif self._stale is None or self._stale:
+            self._history.refresh(self._stale)
+        self._stale = set()
+        return self._history
+
+    def changed(self, frames: tuple[int, ...] | None) -> None:
+        """These frames were committed, deleted or taken back since; None: any may have been."""
+        self._stale = None if frames is None or self._stale is None else self._stale | set(frames)
+
+    @property
+    def reader(self) -> Reader:
+        """The engine's reader of all that is committed."""
+        history = self.history
+        if self._reader is None:
+            self._reader = self.engine.reader(self.spec.rig, self.spec.settings, history)
+        return self._reader
+
+    def labels(self, count: int | None) -> NDArray[np.int64]:
+        """Part labels, found once for what is committed now."""
+        return self._parts.of(self.reader, self.history, count)
+
+    def take_faults(self) -> dict[str, str]:
+        """Files that were found damaged or gone since this was asked last, by name with the reason."""
+        return {} if self._history is None else self._history.take_faults()
+
+    def _note_missing(self, query: Query) -> None:
+        """Frames that the service takes for committed and that are not here: it knows whether they were deleted."""
+        frames = query.frames if isinstance(query, TracksQuery) else (getattr(query, "frame", None),)
+        history = self._history
+        if history is not None and history.files is not None:
+            known = set(history.indices)
+            for index in frames:
+                if index is not None and index not in known:
+                    history.files.faults.setdefault(frame_file(index), f"{frame_file(index)} is gone")
+
+    def answer(self, ask: Ask) -> Answer | Refused:
+        """The encoded answer, or why there is none."""
+        asked = type(ask.query).__name__
+        for more in range(DAMAGED_AT_ONCE, -1, -1):
+            try:
+                return self._answer(ask.number, ask.query)
+            except DamagedFrameError as error:
+                log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
+                if more and isinstance(ask.query, PartsQuery | LabelsQuery):  # found from all others
+                    continue
+                return Refused(ask.number, f"{told(error)}; it is mended if it can be", status=503)
+            except UnreadableFrameError as error:  # deleted since the door looked
+                log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
+                self._note_missing(ask.query)
+                return Refused(ask.number, told(error), status=404)
+            except ValueError as error:
+                log.warning("scene %s refused %s: %s", self.spec.folder.name, asked, error)
+                return Refused(ask.number, told(error))
+            except Exception as error:
+                log.exception("scene %s, %s", self.spec.folder.name, asked)
+                return Refused(ask.number, f"{type(error).__name__}: {told(error)}", status=500)
+        raise AssertionError("the last turn returns")
+
+    def _answer(self, number: int, query: Query) -> Answer:
+        match query:
+            case RenderQuery():
+                view = self.reader.render(query.camera, query.frame, background=query.background, labels=query.labels)
+                body, media_type, headers = encode.view(view, query.kinds, query.format, query.quality)
+                return Answer(number, body, media_type, {**headers, "X-Frame": str(query.frame)})
+            case TracksQuery():
+                found = track_answers.find(self.reader, self.history, query)
+                return Answer(number, *track_answers.encoded(found, query, track_answers.metres_per_unit(self.spec)))
+            case PartsQuery():
+                labels, last = self.labels(query.count), self.history.indices[-1]
+                model = parts_model(labels, self.history.gaussians(last).ids, last)
+                return Answer(number, model.model_dump_json().encode(), "application/json")
+            case LabelsQuery():
+                labels = self.labels(query.count)
+                body = labels.astype("<i2").tobytes()
+                headers = {"X-Parts-Frame": str(self.history.indices[-1])}
+                return Answer(number, body, "application/octet-stream", headers)
+            case PlyQuery():
+                file = self.spec.folder / "splat.ply"
+                self.reader.write_ply(file, query.frame)
+                return Answer(number, file.read_bytes(), "application/octet-stream")

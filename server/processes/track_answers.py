@@ -1,0 +1,155 @@
+"""Trajectories as the bytes of an answer, and long questions cut into short ones.
+
+A reader answers one question after the other; a long one is asked in pieces, so that others come in between, and put
+together again. docs/tracks.md has the layout of the npz.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.wire import tracks_model
+from scas4d_core.cameras import Camera
+from scas4d_core.query.tapvid3d import tapvid3d
+from scas4d_core.storage.history import History
+from server.processes import encode
+from server.processes.engine import Reader
+from server.processes.messages import SceneSpec, TracksQuery
+
+Arrays = dict[str, NDArray[Any]]
+
+PIECE_QUERIES = 2048
+"""Points of one piece: some 0.3 s to find what carries them among 25,000 Gaussians."""
+PIECE_POINTS = 32_768
+"""Points times frames of one piece: some 2 s."""
+PIECE_VIEWS = 64
+"""Depth pictures of one piece, one a frame and camera in which visibility is asked: some 1 s at 256×256."""
+
+
+def metres_per_unit(spec: SceneSpec) -> float:
+    """Metres in a unit of the scene's world."""
+    return spec.rig.world_frame(spec.settings.scene.metres_per_unit).metres_per_unit
+
+
+def cameras_of(query: TracksQuery) -> list[Camera]:
+    """The cameras in which pixels and visibility are told: those asked for and, first, that of the query's pixels."""
+    own = [query.camera] if query.pixels is not None and query.camera is not None else []
+    names = [camera.name for camera in own]
+    return own + [camera for camera in query.project if camera.name not in names]
+
+
+def find(reader: Reader, history: History, query: TracksQuery) -> Arrays:
+    """What a reader finds: ``tracks_world`` [T, Q, 3], ``confidence`` [T, Q] and more, as docs/tracks.md has it."""
+    frames = list(query.frames)
+    if query.ids is not None:
+        tracks = reader.tracks_of_ids(np.array(query.ids, dtype=np.int64), frames)
+    elif query.pixels is not None and query.camera is not None:
+        tracks = reader.tracks_of_pixels(query.camera, query.pixels, query.at, frames)
+    else:
+        assert query.points is not None
+        tracks = reader.tracks_of_points(query.points, query.at, frames)
+    for camera in cameras_of(query):
+        if camera.name not in tracks.visibility:
+            tracks = reader.with_visibility(tracks, camera, query.at)
+    return {
+        "tracks_world": tracks.positions,
+        "confidence": tracks.confidence,
+        "ids": tracks.ids,
+        "frames": np.array(frames, dtype=np.int64),
+        "times": np.array([history.time(frame) for frame in frames]),
+        **{f"visibility.{camera.name}": tracks.visibility[camera.name] for camera in cameras_of(query)},
+    }
+
+
+def encoded(found: Arrays, query: TracksQuery, metres_per_unit: float) -> tuple[bytes, str]:
+    """Body and media type of the answer, in the format that the query asks for."""
+    cameras = cameras_of(query)
+    pixels = {camera.name: camera.project(found["tracks_world"])[0] for camera in cameras}
+    if query.format == "npz":
+        arrays = found | {f"pixels.{name}": uv for name, uv in pixels.items()}
+        return encode.npz(arrays | _layout(found, query, cameras, metres_per_unit)), encode.NPZ
+    asked = [camera.name for camera in query.project]
+    model = tracks_model(
+        found["frames"].tolist(),
+        found["times"].tolist(),
+        found["ids"],
+        found["confidence"],
+        found["tracks_world"],
+        {name: pixels[name] for name in asked},
+        {name: found[f"visibility.{name}"] for name in asked},
+    )
+    return model.model_dump_json().encode(), "application/json"
+
+
+def _layout(found: Arrays, query: TracksQuery, cameras: Sequence[Camera], metres_per_unit: float) -> Arrays:
+    """The keys of TAPVid-3D, in the first camera; where none is named, the points alone, in the axes of the world."""
+    if not cameras:
+        return {"tracks_XYZ": (found["tracks_world"] * metres_per_unit).astype(np.float32)}
+    row = query.frames.index(query.at) if query.at in query.frames else -1
+    visible = found[f"visibility.{cameras[0].name}"]
+    return tapvid3d(
+        found["tracks_world"], visible, cameras[0], row, metres_per_unit=metres_per_unit, pixels=query.pixels
+    )
+
+
+def pieces(query: TracksQuery) -> list[list[TracksQuery]]:
+    """The query cut by points, then by frames; a short one is one piece. Every piece is answered as npz."""
+    queries = next(value for value in (query.ids, query.pixels, query.points) if value is not None)
+    frames = min(PIECE_POINTS // min(len(queries), PIECE_QUERIES), PIECE_VIEWS // max(1, len(cameras_of(query))))
+    return [
+        [
+            replace(_points(query, start, stop), frames=query.frames[first:last], format="npz")
+            for first, last in _cuts(len(query.frames), max(1, frames))
+        ]
+        for start, stop in _cuts(len(queries), PIECE_QUERIES)
+    ]
+
+
+def joined(answers: Sequence[Sequence[bytes]]) -> Arrays:
+    """What the pieces found, put together: inner ones follow each other in time, outer ones hold more points."""
+    rows = [_in_time([_found(body) for body in row]) for row in answers]
+    once = ("frames", "times")
+    return {
+        name: rows[0][name]
+        if name in once
+        else np.concatenate([row[name] for row in rows], axis=0 if name == "ids" else 1)
+        for name in rows[0]
+    }
+
+
+def together(answers: Sequence[Sequence[bytes]], query: TracksQuery, spec: SceneSpec) -> tuple[bytes, str]:
+    """Body and media type of the whole answer, from those of its pieces."""
+    return encoded(joined(answers), query, metres_per_unit(spec))
+
+
+def _in_time(found: Sequence[Arrays]) -> Arrays:
+    return {
+        name: found[0][name] if name == "ids" else np.concatenate([piece[name] for piece in found]) for name in found[0]
+    }
+
+
+def _found(body: bytes) -> Arrays:
+    """What ``find`` found, out of an answer as npz."""
+    names = ("tracks_world", "confidence", "ids", "frames", "times")
+    with np.load(io.BytesIO(body), allow_pickle=False) as file:
+        return {name: file[name] for name in file.files if name in names or name.startswith("visibility.")}
+
+
+def _points(query: TracksQuery, start: int, stop: int) -> TracksQuery:
+    return replace(
+        query,
+        ids=None if query.ids is None else query.ids[start:stop],
+        pixels=None if query.pixels is None else query.pixels[start:stop],
+        points=None if query.points is None else query.points[start:stop],
+    )
+
+
+def _cuts(count: int, size: int) -> list[tuple[int, int]]:
+    return list(pairwise([*range(0, count, size), count]))

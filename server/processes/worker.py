@@ -1,0 +1,262 @@
+"""The process that owns a scene's `Reconstruction`: takes it up again, decodes frames, steps, commits, reports."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import threading
+import time
+from collections import deque
+from multiprocessing.connection import Connection
+from typing import Any
+
+from client.wire import Budget
+from scas4d_core.captures import Frame, InitialPoints
+from scas4d_core.storage.error_text import told
+from scas4d_core.storage.history import History, HistoryError
+from scas4d_core.storage.npz import read_npz
+from server.processes.decoding import decode, read
+from server.processes.engine import Reconstruction, load_engine
+from server.processes.messages import (
+    Broken,
+    Committed,
+    FrameReady,
+    Mend,
+    Progressed,
+    Ready,
+    Remake,
+    SceneSpec,
+    SetAside,
+    Stalled,
+    Stop,
+)
+from server.repair import repairs
+from server.repair.repairs import mend_at_start
+from server.storage.disk import FolderLock, no_room
+from server.storage.frame_store import FrameDamage, holds
+
+PROGRESS_EVERY_S = 0.2
+PARENT_EVERY_S = 0.5
+NICE = 5
+"""Added to the worker's niceness: requests and views go ahead of updates (docs/live-views.md: what that is worth)."""
+STALL_S, LONGEST_STALL_S = 1.0, 30.0
+
+log = logging.getLogger("scas4d.worker")
+
+
+def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
+    """Runs until told to stop, or until the service is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the service says when to stop
+    os.nice(NICE)
+    end_with_parent()
+    # A service that was killed leaves a worker in the middle of an update: two must not commit to one history.
+    lock = FolderLock(spec.folder / "worker.lock", wait=True)
+    with contextlib.suppress(OSError):  # a full disk is no reason not to work
+        lock.write(f"{os.getpid()}\n")
+    worker = Worker(spec, connection)
+    try:
+        if worker.open():
+            while not isinstance(message := worker.next(), Stop):
+                match message:
+                    case FrameReady():
+                        worker.take(message)
+                    case Mend():
+                        worker.mend(message)
+                    case Remake():
+                        worker.remake(message)
+    except (EOFError, OSError) as error:
+        if no_room(error):
+            raise
+    except _Stopped:
+        pass
+    # Numerical libraries keep threads that can hang at exit, and all that matters is on disk.
+    logging.shutdown()
+    lock.release()
+    os._exit(0)
+
+
+def end_with_parent() -> None:
+    """The process ends soon after the one that started it: for those that may be busy for long."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(PARENT_EVERY_S)
+        os._exit(0)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+class _Stopped(Exception):
+    """Told to stop while waiting for room on the disk."""
+
+
+class Worker:
+    """One scene. Every frame ends as `Committed` or `SetAside`, or with the process."""
+
+    def __init__(self, spec: SceneSpec, connection: Connection[Any, Any]) -> None:
+        self.spec = spec
+        self.connection = connection
+        self.engine = load_engine(spec.engine)
+        self.states: History | None = None
+        self.reconstruction: Reconstruction | None = None
+        self._progress_at = 0.0
+        self._budget = Budget()
+        self._write_seconds: float | None = None
+        self._publish_seconds = 0.0
+        self._later: deque[Any] = deque()
+
+    def open(self) -> bool:
+        """Takes up what is committed and says so; False where it cannot be gone on from."""
+        try:
+            self.states = history = History.open(self.spec.states)
+            undone: tuple[int, ...] = ()
+            faults: tuple[str, ...] = ()
+            if history.indices:
+                self.reconstruction = self.engine.resume(
+                    self.spec.rig, self.spec.settings, history, held=lambda index: holds(self.spec.frames, index)
+                )
+                if self.reconstruction.resumed is not None:
+                    undone = tuple(self.reconstruction.resumed.undone)
+                    faults = tuple(self.reconstruction.resumed.faults)
+                faults += tuple(mend_at_start(history))
+            report = history.report(history.indices[-1]) if history.indices else {}
+            self.connection.send(Ready(tuple(history.indices), dict(history.damaged), report, undone, faults))
+        except (HistoryError, ValueError) as error:  # what is damaged says so with a ValueError
+            log.exception("scene %s cannot be taken up again", self.spec.folder.name)
+            self.connection.send(Broken(f"{type(error).__name__}: {told(error)}"))
+            return False
+        return True
+
+    def take(self, message: FrameReady) -> None:
+        """Reconstructs one frame; where the disk is full, again until there is room."""
+        stall = STALL_S
+        while True:
+            try:
+                done = self.finish(message)
+                began = time.perf_counter()
+                self.connection.send(done)
+                self._publish_seconds += time.perf_counter() - began
+                return
+            except Exception as error:  # whatever came of it, as zipfile closing what it could not write
+                if not no_room(error):
+                    raise
+                log.warning("scene %s, frame %d: %s", self.spec.folder.name, message.index, error)
+                self.connection.send(Stalled(message.index, told(error), stall))
+            self._await_room(stall)
+            stall = min(2 * stall, LONGEST_STALL_S)
+
+    def next(self) -> Any:
+        """The next message; those that came while a frame waited for room first."""
+        return self._later.popleft() if self._later else self.connection.recv()
+
+    def _await_room(self, seconds: float) -> None:
+        """Waits; only being told to stop ends it early, everything else is for later.
+
+        Raises:
+            _Stopped: it was.
+        """
+        until = time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0 and self.connection.poll(left):
+            message = self.connection.recv()
+            if isinstance(message, Stop):
+                raise _Stopped
+            self._later.append(message)
+
+    def finish(self, message: FrameReady) -> Committed | SetAside:
+        """Commits a frame, or says why not.
+
+        Raises:
+            OSError: the disk is full; nothing is committed.
+        """
+        dropped: dict[str, str] = {}
+        began = time.perf_counter()
+        try:
+            frame, dropped = decode(self.spec.rig, message, read(self.spec.frames, message))
+            least = self.spec.minimum_cameras
+            if len(frame.images) < least:
+                reason = f"{len(frame.images)} cameras' pictures are left, the scene's minimum is {least}"
+                return SetAside(message.index, reason, dropped)
+            return self.reconstruct(frame, dropped, message.budget, began)
+        except FrameDamage as error:
+            return SetAside(message.index, f"its record in the frame log is damaged: {error}", dropped)
+        except Exception as error:  # whatever the engine raises, the service goes on and says so
+            if no_room(error):
+                raise
+            log.exception("scene %s, frame %d", self.spec.folder.name, message.index)
+            # Without a first frame there is nothing to go on from.
+            first = self.reconstruction is None
+            return SetAside(message.index, f"{type(error).__name__}: {told(error)}", dropped, fatal=first)
+
+    def mend(self, message: Mend) -> None:
+        """Looks at files that were found damaged, and says what came of each."""
+        assert self.states is not None
+        for mended in repairs.mend(self.states, self.reconstruction, message):
+            self.connection.send(mended)
+
+    def remake(self, message: Remake) -> None:
+        """Makes a state again from its pictures, and says whether it could be."""
+        assert self.states is not None
+        frame = message.frame
+
+        def pictures() -> tuple[Frame, dict[str, str]]:
+            return decode(self.spec.rig, frame, read(self.spec.frames, frame))
+
+        for mended in repairs.remake(self.engine, self.spec, self.states, message, pictures):
+            self.connection.send(mended)
+
+    def reconstruct(self, frame: Frame, dropped: dict[str, str], budget: Budget, began: float) -> Committed:
+        """Runs the first frame or an update, and commits. `began`: `perf_counter` before decoding."""
+        assert self.states is not None
+        if self.reconstruction is None:
+            self.reconstruction = self.engine.start(
+                self.spec.rig,
+                frame,
+                self.spec.settings,
+                points=self.points(),
+                progress=self.progress,
+                history=self.states,
+                dropped=dropped,
+                started=began,
+            )
+        else:
+            if budget != self._budget:
+                self.reconstruction.spend(**budget.model_dump())
+                self._budget = budget
+            notes = {
+                "budget": budget.model_dump(),
+                "write_seconds": self._write_seconds,
+                "publish_seconds": self._publish_seconds,
+            }
+            report = self.reconstruction.step(frame, dropped=dropped, notes=notes, started=began)
+            self._write_seconds = max(0.0, time.perf_counter() - began - sum(report.seconds.values()))
+        ended = time.perf_counter()
+        committed = self.states.report(frame.index)
+        self._publish_seconds = time.perf_counter() - ended
+        return Committed(frame.index, committed, tuple(self.retain()))
+
+    def retain(self) -> list[int]:
+        """Deletes old states by the scene's rule; what cannot be deleted now is next time."""
+        assert self.states is not None
+        rule = self.spec.keep_states
+        if rule.last is None and rule.bytes is None:
+            return []
+        last, size = (None if value is None else max(1, value) for value in (rule.last, rule.bytes))
+        return self.states.retain(last=last, size_bytes=size)
+
+    def points(self) -> InitialPoints | None:
+        """The initial cloud that was put before the first frame."""
+        if not self.spec.points.exists():
+            return None
+        arrays = read_npz(self.spec.points)
+        return InitialPoints(arrays["positions"], arrays["colours"], arrays.get("foreground"))
+
+    def progress(self, progress: Any) -> None:
+        """Passes progress on, a few times a second at most, and the end of a stage always."""
+        now = time.monotonic()
+        if now - self._progress_at >= PROGRESS_EVERY_S or progress.done >= progress.total:
+            self._progress_at = now
+            detail = {name: float(value) for name, value in progress.detail.items()}
+            self.connection.send(Progressed(progress.stage, int(progress.done), int(progress.total), detail))

@@ -1,0 +1,149 @@
+"""Damaged files of the states, in the process that owns them: written again from memory, copies or pictures."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from scas4d_core.captures import Frame
+from scas4d_core.storage.error_text import told
+from scas4d_core.storage.frame_files import (
+    FIRST_COPY,
+    FIXED_COPY,
+    FIXED_FILE,
+    FrameFiles,
+    checkpoint_of,
+    fault_of,
+    frame_of,
+)
+from scas4d_core.storage.history import NEWEST_KEPT, PER_FRAME, History
+from server.processes.engine import Engine, Reconstruction
+from server.processes.messages import Mend, Mended, MendOutcome, Remake, SceneSpec
+from server.storage.disk import no_room
+
+Decode = Callable[[], tuple[Frame, dict[str, str]]]
+
+log = logging.getLogger("scas4d.worker")
+
+
+def mend_at_start(history: History) -> list[str]:
+    """What every frame needs, and its copies, written again where they are damaged; a sentence for each."""
+    try:
+        mended = history.mend_fixed()
+    except OSError as error:  # states can be read all the same: a disk that takes nothing must not keep them away
+        log.warning("what every frame needs cannot be mended: %s", error)
+        return []
+    history.take_faults()  # of files that were just written again, or that `History.damaged` names
+    return [
+        f"{reason}; it was written again from its copy"
+        for name, reason in mended.items()
+        if not (name in (FIXED_COPY, FIRST_COPY) and reason.endswith("is gone"))  # an earlier version wrote none
+    ]
+
+
+def mend(history: History, reconstruction: Reconstruction | None, message: Mend) -> Iterator[Mended]:
+    """Looks at each file and writes it again where it can be, the same bits."""
+    assert history.files is not None
+    for name in message.names:
+        try:
+            outcome, reason = _mend(history, history.files, reconstruction, name, message)
+        except Exception as error:
+            log.exception("%s cannot be mended", name)
+            outcome, reason = MendOutcome.NO_ROOM if no_room(error) else MendOutcome.DAMAGED, told(error)
+        yield Mended(name, outcome, reason)
+
+
+def _mend(
+    history: History, files: FrameFiles, reconstruction: Reconstruction | None, name: str, message: Mend
+) -> tuple[MendOutcome, str]:
+    fault = fault_of(files.directory / name)
+    if fault is None:
+        return MendOutcome.WHOLE, ""
+    index, known = frame_of(name), history.indices
+    if name in (FIXED_FILE, FIXED_COPY, FIRST_COPY) or (known and index == known[0]):
+        if name in history.mend_fixed():
+            return MendOutcome.WRITTEN, fault
+        return (MendOutcome.DAMAGED, fault) if known else (MendOutcome.GONE, "")
+    if index is not None:
+        if index not in known and index not in history.damaged:
+            return MendOutcome.GONE, ""
+        if history.write_again(index):
+            return MendOutcome.WRITTEN, fault
+        return _written_in_part(history, files, index, message), fault
+    checkpoint = checkpoint_of(name)
+    if checkpoint not in known[-NEWEST_KEPT:]:
+        return MendOutcome.GONE, ""
+    again = checkpoint is not None and reconstruction is not None and reconstruction.write_checkpoint(checkpoint)
+    return (MendOutcome.WRITTEN if again else MendOutcome.DAMAGED), fault
+
+
+def _written_in_part(history: History, files: FrameFiles, index: int, message: Mend) -> MendOutcome:
+    """Writes a file again of which only the report or the time is damaged: the state is whole in it."""
+    try:
+        arrays = files.read(index, PER_FRAME)
+        report = message.reports.get(index)
+        time = message.times[index] if index in message.times else files.time(index)
+    except (ValueError, FileNotFoundError):
+        return MendOutcome.DAMAGED
+    if index >= max(history.indices, default=-1):
+        return MendOutcome.DAMAGED
+    if report is None:
+        report = _report_of(files, index)
+    history.replace(index, time, arrays, report or {})
+    return MendOutcome.REPORT_LOST if report is None else MendOutcome.WRITTEN
+
+
+def _report_of(files: FrameFiles, index: int) -> dict[str, Any] | None:
+    """The report of a frame, where that is what is whole."""
+    try:
+        report: dict[str, Any] = json.loads(files.read(index, ("report",))["report"].tobytes())
+    except (ValueError, FileNotFoundError):
+        return None
+    return report
+
+
+def remake(engine: Engine, spec: SceneSpec, history: History, message: Remake, decode: Decode) -> Iterator[Mended]:
+    """Makes a state again from its pictures; whatever comes of it, the scene goes on as before.
+
+    Damage often has neighbours: where the state before it is damaged too, and nobody has noticed, that comes first.
+    """
+    index = message.frame.index
+    assert history.files is not None
+    name = history.files.path(index).name
+    base = history.files.path(message.base).name
+    if (fault := fault_of(history.files.directory / base)) is not None:
+        for mended in mend(history, None, Mend((base,), {}, {})):
+            yield mended
+            match mended.outcome:
+                case MendOutcome.WRITTEN | MendOutcome.WHOLE | MendOutcome.REPORT_LOST:
+                    continue
+                case MendOutcome.DAMAGED:
+                    yield Mended(name, MendOutcome.LATER, fault)
+                case MendOutcome.NO_ROOM:
+                    yield Mended(name, MendOutcome.NO_ROOM, mended.reason)
+                case _:
+                    yield Mended(name, MendOutcome.LOST, "the state before it is gone")
+            return
+    yield _remade(engine, spec, history, message, decode)
+
+
+def _remade(engine: Engine, spec: SceneSpec, history: History, message: Remake, decode: Decode) -> Mended:
+    index = message.frame.index
+    assert history.files is not None
+    name = history.files.path(index).name
+    try:
+        frame, dropped = decode()
+        if len(frame.images) < spec.minimum_cameras:
+            reason = f"{len(frame.images)} cameras' pictures are left, the scene's minimum is {spec.minimum_cameras}"
+            return Mended(name, MendOutcome.LOST, reason)
+        budget = message.frame.budget.model_dump()
+        notes = {"budget": budget}
+        report = engine.remake(
+            spec.rig, spec.settings, history, message.base, frame, budget, dropped=dropped, notes=notes
+        )
+        return Mended(name, MendOutcome.REMADE, report=report)
+    except Exception as error:  # whatever the engine raises, the service goes on and says so
+        log.exception("scene %s, frame %d cannot be made again", spec.folder.name, index)
+        return Mended(name, MendOutcome.NO_ROOM if no_room(error) else MendOutcome.LOST, told(error))

@@ -1,0 +1,194 @@
+"""Replays of a scene's last frames with other budgets: one at a time, what came of them is kept in memory."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+from client.wire import PointKind, ReplayRequest, ReplayState, ReplayStatus, TradeoffPoint
+from server.problems import Problem, counted
+from server.processes import replayer
+from server.processes.messages import Damaged, FrameReady, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
+from server.processes.placement import Ended, Placement, Process
+from server.scene.budgets import effective
+
+if TYPE_CHECKING:
+    from server.scene.scene import Scene
+
+KEPT = 32
+"""Points: those measured last."""
+
+log = logging.getLogger("scas4d.server")
+
+
+class Replays:
+    """Of one scene.
+
+    Attributes:
+        status: of the replay that was asked for last. points: by iterations, as they were measured last; of each the
+            milliseconds lack the writing of a commit.
+    """
+
+    def __init__(self, scene: Scene, placement: Placement) -> None:
+        self._scene = scene
+        self._placement = placement
+        self._process: Process | None = None
+        self._life: object = None
+        self.status = ReplayStatus()
+        self.points: dict[int, TradeoffPoint] = {}
+
+    def start(self, request: ReplayRequest) -> None:
+        """Starts a replay in a process of its own.
+
+        Raises:
+            Problem: 409, one is running; or the frames, their pictures or the state before them are not here.
+        """
+        scene = self._scene
+        if self._process is not None:
+            raise Problem(
+                409,
+                f"a replay of this scene is running: {self.status.done} of {counted(self.status.total, 'update')} over",
+                field="id",
+                value=scene.id,
+                remedy=f"wait for it: GET /v1/scenes/{scene.id}/tradeoff tells how far it is",
+            )
+        if scene.spec.settings.device != "cpu":
+            raise Problem(
+                409,
+                f"the scene is updated on {scene.spec.settings.device}: a replay there would stand in its way",
+                field="settings.device",
+                value=scene.spec.settings.device,
+                remedy="put other budgets in turn: PUT …/budget; what frames run with them is measured",
+            )
+        base, indices = self._chosen(request.frames)
+        own = self._own_iterations()
+        iterations = tuple(dict.fromkeys([own, *request.iterations]))
+        messages = tuple(self._message(index) for index in indices)
+        spec = ReplaySpec(scene.spec, scene.committed[0], base, messages, iterations)
+        self._life = life = object()
+        self._process = self._placement.start(
+            replayer.main,
+            spec,
+            lambda message: self._told(life, message),
+            lambda reason: self._ended(life, reason),
+        )
+        self.status = ReplayStatus(
+            state=ReplayState.RUNNING,
+            iterations=list(iterations),
+            frames=indices[1:],
+            warm_up=indices[0],
+            threads=replayer.THREADS,
+            total=len(iterations) * len(indices),
+        )
+
+    def _chosen(self, count: int) -> tuple[int, list[int]]:
+        """The commit to start from, and the frames after it, the one that warms up first."""
+        scene = self._scene
+        committed = scene.committed
+        if len(committed) < count + 2:
+            raise Problem(
+                409,
+                f"{counted(len(committed), 'committed state')} can be read, {count + 2} are needed: the one to start "
+                f"from, one to warm up, and {counted(count, 'frame')} that count",
+                field="frames",
+                value=count,
+                remedy="ask again when more frames are committed, or for fewer frames (ingest.keep_states says how "
+                "many states are kept)",
+            )
+        base, indices = committed[-count - 2], list(committed[-count - 1 :])
+        gone = [index for index in range(base + 1, indices[-1]) if scene.frames[index].deleted]
+        if gone:
+            raise Problem(
+                409,
+                f"the state of frame {gone[-1]} is deleted: the {len(indices)} frames after it have none to start from",
+                field="frames",
+                value=count,
+                remedy="ask for fewer frames, or make scenes that keep more states (ingest.keep_states)",
+            )
+        bare = [index for index in indices if not scene.frames[index].files]
+        if bare:
+            held = len(indices) - 1 - indices.index(bare[-1])
+            raise Problem(
+                409,
+                f"the pictures of frame {bare[-1]} are not held any more",
+                field="frames",
+                value=count,
+                remedy=(f"ask for at most {counted(held - 1, 'frame')}, or " if held > 1 else "")
+                + "make scenes that keep more pictures (ingest.keep_frames)",
+            )
+        return base, indices
+
+    def _own_iterations(self) -> int:
+        """What the scene runs: as its budget says, or, where that is a time, what fitted into it last.
+
+        A frame that stood still or was held says nothing of that.
+        """
+        scene = self._scene
+        budget = effective(scene.spec.settings, scene.ledger.budgets[-1][1])
+        if budget.budget_ms is not None:
+            for index in reversed(scene.committed[1:]):
+                report = scene.frames[index].report
+                if report.iterations is None:  # older than those in memory
+                    break
+                if report.iterations and report.degraded is None:
+                    return report.iterations
+        return budget.iterations
+
+    def _message(self, index: int) -> FrameReady:
+        entry = self._scene.frames[index]
+        receipt = entry.receipt
+        assert receipt is not None  # it has files
+        return FrameReady(index, receipt.time, entry.files, receipt.identity)
+
+    def _told(self, life: object, message: Any) -> None:
+        if life is not self._life:
+            return
+        match message:
+            case Damaged():
+                self._scene.mending.noticed(message.files)
+            case ReplayUpdated():
+                self.status.done += 1
+            case ReplayPoint():
+                self.points.pop(message.iterations, None)
+                while len(self.points) >= KEPT:
+                    del self.points[next(iter(self.points))]
+                self.points[message.iterations] = TradeoffPoint(
+                    kind=PointKind.REPLAYED,
+                    iterations=message.iterations,
+                    milliseconds=message.milliseconds,
+                    error=message.error,
+                    psnr=message.psnr,
+                    frames=message.frames,
+                    threads=replayer.THREADS,
+                )
+            case ReplayEnded():
+                self._over(message.fault)
+
+    def _ended(self, life: object, reason: Ended) -> None:
+        if life is self._life:
+            self._process = None
+            self._over(f"the replay is gone: {reason}")
+
+    def _over(self, fault: str | None) -> None:
+        self.status.state = ReplayState.DONE if fault is None else ReplayState.FAILED
+        self.status.error = fault
+        self._life = None
+        if fault is not None:
+            log.error("scene %s: a replay failed: %s", self._scene.id, fault)
+        process, self._process = self._process, None
+        if process is not None:
+            self._scene.background(process.stop(1.0))
+
+    async def end(self) -> None:
+        """Ends the replay that is running, if one is; its points so far stay."""
+        if self._process is None:
+            return
+        await self.stop()
+        self.status.state, self.status.error = ReplayState.FAILED, "it was ended on request"
+
+    async def stop(self) -> None:
+        """Ends what is running: nobody will ask."""
+        self._life = None
+        process, self._process = self._process, None
+        if process is not None:
+            await process.stop(0)

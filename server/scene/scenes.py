@@ -1,0 +1,237 @@
+"""All scenes of the service: made, found again at a start, deleted so that no power cut brings half of one back."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+import shutil
+from datetime import UTC, datetime
+from pathlib import Path
+
+from client.wire import SceneCreate
+from scas4d_core.settings import Settings
+from scas4d_core.storage.error_text import told
+from scas4d_core.storage.npz import read_npz, sync_folder
+from server.problems import Problem, counted
+from server.processes.placement import Placement
+from server.scene.scene import Scene
+from server.settings import ServerSettings
+from server.storage.definition import (
+    FRAMES_FOLDER,
+    JOURNAL_FILE,
+    Definition,
+    DefinitionError,
+    is_nothing,
+    read_definition,
+    write_definition,
+)
+from server.storage.disk import FolderLock, full_disk, no_room
+from server.storage.events import Created
+from server.storage.journal import Journal
+from server.storage.recovery import recover
+from server.stream.hub import Hub
+
+__all__ = ["Scene", "Scenes"]
+
+log = logging.getLogger("scas4d.server")
+
+
+def hold(data: Path) -> FolderLock:
+    """The data folder, for this service alone; made where there is none.
+
+    Raises:
+        RuntimeError: another service is at work in it.
+    """
+    data.mkdir(parents=True, exist_ok=True)
+    try:
+        return FolderLock(data / "service.lock", wait=False)
+    except BlockingIOError:
+        raise RuntimeError(
+            f"another service is at work in {data}; stop it, or give this one another folder: --data FOLDER"
+        ) from None
+
+
+class Scenes:
+    """All scenes of the service, by id.
+
+    Attributes:
+        unreadable: folders of the data folder that hold no scene that can be read, with the reason; left as they are.
+    """
+
+    def __init__(self, server: ServerSettings, placement: Placement, hub: Hub) -> None:
+        self.server = server
+        self.placement = placement
+        self.hub = hub
+        self.by_id: dict[str, Scene] = {}
+        self.unreadable: dict[str, str] = {}
+        self._folder = (server.data / "scenes").resolve()
+        self._deleted = (server.data / "deleted").resolve()
+        self._lock: FolderLock | None = None
+        self._making = 0
+        self._found: list[str] = []
+        """Folders found at the start. What comes after `by_id` and `unreadable` have it is recovered."""
+        self._recovering: asyncio.Task[None] | None = None
+
+    async def open(self) -> None:
+        """Finds the scenes of the data folder; taking them up again goes on behind, a journal may be that of a day.
+
+        Raises:
+            RuntimeError: another service is at work in the data folder.
+        """
+        for folder in (self._folder, self._deleted):
+            folder.mkdir(parents=True, exist_ok=True)
+        self._lock = hold(self.server.data)
+        self._found = await asyncio.to_thread(self._folders)
+        self._recovering = asyncio.create_task(self._recover())
+
+    def _folders(self) -> list[str]:
+        """Of scenes; those that were never acknowledged are put with what is deleted."""
+        found = []
+        for path in sorted(path for path in self._folder.iterdir() if path.is_dir()):
+            if is_nothing(path):
+                path.rename(self._deleted / f"{path.name}-{secrets.token_hex(4)}")
+            else:
+                found.append(path.name)
+        sync_folder(self._folder)
+        return found
+
+    async def _recover(self) -> None:
+        """Takes up what was found, one scene after the other, and finishes deletions that were interrupted."""
+        graves = list(self._deleted.iterdir())
+        for name in self._found:
+            try:
+                await self._restore(self._folder / name)
+            except Exception as error:  # a fault of one scene is none of the others
+                self.unreadable[name] = f"the service failed: {type(error).__name__}: {told(error)}"
+                log.exception("scene %s cannot be taken up", name)
+        for path in graves:
+            await asyncio.to_thread(shutil.rmtree, path, ignore_errors=True)
+
+    def check_recovered(self, id: str | None = None) -> None:
+        """Returns where what was found at the start, or one scene of it, is taken up again.
+
+        Raises:
+            Problem: 503, with how many are.
+        """
+        missing = [name for name in self._found if name not in self.by_id and name not in self.unreadable]
+        if id not in missing and (id is not None or not missing):
+            return
+        raise Problem(
+            503,
+            f"recovering {len(self._found) - len(missing)} of {counted(len(self._found), 'scene')}",
+            field="id" if id is not None else None,
+            value=id,
+            remedy="ask again: what was acknowledged is on disk, and is being read",
+            headers={"Retry-After": "1"},
+            recovering=missing,
+        )
+
+    async def _restore(self, folder: Path) -> None:
+        try:
+            definition, damage = await asyncio.to_thread(read_definition, folder)
+            if definition.id != folder.name:
+                raise DefinitionError(f"it is of scene {definition.id}; the folder was renamed or copied")
+            if damage is not None:
+                await asyncio.to_thread(write_definition, folder, definition)
+            found = await asyncio.to_thread(recover, folder, definition.id, definition.as_json())
+            found.damage[:0] = [damage] if damage is not None else []
+            scene = Scene(definition, folder, found, self.server, self.placement, self.hub)
+            scene.points_sha256 = await asyncio.to_thread(points_sha256, scene.spec.points)
+        except (DefinitionError, OSError) as error:
+            self.unreadable[folder.name] = told(error)
+            log.error("folder %s holds no scene that can be read; it is left as it is: %s", folder, error)
+            return
+        for said in found.damage:
+            log.warning("scene %s: %s", definition.id, said)
+        self.by_id = dict(sorted([*self.by_id.items(), (scene.id, scene)], key=lambda item: item[1].created))
+
+    async def create(self, request: SceneCreate, settings: Settings) -> Scene:
+        """A new scene with its processes started; it is on disk when this returns.
+
+        Raises:
+            Problem: 429, as many scenes run as may; 503, those found at the start are still being recovered; 507, the
+                disk is full.
+        """
+        self.check_recovered()  # they count
+        if len(self.by_id) + self._making >= self.server.max_scenes:
+            raise Problem(
+                429,
+                f"{counted(len(self.by_id), 'scene')} of at most {self.server.max_scenes} are here already",
+                field="SCAS4D_MAX_SCENES",
+                value=self.server.max_scenes,
+                remedy="delete a scene, or raise the limit",
+                headers={"Retry-After": "60"},
+            )
+        definition = Definition(secrets.token_hex(6), datetime.now(UTC), request, settings)
+        folder = self._folder / definition.id
+        self._making += 1
+        try:
+            await self._write(folder, definition)
+            found = await asyncio.to_thread(recover, folder, definition.id)
+        except OSError as error:
+            await asyncio.to_thread(shutil.rmtree, folder, ignore_errors=True)
+            if no_room(error):
+                raise full_disk(error) from None
+            raise
+        finally:
+            self._making -= 1
+        scene = Scene(definition, folder, found, self.server, self.placement, self.hub)
+        self.by_id[definition.id] = scene
+        return scene
+
+    async def _write(self, folder: Path, definition: Definition) -> None:
+        """The folder, its journal, and last the definition, which makes it a scene."""
+        (folder / FRAMES_FOLDER).mkdir(parents=True)
+        journal = Journal(folder / JOURNAL_FILE)
+        try:
+            await journal.append(Created(definition=definition.as_json()))
+        finally:
+            await journal.close()
+        sync_folder(folder.parent)
+        await asyncio.to_thread(write_definition, folder, definition)
+
+    def __getitem__(self, id: str) -> Scene:
+        scene = self.by_id.get(id)
+        if scene is None:
+            self.check_recovered(id)
+            reason = f": {self.unreadable[id]}" if id in self.unreadable else ""
+            raise Problem(
+                404, f"no scene {id!r}{reason}", field="id", value=id, remedy="GET /v1/scenes lists the scenes"
+            )
+        return scene
+
+    async def delete(self, id: str) -> None:
+        """Ends the scene's processes and removes its folder. From the rename on it is gone, whatever happens."""
+        scene = self[id]
+        self._found = [name for name in self._found if name != id]
+        del self.by_id[id]
+        self.hub.close(id, "the scene was deleted")
+        await scene.stop()
+        await asyncio.to_thread(self._remove, scene.spec.folder)
+
+    def _remove(self, folder: Path) -> None:
+        grave = self._deleted / f"{folder.name}-{secrets.token_hex(4)}"
+        folder.rename(grave)
+        sync_folder(self._deleted)
+        sync_folder(self._folder)
+        shutil.rmtree(grave, ignore_errors=True)
+
+    async def stop(self) -> None:
+        """Ends all processes; the folders stay."""
+        if self._recovering is not None:
+            self._recovering.cancel()
+            await asyncio.wait([self._recovering])
+        await asyncio.gather(*(scene.stop() for scene in self.by_id.values()))
+        if self._lock is not None:
+            self._lock.release()
+
+
+def points_sha256(path: Path) -> str | None:
+    """SHA-256 of the body that a scene's points came in, or None where it has none."""
+    try:
+        return bytes(read_npz(path, ("sha256",))["sha256"]).hex()
+    except FileNotFoundError:
+        return None
+    except ValueError:
+        return ""

@@ -1,0 +1,1 @@
+"""Durability: record log, journal, ledger, frame store, recovery."""

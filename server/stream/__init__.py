@@ -1,0 +1,1 @@
+"""Subscriptions: who listens, what is sent, what is asked once for all."""

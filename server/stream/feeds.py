@@ -1,0 +1,227 @@
+"""Subscriptions that cost the reader something: views, tracks, parts. Each has one question and one message under way.
+
+A feed asks only when its message before was sent, for what is newest at that moment: a slow reader costs less, and a
+camera that is dragged is rendered where it is, not everywhere it was.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Hashable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from client.wire import RenderRequest, TracksRequest
+from client.wire.base import Model
+from client.wire.stream import BulkHead, PartsSubscription, StreamProblem, pack
+from server.problems import Problem
+from server.processes.messages import PartsQuery, Query, RenderQuery, TracksQuery
+from server.routes import render, tracks
+from server.scene.scenes import Scene
+from server.settings import ServerSettings
+from server.stream.outbox import Mailbox
+from server.stream.shared_queries import Desk, fingerprint
+
+log = logging.getLogger("scas4d.server")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A question of a feed.
+
+    Attributes:
+        key: the same for all who would get the same answer.
+        head: of the message that the answer will be; media type and headers are the answer's.
+        changes: how many it answers for.
+    """
+
+    key: Hashable
+    query: Query
+    head: BulkHead
+    changes: int
+
+
+class Feed(ABC):
+    """One subscription.
+
+    Attributes:
+        request: what the client asks for. tag: the client's, of that request; comes back with what is sent for it.
+    """
+
+    request: Any
+    tag: int | None
+
+    def __init__(self, id: str, scene: Scene, server: ServerSettings, desk: Desk, box: Mailbox) -> None:
+        self.id = id
+        self.scene = scene
+        self.server = server
+        self._desk = desk
+        self._mailbox = box
+        self._changes = 0
+        self._changed = asyncio.Event()
+        self._sent: Hashable = None
+
+    def ask_for(self, request: Model, tag: int | None) -> None:
+        """Another question from now on."""
+        self.request = request
+        self.tag = tag
+        self.change()
+
+    def change(self) -> None:
+        """There may be something newer to send."""
+        self._changes += 1
+        self._changed.set()
+
+    async def run(self) -> None:
+        """Until cancelled."""
+        while True:
+            await self._changed.wait()
+            await self._mailbox.sent(self.id)
+            self._changed.clear()
+            if not (self.scene.committed and self.due()):
+                self._changes = 0
+                continue
+            try:
+                await self._send_newest()
+            except Problem as problem:
+                self._changes = 0
+                await self._mailbox.reply(StreamProblem(id=self.id, tag=self.tag, problem=problem.document))
+            except Exception:
+                log.exception("scene %s, subscription %r", self.scene.id, self.id)
+                fault = Problem(500, "the service failed", remedy="its log has the traceback")
+                await self._mailbox.reply(StreamProblem(id=self.id, tag=self.tag, problem=fault.document))
+
+    async def _send_newest(self) -> None:
+        asked = self._ask()
+        if (asked.key, asked.head.tag) != self._sent:
+            asked, answer = await self._desk.answer(self._ask)
+            headers = {name.lower(): value for name, value in answer.headers.items()}
+            head = asked.head.model_copy(update={"media_type": answer.media_type, "headers": headers})
+            self._mailbox.put(
+                self.id,
+                lambda missed: pack(head.model_copy(update={"missed": missed}), answer.body),
+                missed=asked.changes - 1,
+            )
+            self._sent = (asked.key, head.tag)
+            self.answered(head)
+        self._changes -= asked.changes
+
+    def _ask(self) -> Asked:
+        query = self.query()
+        # Parts are found from the whole history: the same question has another answer after a commit.
+        newest = self.scene.committed[-1] if self.of_all_history(query) else None
+        head = self.head(query).model_copy(update={"id": self.id, "tag": self.tag})
+        return Asked((fingerprint(query), newest), query, head, self._changes)
+
+    def due(self) -> bool:
+        """Whether there is something to ask for now."""
+        return True
+
+    def of_all_history(self, query: Query) -> bool:
+        """Whether the answer depends on every committed frame."""
+        return False
+
+    def answered(self, head: BulkHead) -> None:
+        """The message with this head is on its way."""
+        return
+
+    @abstractmethod
+    def query(self) -> Query:
+        """What to ask now; raises `Problem` where that cannot be asked."""
+
+    @abstractmethod
+    def head(self, query: Query) -> BulkHead:
+        """Of the message that answers the query."""
+
+
+class RenderFeed(Feed):
+    """A view of the newest frame, or of a chosen one, from a camera that may be moved."""
+
+    request: RenderRequest
+
+    def query(self) -> RenderQuery:
+        """The view as the reader takes it."""
+        return render.query_of(self.scene, self.server, self.request)
+
+    def head(self, query: Query) -> BulkHead:
+        """Names the frame."""
+        assert isinstance(query, RenderQuery)
+        return _head("render", query.frame)
+
+    def of_all_history(self, query: Query) -> bool:
+        """Parts are."""
+        return isinstance(query, RenderQuery) and "parts" in query.kinds
+
+
+class TracksFeed(Feed):
+    """Trajectories: first over all frames asked for, then over those committed since, so that nothing is missed."""
+
+    request: TracksRequest
+    _from: int | None = None
+    _at: int | None = None
+
+    def ask_for(self, request: Model, tag: int | None) -> None:
+        """Trajectories of another question are sent from their beginning."""
+        self._from = self._at = None
+        super().ask_for(request, tag)
+
+    def due(self) -> bool:
+        """Whether there are frames that were not sent, within those asked for."""
+        newest, last = self.scene.committed[-1], self.request.last
+        return self._from is None or (self._from <= newest and (last is None or self._from <= last))
+
+    def query(self) -> TracksQuery:
+        """The frames not yet sent."""
+        first = self.request.first if self._from is None else self._from
+        if self._at is None:  # stays the same frame when the scene gives up its first ones
+            self._at = self.scene.committed[0] if self.request.at is None else self.request.at
+        return tracks.query_of(
+            self.scene, self.server, self.request.model_copy(update={"first": first, "at": self._at})
+        )
+
+    def head(self, query: Query) -> BulkHead:
+        """Names the frames."""
+        assert isinstance(query, TracksQuery)
+        return _head("tracks", query.frames[-1]).model_copy(update={"first": query.frames[0]})
+
+    def answered(self, head: BulkHead) -> None:
+        """Goes on after the last frame sent."""
+        self._from = head.frame + 1
+
+
+class PartsFeed(Feed):
+    """Labels of all Gaussians."""
+
+    request: PartsSubscription
+    _next: int | None = None
+
+    def ask_for(self, request: Model, tag: int | None) -> None:
+        """Another question is answered at once."""
+        self._next = None
+        super().ask_for(request, tag)
+
+    def due(self) -> bool:
+        """Whether enough frames came since."""
+        return self._next is None or self.scene.committed[-1] >= self._next
+
+    def query(self) -> PartsQuery:
+        """How many parts."""
+        return PartsQuery(self.request.count)
+
+    def head(self, query: Query) -> BulkHead:
+        """Names the newest frame."""
+        return _head("parts", self.scene.committed[-1])
+
+    def of_all_history(self, query: Query) -> bool:
+        """They are."""
+        return True
+
+    def answered(self, head: BulkHead) -> None:
+        """The next waits for more frames."""
+        self._next = head.frame + self.request.every
+
+
+def _head(kind: Literal["render", "tracks", "parts"], frame: int) -> BulkHead:
+    return BulkHead(type=kind, id="-", missed=0, frame=frame, media_type="")

@@ -1,0 +1,117 @@
+"""Questions to a scene's reader on behalf of its subscribers: each is asked once, however many want the answer."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable, Hashable
+from dataclasses import fields, is_dataclass
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from server.processes.messages import Answer, Query, RenderQuery
+
+KEPT_ANSWERS = 64
+KEPT_BYTES = 32_000_000
+
+Ask = Callable[[Query], Awaitable[Answer]]
+
+
+class Question(Protocol):
+    """A query and the key that is the same for all who would get the same answer."""
+
+    @property
+    def key(self) -> Hashable:
+        """See above."""
+
+    @property
+    def query(self) -> Query:
+        """What the reader is asked."""
+
+
+Q = TypeVar("Q", bound=Question)
+
+
+def fingerprint(value: Any) -> Hashable:
+    """A value that is equal for equal questions: dataclasses by field, arrays by content."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return (type(value).__name__, *(fingerprint(getattr(value, field.name)) for field in fields(value)))
+    if isinstance(value, np.ndarray):
+        return (value.shape, value.dtype.str, value.tobytes())
+    if isinstance(value, list | tuple):
+        return tuple(fingerprint(one) for one in value)
+    if isinstance(value, dict):
+        return tuple((name, fingerprint(value[name])) for name in sorted(value))
+    hashable: Hashable = value
+    return hashable
+
+
+def lane(query: Query) -> str:
+    """Views are short and somebody is looking; trajectories and parts take longer and must not stand before them."""
+    return "views" if isinstance(query, RenderQuery) and "parts" not in query.kinds else "bulk"
+
+
+class Desk:
+    """Asks the reader, `turns` questions of a lane at a time; keeps the last answers for those who come a moment later.
+
+    Whoever waits for a turn makes up the question when the turn has come: a camera that was moved meanwhile is asked
+    for where it is now. Turns are given in the order of waiting, so nobody is starved by one who asks faster.
+    """
+
+    def __init__(self, ask: Ask, turns: int) -> None:
+        self._ask = ask
+        self._turns = {"views": asyncio.Semaphore(turns), "bulk": asyncio.Semaphore(turns)}
+        self._working: dict[Hashable, asyncio.Future[Answer]] = {}
+        self._kept: OrderedDict[Hashable, Answer] = OrderedDict()
+        self._bytes = 0
+        self.asked = 0
+        """Questions that reached the reader."""
+
+    async def answer(self, question: Callable[[], Q]) -> tuple[Q, Answer]:
+        """What was asked, and its answer; `question` says what to ask at the moment of asking.
+
+        Raises:
+            Problem: what `question` or the scene raises.
+        """
+        asked = question()
+        while not self._known(asked.key):
+            turns = self._turns[lane(asked.query)]
+            await turns.acquire()
+            begun = False
+            try:
+                now = question()
+                # Another kind of question by now: it has its own turns to wait for.
+                if not self._known(now.key) and self._turns[lane(now.query)] is turns:
+                    self._begin(now.key, now.query, turns)
+                    begun = True
+                asked = now
+            finally:
+                if not begun:
+                    turns.release()
+        if asked.key in self._kept:
+            self._kept.move_to_end(asked.key)
+            return asked, self._kept[asked.key]
+        # Shielded: one who leaves does not take the answer away from the others.
+        return asked, await asyncio.shield(self._working[asked.key])
+
+    def _known(self, key: Hashable) -> bool:
+        return key in self._kept or key in self._working
+
+    def _begin(self, key: Hashable, query: Query, turns: asyncio.Semaphore) -> None:
+        def done(task: asyncio.Future[Answer]) -> None:
+            turns.release()
+            del self._working[key]
+            if not task.cancelled() and task.exception() is None:
+                self._keep(key, task.result())
+
+        self.asked += 1
+        self._working[key] = asyncio.ensure_future(self._ask(query))
+        self._working[key].add_done_callback(done)
+
+    def _keep(self, key: Hashable, answer: Answer) -> None:
+        self._kept[key] = answer
+        self._bytes += len(answer.body)
+        while len(self._kept) > KEPT_ANSWERS or self._bytes > KEPT_BYTES:
+            _, old = self._kept.popitem(last=False)
+            self._bytes -= len(old.body)

@@ -1,0 +1,192 @@
+"""One client of a scene's stream: what it subscribed to, and what the scene's events mean for that."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+
+from client.wire import FrameState
+from client.wire.base import Model
+from client.wire.stream import (
+    CLIENT_MESSAGE,
+    REQUESTS,
+    STREAM_PROTOCOL,
+    Gone,
+    Hello,
+    StreamLimits,
+    StreamProblem,
+    Subscribe,
+    Subscribed,
+    Topic,
+    Unsubscribe,
+    Unsubscribed,
+    Update,
+)
+from server.http import validation
+from server.problems import Problem, counted
+from server.scene.scenes import Scene
+from server.settings import ServerSettings
+from server.stream.feeds import Feed, PartsFeed, RenderFeed, TracksFeed
+from server.stream.hub import Event, FrameFinished, Room
+from server.stream.outbox import Mailbox
+
+T = TypeVar("T")
+
+WHERE = "docs/stream.md lists the messages"
+
+FEEDS: dict[Topic, type[Feed]] = {Topic.RENDER: RenderFeed, Topic.TRACKS: TracksFeed, Topic.PARTS: PartsFeed}
+
+
+class Subscriber:
+    """Listens to a scene for one client. Its mailbox is emptied by whoever holds the connection."""
+
+    def __init__(self, scene: Scene, server: ServerSettings, room: Room) -> None:
+        self.scene = scene
+        self.server = server
+        self.mailbox = Mailbox()
+        self._room = room
+        self._topics: dict[str, Topic] = {}
+        self._feeds: dict[str, tuple[Feed, asyncio.Task[None]]] = {}
+
+    def limits(self) -> StreamLimits:
+        """What the client is told."""
+        return StreamLimits(
+            subscriptions=self.server.max_subscriptions,
+            message_bytes=self.server.max_stream_message_kb * 1000,
+            render_pixels=self.server.max_render_pixels,
+            track_points=self.server.max_track_points,
+        )
+
+    async def greet(self) -> None:
+        """The first message."""
+        await self.mailbox.reply(Hello(protocol=STREAM_PROTOCOL, scene=self.scene.id, limits=self.limits()))
+
+    async def take(self, text: str | None) -> None:
+        """A message of the client, None for a binary one; what is wrong with it is answered and changes nothing."""
+        id: str | None = None
+        tag: int | None = None
+        try:
+            if text is None:
+                raise Problem(422, "a binary message", field="message", remedy="send JSON in text messages")
+            message = _valid(CLIENT_MESSAGE.validate_json, text)
+            id = message.id
+            if isinstance(message, Unsubscribe):
+                self._known(id)
+                self._end(id)
+                await self.mailbox.reply(Unsubscribed(id=id))
+                return
+            tag = message.tag
+            if isinstance(message, Subscribe):
+                request = self._begin(message)
+                await self.mailbox.reply(Subscribed(id=id))
+                self._start(message, request)
+            else:
+                self._update(message)
+        except Problem as problem:
+            await self.mailbox.reply(StreamProblem(id=id, tag=tag, problem=problem.document))
+
+    def close(self) -> None:
+        """The client has left."""
+        for id in list(self._topics):
+            self._end(id)
+
+    # What the hub tells.
+
+    def told(self, event: Event) -> None:
+        """Something happened in the scene."""
+        for id, topic in self._topics.items():
+            if topic == Topic.SCENE:
+                self._put_status(id)
+            elif topic == Topic.FRAMES and isinstance(event, FrameFinished):
+                self._put_report(id, event)
+        if isinstance(event, FrameFinished) and event.report.state == FrameState.COMMITTED:
+            for feed, _ in self._feeds.values():
+                feed.change()
+
+    def gone(self, reason: str) -> None:
+        """The scene is no more."""
+        self.mailbox.close_with(Gone(reason=reason))
+
+    # Subscriptions.
+
+    def _known(self, id: str) -> Topic:
+        if id not in self._topics:
+            raise Problem(
+                404, f"no subscription {id!r}", field="id", value=id, remedy="subscribe first; ids are yours to choose"
+            )
+        return self._topics[id]
+
+    def _begin(self, message: Subscribe) -> Model:
+        wanted = REQUESTS[message.topic]
+        request = _valid(wanted.model_validate, message.request, "request", wanted)
+        if message.id not in self._topics and len(self._topics) >= self.server.max_subscriptions:
+            raise Problem(
+                429,
+                f"{counted(len(self._topics), 'subscription')} open already, and no more are taken",
+                field="SCAS4D_MAX_SUBSCRIPTIONS",
+                value=self.server.max_subscriptions,
+                remedy="unsubscribe from another one, or open a second stream",
+            )
+        return request
+
+    def _start(self, message: Subscribe, request: Model) -> None:
+        self._end(message.id)
+        self._topics[message.id] = message.topic
+        if message.topic == Topic.SCENE:
+            self._put_status(message.id)
+        elif message.topic == Topic.FRAMES:
+            if self.scene.committed:
+                newest = self.scene.frames[self.scene.committed[-1]].report
+                self._put_report(message.id, FrameFinished(newest))
+        else:
+            feed = FEEDS[message.topic](message.id, self.scene, self.server, self._room.desk, self.mailbox)
+            feed.ask_for(request, message.tag)
+            self._feeds[message.id] = (feed, asyncio.create_task(feed.run()))
+
+    def _update(self, message: Update) -> None:
+        topic = self._known(message.id)
+        if message.id not in self._feeds:
+            raise Problem(
+                422,
+                f"topic {topic} has nothing to update",
+                field="id",
+                value=message.id,
+                remedy="update subscriptions to render, tracks or parts",
+            )
+        feed, _ = self._feeds[message.id]
+        changed = feed.request.model_dump() | message.request
+        feed.ask_for(_valid(REQUESTS[topic].model_validate, changed, "request", REQUESTS[topic]), message.tag)
+
+    def _end(self, id: str) -> None:
+        self._topics.pop(id, None)
+        if id in self._feeds:
+            self._feeds.pop(id)[1].cancel()
+        self.mailbox.drop(id)
+
+    def _put_status(self, id: str) -> None:
+        # The status is read when it is sent: whoever is slow gets it as it is then.
+        def make(missed: int) -> str:
+            return _text("scene", id, missed, "status", self._room.status(self.scene.status))
+
+        self.mailbox.put(id, make)
+
+    def _put_report(self, id: str, finished: FrameFinished) -> None:
+        self.mailbox.put(id, lambda missed: _text("frame", id, missed, "report", finished.text))
+
+
+def _text(kind: str, id: str, missed: int, name: str, value: str) -> str:
+    """A `SceneMessage` or `FrameMessage` around a value that is JSON already, written once for all who listen."""
+    return f'{{"type":"{kind}","id":{json.dumps(id)},"missed":{missed},"{name}":{value}}}'
+
+
+def _valid(validate: Callable[[Any], T], given: Any, within: str = "", model: object = None) -> T:
+    try:
+        return validate(given)
+    except ValidationError as error:
+        raise validation.invalid(
+            error.errors()[0], model=model, prefix=within, text=given if isinstance(given, str) else None, schema=WHERE
+        ) from None

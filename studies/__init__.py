@@ -1,0 +1,1 @@
+"""Measures the method and the service; run by `scripts/bench`, not packaged."""

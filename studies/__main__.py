@@ -1,0 +1,6 @@
+"""`scripts/bench`, from a checkout: `python -m studies`."""
+
+from client.cli.main import run
+from studies.commands import app
+
+run(app)

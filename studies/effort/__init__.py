@@ -1,0 +1,1 @@
+"""Budgets kept, and effort spared on frames that show nothing new."""

@@ -1,0 +1,220 @@
+"""Budgets and adaptive effort, kept to and paid for: how many milliseconds a frame took of those it may take, and what
+a preset that spares effort spares, frame by frame in turns with the one that does not.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.captures import Capture, open_capture
+from scas4d_core.metrics import psnr as image_psnr
+from scas4d_core.presets import preset
+from scas4d_core.settings import Settings
+from studies.effort.sequences import Shown, as_it_is, back_and_forth, repeated, slowed
+from studies.frontier.timing import started
+from studies.machine import core_version, machine
+from studies.quality.store import Row
+
+Report = Callable[[str], None]
+
+TOLERANCE = 0.05
+"""Of a budget that a frame may be off, or one iteration if that is more."""
+FRAMES = 50
+"""Of a capture played back and forth."""
+FEW = 8
+"""Updates of a capture at most whose frames are repeated, or slowed."""
+SEEDS = 3
+"""Of the updates of a capture as it is."""
+COUNTED_FROM = 2
+"""Updates before are not counted: the first has no motion to start from and knows no speed."""
+
+
+@dataclass
+class Kept:
+    """How one budget was kept: seconds of each counted frame, its iterations, and the seconds of one."""
+
+    milliseconds: float
+    seconds: list[float] = field(default_factory=list)
+    iterations: list[int] = field(default_factory=list)
+    each: list[float] = field(default_factory=list)
+
+    def off(self) -> list[float]:
+        """Milliseconds that each frame took more (+) or less than the budget."""
+        return [1000 * seconds - self.milliseconds for seconds in self.seconds]
+
+    def allowed(self) -> list[float]:
+        """Milliseconds that each may be off."""
+        return [max(TOLERANCE * self.milliseconds, 1000 * each) for each in self.each]
+
+    def row(self) -> Row:
+        """The answer for one budget; shares of frames."""
+        off, allowed = np.array(self.off()), np.array(self.allowed())
+        return {
+            "milliseconds": self.milliseconds,
+            "frames": len(off),
+            "within": float((np.abs(off) <= allowed).mean()),
+            "not_over": float((off <= allowed).mean()),
+            "median_off_ms": float(np.median(off)),
+            "worst_off_ms": float(off.max()),
+            "iterations": np.percentile(self.iterations, (0, 50, 100)).tolist(),
+            "off_ms": off.round(2).tolist(),
+        }
+
+
+def measure_budgets(
+    folder: Path, out: Path, milliseconds: Sequence[float], *, frames: int = FRAMES, report: Report = print
+) -> Row:
+    """Plays a capture back and forth under each budget; leaves ``out/effort/<capture>-budgets.json``.
+
+    A frame's time goes from before its pictures are decoded to the end of its commit, on disk and synced.
+
+    Args:
+        folder: of the capture. out: folder of a study, with its frames 0. milliseconds: the budgets.
+    """
+    capture = open_capture(folder)
+    kept = []
+    for budget in milliseconds:
+        settings = changed(preset("scas4d"), budget_ms=budget)
+        one = Kept(budget)
+        with tempfile.TemporaryDirectory() as directory:
+            reconstruction = started(capture, settings, out, Path(directory))
+            played = back_and_forth(capture, frames)
+            for number in range(frames):
+                began = time.perf_counter()
+                frame = next(played)
+                done = reconstruction.step(frame, started=began)
+                seconds = time.perf_counter() - began
+                if number >= COUNTED_FROM:
+                    one.seconds.append(seconds)
+                    one.iterations.append(done.iterations)
+                    one.each.append(_each(done))
+        kept.append(one)
+        row = one.row()
+        report(
+            f"    {capture.name}, {budget:g} ms: {100 * row['within']:.0f} % within, {100 * row['not_over']:.0f} % not "
+            f"over; {row['iterations'][1]:.0f} iterations; worst {row['worst_off_ms']:+.0f} ms"
+        )
+    return leave(out, f"{capture.name}-budgets", capture, {"budgets": [one.row() for one in kept]})
+
+
+def measure_adaptive(
+    folder: Path, out: Path, *, name: str = "adaptive", updates: int = 10, seeds: int = SEEDS, report: Report = print
+) -> Row:
+    """A preset that spares effort against ``scas4d``, frame by frame in turns, on a capture as it is, with frames
+    repeated, and slowed; leaves ``out/effort/<capture>-<name>.json``.
+
+    Args:
+        folder: of a capture with test cameras. out: folder of a study, with its frames 0. updates: of the capture.
+        seeds: of the updates, tried on the capture as it is; what the first update finds or loses goes by chance.
+    """
+    capture = open_capture(folder)
+    few = min(updates, FEW)
+    sequences: dict[str, tuple[int, Callable[[], Iterator[Shown]]]] = {
+        "as it is": (seeds, lambda: as_it_is(capture, updates)),
+        "repeated": (1, lambda: repeated(capture, few)),
+        "slowed": (1, lambda: slowed(capture, few, out)),
+    }
+    answers = []
+    for what, (tries, frames) in sequences.items():
+        turns = Turns(("scas4d", name))
+        for seed in range(tries):
+            fixed, spare = (changed(preset(key), seed=seed) for key in turns.names)
+            turns.take(capture, (changed(fixed, still=-1.0), spare), frames(), out)
+        answer = {"sequence": what, **turns.row()}
+        answers.append(answer)
+        difference = answer["psnr"][name] - answer["psnr"]["scas4d"]
+        told = "" if answer["time_repeats"] is None else f", repeats {100 * answer['time_repeats']:.0f} %"
+        report(f"    {capture.name}, {what}: {100 * answer['time']:.0f} % of the time{told}, {difference:+.2f} dB")
+    return leave(out, f"{capture.name}-{name}", capture, {"name": name, "sequences": answers})
+
+
+class Turns:
+    """Two settings on the same frames, in turns: what each frame took, and how well it was met.
+
+    Args:
+        names: of the settings; the first is what the other is compared with.
+    """
+
+    def __init__(self, names: tuple[str, str]) -> None:
+        self.names = names
+        self._seconds: dict[str, list[float]] = {name: [] for name in names}
+        self._psnr: dict[str, list[list[float]]] = {name: [] for name in names}
+        self._iterations: list[int] = []
+        self._repeats: list[bool] = []
+
+    def take(self, capture: Capture, settings: tuple[Settings, Settings], frames: Iterator[Shown], out: Path) -> None:
+        """One sequence of frames more, each of the two from frame 0 on."""
+        pair = {name: started(capture, one, out) for name, one in zip(self.names, settings, strict=True)}
+        for values in self._psnr.values():
+            values.append([])
+        for number, shown in enumerate(frames):
+            for name in self.names if number % 2 else self.names[::-1]:
+                began = time.perf_counter()
+                done = pair[name].step(shown.frame, started=began)
+                self._seconds[name].append(time.perf_counter() - began)
+                self._psnr[name][-1].append(_score(pair[name], capture, shown.truth))
+                if name == self.names[1]:
+                    self._iterations.append(done.iterations)
+            self._repeats.append(shown.repeats)
+
+    def row(self) -> Row:
+        """The answer over all sequences taken; ``psnr`` and ``psnr_each`` in dB, times as shares of the first's."""
+        full, spared = (np.array(self._seconds[name]) for name in self.names)
+        again = np.array(self._repeats)
+        each = {name: [float(np.mean(values)) for values in self._psnr[name]] for name in self.names}
+        return {
+            "frames": len(self._psnr[self.names[0]][0]),
+            "psnr": {name: float(np.mean(values)) for name, values in each.items()},
+            "psnr_each": each,
+            "seconds": {name: float(np.median(values)) for name, values in self._seconds.items()},
+            "time": float(spared.sum() / full.sum()),
+            "time_repeats": float(spared[again].mean() / full[~again].mean()) if again.any() else None,
+            "iterations": np.percentile(self._iterations, (0, 50, 100)).tolist(),
+        }
+
+
+def _score(reconstruction: Any, capture: Capture, truth: Mapping[str, NDArray[np.float32]]) -> float:
+    """dB, mean over the test cameras."""
+    cameras = capture.test_rig.cameras if capture.test_rig is not None else ()
+    return float(np.mean([image_psnr(reconstruction.render(c).colour, truth[c.name]) for c in cameras]))
+
+
+def _each(report: Any) -> float:
+    """Seconds of an iteration of an update."""
+    points = report.curve
+    if len(points) < 2:
+        return 0.0
+    last, first = points[-1], points[0]
+    return float((last.milliseconds - first.milliseconds) / 1000 / max(1, last.iterations - first.iterations))
+
+
+def changed(settings: Settings, **changes: Any) -> Settings:
+    """The settings with others of the update."""
+    return settings.model_copy(update={"update": settings.update.model_copy(update=changes)})
+
+
+def leave(out: Path, name: str, capture: Capture, answer: Row) -> Row:
+    """Write an answer as ``out/effort/<name>.json``, with what it was measured on."""
+    from scas4d_core.kernels.jit import threads
+
+    row: Row = {
+        "capture": capture.name,
+        "measured": datetime.now(UTC).isoformat(timespec="seconds"),
+        "core": core_version(),
+        "machine": {**machine(), "threads": threads()},
+        **answer,
+    }
+    path = out / "effort" / f"{name}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(row, indent=1))
+    return row

@@ -1,0 +1,129 @@
+"""Budgets and adaptive effort, as a part of the page of the frontier."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from studies.effort.effort import SEEDS, TOLERANCE
+from studies.effort.report import BAR
+from studies.quality.store import Row
+
+KEPT = 0.95
+"""Share of the frames that have to keep a budget."""
+TIME, LOSS_DB, REPEATS = 0.60, 0.10, 0.10
+"""The adaptive preset may take so much of the time of the fixed one, lose so much, and take so much for repeats."""
+
+
+def effort_text(out: Path, captures: Sequence[str]) -> str:
+    """The sections that there are measurements for, as Markdown; empty where there are none."""
+    budgets = _rows(out, captures, "budgets")
+    adaptive = _rows(out, captures, "adaptive")
+    report = _rows(out, captures, "report")
+    return "\n".join(
+        [
+            *(_budgets(budgets) if budgets else []),
+            *(_adaptive(adaptive) if adaptive else []),
+            *(_report(report) if report else []),
+        ]
+    )
+
+
+def _rows(out: Path, captures: Sequence[str], what: str) -> list[Row]:
+    files = [out / "effort" / f"{name}-{what}.json" for name in captures]
+    return [json.loads(file.read_text()) for file in files if file.exists()]
+
+
+def _budgets(rows: Sequence[Row]) -> list[str]:
+    lines = [
+        "## Budgets in milliseconds",
+        "",
+        "A capture played back and forth under each budget, `scripts/bench effort`: from before a frame's pictures are",
+        "decoded to the end of its commit, synced on disk; the first two frames teach the scene's speed and are not",
+        f"counted. Allowed is the larger of {100 * TOLERANCE:.0f} % of the budget and one iteration; "
+        f"{100 * KEPT:.0f} % of the frames have to keep it.",
+        "",
+        "| capture | budget ms | within, both ways | not over | median off ms | worst over ms | iterations, median | |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        for one in row["budgets"]:
+            verdict = "reached" if one["within"] >= KEPT else "**missed**"
+            lines.append(
+                f"| {row['capture']} | {one['milliseconds']:g} | {100 * one['within']:.0f} % "
+                f"| {100 * one['not_over']:.0f} % | {one['median_off_ms']:+.1f} | {one['worst_off_ms']:+.1f} "
+                f"| {one['iterations'][1]:.0f} | {verdict} |"
+            )
+    return [*lines, ""]
+
+
+def _adaptive(rows: Sequence[Row]) -> list[str]:
+    lines = [
+        "## Adaptive effort",
+        "",
+        "Preset `adaptive` against `scas4d` with 100 iterations for every frame, in turns, frame by frame. *Repeated*: "
+        "every frame",
+        "twice, one four times; *repeats* is the time of a frame that is shown again. *Slowed*: a third of the speed, "
+        "drawn from a",
+        "reconstruction, states in between interpolated; its dB compare with each other only. As it is, a",
+        f"capture is run with {SEEDS} seeds; ± is their standard deviation.",
+        "",
+        "| capture | frames | time | dB | repeats | slowed: time | slowed: dB |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    losses, times, repeats = [], [], []
+    for row in rows:
+        found = {one["sequence"]: one for one in row["sequences"]}
+        plain, again, slow = found["as it is"], found["repeated"], found["slowed"]
+        losses.append(_gain(plain))
+        times.append(plain["time"])
+        repeats.append(again["time_repeats"])
+        lines.append(
+            f"| {row['capture']} | {plain['frames']} | {100 * plain['time']:.0f} % | {_gain(plain):+.2f} "
+            f"({_told(plain, 'adaptive')} : {_told(plain, 'scas4d')}) | {100 * again['time_repeats']:.0f} % "
+            f"| {100 * slow['time']:.0f} % | {_gain(slow):+.2f} |"
+        )
+    ok = max(times) <= TIME and min(losses) >= -LOSS_DB and max(repeats) <= REPEATS
+    lines += [
+        "",
+        f"Mean: {100 * np.mean(times):.0f} % of the time, {np.mean(losses):+.2f} dB; "
+        f"repeats {100 * np.mean(repeats):.0f} %. The bar, at most {100 * TIME:.0f} % of the time at {LOSS_DB:g} dB, "
+        f"and {100 * REPEATS:.0f} % for repeats, is "
+        f"{'reached on every capture' if ok else '**missed** on some captures'}.",
+        "",
+    ]
+    return lines
+
+
+def _report(rows: Sequence[Row]) -> list[str]:
+    lines = [
+        "## What the report costs",
+        "",
+        "Stage `report` of an update of `scas4d`: the stage timers, losses that nothing but the curve asks for, colour",
+        "shifts, assembling, writing and publishing the record. *With : without* is the CPU time of the same",
+        "updates with and without what can be left out of the iterations, in turns; median and quartiles.",
+        "",
+        "| capture | updates | report ms | report: % of an update | worst update | with : without | |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        verdict = "reached" if row["share"] <= BAR else "**missed**"
+        low, high = row["ratio_quartiles"]
+        lines.append(
+            f"| {row['capture']} | {row['updates']} | {row['milliseconds']:.1f} | {100 * row['share']:.2f} % "
+            f"| {100 * row['share_worst']:.2f} % | {row['ratio']:.3f} ({low:.3f} to {high:.3f}) | {verdict} |"
+        )
+    return [*lines, "", f"The bar: at most {100 * BAR:.0f} % of an update.", ""]
+
+
+def _gain(one: Row) -> float:
+    """DB of the adaptive preset over the fixed one."""
+    return float(one["psnr"]["adaptive"] - one["psnr"]["scas4d"])
+
+
+def _told(one: Row, name: str) -> str:
+    """DB of a setting, and how far its seeds lie apart."""
+    return f"{one['psnr'][name]:.2f} ± {np.std(one['psnr_each'][name]):.2f}"

@@ -1,0 +1,94 @@
+"""What an update spends on its own report: the share of its stage, and the check that the stage leaves nothing out.
+
+The stage ``report`` has the stage timers themselves, losses that nothing but the curve asks for, the cameras' colour
+shifts, and assembling and writing the record; publishing it, as a worker does, is timed here and belongs to it. What is
+interleaved with the iterations can be left out (``FrameUpdate.tells``): the same frames with and without it, in turns,
+say what it takes in all, whatever the timers say.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Sequence
+from multiprocessing.reduction import ForkingPickler
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scas4d_core.captures import open_capture
+from scas4d_core.presets import preset
+from scas4d_core.update.result import REPORT
+from studies.effort.effort import COUNTED_FROM, Report, changed, leave
+from studies.frontier.timing import started
+from studies.quality.store import Row
+
+BAR = 0.02
+"""Share of an update that its report may cost."""
+
+
+def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report = print) -> Row:
+    """Updates of ``scas4d`` that tell everything, in turns with ones that do not; leaves
+    ``out/effort/<capture>-report.json``.
+
+    Args:
+        folder: of the capture. out: folder of a study, with its frames 0.
+        updates: of the capture; the first ones are not counted.
+    """
+    from scas4d_core.update.frame_update import FrameUpdate
+
+    capture = open_capture(folder)
+    settings = changed(preset("scas4d"), still=-1.0)
+    shares: list[float] = []
+    stages: list[dict[str, float]] = []
+    cpu: dict[bool, list[float]] = {True: [], False: []}
+    with tempfile.TemporaryDirectory() as directory:
+        scenes = {tells: started(capture, settings, out, Path(directory) / str(tells)) for tells in (True, False)}
+        for index in range(1, min(updates, capture.frame_count - 1) + 1):
+            frame = capture.frame(index)
+            dict(frame.images), dict(frame.masks)  # decoded before, so that both find them so
+            for tells in (True, False) if index % 2 else (False, True):
+                began = time.process_time()
+                FrameUpdate.tells = tells
+                try:
+                    done = scenes[tells].step(frame)
+                finally:
+                    FrameUpdate.tells = True
+                taken = time.process_time() - began
+                if index < COUNTED_FROM:
+                    continue
+                cpu[tells].append(taken)
+                if tells:
+                    found = {**done.seconds, REPORT: done.seconds[REPORT] + _published(scenes[tells], index)}
+                    stages.append(found)
+                    shares.append(found[REPORT] / sum(found.values()))
+    ratios = np.array(cpu[True]) / np.array(cpu[False])
+    answer = {
+        "updates": len(shares),
+        "share": float(np.median(shares)),
+        "share_worst": float(max(shares)),
+        "milliseconds": 1000 * float(np.median([one[REPORT] for one in stages])),
+        "stages": {name: float(np.median([one.get(name, 0.0) for one in stages])) for name in _names(stages)},
+        "ratio": float(np.median(ratios)),
+        "ratio_quartiles": np.percentile(ratios, (25, 75)).tolist(),
+    }
+    verdict = "reached" if answer["share"] <= BAR else "missed"
+    low, high = answer["ratio_quartiles"]
+    report(
+        f"    {capture.name}: report: {100 * answer['share']:.2f} % of an update ({verdict}: {100 * BAR:.0f} %), "
+        f"{answer['milliseconds']:.1f} ms; with what can be left out {answer['ratio']:.3f} × the CPU time without "
+        f"(quartiles {low:.3f}, {high:.3f})"
+    )
+    return leave(out, f"{capture.name}-report", capture, answer)
+
+
+def _published(scene: Any, index: int) -> float:
+    """Seconds of what a worker does to publish a record: it is read from the commit and sent through a pipe."""
+    began = time.perf_counter()
+    ForkingPickler.dumps(scene.history.report(index))  # as a pipe does
+    return time.perf_counter() - began
+
+
+def _names(stages: Sequence[dict[str, float]]) -> list[str]:
+    return list(dict.fromkeys(name for one in stages for name in one))

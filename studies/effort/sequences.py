@@ -1,0 +1,95 @@
+"""Sequences of frames to try an update on: a capture as it is, back and forth, with frames repeated, and slowed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.captures import Capture, Frame
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.presets import preset
+from studies.frontier.timing import started
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A frame of a sequence, what the test cameras would have seen, and whether it repeats the frame before."""
+
+    frame: Frame
+    truth: Mapping[str, NDArray[np.float32]]
+    repeats: bool = False
+
+
+def back_and_forth(capture: Capture, frames: int) -> Iterator[Frame]:
+    """So many frames after the first, played to the end, back to the start and so on; time goes on."""
+    count = capture.frame_count
+    first, second = capture.frame(0), capture.frame(1)
+    step = second.time - first.time
+    for index in range(1, frames + 1):
+        place = index % (2 * count - 2)
+        shown = capture.frame(min(place, 2 * count - 2 - place))
+        yield Frame(index, first.time + index * step, shown.images, shown.masks)
+
+
+def as_it_is(capture: Capture, updates: int) -> Iterator[Shown]:
+    """The first updates of a capture."""
+    for index in range(1, min(updates + 1, capture.frame_count)):
+        yield Shown(capture.frame(index), _truth(capture, index))
+
+
+def repeated(capture: Capture, updates: int) -> Iterator[Shown]:
+    """The same with every frame sent twice, as a camera at half the rate of its rig does, and one held for three."""
+    step = capture.frame(1).time - capture.frame(0).time
+    number = 0
+    for index in range(1, min(updates + 1, capture.frame_count)):
+        shown = capture.frame(index)
+        for turn in range(4 if index == 3 else 2):
+            number += 1
+            frame = Frame(number, capture.frame(0).time + number * step, shown.images, shown.masks)
+            yield Shown(frame, _truth(capture, index), repeats=turn > 0)
+
+
+def slowed(capture: Capture, updates: int, out: Path, factor: int = 3) -> Iterator[Shown]:
+    """A capture at a third of its speed, drawn from a reconstruction of it: in-between states are interpolated.
+
+    Training pictures and truth are both rendered, so that its figures compare with each other and with no others.
+    """
+    source = started(capture, preset("scas4d"), out)
+    for index in range(1, min(updates + 1, capture.frame_count)):
+        source.step(capture.frame(index))
+    drawn = started(capture, preset("scas4d"), out)  # draws the states in between
+    step = capture.frame(1).time - capture.frame(0).time
+    number = 0
+    for index in range(1, min(updates + 1, capture.frame_count)):
+        before, after = source.history.gaussians(index - 1), source.history.gaussians(index)
+        for part in range(1, factor + 1):
+            number += 1
+            mixed = _between(before, after, part / factor)
+            drawn.history.append(number, capture.frame(0).time + number * step, mixed)
+            images = {c.name: _levels(drawn.render(c).colour) for c in capture.rig.cameras}
+            cameras = capture.test_rig.cameras if capture.test_rig is not None else ()
+            truth = {c.name: drawn.render(c).colour for c in cameras}
+            yield Shown(Frame(number, capture.frame(0).time + number * step, images, {}), truth)
+
+
+def _truth(capture: Capture, index: int) -> dict[str, NDArray[np.float32]]:
+    return {key: image.astype(np.float32) / np.float32(255) for key, image in capture.test_frame(index).images.items()}
+
+
+def _levels(colour: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """A rendering as a camera would have stored it."""
+    levels: NDArray[np.uint8] = np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8)
+    return levels
+
+
+def _between(before: Gaussians, after: Gaussians, share: float) -> Gaussians:
+    """A state between two, on straight lines: for frames that are near each other."""
+    mixed = {
+        name: ((1 - share) * getattr(before, name) + share * getattr(after, name)).astype(np.float32)
+        for name in ("means", "factors", "colours")
+    }
+    return after.replace(**mixed)

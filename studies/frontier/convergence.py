@@ -1,0 +1,141 @@
+"""How an update converges: the test cameras' PSNR of the state after some of its iterations.
+
+Rates fall and layers begin by shares of an update's iterations, so the curve of a long update does not run through the
+ends of shorter ones. The test cameras are rendered beside the update and never reach it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scas4d_core import metrics
+from scas4d_core.captures import Capture, open_capture
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.warm_up import warm_up_elsewhere
+from studies.frontier.frontier import Variant
+from studies.frontier.timing import started
+from studies.machine import core_version
+from studies.quality.quality import Report
+from studies.quality.store import Row
+
+CHECKPOINTS = (0, 1, 2, 4, 7, 10, 15, 20, 25, 30, 40, 50, 60, 70, 80, 90, 100, 125, 150, 175, 200, 225, 250, 275)
+"""Iterations after which the state is looked at, as far as an update has them; its end is looked at in any case."""
+WATCHED = (("scas4d", 25), ("scas4d", 100), ("scas4d", 300), ("dynamic3dgs", 100), ("dynamic3dgs", 300))
+"""Preset and iterations."""
+
+Look = Callable[[int, Any, Any, Any, Any], None]
+"""Told the iterations done, means, factors, opacities and features."""
+
+
+class WatchedPictures:
+    """Stands before an update's ``PictureLoss`` and shows what it is about to render, iteration by iteration."""
+
+    def __init__(self, inner: Any, look: Look) -> None:
+        self._inner, self._look = inner, look
+        self._done = 0
+
+    def evaluate(self, means: Any, factors: Any, opacities: Any, features: Any, *others: Any, **more: Any) -> Any:
+        """See ``PictureLoss.evaluate``."""
+        self._look(self._done, means, factors, opacities, features)
+        self._done += 1
+        return self._inner.evaluate(means, factors, opacities, features, *others, **more)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._inner, name)
+
+
+def measure_convergence(
+    folder: Path, out: Path, *, updates: int = 5, variants: Sequence[Variant] = (), report: Report = print
+) -> Row:
+    """Watches the first updates of a capture and leaves the curves in ``out/convergence/<capture>.json``.
+
+    Args:
+        folder: of a capture with test cameras.
+        out: folder of the study, with its frames 0.
+        updates: whose curves are averaged.
+        variants: none: those of ``WATCHED``.
+        report: takes the lines that are printed.
+    """
+    warm_up_elsewhere()
+    capture = open_capture(folder)
+    updates = min(updates, capture.frame_count - 1)
+    curves = []
+    for variant in variants or [Variant(f"{name} {count}", name, count) for name, count in WATCHED]:
+        each = _watched(capture, variant, out, updates)
+        points = sorted(each[0])
+        curves.append(
+            {
+                "label": variant.label,
+                "preset": variant.preset,
+                "iterations": points,
+                "psnr": [float(np.mean([curve[point] for curve in each])) for point in points],
+            }
+        )
+        report(f"    {capture.name}, {variant.label}: {curves[-1]['psnr'][0]:.2f} to {curves[-1]['psnr'][-1]:.2f} dB")
+    row: Row = {
+        "capture": capture.name,
+        "updates": updates,
+        "measured": datetime.now(UTC).isoformat(timespec="seconds"),
+        "core": core_version(),
+        "curves": curves,
+    }
+    path = out / "convergence" / f"{capture.name}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(row, indent=1))
+    return row
+
+
+def read_convergence(out: Path, capture: str) -> Row | None:
+    """What ``measure_convergence`` left for a capture; None where it was not measured."""
+    path = out / "convergence" / f"{capture}.json"
+    if not path.exists():
+        return None
+    row: Row = json.loads(path.read_text())
+    return row
+
+
+def _watched(capture: Capture, variant: Variant, out: Path, updates: int) -> list[dict[int, float]]:
+    """For each update the test cameras' mean PSNR in dB, by iterations done."""
+    reconstruction = started(capture, variant.settings, out)
+    curves: list[dict[int, float]] = []
+    for index in range(1, updates + 1):
+        curve: dict[int, float] = {}
+        true = capture.test_frame(index).images
+        state: Gaussians = reconstruction.history.gaussians(index - 1)
+
+        def look(
+            done: int, means: Any, factors: Any, opacities: Any, features: Any,
+            curve: dict[int, float] = curve, true: Any = true, state: Gaussians = state,
+        ) -> None:  # fmt: skip
+            if done in CHECKPOINTS:
+                now = state.replace(
+                    means=means.copy(), factors=factors.copy(), opacities=opacities, colours=features[:, :3].copy()
+                )
+                curve[done] = _psnr(reconstruction, capture, now, true)
+
+        updater = reconstruction._updater
+        updater._picture = WatchedPictures(updater._picture, look)
+        reconstruction.step(capture.frame(index))
+        updater._picture = updater._picture._inner
+        curve[variant.iterations] = _psnr(reconstruction, capture, reconstruction.history.gaussians(index), true)
+        curves.append(curve)
+    return curves
+
+
+def _psnr(reconstruction: Any, capture: Capture, state: Gaussians, true: Any) -> float:
+    """Mean over the test cameras, of a state that need not be committed."""
+    from scas4d_core.query.committed import Committed
+    from scas4d_core.storage.history import History
+
+    held = History()
+    held.append(0, 0.0, state, {})
+    shown = Committed(held, reconstruction.world, reconstruction._limits)
+    assert capture.test_rig is not None
+    cameras = capture.test_rig.cameras
+    return float(np.mean([metrics.psnr(shown.render(camera).colour, true[camera.name]) for camera in cameras]))

@@ -1,0 +1,188 @@
+"""``scripts/bench frontier``: what accuracy costs in time, setting by setting.
+
+Iterations by method, and one axis at a time around the default of 100 iterations of ``scas4d``. A row is one capture,
+one setting and one seed over the same first updates, so that all rows of a capture can be compared; every row is a row
+of ``bench.quality``, and rows on disk are not measured again. Frame 0 is fitted once for each capture and budget of
+Gaussians. The seconds that count are those of ``bench.timing``, which measures settings in turns: rows may be measured
+on a machine that does other things.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from scas4d_core.presets import PRESETS
+from scas4d_core.settings import Settings
+from studies.quality.job import Job, settings_of
+from studies.quality.quality import Report, run_jobs
+from studies.quality.runs import completed
+from studies.quality.store import Row, Store
+
+METHODS = ("scas4d", "dynamic3dgs")
+ITERATIONS = (10, 25, 50, 100, 200, 300, 500, 1000, 2000)
+DEFAULT_ITERATIONS = 100
+UPDATES = 5
+"""Of each row."""
+SEEDS = (0, 1, 2)
+"""Of the updates, on the axis "seeds"; every other row has the first."""
+DRIFT = (("scas4d", 25), ("scas4d", 100), ("scas4d", 300), ("dynamic3dgs", 100), ("dynamic3dgs", 300))
+"""Preset and iterations of the rows that go through a whole capture."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One setting of the study.
+
+    Attributes:
+        label: in words, for plots and tables.
+        preset: name. iterations: of an update. changes: further settings, as ``"update.clusters=[64]"``.
+        seed: of the updates alone: frame 0 is the same for all.
+        whole: through all frames of the capture.
+    """
+
+    label: str
+    preset: str = "scas4d"
+    iterations: int = DEFAULT_ITERATIONS
+    changes: tuple[str, ...] = ()
+    seed: int = 0
+    whole: bool = False
+
+    @property
+    def settings(self) -> Settings:
+        """Complete."""
+        return settings_of(self.preset, self.iterations, overrides=[f"update.seed={self.seed}", *self.changes])
+
+    def job(self, capture: Path, updates: int) -> Job:
+        """The row of a capture over so many updates, or over all."""
+        return Job(capture, self.preset, self.settings, None if self.whole else updates + 1, pictures=(-1,))
+
+
+def _changed(label: str, name: str, value: object, *more: str) -> Variant:
+    return Variant(label, changes=(f"{name}={json.dumps(value)}", *more))
+
+
+DEFAULT = Variant("scas4d 100")
+"""What the other axes go through, and what times are compared with."""
+
+AXES: Mapping[str, tuple[Variant, ...]] = {
+    "iterations": tuple(Variant(f"{name} {count}", name, count) for count in ITERATIONS for name in METHODS),
+    "adaptive": tuple(
+        Variant(f"{name} {PRESETS[name].update.iterations}", name, PRESETS[name].update.iterations)
+        for name in PRESETS
+        if name not in METHODS
+    ),
+    "layers": (
+        _changed("K=1: 64", "update.clusters", [64]),
+        _changed("K=1: 320", "update.clusters", [320]),
+        _changed("K=1: 1280", "update.clusters", [1280]),
+        _changed("K=2", "update.clusters", [64, 1280]),
+        _changed("K=4", "update.clusters", [64, 175, 475, 1280]),
+        _changed("K=5", "update.clusters", [64, 135, 285, 605, 1280]),
+    ),
+    "clusters": tuple(_changed(f"N={count}", "update.clusters", [count, 320, 1280]) for count in (16, 32, 48)),
+    "pyramid": (
+        _changed("½ size for 30 %", "update.coarse_until", 0.3),
+        _changed("½ size for 60 %", "update.coarse_until", 0.6),
+        _changed("¼ size for 30 %", "update.coarse_until", 0.3, "update.coarse_scale=0.25"),
+    ),
+    "views": (
+        _changed("2 views", "update.views", 2),
+        _changed("4 views", "update.views", 4),
+        Variant("50 iterations of 2 views", iterations=50, changes=("update.views=2",)),
+    ),
+    "gaussians": tuple(
+        _changed(f"{count:,} Gaussians", "static.max_gaussians", count) for count in (6_000, 12_000, 40_000)
+    ),
+    "max-scale": (_changed("max_scale 2 m", "update.max_scale", 2.0),),
+    "covariance": (_changed("separate covariance", "update.covariance", "separate", "update.own_start=0"),),
+    "seeds": tuple(
+        Variant(f"{name} {DEFAULT_ITERATIONS}, seed {seed}", name, seed=seed) for name in METHODS for seed in SEEDS[1:]
+    ),
+    "drift": tuple(Variant(f"{name} {count}", name, count, whole=True) for name, count in DRIFT),
+}
+"""One setting at a time; layers in between are spaced evenly in their logarithm, and the default is on every axis.
+
+A separate covariance is all ΔR and Δs: there each Gaussian's own begins at once, with the first layer.
+"""
+
+
+def variants(axes: Sequence[str] = (), most_iterations: int | None = None) -> list[Variant]:
+    """The settings of some axes, each once, the default first and always; none: all axes.
+
+    Args:
+        axes: of ``AXES``. most_iterations: leave out settings with more.
+
+    Raises:
+        ValueError: an unknown axis.
+    """
+    for name in axes:
+        if name not in AXES:
+            raise ValueError(f"axis {name!r} is unknown; choose of {', '.join(AXES)}")
+    asked = [variant for name in axes or AXES for variant in AXES[name]]
+    return list(
+        dict.fromkeys([DEFAULT, *(v for v in asked if most_iterations is None or v.iterations <= most_iterations)])
+    )
+
+
+def measure_frontier(
+    captures: Sequence[Path],
+    out: Path,
+    axes: Sequence[str] = (),
+    *,
+    updates: int = UPDATES,
+    most_iterations: int | None = None,
+    report: Report = print,
+) -> list[Row]:
+    """Measures what is not on disk yet, the cheapest rows of all captures first.
+
+    Args:
+        captures: folders with test cameras. out: folder of the study.
+        axes: of ``AXES``; none: all.
+        updates: of each row, but for the axis "drift", which goes through whole captures.
+        most_iterations: leave out settings with more.
+        report: takes the lines that are printed.
+
+    Returns:
+        The rows that this call has measured; failed ones have ``error`` and are tried again next time.
+
+    Raises:
+        ValueError: an unknown axis.
+    """
+    chosen = variants(axes, most_iterations)
+    return measure_variants(captures, chosen, out, updates=updates, report=report)
+
+
+def measure_variants(
+    captures: Sequence[Path], chosen: Sequence[Variant], out: Path, *, updates: int = UPDATES, report: Report = print
+) -> list[Row]:
+    """Measures the rows of some settings that are not on disk yet, see ``measure_frontier``."""
+    known = list(Store(out).rows())
+    wanted = [(variant, capture) for variant in chosen for capture in captures]
+    jobs = [
+        variant.job(capture, updates)
+        for variant, capture in sorted(wanted, key=lambda pair: pair[0].iterations * (5 if pair[0].whole else 1))
+        if row_of(known, variant, capture.resolve().name, updates) is None
+    ]
+    report(f"{len(wanted)} rows, {len(wanted) - len(jobs)} of them measured already")
+    return run_jobs(jobs, out, report=report) if jobs else []
+
+
+def row_of(rows: Iterable[Row], variant: Variant, capture: str, updates: int) -> Row | None:
+    """The row of a setting on a capture; None where it is not measured.
+
+    A row belongs to a setting where its settings are, to the last number, those that the setting has today, and where
+    it has exactly so many updates, or all of the capture.
+    """
+    settings = variant.settings.model_dump(mode="json")
+    for row in rows:
+        if "error" in row or row["capture"] != capture or row["preset"] != variant.preset:
+            continue
+        given = row["given"]
+        frames = row["capture_frames"] if variant.whole else min(updates + 1, row["capture_frames"])
+        told = completed(row["settings"], settings)
+        if given == {"frames": frames, "masks": True, "points": True} and told == settings:
+            return row
+    return None

@@ -1,0 +1,351 @@
+"""The page of the frontier: plots, what to choose for what, who is ahead at equal seconds, and the tables behind."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import log2
+from pathlib import Path
+
+from studies.effort.page import effort_text
+from studies.frontier import plots
+from studies.frontier.convergence import read_convergence
+from studies.frontier.frontier import AXES, DEFAULT, METHODS, UPDATES, Variant
+from studies.frontier.timing import read_times
+from studies.frontier.tradeoff import (
+    EqualSeconds,
+    Point,
+    curve,
+    equal_seconds,
+    mean_points,
+    of_axis,
+    read_points,
+    spread,
+    undominated,
+)
+from studies.machine import in_words
+from studies.quality.store import Store
+
+PREVIEW_LOSS_DB = 4.0
+"""A preview may lose so much against the default."""
+LIVE_GAIN_DB = 1.0
+"""A live show goes on to a slower setting while it gains this much for each doubling of the time."""
+ARCHIVE_GAIN_DB = 0.1
+"""An archive takes the fastest setting within this of the best."""
+BARS = ("scas4d 10", "scas4d 25", "scas4d 50", "scas4d 100", "dynamic3dgs 100", "dynamic3dgs 200")
+"""Labels of the settings whose stages are drawn."""
+AXIS_WORDS: Mapping[str, str] = {
+    "adaptive": "Other presets",
+    "layers": "Layers",
+    "clusters": "Clusters of the first layer",
+    "pyramid": "Image pyramid",
+    "views": "Views per iteration",
+    "gaussians": "Budget of Gaussians",
+    "max-scale": "Largest scale",
+    "covariance": "Covariance",
+}
+COLUMNS = (
+    ("PSNR dB", "psnr", ".2f"),
+    ("fg dB", "psnr_foreground", ".2f"),
+    ("SSIM", "ssim", ".4f"),
+    ("FLIP", "flip", ".4f"),
+    ("3D %", "track_3d_median", ".2f"),
+    ("2D %", "mte_2d", ".2f"),
+    ("parts ARI", "parts_ari", ".3f"),
+    ("flicker", "flicker", ".2f"),
+)
+"""Heading, name in ``Point.scores``, form."""
+
+
+class NothingMeasured(ValueError):
+    """The study has no row of the captures."""
+
+
+def write_page(out: Path, captures: Sequence[str], page: Path, updates: int = UPDATES) -> str:
+    """Draws the plots into a folder named like the page, and writes the page.
+
+    Args:
+        out: folder of the study. captures: names; those without rows are left out.
+        page: Markdown file. updates: that the rows cover.
+
+    Returns:
+        The page's text.
+
+    Raises:
+        NothingMeasured: no capture has a row of both methods.
+    """
+    points = read_points(out, captures, updates)
+    there = [name for name in captures if all(curve(points, method, name) for method in METHODS)]
+    if not there:
+        raise NothingMeasured(f"{out} has no rows of {', '.join(captures)}; run scripts/bench frontier on them first")
+    means = mean_points(points, there)
+    pictures = _draw(out, points, means, there, page.with_suffix(""), updates)
+    text = _text(out, points, means, there, pictures, page.stem, updates)
+    page.parent.mkdir(parents=True, exist_ok=True)
+    page.write_text(text)
+    return text
+
+
+def chosen(means: Sequence[Point]) -> dict[str, Point]:
+    """A setting for a preview, a live show and an archive, by the rules of the page.
+
+    Args:
+        means: points of every setting, on one capture or averaged; the default among them.
+    """
+    best = undominated([p for p in means if p.variant.seed == DEFAULT.seed and not p.variant.whole])
+    default = next(point for point in means if point.variant == DEFAULT)
+    preview = next(point for point in best if point.psnr >= default.psnr - PREVIEW_LOSS_DB)
+    live = preview
+    for point in best[best.index(preview) + 1 :]:
+        doublings = log2(point.seconds / live.seconds)
+        if point.psnr - live.psnr >= LIVE_GAIN_DB * doublings:
+            live = point
+    archive = next(point for point in best if point.psnr >= best[-1].psnr - ARCHIVE_GAIN_DB)
+    return {"preview": preview, "live show": live, "archive": archive}
+
+
+def score_table(points: Sequence[Point], default: Point | None = None, counts: bool = False) -> str:
+    """A Markdown table, a line a setting, its time against ``default``'s; ``counts`` adds a column of Gaussians."""
+    head = ["setting", *(["Gaussians"] if counts else []), "s/frame", "× default", "CPU s", *(h for h, _, _ in COLUMNS)]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for point in points:
+        ratio = "–" if default is None else f"{point.seconds / default.seconds:.2f}"
+        cpu = "–" if point.cpu_seconds is None else f"{point.cpu_seconds:.2f}"
+        cells = [
+            point.variant.label,
+            *([f"{point.gaussians:,.0f}"] if counts else []),
+            f"{point.seconds:.2f}",
+            ratio,
+            cpu,
+        ]
+        for _, name, form in COLUMNS:
+            value = point.scores[name]
+            cells.append("–" if value is None else format(value, form))
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def equal_table(compared: Sequence[EqualSeconds]) -> str:
+    """A Markdown table: a line a capture, a column a budget, "lead (ours against the baseline's)" in each cell."""
+    budgets = sorted({one.iterations for one in compared})
+    head = ["capture", *(f"{count} iterations" for count in budgets)]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for capture in dict.fromkeys(one.capture for one in compared):
+        by_budget = {one.iterations: one for one in compared if one.capture == capture}
+        lines.append("| " + " | ".join([capture, *(_equal_cell(by_budget.get(count)) for count in budgets)]) + " |")
+    return "\n".join(lines)
+
+
+def equal_words(compared: Sequence[EqualSeconds]) -> str:
+    """How often ``scas4d`` is ahead, and by how much at least."""
+    leads = [one.lead for one in compared if one.lead is not None]
+    missing = len(compared) - len(leads)
+    if not leads:
+        return "Not measured at a common time."
+    ahead = sum(lead > 0 for lead in leads)
+    words = f"`scas4d` is ahead at {ahead} of {len(leads)} budgets; the smallest lead is {min(leads):+.2f} dB."
+    return words + (f" {missing} lie outside its curve." if missing else "")
+
+
+def _draw(
+    out: Path, points: Sequence[Point], means: Sequence[Point], captures: Sequence[str], folder: Path, updates: int
+) -> list[str]:
+    """Draws what there are rows for; the files' names."""
+    words = f"mean of {', '.join(captures)}; first {updates} updates"
+    plots.draw_frontier(means, words, folder / "frontier.png", _deviations(points, captures))
+    plots.draw_captures(points, captures, folder / "captures.png")
+    drawn = ["frontier.png", "captures.png"]
+    watched = next((row for name in captures if (row := read_convergence(out, name))), None)
+    if watched is not None:
+        plots.draw_convergence(watched, folder / "convergence.png")
+        drawn.append("convergence.png")
+    whole = next((name for name in captures if of_axis(points, "drift", name)), None)
+    if whole is not None:
+        plots.draw_drift(points, whole, folder / "drift.png")
+        drawn.append("drift.png")
+    bars = [p for label in BARS for p in means if p.variant.label == label and not p.variant.whole]
+    plots.draw_stages(bars, words, folder / "stages.png")
+    return [*drawn, "stages.png"]
+
+
+def _deviations(points: Sequence[Point], captures: Sequence[str]) -> dict[str, float]:
+    """dB, by method: standard deviation over seeds of a mean over captures, whose seeds are independent."""
+    found = {method: [spread(points, method, name) for name in captures] for method in METHODS}
+    return {
+        method: sum(one[0] ** 2 for one in each if one is not None) ** 0.5 / len(each)
+        for method, each in found.items()
+        if None not in each
+    }
+
+
+def _text(
+    out: Path,
+    points: Sequence[Point],
+    means: Sequence[Point],
+    captures: Sequence[str],
+    pictures: Sequence[str],
+    stem: str,
+    updates: int,
+) -> str:
+    default = next(point for point in means if point.variant == DEFAULT)
+    iterations = [point for method in METHODS for point in curve(means, method)]
+    images = {name.removesuffix(".png"): f"![{name.removesuffix('.png')}]({stem}/{name})" for name in pictures}
+    compared = equal_seconds(points, captures)
+    others = "\n\n".join(
+        f"**{words}**{_over(points, axis, captures)}\n\n" + score_table(found, base, counts=axis == "gaussians")
+        for axis, words in AXIS_WORDS.items()
+        for found, base in [_axis_means(points, axis, captures)]
+        if found
+    )
+    return f"""# What accuracy costs in time
+
+{images["frontier"]}
+
+{_provenance(out, captures)}
+
+An iteration is one forward and backward render of one training view, or of several where a line says so. Each row
+covers the first {updates} updates of a capture, from a frame 0 that all its rows share; accuracy is the mean over these
+updates and the test cameras. Definitions: [quality.md](quality.md), `studies/quality/measure.py`. Seconds are medians
+of one update, pictures decoded and state committed. A setting is dominated where another one is at least as fast and
+more accurate.
+
+## What to choose
+
+{_choice(means, default)}
+
+The rules, computed from the rows: a preview takes the fastest setting that loses at most {PREVIEW_LOSS_DB:g} dB against
+the default; a live show goes on to slower ones while each doubling of the time gains {LIVE_GAIN_DB:g} dB; an archive
+takes the fastest within {ARCHIVE_GAIN_DB:g} dB of the best.
+
+## At equal seconds
+
+The baseline's iterations are the budget: its seconds on each capture, and what `scas4d` reaches in as many, on straight
+lines between its measured numbers of iterations over the logarithm of time. dB that `scas4d` is ahead (its PSNR against
+the baseline's). {equal_words(compared)}
+
+{equal_table(compared)}
+
+{images["captures"]}
+
+{effort_text(out, captures)}
+## Iterations
+
+{score_table(iterations, default)}
+
+{_spreads(points, captures)}
+
+## One setting at a time
+
+Around the default, 100 iterations of `scas4d`.
+
+{others}
+
+## Within an update, over frames, by stage
+
+{
+        _picture(
+            images,
+            "convergence",
+            "The test cameras' PSNR within an update. Rates fall, and layers begin, by shares of the "
+            "iterations asked for: a curve does not run through the ends of shorter ones.",
+        )
+    }
+
+{_picture(images, "drift", "Through a whole capture: what one update leaves wrong, the next starts from.")}
+
+{_picture(images, "stages", "Where the time of a frame goes.")}
+
+## How it was measured
+
+```
+scripts/bench frontier {" ".join(f"CAPTURES/{name}" for name in captures)} --page docs/{stem}.md
+```
+
+Accuracy does not depend on what else a machine does; seconds do. They come from a pass of their own in which all
+settings take turns (`--only times`) where it was made, and are CPU seconds of rows on one thread otherwise. A budget of
+Gaussians has a frame 0 of its own, and only "through a whole capture" covers more than the first updates.
+"""
+
+
+def _choice(means: Sequence[Point], default: Point) -> str:
+    lines = [
+        "| for a | setting | s/frame | PSNR dB | against the default | 3D % | parts ARI |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for purpose, point in chosen(means).items():
+        track, parts = point.scores["track_3d_median"], point.scores["parts_ari"]
+        cells = [
+            purpose,
+            point.variant.label,
+            f"{point.seconds:.2f}",
+            f"{point.psnr:.2f}",
+            f"{point.psnr - default.psnr:+.2f} dB, {point.seconds / default.seconds:.2f} × the time",
+            "–" if track is None else f"{track:.2f}",
+            "–" if parts is None else f"{parts:.3f}",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _axis_means(points: Sequence[Point], axis: str, captures: Sequence[str]) -> tuple[list[Point], Point | None]:
+    """The default's means over the captures that have an axis, and behind them the axis's; the default's alone."""
+    on = _captures_of(points, axis, captures)
+    if not on:
+        return [], None
+    means = mean_points(points, on)
+    default = next(point for point in means if point.variant == DEFAULT)
+    return [default, *of_axis(means, axis)], default
+
+
+def _captures_of(points: Sequence[Point], axis: str, captures: Sequence[str]) -> list[str]:
+    """Those on which all of an axis was measured."""
+    needed = set(AXES[axis])
+
+    def has(capture: str) -> set[Variant]:
+        return {point.variant for point in points if point.capture == capture}
+
+    return [capture for capture in captures if needed and needed <= has(capture)]
+
+
+def _over(points: Sequence[Point], axis: str, captures: Sequence[str]) -> str:
+    on = _captures_of(points, axis, captures)
+    return "" if len(on) == len(captures) else f" (mean of {', '.join(on)})"
+
+
+def _spreads(points: Sequence[Point], captures: Sequence[str]) -> str:
+    """What chance does: the standard deviation over the seeds of the updates."""
+    told = []
+    for method in METHODS:
+        by_capture = {name: spread(points, method, name) for name in captures}
+        found = {name: value for name, value in by_capture.items() if value is not None}
+        if found:
+            count = max(seeds for _, seeds in found.values())
+            words = ", ".join(f"{name} {deviation:.2f}" for name, (deviation, _) in found.items())
+            told.append(f"`{method}` {words} ({count} seeds)")
+    return f"Standard deviation of PSNR over seeds of the updates, dB: {'; '.join(told)}." if told else ""
+
+
+def _provenance(out: Path, captures: Sequence[str]) -> str:
+    rows = [row for row in Store(out).rows() if "error" not in row and row["capture"] in captures]
+    times = [row for name in captures if (row := read_times(out, name)) is not None]
+    days = sorted({str(row["measured"])[:10] for row in [*rows, *times]})
+    when = " to ".join(dict.fromkeys((days[0], days[-1])))
+    cores = sorted({str(row["core"]) for row in [*rows, *times]})
+    where = (
+        "; ".join(sorted({in_words(row["machine"]) for row in times}))
+        or "not in turns, but CPU seconds of rows on one thread"
+    )
+    accuracy = "; ".join(sorted({in_words(row["machine"]) for row in rows}))
+    return (
+        f"Measured {when}. Seconds: {where}. Accuracy: {accuracy}. "
+        f"Code: {len(cores)} state(s) of the core's sources ({', '.join(cores)})."
+    )
+
+
+def _picture(images: Mapping[str, str], name: str, words: str) -> str:
+    return f"{words}\n\n{images[name]}" if name in images else ""
+
+
+def _equal_cell(one: EqualSeconds | None) -> str:
+    if one is None or one.psnr is None or one.lead is None:
+        return "–"
+    return f"{one.lead:+.2f} ({one.psnr:.2f} : {one.baseline_psnr:.2f}) at {one.seconds:.2f} s"

@@ -1,0 +1,461 @@
+"""The plots of the frontier, as PNG files: accuracy over time, within an update, over frames, and where the time goes.
+
+They are as wide as a column (``COLUMN``) or a page (``PAGE``) of a paper, with text of 6.5 to 8 points at that width.
+Colours are those of Okabe and Ito, told apart with any colour vision; shapes and labels say the same again. A colour is
+a method's, an axis's or a stage's, and a dash is a number of iterations, in every plot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scas4d_core.update.result import REPORT
+from studies.frontier.frontier import DEFAULT, METHODS
+from studies.frontier.tradeoff import Point, curve, of_axis, spread, undominated
+from studies.quality.store import Row
+
+OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#CC79A7", "#F0E442", "#000000")
+COLOURS = dict(zip(METHODS, OKABE_ITO, strict=False))
+MARKERS = dict(zip(METHODS, "os", strict=False))
+OTHER_AXES = {
+    "layers": ("layers K", "s", OKABE_ITO[2]),
+    "clusters": ("clusters of the first layer N", "D", OKABE_ITO[3]),
+    "pyramid": ("image pyramid", "^", OKABE_ITO[5]),
+    "views": ("views per iteration", "X", "#882255"),
+    "covariance": ("covariance", "P", "#661100"),
+    "gaussians": ("budget of Gaussians", "v", OKABE_ITO[4]),
+    "adaptive": ("other presets", "*", OKABE_ITO[7]),
+}
+"""In words, marker and colour."""
+STAGES = {
+    "render backward": "#332288",
+    "render": "#88CCEE",
+    "picture loss": "#44AA99",
+    "cascade backward": "#117733",
+    "cascade": "#999933",
+    "neighbours": "#DDCC77",
+    "adam": "#CC6677",
+    "decode": "#882255",
+    "start": "#AA4499",
+    "end": "#661100",
+    "judge": "#6699CC",
+    "iterations": "#44AA99",
+    REPORT: "#000000",
+    "rest": "#BBBBBB",
+}
+"""Colours of the stages (Paul Tol's "muted"), none of them a method's."""
+ABOUT = (0.7, 1.6)
+"""Times the default's seconds: settings in between are drawn about it, others among the iterations."""
+COLUMN, PAGE = 3.45, 7.0
+"""Inches."""
+STYLE = {
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "axes.labelsize": 8,
+    "legend.fontsize": 7.5,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "axes.linewidth": 0.7,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e6e6e6",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "savefig.dpi": 300,
+    "savefig.bbox": "tight",
+    "savefig.pad_inches": 0.03,
+    "figure.constrained_layout.use": True,
+}
+SECONDS = "seconds per frame"
+PSNR = "PSNR on the test cameras (dB)"
+DASHES = {25: ":", 100: "-", 300: "--"}
+"""By iterations."""
+SMALL_STAGES = 0.02
+"""Of the longest bar: stages that are shorter in every bar are drawn as one, but for the report's."""
+DEVIATION = "± 1 standard deviation over seeds"
+SIDES = (
+    *((5, 0, "left", "center"), (-5, 0, "right", "center"), (0, 4, "center", "bottom"), (0, -4, "center", "top")),
+    *((5, 5, "left", "bottom"), (5, -5, "left", "top"), (-5, 5, "right", "bottom"), (-5, -5, "right", "top")),
+    *((3, 11, "left", "bottom"), (3, -11, "left", "top"), (-3, 11, "right", "bottom"), (-3, -11, "right", "top")),
+)
+"""Where a name may stand beside its point: offset in points, alignments; what comes first is preferred."""
+FAR = 150
+"""What a place that is far off its point counts: more than a line that is crossed, less than a name that is hidden."""
+LABEL_GAP = 8.5
+"""Points between the middles of labels that stand one above the other."""
+
+
+class PlotsMissing(RuntimeError):
+    """matplotlib is not installed."""
+
+
+def draw_frontier(points: Sequence[Point], title: str, file: Path, deviations: Mapping[str, float]) -> None:
+    """Accuracy over seconds: both methods by iterations, who is not dominated; beside it settings about the default.
+
+    Args:
+        points: of one capture, or means over several.
+        title: what was measured.
+        file: PNG.
+        deviations: by method, dB, standard deviation of ``points`` over seeds, where known.
+    """
+    plt = _pyplot()
+    default = next((point for point in points if point.variant == DEFAULT), None)
+    least, most = (0.0, inf) if default is None else (share * default.seconds for share in ABOUT)
+    settings = [(axis, point) for axis in OTHER_AXES for point in of_axis(points, axis)]
+    others: dict[str, list[Point]] = {}
+    for axis, point in settings:
+        if least <= point.seconds <= most:
+            others.setdefault(axis, []).append(point)
+    figure, grid = plt.subplots(
+        1,
+        1 + bool(others),
+        figsize=(PAGE if others else COLUMN, 3.2),
+        squeeze=False,
+        width_ratios=[1, 1][: 1 + bool(others)],
+    )
+    axes = grid[0, 0]
+    best = undominated([point for axis in ("iterations", *OTHER_AXES) for point in of_axis(points, axis)])
+    shown = [_steps(axes, best)]
+    shown += [_curve(axes, points, method, best, deviations.get(method)) for method in METHODS]
+    for method in METHODS:
+        for point in curve(points, method):
+            where, side = ((-3, 4), "right") if method == METHODS[0] else ((4, -8), "left")
+            axes.annotate(
+                f"{point.variant.iterations}", (point.seconds, point.psnr), xytext=where, textcoords="offset points",
+                fontsize=7, color=COLOURS[method], ha=side,
+            )  # fmt: skip
+    far = [(point, *OTHER_AXES[axis][1:]) for axis, point in settings if not least <= point.seconds <= most]
+    for point, marker, colour in far:
+        _markers(axes, [point], best, marker, colour, 20)
+    _log_seconds(axes)
+    axes.margins(y=0.07)
+    axes.set_ylabel(PSNR)
+    axes.set_title("a  by iterations of an update (figures)", loc="left")
+    axes.legend(handles=shown, loc="lower right", handletextpad=0.5, borderaxespad=0.2)
+    _name(axes, [(p.seconds, p.psnr, p.variant.label, c) for p, _, c in far], [one.get_data() for one in axes.lines])
+    if others:
+        _draw_about_default(plt, grid[0, 1], points, others, best, deviations.get(METHODS[0]))
+    words = f"{title}; hollow: dominated" + (f"; bars: {DEVIATION}" if deviations else "")
+    figure.suptitle(words, fontsize=7.5, color="#555555")
+    _save(plt, figure, file)
+
+
+def _draw_about_default(
+    plt: Any, axes: Any, points: Sequence[Point], others: Mapping[str, list[Point]], best: Sequence[Point],
+    deviation: float | None,
+) -> None:  # fmt: skip
+    """One setting at a time, each named, with the curve that goes through the default."""
+    method = METHODS[0]
+    _steps(axes, best)
+    _curve(axes, points, method, best, deviation)
+    default = next((point for point in points if point.variant == DEFAULT), None)
+    named = [(point, OTHER_AXES[axis][2]) for axis, found in others.items() for point in found]
+    for axis, found in others.items():
+        _, marker, colour = OTHER_AXES[axis]
+        _markers(axes, found, best, marker, colour, 20)
+    if default is not None:
+        named.insert(0, (default, COLOURS[method]))
+    seconds, psnr = [point.seconds for point, _ in named], [point.psnr for point, _ in named]
+    axes.set_xlim(min(seconds) / 1.27, max(seconds) * 1.16)
+    room = 0.12 * (max(psnr) - min(psnr)) + 0.1
+    axes.set_ylim(min(psnr) - room, max(psnr) + room)
+    axes.set_xlabel(SECONDS)
+    axes.set_title("b  one setting at a time about the default", loc="left")
+    keys = [
+        _key(plt, OTHER_AXES[axis][1], OTHER_AXES[axis][2], OTHER_AXES[axis][0])
+        for axis in others
+        if len(others[axis]) > 1
+    ]
+    axes.legend(handles=keys, loc="lower right", handletextpad=0.3, borderaxespad=0.2, labelspacing=0.3)
+    avoided = [line.get_data() for line in axes.lines]
+    if default is not None and deviation is not None:
+        avoided.append(([default.seconds] * 2, [default.psnr - deviation, default.psnr + deviation]))
+    words = {DEFAULT: f"{DEFAULT.iterations}"}
+    _name(axes, [(p.seconds, p.psnr, words.get(p.variant, p.variant.label), colour) for p, colour in named], avoided)
+
+
+def draw_captures(points: Sequence[Point], captures: Sequence[str], file: Path) -> None:
+    """Both methods by iterations, a panel a capture; bars where several seeds were measured."""
+    plt = _pyplot()
+    columns = min(3, len(captures))
+    rows = -(-len(captures) // columns)
+    figure, grid = plt.subplots(
+        rows, columns, figsize=(max(COLUMN, PAGE * columns / 3), 1.75 * rows + 0.2), squeeze=False, sharex=True
+    )
+    known = False
+    for capture, axes in zip(captures, grid.flat, strict=False):
+        here = [point for point in points if point.capture == capture]
+        for method in METHODS:
+            found = spread(here, method, capture)
+            known |= found is not None
+            _curve(axes, here, method, here, None if found is None else found[0], size=12)
+        axes.set_title(capture, loc="left")
+        _whole_decibels(axes)
+        _log_seconds(axes, label=False)
+    spare = list(grid.flat)[len(captures) :]
+    for axes in spare:
+        axes.axis("off")
+    handles = [_key(plt, MARKERS[m], COLOURS[m], f"{m}, by iterations", line=True) for m in METHODS]
+    if known:
+        handles.append(plt.Line2D([], [], linestyle="none", marker="|", color="#555555", markersize=8, label=DEVIATION))
+    if spare:
+        spare[0].legend(handles=handles, loc="center", borderaxespad=0)
+    else:
+        figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    for column in range(columns):
+        last = max(row for row in range(rows) if row * columns + column < len(captures))
+        grid[last, column].set_xlabel(SECONDS)
+        grid[last, column].tick_params(labelbottom=True)
+    figure.supylabel(PSNR, fontsize=8)
+    _save(plt, figure, file)
+
+
+def draw_convergence(row: Row, file: Path) -> None:
+    """The test cameras' PSNR within an update, what ``measure_convergence`` returned."""
+    plt = _pyplot()
+    figure, axes = plt.subplots(figsize=(COLUMN, 2.5))
+    longest = max(drawn["iterations"][-1] for drawn in row["curves"])
+    lines, short = [], []
+    for drawn in row["curves"]:
+        colour, end = _colour(drawn["preset"]), drawn["iterations"][-1]
+        lines += axes.plot(
+            drawn["iterations"], drawn["psnr"], DASHES.get(end, "-."), color=colour, linewidth=1.3, clip_on=False
+        )
+        axes.plot(end, drawn["psnr"][-1], "o", color=colour, markersize=3.5, clip_on=False)
+        if end < longest:
+            short.append((end, drawn["psnr"][-1], drawn["label"], colour))
+    axes.set_xlabel("iterations done")
+    axes.set_ylabel(PSNR)
+    axes.set_title(f"{row['capture']}, mean of the first {row['updates']} updates", loc="left")
+    _whole_decibels(axes)
+    _up_to(axes, longest)
+    whole = [one for one in row["curves"] if one["iterations"][-1] == longest]
+    _beside(axes, [(longest, one["psnr"][-1], one["label"], _colour(one["preset"])) for one in whole])
+    _name(axes, short, [line.get_data() for line in lines])
+    _save(plt, figure, file)
+
+
+def draw_drift(points: Sequence[Point], capture: str, file: Path) -> None:
+    """PSNR frame by frame through a whole capture."""
+    plt = _pyplot()
+    figure, axes = plt.subplots(figsize=(COLUMN, 2.5))
+    ends = []
+    for point in of_axis(points, "drift", capture):
+        colour, last = _colour(point.variant.preset), len(point.psnr_by_frame) - 1
+        dashes = DASHES.get(point.variant.iterations, "-.")
+        axes.plot(range(last + 1), point.psnr_by_frame, dashes, color=colour, linewidth=1.3)
+        ends.append((last, point.psnr_by_frame[-1], point.variant.label, colour))
+    axes.set_xlabel("frame")
+    axes.set_ylabel(PSNR)
+    axes.set_title(capture, loc="left")
+    _whole_decibels(axes)
+    _up_to(axes, max(end for end, *_ in ends))
+    _beside(axes, ends)
+    _save(plt, figure, file)
+
+
+def draw_stages(points: Sequence[Point], title: str, file: Path) -> None:
+    """Where the time of a frame goes, a bar a setting.
+
+    Args:
+        points: in the order of the bars, the first on top.
+        title: what was measured.
+        file: PNG.
+    """
+    plt = _pyplot()
+    stages = _grouped_stages(points)
+    figure, axes = plt.subplots(figsize=(PAGE, 0.27 * len(points) + 1.1))
+    left = [0.0] * len(points)
+    for name, seconds in stages.items():
+        widths = [1000 * value for value in seconds]
+        axes.barh(
+            range(len(points)), widths, left=left, height=0.66, edgecolor="white", linewidth=0.5, label=name,
+            color=STAGES.get(name, "#777777"),
+        )  # fmt: skip
+        left = [a + b for a, b in zip(left, widths, strict=True)]
+    for number, whole in enumerate(left):
+        axes.annotate(
+            f"{whole:,.0f} ms", (whole, number), xytext=(4, 0), textcoords="offset points", va="center", fontsize=7.5
+        )
+    axes.set_yticks(range(len(points)), [p.variant.label for p in points])
+    axes.tick_params(axis="y", length=0)
+    axes.invert_yaxis()
+    axes.grid(visible=False, axis="y")
+    axes.set_xlim(0, 1.1 * max(left))
+    axes.set_xlabel("milliseconds per frame")
+    axes.set_title(title, loc="left", fontsize=7.5, color="#555555")
+    figure.legend(loc="outside lower center", ncols=5, handlelength=1.0, columnspacing=1.2)
+    _save(plt, figure, file)
+
+
+def _pyplot() -> Any:
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise PlotsMissing("plots need matplotlib; run pip install -e '.[bench]'") from error
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    plt: Any = pyplot
+    plt.rcParams.update(STYLE)
+    return plt
+
+
+def _save(plt: Any, figure: Any, file: Path) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file)
+    plt.close(figure)
+
+
+def _colour(preset: str) -> str:
+    return COLOURS.get(preset, OKABE_ITO[7])
+
+
+def _steps(axes: Any, best: Sequence[Point]) -> Any:
+    """The frontier, behind everything."""
+    (line,) = axes.step(
+        [p.seconds for p in best], [p.psnr for p in best], where="post", color="#d4d4d4", linewidth=4, zorder=1,
+        solid_capstyle="round", label="not dominated",
+    )  # fmt: skip
+    return line
+
+
+def _curve(
+    axes: Any, points: Sequence[Point], method: str, best: Sequence[Point], deviation: float | None, size: float = 24
+) -> Any:
+    """A method by iterations, with the deviation of the default's iterations; for the legend."""
+    line, colour = curve(points, method), COLOURS[method]
+    axes.plot([p.seconds for p in line], [p.psnr for p in line], color=colour, linewidth=1.2, zorder=2)
+    _markers(axes, line, best, MARKERS[method], colour, size)
+    for point in line:
+        if deviation is not None and point.variant.iterations == DEFAULT.iterations:
+            axes.errorbar(point.seconds, point.psnr, deviation, color=colour, linewidth=1.0, capsize=2.2, zorder=4)
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], color=colour, marker=MARKERS[method], markersize=4, linewidth=1.2, label=method)
+
+
+def _markers(axes: Any, points: Sequence[Point], best: Sequence[Point], marker: str, colour: str, size: float) -> None:
+    """Full markers for what is not dominated, hollow ones for the rest."""
+    axes.scatter(
+        [p.seconds for p in points], [p.psnr for p in points], s=size, marker=marker, linewidths=1.0, zorder=3,
+        facecolors=[colour if p in best else "white" for p in points], edgecolors=colour,
+    )  # fmt: skip
+
+
+def _key(plt: Any, marker: str, colour: str, words: str, line: bool = False) -> Any:
+    """An entry of the legend."""
+    return plt.Line2D(
+        [], [], linestyle="-" if line else "none", linewidth=1.2, marker=marker, color=colour, markersize=4, label=words
+    )
+
+
+def _log_seconds(axes: Any, label: bool = True) -> None:
+    """A logarithmic axis; without a label it is a small panel's, with fewer ticks."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if label else (1, 3)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    if label:
+        axes.set_xlabel(SECONDS)
+
+
+def _whole_decibels(axes: Any) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=5, steps=[1, 2, 5, 10], integer=True))
+
+
+def _up_to(axes: Any, last: float) -> None:
+    """The axis ends at the last value; labels stand behind it."""
+    from matplotlib.ticker import MaxNLocator
+
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10], integer=True))
+    axes.set_xlim(0, last)
+
+
+def _beside(axes: Any, ends: Sequence[tuple[float, float, str, str]]) -> None:
+    """The names of curves behind their ends (x, y, name, colour), moved apart where they would touch."""
+    axes.figure.draw_without_rendering()
+    scale = 72 / axes.figure.dpi
+    heights = {end: scale * axes.transData.transform(end[:2])[1] for end in ends}
+    free = -float("inf")
+    for end in sorted(ends, key=lambda one: heights[one]):
+        x, y, words, colour = end
+        at = max(heights[end], free + LABEL_GAP)
+        free = at
+        axes.annotate(
+            words, (x, y), xytext=(5, at - heights[end]), textcoords="offset points", va="center", fontsize=7,
+            color=colour, annotation_clip=False,
+        )  # fmt: skip
+
+
+def _name(axes: Any, named: Sequence[tuple[float, float, str, str]], avoided: Sequence[Any] = ()) -> None:
+    """Names beside points (x, y, name, colour): each on the side on which it hides least of points, names and lines.
+
+    Args:
+        avoided: lines, x and y of their vertices.
+    """
+    from matplotlib.patheffects import withStroke
+    from matplotlib.transforms import Bbox
+
+    figure = axes.figure
+    figure.draw_without_rendering()
+    half = 3 * figure.dpi / 72
+    legend = axes.get_legend()
+
+    def around(point: tuple[float, float]) -> Any:
+        across, up = axes.transData.transform(point)
+        return Bbox.from_bounds(across - half, up - half, 2 * half, 2 * half)
+
+    taken = [] if legend is None else [legend.get_window_extent()]
+    taken += [text.get_window_extent() for text in axes.texts] + [around(one[:2]) for one in named]
+    crossed = [around(point) for line in avoided for point in _along(line)]
+    for x, y, words, colour in sorted(named, key=lambda one: -len(one[2])):  # long ones find room while there is some
+        tried = []
+        for across, up, ha, va in SIDES:
+            label = axes.annotate(
+                words, (x, y), xytext=(across, up), textcoords="offset points", ha=ha, va=va, fontsize=6.5, zorder=6,
+                color=colour, path_effects=[withStroke(linewidth=1.6, foreground="white")],
+            )  # fmt: skip
+            label.set_in_layout(False)
+            box = label.get_window_extent()
+            inside = axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1 and axes.bbox.y0 <= box.y0
+            hidden = sum(box.overlaps(other) for other in taken) + 100 * (not inside)
+            lines = sum(box.overlaps(other) for other in crossed)
+            tried.append((1000 * hidden + lines + FAR * (abs(up) > LABEL_GAP), label, box))
+        best = min(tried, key=lambda one: one[0])
+        for one in tried:
+            if one is not best:
+                one[1].remove()
+        taken.append(best[2])
+
+
+def _along(line: tuple[Any, Any]) -> list[tuple[float, float]]:
+    """Points of a line, also between its vertices."""
+    x, y = (np.asarray(values, float) for values in line)
+    where = np.linspace(0, len(x) - 1, 20 * len(x))
+    return list(zip(np.interp(where, range(len(x)), x), np.interp(where, range(len(y)), y), strict=True))
+
+
+def _grouped_stages(points: Sequence[Point]) -> Mapping[str, list[float]]:
+    """Seconds of each stage, one a point, the slowest first; short ones together as "rest", the report's last."""
+    names = dict.fromkeys(name for point in points for name in point.stages)
+    by_name = {name: [point.stages.get(name, 0.0) for point in points] for name in names}
+    longest = max(sum(point.stages.values()) for point in points)
+    ordered = sorted((name for name in by_name if name != REPORT), key=lambda name: -sum(by_name[name]))
+    large = [name for name in ordered if max(by_name[name]) >= SMALL_STAGES * longest][:7]
+    rest = [sum(by_name[name][i] for name in ordered if name not in large) for i in range(len(points))]
+    own = {REPORT: by_name[REPORT]} if REPORT in by_name else {}
+    return {**{name: by_name[name] for name in large}, "rest": rest, **own}

@@ -1,0 +1,201 @@
+"""Seconds of settings measured in turns, so that what else the machine does meets all of them alike.
+
+Every setting has a reconstruction of its own, all in one process, from the frame 0 that the rows of the study share.
+In each round every setting updates to the next frame, in an order that turns from round to round. The first round loads
+kernels and starts without a motion; it is not counted. Settings of many iterations are counted once. What is kept is
+the median, and the median over the rounds of the ratio to the first setting.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scas4d_core.captures import Capture, open_capture
+from scas4d_core.settings import Settings
+from scas4d_core.warm_up import warm_up_elsewhere
+from studies.frontier.frontier import Variant
+from studies.machine import core_version, machine
+from studies.quality.quality import Report
+from studies.quality.runs import completed
+from studies.quality.store import Row
+
+ROUNDS = 5
+"""That are counted."""
+MANY_ITERATIONS = 500
+"""Settings with more are counted once: their seconds vary little, and a round of them takes a minute."""
+
+
+@dataclass
+class Timed:
+    """One setting under way: its reconstruction, and what each counted update took."""
+
+    variant: Variant
+    reconstruction: Any
+    seconds: list[float] = field(default_factory=list)
+    cpu_seconds: list[float] = field(default_factory=list)
+    stages: list[dict[str, float]] = field(default_factory=list)
+
+    def step(self, capture: Capture, index: int, *, counts: bool) -> float:
+        """Reads a frame and updates to it; the seconds of both, noted where it ``counts``."""
+        started, cpu = time.perf_counter(), time.process_time()
+        done = self.reconstruction.step(capture.frame(index))
+        seconds = time.perf_counter() - started
+        if counts:
+            self.seconds.append(seconds)
+            self.cpu_seconds.append(time.process_time() - cpu)
+            self.stages.append({name: float(value) for name, value in done.seconds.items()})
+        return seconds
+
+
+def measure_times(
+    folder: Path, variants: Sequence[Variant], out: Path, *, rounds: int = ROUNDS, report: Report = print
+) -> Row:
+    """Times settings on a capture and leaves the answer in ``out/timing/<capture>.json``.
+
+    What was timed there before, and is not now, stays: its seconds times what the first setting's are to its own then.
+
+    Args:
+        folder: of the capture.
+        variants: the first is what the others are compared with; those whose frame 0 is not kept yet have it fitted.
+        out: folder of the study.
+        rounds: that are counted.
+        report: takes the lines that are printed.
+
+    Raises:
+        ValueError: no setting, fewer than 1 round, or a capture of fewer than 3 frames.
+    """
+    if not variants:
+        raise ValueError("variants is empty; give at least one setting to time")
+    if rounds < 1:
+        raise ValueError(f"rounds is {rounds}; give at least 1")
+    warm_up_elsewhere()
+    # These bring the kernels.
+    from scas4d_core.kernels.jit import threads
+
+    capture = open_capture(folder)
+    turns = min(rounds + 1, capture.frame_count - 1)
+    if turns < 2:
+        raise ValueError(f"{folder} has {capture.frame_count} frame(s); timing needs at least 3")
+    timed = [Timed(variant, started(capture, variant.settings, out)) for variant in _distinct(variants)]
+    ratios: list[list[float]] = [[] for _ in timed]
+    for turn in range(turns):
+        taken: dict[int, float] = {}
+        for place in range(len(timed)):
+            number = (turn + place) % len(timed)
+            if turn < 2 or number == 0 or timed[number].variant.iterations <= MANY_ITERATIONS:
+                taken[number] = timed[number].step(capture, turn + 1, counts=turn > 0)
+        if turn:
+            for number, seconds in taken.items():
+                ratios[number].append(seconds / taken[0])
+        report(f"    {capture.name}: round {turn} of {turns - 1}, {sum(taken.values()):.1f} s")
+    row: Row = {
+        "capture": capture.name,
+        "measured": datetime.now(UTC).isoformat(timespec="seconds"),
+        "core": core_version(),
+        "machine": {**machine(), "threads": threads()},
+        "rounds": turns - 1,
+        "settings": [_answer(one, ratios[number]) for number, one in enumerate(timed)],
+    }
+    row["settings"] += _timed_before(read_times(out, capture.name), row["settings"])
+    path = out / "timing" / f"{capture.name}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(row, indent=1))
+    return row
+
+
+def read_times(out: Path, capture: str) -> Row | None:
+    """What ``measure_times`` left for a capture; None where it was not measured."""
+    path = out / "timing" / f"{capture}.json"
+    if not path.exists():
+        return None
+    row: Row = json.loads(path.read_text())
+    return row
+
+
+def _timed_before(before: Row | None, now: Sequence[Row]) -> list[Row]:
+    """The answers of an earlier pass that the one of today lacks, in its seconds; none where it had another first."""
+    if before is None:
+        return []
+    first, *others = before["settings"]
+    if _unseeded(first["settings"]) != _unseeded(now[0]["settings"]):
+        return []
+    scale = now[0]["seconds"] / first["seconds"]
+    have = [_unseeded(answer["settings"]) for answer in now]
+    kept = [answer for answer in others if _unseeded(answer["settings"]) not in have]
+    return [
+        {
+            **answer,
+            "seconds": scale * answer["seconds"],
+            "seconds_each": [round(scale * value, 4) for value in answer["seconds_each"]],
+            "cpu_seconds": scale * answer["cpu_seconds"],
+            "stages": {name: scale * value for name, value in answer["stages"].items()},
+        }
+        for answer in kept
+    ]
+
+
+def time_of(times: Row | None, settings: Settings) -> Row | None:
+    """The entry of a setting, whatever its seeds; None where it was not timed."""
+    today = settings.model_dump(mode="json")
+    for entry in times["settings"] if times else ():
+        if _unseeded(completed(entry["settings"], today)) == _unseeded(today):
+            found: Row = entry
+            return found
+    return None
+
+
+def _distinct(variants: Sequence[Variant]) -> list[Variant]:
+    """One for each setting: seeds, and how many frames a row has, do not change the time of an update."""
+    by_settings = {json.dumps(_unseeded(v.settings.model_dump(mode="json")), sort_keys=True): v for v in variants[::-1]}
+    chosen = set(by_settings.values())
+    return [variant for variant in variants if variant in chosen]
+
+
+def _unseeded(settings: Row) -> Row:
+    return settings | {"update": {**settings["update"], "seed": 0}}
+
+
+def started(capture: Capture, settings: Settings, out: Path, states: Path | None = None) -> Any:
+    """A reconstruction after frame 0, which is read from the study or, the first time, fitted and kept there.
+
+    Args:
+        states: empty folder to commit to; None: in memory.
+    """
+    from scas4d_core.reconstruction import Reconstruction
+    from scas4d_core.storage.history import History
+    from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
+
+    file = out / "first" / f"{first_frame_key(capture, settings)}.npz"
+    static, _ = load_first_frame(file) or (None, 0.0)
+    began = time.perf_counter()
+    history = History() if states is None else History(states)
+    reconstruction = Reconstruction.start(
+        capture.rig, capture.frame(0), settings, points=capture.points, static=static, history=history
+    )
+    if static is None and reconstruction.static is not None:
+        save_first_frame(file, reconstruction.static, time.perf_counter() - began)
+    return reconstruction
+
+
+def _answer(one: Timed, ratios: Sequence[float]) -> Row:
+    names = dict.fromkeys(name for stages in one.stages for name in stages)
+    return {
+        "label": one.variant.label,
+        "preset": one.variant.preset,
+        "iterations": one.variant.iterations,
+        "settings": one.variant.settings.model_dump(mode="json"),
+        "gaussians": len(one.reconstruction.history.gaussians(0)),
+        "seconds": float(np.median(one.seconds)),
+        "seconds_each": [round(value, 4) for value in one.seconds],
+        "cpu_seconds": float(np.median(one.cpu_seconds)),
+        "ratio": float(np.median(ratios)),
+        "stages": {name: float(np.median([stages.get(name, 0.0) for stages in one.stages])) for name in names},
+    }

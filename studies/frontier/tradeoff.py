@@ -1,0 +1,215 @@
+"""Rows and times of the frontier as points: what a setting reaches in how many seconds, and who is ahead at equal ones.
+
+Accuracy is that of the rows, over the same updates for all of a capture. Seconds are those of ``bench.timing``; where
+there are none, those of the row: CPU seconds if it ran on one thread, for they mind little what else a machine does.
+A setting that was not timed on a capture where others were has the seconds of its row, times what the default's timed
+seconds are to those of its row: so all seconds of a capture mean the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from studies.frontier.frontier import AXES, DEFAULT, METHODS, Variant, row_of, variants
+from studies.frontier.timing import read_times, time_of
+from studies.quality.store import Row, Store
+
+SCORES = (
+    "psnr",
+    "psnr_foreground",
+    "ssim",
+    "flip",
+    "track_3d_median",
+    "mte_2d",
+    "mte_2d_oracle",
+    "parts_ari",
+    "flicker",
+)
+"""Of a row, by name."""
+BUDGETS = (25, 50, 100, 200, 300)
+"""Iterations of the baseline whose seconds are compared at."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One setting on one capture, or its mean over several.
+
+    Attributes:
+        capture: name, or what is averaged. updates: how many the scores cover.
+        seconds: of an update, see above. cpu_seconds: of all threads, None where not measured.
+        timed: whether the seconds were measured in turns. stages: median seconds by stage.
+        gaussians: in the scene. scores: by name of ``SCORES``, None where the capture has no truth for them.
+        psnr_by_frame: dB, frame 0 first; empty for a mean.
+    """
+
+    variant: Variant
+    capture: str
+    updates: int
+    seconds: float
+    cpu_seconds: float | None
+    timed: bool
+    stages: Mapping[str, float]
+    gaussians: float
+    scores: Mapping[str, float | None]
+    psnr_by_frame: tuple[float, ...] = ()
+
+    @property
+    def psnr(self) -> float:
+        """dB, mean over updates and test cameras."""
+        value = self.scores["psnr"]
+        assert value is not None  # every row has it
+        return value
+
+
+def read_points(out: Path, captures: Sequence[str], updates: int) -> list[Point]:
+    """Every setting of the study that was measured on these captures, in the order of the axes."""
+    rows = list(Store(out).rows())
+    points = []
+    for capture in captures:
+        times = read_times(out, capture)
+        default, scale = time_of(times, DEFAULT.settings), 1.0
+        if default is not None and (row := row_of(rows, DEFAULT, capture, updates)) is not None:
+            scale = default["seconds"] / _own_seconds(row)
+        for variant in variants():
+            row = row_of(rows, variant, capture, updates)
+            if row is not None:
+                points.append(_point(variant, row, time_of(times, variant.settings), scale))
+    return points
+
+
+def mean_points(points: Iterable[Point], captures: Sequence[str]) -> list[Point]:
+    """The means over captures of the settings that were measured on all of them, with the same number of updates."""
+    by_variant: dict[Variant, dict[str, Point]] = {}
+    for point in points:
+        by_variant.setdefault(point.variant, {})[point.capture] = point
+    means = []
+    for variant, found in by_variant.items():
+        if all(capture in found for capture in captures):
+            means.append(_mean(variant, [found[capture] for capture in captures]))
+    return means
+
+
+def of_axis(points: Iterable[Point], axis: str, capture: str | None = None) -> list[Point]:
+    """The points of an axis, on one capture or on all."""
+    return [p for p in points if p.variant in AXES[axis] and capture in (None, p.capture)]
+
+
+def curve(points: Iterable[Point], method: str, capture: str | None = None) -> list[Point]:
+    """A method by its number of iterations, ascending."""
+    found = [p for p in of_axis(points, "iterations", capture) if p.variant.preset == method]
+    return sorted(found, key=lambda point: point.variant.iterations)
+
+
+def undominated(points: Sequence[Point]) -> list[Point]:
+    """Those that no other beats in PSNR without taking longer, by seconds ascending."""
+    best: list[Point] = []
+    for point in sorted(points, key=lambda point: (point.seconds, -point.psnr)):
+        if not best or point.psnr > best[-1].psnr:
+            best.append(point)
+    return best
+
+
+def psnr_at(points: Sequence[Point], seconds: float) -> float | None:
+    """PSNR (dB) of a curve at so many seconds, on straight lines over log time; None outside the curve."""
+    ordered = sorted(points, key=lambda point: point.seconds)
+    if not ordered or not ordered[0].seconds <= seconds <= ordered[-1].seconds:
+        return None
+    return float(np.interp(np.log(seconds), [np.log(p.seconds) for p in ordered], [p.psnr for p in ordered]))
+
+
+@dataclass(frozen=True)
+class EqualSeconds:
+    """Both methods at the seconds that the baseline takes for so many iterations.
+
+    Attributes:
+        psnr: dB of ``scas4d``, interpolated; None where its curve does not reach there.
+        baseline_psnr: dB, measured.
+    """
+
+    capture: str
+    iterations: int
+    seconds: float
+    psnr: float | None
+    baseline_psnr: float
+
+    @property
+    def lead(self) -> float | None:
+        """How far ``scas4d`` is ahead, in dB."""
+        return None if self.psnr is None else self.psnr - self.baseline_psnr
+
+
+def equal_seconds(points: Sequence[Point], captures: Sequence[str]) -> list[EqualSeconds]:
+    """Who is ahead at equal seconds, at every budget of ``BUDGETS`` that was measured."""
+    own, other = METHODS
+    found = []
+    for capture in captures:
+        own_curve = curve(points, own, capture)
+        for base in curve(points, other, capture):
+            if base.variant.iterations in BUDGETS:
+                psnr = psnr_at(own_curve, base.seconds)
+                found.append(EqualSeconds(capture, base.variant.iterations, base.seconds, psnr, base.psnr))
+    return found
+
+
+def spread(points: Iterable[Point], method: str, capture: str, score: str = "psnr") -> tuple[float, int] | None:
+    """Standard deviation of a score over the seeds of a method at the default's iterations, and how many seeds."""
+    of_seeds = [p for p in of_axis(points, "seeds", capture) if p.variant.preset == method]
+    first = [p for p in curve(points, method, capture) if p.variant.iterations == DEFAULT.iterations]
+    values = [p.scores[score] for p in first + of_seeds]
+    known = [value for value in values if value is not None]
+    return (float(np.std(known, ddof=1)), len(known)) if len(known) > 1 else None
+
+
+def _own_seconds(row: Row) -> float:
+    """Of an update, as the row itself has them."""
+    alone = row["machine"].get("threads") == 1 and "cpu_seconds_update" in row
+    return float(row["cpu_seconds_update" if alone else "seconds_update"])
+
+
+def _point(variant: Variant, row: Row, timed: Row | None, scale: float) -> Point:
+    seconds = scale * _own_seconds(row)
+    known: Any = timed or {
+        "seconds": seconds,
+        "cpu_seconds": row.get("cpu_seconds_update"),
+        "stages": {name: seconds * part / row["seconds_update"] for name, part in row["seconds_stages"].items()},
+    }
+    return Point(
+        variant=variant,
+        capture=row["capture"],
+        updates=row["updates"],
+        seconds=known["seconds"],
+        cpu_seconds=known["cpu_seconds"],
+        timed=timed is not None,
+        stages=known["stages"],
+        gaussians=row["gaussians"],
+        scores={name: row.get(name) for name in SCORES},
+        psnr_by_frame=tuple(row["psnr_by_frame"]),
+    )
+
+
+def _mean(variant: Variant, points: Sequence[Point]) -> Point:
+    """Scores are averaged over the captures that have them."""
+    cpu = [point.cpu_seconds for point in points]
+    names = dict.fromkeys(name for point in points for name in point.stages)
+    scores = {name: [p.scores[name] for p in points] for name in SCORES}
+    return Point(
+        variant=variant,
+        capture="mean of " + ", ".join(point.capture for point in points),
+        updates=min(point.updates for point in points),
+        seconds=float(np.mean([point.seconds for point in points])),
+        cpu_seconds=None if None in cpu else float(np.mean([value for value in cpu if value is not None])),
+        timed=all(point.timed for point in points),
+        stages={name: float(np.mean([point.stages.get(name, 0.0) for point in points])) for name in names},
+        gaussians=float(np.mean([point.gaussians for point in points])),
+        scores={name: _known_mean(values) for name, values in scores.items()},
+    )
+
+
+def _known_mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None

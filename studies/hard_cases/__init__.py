@@ -1,0 +1,1 @@
+"""Hard cases of single functions, on every backend."""

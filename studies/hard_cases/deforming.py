@@ -1,0 +1,204 @@
+"""A deformation applied and differentiated, on every backend."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.structure.hierarchy import Hierarchy
+from scas4d_core.structure.neighbours import Neighbours, build_neighbours
+from scas4d_core.update.deformation import CpuDeformation
+from studies.hard_cases.case import (
+    CPU,
+    CUDA,
+    REFERENCE,
+    Outcome,
+    Values,
+    apart,
+    beyond,
+    not_finite,
+    unexpected_counts,
+)
+
+Array = NDArray[np.float32]
+
+STRENGTHS = (4.0, 2.0, 4.0)
+"""Of rigidity, isometry and rotation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Deforming:
+    """Gaussians under layers of clusters.
+
+    The loss is a sum of the moved means and factors, each number with a random weight, and the neighbour terms, which
+    read the turns.
+
+    Attributes:
+        means [M, 3], factors [M, 3, 3]: of frame t−1.
+        labels: per layer, coarse to fine, [M] ascending; nested.
+        clusters: per layer [K, 10]. deltas: [M, 9].
+        bad: [M] rows that are not finite: they stay as they are, the others as if they were not there.
+        near: [M] rows whose agreement is asked for; all where left out.
+        value: metres (of means), and per unit of the factors' norm. turn, gradient: as shares. None: no agreement.
+        bound: no gradient is larger.
+    """
+
+    means: Array
+    factors: Array
+    labels: Sequence[NDArray[np.int32]]
+    clusters: Sequence[Array]
+    deltas: Array
+    bad: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    guards: Mapping[str, int] | None = field(default_factory=dict)
+    value: float | None = 1e-5
+    turn: float | None = 1e-4
+    gradient: float | None = 2e-3
+    bound: float = 1e6
+    kind: Literal["centred", "published"] = "centred"
+
+    def weights(self) -> tuple[Array, Array]:
+        """Of means [M, 3] and factors [M, 3, 3]."""
+        rng = np.random.default_rng(7)
+        pulls = rng.normal(size=(len(self.means), 3)), rng.normal(size=(len(self.means), 3, 3))
+        by_mean, by_factor = (pull.astype(np.float32) for pull in pulls)
+        if self.bad.any():
+            by_mean[self.bad], by_factor[self.bad] = 0, 0
+        return by_mean, by_factor
+
+    def neighbours(self) -> Neighbours | None:
+        """Of the sound ones, in metres of the cloud's size; None for a single one."""
+        sound = ~self.bad if self.bad.size else np.ones(len(self.means), bool)
+        if sound.sum() < 2:
+            return None
+        where = np.where(sound[:, None], self.means, 0)
+        spread = float(np.square(where[sound] - where[sound].mean(axis=0)).sum(axis=1).mean())
+        return build_neighbours(where, 4, 1 / max(spread, 1e-30))
+
+    def run(self, backend: str) -> Outcome | None:
+        """See ``Problem``."""
+        if backend == CPU:
+            return self._cpu()
+        return self._torch(backend)
+
+    def _cpu(self) -> Outcome:
+        count = len(self.means)
+        starts = tuple(np.searchsorted(k, np.arange(k.max() + 2)).astype(np.int64) for k in self.labels)
+        hierarchy = Hierarchy(np.arange(count), tuple(k.astype(np.int32) for k in self.labels), starts)
+        model = CpuDeformation(hierarchy, self.neighbours(), np.full((count, 3), 1e30, np.float32), self.kind)
+        model.start(state(self.means, self.factors))
+        for table, given in zip([*model.clusters, model.deltas], [*self.clusters, self.deltas], strict=True):
+            table[:] = given
+        model.forward()
+        values: Values = {"means": model.means.copy(), "factors": model.factors.copy(), "turns": model.turns.copy()}
+        values["terms"] = model.neighbour_losses(np.arange(count), STRENGTHS).copy()
+        model.backward(*self.weights(), 0.0)
+        gradients: Values = {f"layer {k}": g.copy() for k, g in enumerate(model.cluster_gradients)}
+        gradients["own"] = model.delta_gradients.copy()
+        return Outcome(values, gradients, dict(model.guards))
+
+    def _torch(self, backend: str) -> Outcome:
+        import torch
+
+        from scas4d_core.torch_backend import deformation, losses
+
+        dtype = torch.float64 if backend == REFERENCE else torch.float32
+        device = "cuda" if backend == CUDA else "cpu"
+        sound = np.flatnonzero(~self.bad) if self.bad.size else np.arange(len(self.means))
+
+        def tensor(values: NDArray[Any], leaf: bool = False) -> torch.Tensor:
+            kind = torch.int64 if values.dtype.kind == "i" else dtype
+            return torch.tensor(values, dtype=kind, device=device, requires_grad=leaf)
+
+        leaves = [tensor(values, True) for values in self.clusters]
+        own = tensor(self.deltas, True)
+        layers = [
+            deformation.Layer(
+                tensor(labels[sound]),
+                deformation.ClusterParams(leaf[:, :3], leaf[:, 3:6], leaf[:, 6:9], leaf[:, 9]),
+            )
+            for labels, leaf in zip(self.labels, leaves, strict=True)
+        ]
+        deltas = deformation.Deltas(own[sound, :3], own[sound, 3:6], own[sound, 6:])
+        previous = tensor(self.means[sound])
+        moved = deformation.deform(previous, tensor(self.factors[sound]), layers, deltas, self.kind)
+        by_mean, by_factor = (tensor(pull[sound]) for pull in self.weights())
+        loss = (moved.means * by_mean).sum() + (moved.factors * by_factor).sum()
+        terms = torch.zeros(3, dtype=dtype, device=device)
+        graph = self.neighbours()
+        if graph is not None:
+            order = np.zeros(len(self.means), np.int64)
+            order[sound] = np.arange(len(sound))
+            pairs = np.isin(graph.index[sound], sound)
+            index, weights = tensor(order[graph.index[sound]]), tensor(graph.weights[sound] * pairs)
+            terms = torch.stack(
+                [
+                    losses.rigidity_loss(moved.means, moved.turns, previous, index, weights),
+                    losses.isometry_loss(moved.means, tensor(graph.distances[sound]), index, weights),
+                    losses.rotation_loss(moved.turns, index, weights),
+                ]
+            )
+            terms = terms * (len(sound) / len(self.means))  # means over all pairs, those held back included
+            loss = loss + (terms * tensor(np.array(STRENGTHS))).sum()
+        found = torch.autograd.grad(loss, [*leaves, own], allow_unused=True)
+        gradients = {f"layer {k}": g for k, g in enumerate(found[:-1])}
+        gradients["own"] = found[-1]
+        values = {"means": self.means.copy(), "factors": self.factors.copy(), "turns": no_turn(len(self.means))}
+        for name in values:
+            values[name] = values[name].astype(np.float64 if backend == REFERENCE else np.float32)
+            values[name][sound] = getattr(moved, name).detach().cpu().numpy()
+        values["terms"] = terms.detach().cpu().numpy()
+        return Outcome(values, {name: np.zeros(1) if g is None else g.cpu().numpy() for name, g in gradients.items()})
+
+    def violations(self, outcomes: Mapping[str, Outcome]) -> list[str]:
+        """See ``Problem``: finite, bounded, unit turns, bad rows held and apart, in agreement."""
+        found = []
+        for backend, outcome in outcomes.items():
+            sound = ~self.bad if self.bad.size else np.ones(len(self.means), bool)
+            rows = {name: v[sound] for name, v in outcome.values.items() if name != "terms"}
+            found += not_finite(Outcome(rows, outcome.gradients), backend) + beyond(outcome, backend, self.bound)
+            norms = np.linalg.norm(rows["turns"], axis=1)
+            if norms.size and np.abs(norms - 1).max() > 1e-4:
+                found.append(f"{backend}: a turn has length {norms[np.abs(norms - 1).argmax()]:.4g}")
+            if self.bad.any():
+                held = all(np.array_equal(outcome.values[n][self.bad], getattr(self, n)[self.bad], equal_nan=True)
+                           for n in ("means", "factors"))  # fmt: skip
+                found += [] if held else [f"{backend}: a row that is not finite was not left as it is"]
+        if CPU in outcomes:
+            found += unexpected_counts(outcomes[CPU], self.guards)
+        for backend in set(outcomes) - {REFERENCE}:
+            found += self._disagreement(outcomes[backend], outcomes[REFERENCE], backend, sound)
+        return found
+
+    def _disagreement(self, outcome: Outcome, truth: Outcome, backend: str, sound: NDArray[np.bool_]) -> list[str]:
+        found = []
+        if self.value is not None and sound.any():
+            off = np.abs(outcome.values["means"][sound] - truth.values["means"][sound]).max()
+            found += [] if off <= self.value else [f"{backend}: means are {off:.2g} m off"]
+            distance = apart(outcome.values["factors"][sound], truth.values["factors"][sound])
+            found += [] if distance <= 100 * self.value else [f"{backend}: factors are {distance:.2g} off"]
+        if self.turn is not None and sound.any():
+            # q and −q are one rotation.
+            dots = (outcome.values["turns"] * truth.values["turns"]).sum(axis=1)[sound]
+            angle = 2 * np.arccos(np.clip(np.abs(dots.astype(np.float64)), 0, 1)).max()
+            found += [] if angle <= max(self.turn, 2e-3) else [f"{backend}: a turn is {angle:.2g} rad off"]
+        if self.gradient is not None:
+            for name, expected in truth.gradients.items():
+                distance = apart(outcome.gradients[name], expected, least=1e-9)
+                found += [] if distance <= self.gradient else [f"{backend}: gradient of {name} is {distance:.2g} off"]
+        return found
+
+
+def no_turn(count: int) -> Array:
+    """[count, 4] unit quaternions of no rotation."""
+    return np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
+
+
+def state(means: Array, factors: Array) -> Gaussians:
+    """Θ of which all moves."""
+    ones = np.ones(len(means), np.float32)
+    return Gaussians(means, factors, no_turn(len(means)), ones, np.zeros_like(means), ones, np.arange(len(means)))

@@ -1,0 +1,197 @@
+"""Each guard taken away, in a copy of the sources and a process of its own: which cases fail then?
+
+The value in the copy's ``guards.py`` is replaced by the row's ``without``; where a comparison does the work and no
+value, the line in ``PATCHES`` is. Compiled kernels of the copies are not kept. Results are, by the digest of the
+sources: the study goes on where it was interrupted.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import scas4d_core
+from scas4d_core.guards import CONVENTIONS, GUARDS, Guard
+
+CORE = Path(scas4d_core.__file__).parent
+SECONDS = 900
+"""A process that takes longer counts as failing."""
+CONTROL = "nothing"
+"""The copy from which nothing was taken: all must hold there."""
+
+PATCHES: dict[str, tuple[tuple[str, str, str], ...]] = {
+    "not_finite": (
+        (
+            "kernels/projection.py",
+            "sound = lanes.choose(size <= FARTHEST, sound_features(features, first), zero)",
+            "sound = lanes.fill(ONE)",
+        ),
+    ),
+    "gradient_not_finite": (
+        (
+            "kernels/projection.py",
+            "steep = not lanes.sum_of(worst) <= STEEPEST",
+            "steep = lanes.sum_of(worst) < ZERO",
+        ),
+        ("kernels/projection.py", "if not steep <= STEEPEST:", "if False:"),
+    ),
+    "held_back": (
+        (
+            "update/deformation.py",
+            "sound: NDArray[np.bool_] = np.isfinite(held).all(axis=1)",
+            "sound: NDArray[np.bool_] = np.ones(len(held), bool)",
+        ),
+    ),
+    "left_out_of_hierarchy": (
+        ("structure/hierarchy.py", "finite = np.isfinite(means).all(axis=1)", "finite = np.ones(len(means), bool)"),
+    ),
+}
+"""File, text that stands there once, and what takes its place."""
+
+SECTIONS = (
+    (("projection", "tiles", "limits", "twin"), "geometry"),
+    (("cascade", "deformation", "neighbour_terms", "lanes"), "cluster_map"),
+    (("adam", "activation", "image_loss", "hierarchy", "losses", "jit"), "steps"),
+)
+"""Which cases look at a guard, by the files that it is in."""
+
+PROGRAM = """
+import json, sys
+from importlib import import_module
+from studies.hard_cases.run import backends, run_case
+found = []
+for section in sys.argv[1].split(","):
+    for case in import_module("studies.hard_cases." + section).CASES:
+        if not case.slow:
+            lines = [run_case(case, size, backends()) for size in case.sizes]
+            if any(line.violations for line in lines):
+                found.append(case.name)
+print("\\n" + json.dumps(found))
+"""
+
+
+class MutationError(RuntimeError):
+    """A mutation that cannot be made or judged: the message says which and why."""
+
+
+def mutants() -> Iterator[Guard]:
+    """Every guard and convention."""
+    yield from GUARDS.values()
+    yield from CONVENTIONS.values()
+
+
+def take_away(guard: Guard, core: Path) -> None:
+    """Edit a copy of ``scas4d_core`` so that a guard does nothing.
+
+    Raises:
+        MutationError: the place to edit is not there once.
+    """
+    if math.isnan(guard.without):
+        edits = PATCHES[guard.name]
+    else:
+        text = (core / "guards.py").read_text()
+        found = re.findall(rf'^    "{guard.name}", [^,]+, ([^,]+),$', text, re.MULTILINE)
+        old = re.findall(rf'^    "{guard.name}", [^,]+, [^,]+,$', text, re.MULTILINE)
+        if len(old) != 1:
+            raise MutationError(f"guard {guard.name!r} has {len(old)} rows in guards.py; one is needed")
+        edits = (("guards.py", old[0], f'    "{guard.name}", {found[0]}, {found[0]},'),)
+    for name, old_text, new_text in edits:
+        path = core / name
+        text = path.read_text()
+        if text.count(old_text) != 1:
+            raise MutationError(
+                f"{name} holds {old_text!r} {text.count(old_text)} times; mend the patch of {guard.name}"
+            )
+        path.write_text(text.replace(old_text, new_text))
+
+
+def sections_of(guard: Guard) -> list[str]:
+    """The modules of cases that look at a guard."""
+    return [section for names, section in SECTIONS if any(name in guard.where for name in names)]
+
+
+def failing_without(guard: Guard | None, sections: list[str]) -> list[str]:
+    """The cases that fail when a guard is taken away; a process that dies or hangs is one of them."""
+    with tempfile.TemporaryDirectory(prefix="scas4d-mutation-") as folder:
+        copy = Path(folder) / "scas4d_core"
+        shutil.copytree(CORE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+        if guard is not None:
+            take_away(guard, copy)
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join((folder, str(CORE.parent))),
+            "NUMBA_CACHE_DIR": str(Path(folder) / "cache"),
+        }
+        command = [sys.executable, "-W", "ignore", "-c", PROGRAM, ",".join(sections)]
+        try:
+            done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=SECONDS)
+        except subprocess.TimeoutExpired:
+            return ["(the run does not end)"]
+        if done.returncode != 0:
+            if done.returncode < 0 and guard is not None:
+                return ["(the run dies)"]
+            raise MutationError(f"the run without {guard.name if guard else CONTROL} failed: {done.stderr[-2000:]}")
+        found: list[str] = json.loads(done.stdout.strip().splitlines()[-1])
+        return found
+
+
+LOOKED_AT = (
+    "scas4d_core/guards.py", "scas4d_core/kernels/*.py", "scas4d_core/rasterize/[!c]*.py",
+    "scas4d_core/rasterize/cpu.py", "scas4d_core/update/deformation.py", "scas4d_core/structure/*h*.py",
+    "scas4d_core/torch_backend/deformation.py", "scas4d_core/torch_backend/losses.py", "scas4d_core/query/ply.py",
+    "studies/hard_cases/ca*.py", "studies/hard_cases/*ing.py", "studies/hard_cases/geometry.py",
+    "studies/hard_cases/cluster_map.py", "studies/hard_cases/steps.py",
+)  # fmt: skip
+"""The files that decide what the mutations find."""
+
+
+def sources() -> str:
+    """Digest of the files that decide what the mutations find."""
+    found = hashlib.sha256()
+    for path in sorted({path for pattern in LOOKED_AT for path in CORE.parent.glob(pattern)}):
+        found.update(str(path.relative_to(CORE.parent)).encode() + path.read_bytes())
+    return found.hexdigest()[:16]
+
+
+def known(store: Path) -> dict[str, list[str]] | None:
+    """What ``study`` has found for these sources; None where it has not been run to its end."""
+    file = store / f"mutations-{sources()}.json"
+    results: dict[str, list[str]] = json.loads(file.read_text()) if file.exists() else {}
+    found = {guard.name: results[guard.name] for guard in mutants() if guard.name in results}
+    return found if len(found) == len(list(mutants())) else None
+
+
+def study(store: Path, told: Callable[[str], None] = print) -> dict[str, list[str]]:
+    """Takes every guard away in turn; the failing cases by guard.
+
+    Args:
+        store: folder of the results; those of the same sources are taken from there.
+
+    Raises:
+        MutationError: a case fails though nothing was taken away, or a mutation cannot be made.
+    """
+    store.mkdir(parents=True, exist_ok=True)
+    digest = sources()
+    file = store / f"mutations-{digest}.json"
+    results: dict[str, list[str]] = json.loads(file.read_text()) if file.exists() else {}
+    if CONTROL not in results:
+        results[CONTROL] = failing_without(None, [section for _, section in SECTIONS])
+        file.write_text(json.dumps(results, indent=1))
+    if results[CONTROL]:
+        raise MutationError(f"cases fail with all guards in place: {', '.join(results[CONTROL])}; mend them first")
+    for guard in mutants():
+        if guard.name not in results:
+            results[guard.name] = failing_without(guard, sections_of(guard))
+            file.write_text(json.dumps(results, indent=1))
+        cases = results[guard.name]
+        told(f"without {guard.name}: {', '.join(cases) if cases else 'NOTHING fails'}")
+    return {name: cases for name, cases in results.items() if name != CONTROL}

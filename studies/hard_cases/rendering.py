@@ -1,0 +1,187 @@
+"""A set of Gaussians rendered and carried back, on every backend."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Camera
+from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
+from scas4d_core.rasterize.limits import DEFAULT, GSPLAT, Limits
+from studies.hard_cases.case import CPU, CUDA, REFERENCE, Outcome, apart, beyond, not_finite, unexpected_counts
+
+Array = NDArray[np.float32]
+
+LEAST_LIGHT = 9e-5
+"""What passes the densest pixel: transmittances stay far above denormal numbers."""
+KINK_SHARE = 0.005
+"""Of the pixels: so many may lie on the other side of the alpha floor or of the stop in float32."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rendering:
+    """Gaussians before a camera.
+
+    The loss is a sum of the picture's features and of the light that is left, each pixel with a random weight.
+
+    Attributes:
+        means [N, 3], factors [N, 3, 3], opacities [N], features [N, 4]: float32.
+        camera: of the inside world.
+        bad: [N] rows that must be left out: no gradient, and the others as if they were not there.
+        guards: how often they must act on the CPU; None: as often as they will.
+        value, gradient: how far float32 may be from float64: a pixel, in units of the features' range; the norm of each
+            gradient, as a share of its norm in float64. None: no agreement is asked for, and ``why`` says why.
+        bound: no gradient is larger, for weights of 1.
+        weight: standard deviation of the pixels' weights.
+    """
+
+    means: Array
+    factors: Array
+    opacities: Array
+    features: Array
+    camera: Camera
+    bad: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    guards: Mapping[str, int] | None = field(default_factory=dict)
+    value: float | None = 2e-4
+    gradient: float | None = 2e-3
+    bound: float = 1e7
+    weight: float = 1.0
+    limits: Limits = DEFAULT
+    why: str = ""
+
+    def weights(self) -> tuple[Array, Array]:
+        """[4, H, W] of the features and [H, W] of alpha."""
+        rng = np.random.default_rng(5)
+        shape = (4, self.camera.height, self.camera.width)
+        return (
+            (self.weight * rng.normal(size=shape)).astype(np.float32),
+            (self.weight * rng.normal(size=shape[1:])).astype(np.float32),
+        )
+
+    def run(self, backend: str) -> Outcome | None:
+        """See ``Problem``."""
+        if backend == CPU:
+            return self._cpu()
+        if backend in (REFERENCE, CUDA):
+            return self._torch(backend)
+        return None
+
+    def _cpu(self) -> Outcome:
+        rasterizer = CpuRasterizer(self.limits)
+        picture = rasterizer.forward(
+            self.means, self.factors, self.opacities, self.features.copy(), CameraArrays.of(self.camera), BACKGROUND
+        )
+        values = {"features": picture.features.copy(), "alpha": 1 - picture.rest}
+        g_image, g_alpha = rasterizer.gradient_buffers()
+        height, width = self.camera.height, self.camera.width
+        g_image[:, :height, :width], g_alpha[:height, :width] = self.weights()
+        found = rasterizer.backward(g_image, g_alpha)
+        names = ("means", "factors", "opacities", "features")
+        gradients = {name: getattr(found, name).copy() for name in names}
+        return Outcome(values, gradients, dict(rasterizer.guards))
+
+    def _torch(self, backend: str) -> Outcome:
+        import torch
+
+        from scas4d_core.rasterize import cuda, twin
+
+        dtype, device = (torch.float64, "cpu") if backend == REFERENCE else (torch.float32, "cuda")
+        names = ("means", "factors", "opacities", "features")
+        leaves = [torch.tensor(getattr(self, name), dtype=dtype, device=device, requires_grad=True) for name in names]
+        drawn = leaves[0], leaves[1], leaves[2], leaves[3]
+        camera = twin.CameraParams.of(self.camera, dtype, device)
+        background = torch.tensor(BACKGROUND, dtype=dtype, device=device)
+        if backend == REFERENCE:
+            picture = twin.render(*drawn, camera, background, self.limits)
+        else:
+            picture = cuda.render(*drawn, camera, background, GSPLAT._replace(near=self.limits.near))
+        by_feature, by_alpha = (torch.tensor(weights, dtype=dtype, device=device) for weights in self.weights())
+        features = torch.movedim(picture.features, -1, 0)
+        loss = (features * by_feature).sum() + (picture.alpha * by_alpha).sum()
+        gradients = torch.autograd.grad(loss, leaves, allow_unused=True)
+        return Outcome(
+            {"features": features.detach().cpu().numpy(), "alpha": picture.alpha.detach().cpu().numpy()},
+            {
+                name: np.zeros(leaf.shape) if g is None else g.cpu().numpy()
+                for name, leaf, g in zip(names, leaves, gradients, strict=True)
+            },
+        )
+
+    def without(self, rows: NDArray[np.bool_]) -> Rendering:
+        """The same without some Gaussians."""
+        kept = ~rows
+        return replace(
+            self, means=self.means[kept], factors=self.factors[kept], opacities=self.opacities[kept],
+            features=self.features[kept], bad=np.zeros(int(kept.sum()), bool), guards=None,
+        )  # fmt: skip
+
+    def violations(self, outcomes: Mapping[str, Outcome]) -> list[str]:
+        """See ``Problem``: finite, bounded, within the hull of the colours, bad rows apart, in agreement."""
+        found = []
+        for backend, outcome in outcomes.items():
+            found += not_finite(outcome, backend) + beyond(outcome, backend, self.bound * self.weight)
+            found += self._outside(outcome, backend) + self._touched(outcome, backend)
+        if CPU in outcomes:
+            found += unexpected_counts(outcomes[CPU], self.guards)
+            if self.bad.any():
+                found += self._spoilt(outcomes[CPU])
+        if REFERENCE in outcomes:
+            truth = outcomes[REFERENCE]
+            for backend in set(outcomes) - {REFERENCE}:
+                found += self._disagreement(outcomes[backend], truth, backend)
+        return found
+
+    def _range(self) -> tuple[float, float]:
+        drawn = self.features[~self.bad] if self.bad.size else self.features
+        drawn = np.concatenate([drawn, BACKGROUND[None]])
+        return float(drawn.min()), float(drawn.max())
+
+    def _outside(self, outcome: Outcome, backend: str) -> list[str]:
+        low, high = self._range()
+        slack = 1e-4 * max(high - low, 1e-3)
+        picture, alpha = outcome.values["features"], outcome.values["alpha"]
+        found = []
+        if picture.min() < low - slack or picture.max() > high + slack:
+            found.append(f"{backend}: picture in {picture.min():.4g}…{picture.max():.4g}, colours {low:.4g}…{high:.4g}")
+        if alpha.min() < -1e-5 or alpha.max() > 1 + 1e-5:
+            found.append(f"{backend}: alpha in {alpha.min():.4g}…{alpha.max():.4g}")
+        if alpha.size and 1 - alpha.max() < LEAST_LIGHT:
+            found.append(f"{backend}: {1 - alpha.max():.2g} of the light is left, less than {LEAST_LIGHT:g}")
+        return found
+
+    def _touched(self, outcome: Outcome, backend: str) -> list[str]:
+        if not self.bad.any() or (backend == REFERENCE and self.value is None):
+            return []
+        return [
+            f"{backend}: bad rows have a gradient of {name}"
+            for name, gradient in outcome.gradients.items()
+            if np.any(gradient[self.bad] != 0)
+        ]
+
+    def _spoilt(self, outcome: Outcome) -> list[str]:
+        alone = self.without(self.bad)._cpu()
+        same = all(np.array_equal(outcome.values[name], alone.values[name]) for name in alone.values) and all(
+            np.array_equal(outcome.gradients[name][~self.bad], alone.gradients[name]) for name in alone.gradients
+        )
+        return [] if same else ["cpu: the others' picture or gradients are not what they are without the bad rows"]
+
+    def _disagreement(self, outcome: Outcome, truth: Outcome, backend: str) -> list[str]:
+        found = []
+        if self.value is not None:
+            low, high = self._range()
+            off = np.abs(outcome.values["features"] - truth.values["features"]).max(axis=0) / max(high - low, 1e-3)
+            share = float(np.mean(~(off <= self.value)))
+            if share > KINK_SHARE and np.count_nonzero(off > self.value) > 1:
+                found.append(f"{backend}: {100 * share:.2g} % of the pixels are up to {off.max():.2g} off")
+        if self.gradient is not None:
+            for name, expected in truth.gradients.items():
+                distance = apart(outcome.gradients[name], expected, least=1e-9 * self.weight)
+                if not distance <= self.gradient:
+                    found.append(f"{backend}: gradient of {name} is {distance:.2g} off")
+        return found
+
+
+BACKGROUND = np.array([0.1, 0.2, 0.3, 0.0], np.float32)

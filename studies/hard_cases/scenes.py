@@ -1,0 +1,181 @@
+"""The catalogue's whole scenes: rigs and units that are unusual, from frame 0 through two updates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from scas4d_core.cameras import Camera, Rig, WorldFrame
+from scas4d_core.captures.frame import Frame
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.settings import Settings
+from studies.hard_cases.case import CPU, HardCase, Outcome
+from studies.kernels.synthetic import ball_on_a_floor, moved, photograph, rig
+
+SIZE, BALL = 32, 400
+"""Pixels across a picture; Gaussians of the ball."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A ball that moves over a floor, for two updates from the true frame 0.
+
+    Attributes:
+        rig: of the world in which the ball is 0.25 m; pictures are taken with it.
+        user: that world as the user's calibration has it.
+        metres_per_unit: as the user says.
+        least: dB that the last update's own views must reach, about what the same scene reaches in metres.
+    """
+
+    rig: Rig
+    user: WorldFrame = field(default_factory=lambda: WorldFrame(np.zeros(3)))
+    metres_per_unit: float | str = 1.0
+    least: float = 0.0
+
+    def run(self, backend: str) -> Outcome | None:
+        """See ``Problem``: on the CPU."""
+        if backend != CPU:
+            return None
+        from scas4d_core.first_frame.static_scene import StaticResult
+        from scas4d_core.reconstruction import Reconstruction
+
+        states = [ball_on_a_floor(BALL, np.random.default_rng(0))]
+        for _ in range(2):
+            states.append(moved(states[-1]))
+        frames = [Frame(k, float(k), f.images, f.masks) for k, f in enumerate(photograph(s, self.rig) for s in states)]
+        cameras = Rig(tuple(_in_users_world(camera, self.user) for camera in self.rig.cameras))
+        world = cameras.world_frame(self.metres_per_unit)
+        settings = Settings.model_validate(
+            {"scene": {"metres_per_unit": self.metres_per_unit}, "update": {"iterations": 60, "clusters": [4, 16]}}
+        )
+        first = _inside(states[0], self.user, world)
+        static = StaticResult(gaussians=first, exposures={}, losses=[])
+        made = Reconstruction.start(cameras, frames[0], settings, static=static)
+        for frame in frames[1:]:
+            report = made.step(frame)
+        last = made.history.gaussians(made.history.indices[-1])
+        values: dict[str, Any] = {name: array for name, array in last.arrays().items() if array.dtype.kind == "f"}
+        values["psnr"] = np.array([report.psnr])
+        truth = _inside(states[-1], self.user, world)
+        rows = first.moving
+        extent = np.ptp(truth.means[rows], axis=0).max()
+        values["error"] = np.linalg.norm(last.means[rows] - truth.means[rows], axis=1) / extent
+        values["standing"] = np.abs(last.means[~rows] - first.means[~rows])
+        return Outcome(values)
+
+    def violations(self, outcomes: Mapping[str, Outcome]) -> list[str]:
+        """See ``Problem``: finite, unit turns, what stands stands, nothing flies off, the pictures are met."""
+        values = outcomes[CPU].values
+        found = [f"{name} is not finite" for name, array in values.items() if not np.isfinite(array).all()]
+        lengths = np.linalg.norm(values["rotations"], axis=1)
+        found += [] if np.abs(lengths - 1).max() < 1e-4 else [f"a rotation has length {lengths.max():.4g}"]
+        found += [] if values["standing"].max() == 0 else ["what stands has moved"]
+        far = float(values["error"].max())
+        found += [] if far < 1 else [f"a Gaussian is {far:.2g} extents off"]
+        psnr = float(values["psnr"][0])
+        found += [] if psnr >= self.least else [f"{psnr:.1f} dB, less than {self.least:.1f}"]
+        return found
+
+
+def _in_users_world(camera: Camera, user: WorldFrame) -> Camera:
+    pose = camera.world_to_camera.copy()
+    centre = user.to_user(camera.centre)
+    pose[:3, 3] = -pose[:3, :3] @ centre
+    return Camera(camera.name, camera.intrinsics, pose, camera.width, camera.height)
+
+
+def _inside(gaussians: Gaussians, user: WorldFrame, world: WorldFrame) -> Gaussians:
+    scale = np.float32(world.metres_per_unit / user.metres_per_unit)
+    means = world.to_inside(user.to_user(gaussians.means)).astype(np.float32)
+    return gaussians.replace(means=means, factors=gaussians.factors * scale)
+
+
+@cache
+def _six() -> Rig:
+    return rig(SIZE)
+
+
+def _with(changes: Mapping[int, Any]) -> Rig:
+    """The six cameras, some of them with other intrinsics."""
+    cameras = list(_six().cameras)
+    for k, intrinsics in changes.items():
+        cameras[k] = replace(cameras[k], intrinsics=np.array(intrinsics))
+    return Rig(tuple(cameras))
+
+
+def _lens(focal: float, cx: float = SIZE / 2, cy: float = SIZE / 2) -> list[list[float]]:
+    return [[focal, 0, cx], [0, focal, cy], [0, 0, 1]]
+
+
+def _scaled(scale: float) -> Scene:
+    """The user's unit is 1/scale metres, and the user says so with metres_per_unit "auto"."""
+    return Scene(_six(), WorldFrame(np.zeros(3), 1 / scale), "auto", least=37.5)
+
+
+def _unsaid(scale: float) -> Scene:
+    """The same, and the user says nothing: rates and bounds in metres are others then."""
+    return Scene(_six(), WorldFrame(np.zeros(3), 1 / scale), 1.0)
+
+
+def _shifted(metres: float) -> Scene:
+    return Scene(_six(), WorldFrame(np.array([-metres, metres, 0.3 * metres])), 1.0, least=40)
+
+
+def _cameras(names: tuple[int, ...]) -> Scene:
+    least = 30 if len(names) > 1 else 26  # one camera does not tell how far away what moves is
+    return Scene(Rig(tuple(_six().cameras[k] for k in names)), least=least)
+
+
+CASES = (
+    HardCase(
+        "six cameras",
+        "of the same ball over a floor as the cases below",
+        "what the others are held against",
+        ("metres",),
+        lambda s: Scene(_six(), least=40),
+    ),
+    HardCase(
+        "other units, said", "lengths times this, metres_per_unit auto", "users' units", (1e-3, 1e-2, 1e2, 1e3), _scaled
+    ),
+    HardCase(
+        "other units, not said",
+        "lengths times this, metres_per_unit 1: finite and bounded",
+        "users' units",
+        (1e-3, 1e-1, 10.0, 1e3),
+        _unsaid,
+    ),
+    HardCase(
+        "origin far away",
+        "metres from the rig: recentred in float64 at the door",
+        "survey coordinates; float32",
+        (1e3, 1e4, 1e6),
+        _shifted,
+    ),
+    HardCase(
+        "few cameras",
+        "those of the six that are there: one, two that face each other",
+        "rigs of one or two",
+        ((0,), (0, 3), (0, 2, 4)),
+        _cameras,
+    ),
+    HardCase(
+        "mixed focal lengths",
+        "two of the six have half and this many times the focal length",
+        "rigs of mixed lenses",
+        (2.0, 8.0),
+        lambda k: Scene(_with({1: _lens(20.0), 2: _lens(40.0 * k)}), least=40),
+    ),
+    HardCase(
+        "principal points outside",
+        "of two of the six, in pictures beside the middle",
+        "cropped rigs",
+        (0.6, 2.0),
+        lambda k: Scene(
+            _with({1: _lens(40.0, SIZE / 2 + k * SIZE), 4: _lens(40.0, SIZE / 2, SIZE / 2 - k * SIZE)}), least=40
+        ),
+    ),
+)

@@ -1,0 +1,530 @@
+"""The catalogue's steps between rendering and deforming: Adam, frame 0's parameters, neighbours, losses, clustering."""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.guards import EXPONENT
+from scas4d_core.kernels import activation, image_loss
+from scas4d_core.kernels.adam import ACTED, EVERY_ROW, adam
+from scas4d_core.query.ply import split_factors
+from scas4d_core.structure.hierarchy import build_hierarchy
+from scas4d_core.structure.neighbours import build_neighbours
+from studies.hard_cases.apart import in_a_process
+from studies.hard_cases.case import CPU, REFERENCE, HardCase, Outcome, apart, beyond, not_finite, unexpected_counts
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A function of arrays, on the CPU and where there is one in float64.
+
+    Attributes:
+        compute: by backend.
+        agreement: of each array with that of float64, as a share of its norm; None asks for none.
+        bound: no gradient is larger. guards: as expected; None: as they will.
+        more: violations of what else must hold.
+    """
+
+    compute: Mapping[str, Callable[[], Outcome]]
+    agreement: float | None = 1e-4
+    bound: float = 1e38
+    guards: Mapping[str, int] | None = field(default_factory=dict)
+    more: Callable[[Mapping[str, Outcome]], list[str]] = lambda outcomes: []
+
+    def run(self, backend: str) -> Outcome | None:
+        """See ``Problem``."""
+        return self.compute[backend]() if backend in self.compute else None
+
+    def violations(self, outcomes: Mapping[str, Outcome]) -> list[str]:
+        """See ``Problem``."""
+        found = []
+        for backend, outcome in outcomes.items():
+            found += not_finite(outcome, backend) + beyond(outcome, backend, self.bound)
+        found += unexpected_counts(outcomes[CPU], self.guards) + self.more(outcomes)
+        if REFERENCE in outcomes and self.agreement is not None:
+            truth = {**outcomes[REFERENCE].values, **outcomes[REFERENCE].gradients}
+            mine = {**outcomes[CPU].values, **outcomes[CPU].gradients}
+            for name in set(truth) & set(mine):
+                distance = apart(mine[name], truth[name], least=1e-9)
+                found += [] if distance <= self.agreement else [f"{name} is {distance:.2g} off"]
+        return found
+
+
+STEPS = 20
+LARGEST = EXPONENT * np.log(2.0)
+"""Of an exponential's argument."""
+
+
+def _adam(gradient: Callable[[int, Array], None], acted: int, flushed: int = 0, **changes: Any) -> Step:
+    """Twenty steps over a table of which ``gradient(step, table)`` spoils some numbers."""
+
+    def start() -> tuple[Array, list[Array]]:
+        rng = np.random.default_rng(11)
+        gradients = []
+        for step in range(STEPS):
+            table = rng.normal(size=(1100, 9)).astype(np.float32)
+            gradient(step, table)
+            gradients.append(table)
+        return np.zeros((1100, 9), np.float32), gradients
+
+    def on_cpu() -> Outcome:
+        parameters, gradients = start()
+        first, second = np.zeros_like(parameters), np.zeros_like(parameters)
+        rates = np.full(9, 0.01, np.float32)
+        counts = np.zeros(2, np.int64)
+        for step, table in enumerate(gradients, 1):
+            counts += adam(parameters, table, first, second, rates, EVERY_ROW, np.float32(0.9), np.float32(0.999), step)
+        values = {"parameters": parameters, "first": first, "second": second}
+        return Outcome(values, {}, dict(zip(ACTED, counts.tolist(), strict=True)))
+
+    def in_torch() -> Outcome:
+        import torch
+
+        parameters, gradients = start()
+        leaf = torch.tensor(parameters, dtype=torch.float64, requires_grad=True)
+        optimizer = torch.optim.Adam([leaf], lr=0.01, betas=(0.9, 0.999), eps=1e-15)
+        for table in gradients:
+            wide = torch.tensor(table, dtype=torch.float64)
+            # A gradient that is none is 0, one too large as large as is taken.
+            leaf.grad = torch.nan_to_num(wide, nan=0.0, posinf=1e18, neginf=-1e18).clamp(-1e18, 1e18)
+            optimizer.step()
+        return Outcome({"parameters": leaf.detach().numpy()})
+
+    return Step({CPU: on_cpu, REFERENCE: in_torch}, guards={ACTED[0]: acted, ACTED[1]: flushed}, **changes)
+
+
+def _spoil(value: float, once: bool) -> Callable[[int, Array], None]:
+    def spoil(step: int, table: Array) -> None:
+        if step == 2 or not once:
+            table[1050, 4] = value
+
+    return spoil
+
+
+def _tiny(value: float) -> Callable[[int, Array], None]:
+    """A whole table of tiny gradients: no number of it, and no moment, may be denormal."""
+
+    def spoil(step: int, table: Array) -> None:
+        table[:] = value
+
+    return spoil
+
+
+def denormal(array: NDArray[Any]) -> int:
+    """How many numbers are neither 0 nor normal in float32."""
+    return int(np.count_nonzero((array != 0) & (np.abs(array) < np.finfo(np.float32).tiny)))
+
+
+def _no_denormals(outcomes: Mapping[str, Outcome]) -> list[str]:
+    values = outcomes[CPU].values
+    return [f"{denormal(values[name])} denormal numbers in the {name} moments" for name in ("first", "second")
+            if denormal(values[name])]  # fmt: skip
+
+
+def _decaying(outcomes: Mapping[str, Outcome]) -> list[str]:
+    return _no_denormals(outcomes)
+
+
+def _activation(
+    columns: slice, value: Any, guards: dict[str, int], agreement: float | None = 1e-4, pull: float = 1.0
+) -> Step:
+    """A tenth of 300 rows of frame 0's parameters take a value in some columns."""
+    rng = np.random.default_rng(12)
+    table = rng.normal(size=(300, activation.COLUMNS)).astype(np.float32)
+    table[::10, columns] = value
+    pulls = [(pull * rng.normal(size=shape)).astype(np.float32) for shape in ((300, 3), (300, 3, 3), (300,), (300, 4))]
+
+    def on_cpu() -> Outcome:
+        names = ("means", "factors", "opacities", "features")
+        arrays = [np.full_like(pull, np.nan) for pull in pulls]
+        counts = activation.activate(table, *arrays)
+        gradients = np.full_like(table, np.nan)
+        activation.activate_backward(table, *arrays[1:], *pulls, gradients)
+        acted = dict(zip(activation.ACTED, counts.tolist(), strict=True))
+        return Outcome(dict(zip(names, arrays, strict=True)), {"parameters": gradients}, acted)
+
+    def in_torch() -> Outcome:
+        import torch
+
+        from scas4d_core.torch_backend.deformation import quaternion_matrices
+
+        leaf = torch.tensor(table, dtype=torch.float64, requires_grad=True)
+        squares = leaf[:, 3:7].square().sum(dim=1, keepdim=True)
+        none = leaf.new_tensor([1.0, 0, 0, 0])
+        aimed = squares > 1e-30
+        quaternions = torch.where(aimed, leaf[:, 3:7], none)
+        quaternions = quaternions / quaternions.norm(dim=1, keepdim=True)
+        clamped = leaf.clamp(-LARGEST, LARGEST)
+        factors = quaternion_matrices(quaternions) * torch.exp(clamped[:, None, 7:10])
+        features = torch.cat([leaf[:, 11:14], torch.sigmoid(clamped[:, 14:])], dim=1)
+        values = {
+            "means": leaf[:, :3], "factors": factors, "opacities": torch.sigmoid(clamped[:, 10]), "features": features
+        }  # fmt: skip
+        loss = sum((v * torch.tensor(pull)).sum() for v, pull in zip(values.values(), pulls, strict=True))
+        (gradients,) = torch.autograd.grad(loss, [leaf])  # type: ignore[arg-type]
+        return Outcome({n: v.detach().numpy() for n, v in values.items()}, {"parameters": gradients.numpy()})
+
+    return Step({CPU: on_cpu, REFERENCE: in_torch}, guards=guards, agreement=agreement)
+
+
+def _opposite(scale: float) -> Step:
+    """Q and −q, of any length: the same Gaussian, and opposite gradients."""
+    rng = np.random.default_rng(13)
+    table = rng.normal(size=(64, activation.COLUMNS)).astype(np.float32)
+    table[:, 3:7] *= np.float32(scale)
+    table[32:] = table[:32]
+    table[32:, 3:7] *= -1
+
+    def on_cpu() -> Outcome:
+        shapes = ((64, 3), (64, 3, 3), (64,), (64, 4))
+        arrays = [np.empty(shape, np.float32) for shape in shapes]
+        counts = activation.activate(table, *arrays)
+        gradients = np.empty_like(table)
+        pulls = [np.ones(shape, np.float32) for shape in shapes]
+        activation.activate_backward(table, *arrays[1:], *pulls, gradients)
+        acted = dict(zip(activation.ACTED, counts.tolist(), strict=True))
+        return Outcome({"factors": arrays[1]}, {"parameters": gradients}, acted)
+
+    def opposite(outcomes: Mapping[str, Outcome]) -> list[str]:
+        factors, g = outcomes[CPU].values["factors"], outcomes[CPU].gradients["parameters"][:, 3:7]
+        same = np.array_equal(factors[:32], factors[32:]) and np.array_equal(g[:32], -g[32:])
+        return [] if same else ["q and −q are not the same Gaussian"]
+
+    return Step({CPU: on_cpu}, more=opposite)
+
+
+def _pictures(rendered: Any, target: Any, size: tuple[int, int] = (40, 37), agreement: float | None = 2e-3) -> Step:
+    """The image loss of two pictures, arrays or numbers that fill them; no pixel pulls with more than its own share."""
+    height, width = size
+    shape = (3, height, width)
+    image = np.broadcast_to(np.asarray(rendered, np.float32), shape).copy()
+    truth = np.broadcast_to(np.asarray(target, np.float32), shape).copy()
+
+    def on_cpu() -> Outcome:
+        pitch = image_loss.stride(width)
+        scratch = np.zeros((6, 3, height + 2 * image_loss.REACH, pitch), np.float32)
+        means, squares = np.empty_like(truth), np.empty_like(truth)
+        image_loss.target_moments(truth, scratch, means, squares)
+        scratch[:] = 0
+        gradient, rows = np.empty_like(image), np.empty((3, height, 2), np.float32)
+        by_exposure = np.empty((3, height, 2), np.float32)
+        exposure = np.tile(np.array([1, 0], np.float32), (3, 1))
+        weights = np.full(3, 1 / 3, np.float32)
+        image_loss.image_loss(image, exposure, truth, means, squares, weights, scratch, gradient, rows, by_exposure)
+        return Outcome({"loss": rows[..., 0].sum(dtype=np.float64)[None]}, {"picture": gradient})
+
+    def in_torch() -> Outcome:
+        import torch
+
+        from scas4d_core.torch_backend import losses
+
+        leaf = torch.tensor(image, dtype=torch.float64, requires_grad=True)
+        other = torch.tensor(truth, dtype=torch.float64)
+        loss = losses.image_loss(leaf.permute(1, 2, 0), other.permute(1, 2, 0))
+        (gradient,) = torch.autograd.grad(loss, [leaf])
+        figure = losses.psnr(leaf.detach().permute(1, 2, 0), other.permute(1, 2, 0))
+        return Outcome(
+            {"loss": loss.detach().numpy()[None], "psnr": figure.numpy()[None]}, {"picture": gradient.numpy()}
+        )
+
+    return Step({CPU: on_cpu, REFERENCE: in_torch}, agreement=agreement, bound=100 / image.size)
+
+
+def _noise(seed: int) -> Array:
+    return np.random.default_rng(seed).integers(0, 2, (3, 40, 37)).astype(np.float32)
+
+
+def _clustering(points: Callable[[np.random.Generator], NDArray[Any]], wished: tuple[int, ...]) -> Step:
+    """Every finite Gaussian in one cluster of each layer, each cluster whole and nested, the same twice."""
+
+    def on_cpu() -> Outcome:
+        means = points(np.random.default_rng(14)).astype(np.float32)
+        found = build_hierarchy(means, np.ones(len(means), bool), wished, 8)
+        again = build_hierarchy(means, np.ones(len(means), bool), wished, 8)
+        finite = np.isfinite(means).all(axis=1)
+        whole = np.array_equal(np.sort(found.rows), np.flatnonzero(finite))
+        same = np.array_equal(found.rows, again.rows)
+        nested = all(set(a) <= set(b) for a, b in zip(found.starts, found.starts[1:], strict=False))
+        full = all((np.diff(starts) > 0).all() and starts[-1] == len(found.rows) for starts in found.starts)
+        capped = all(size <= wish for size, wish in zip(found.sizes, wished, strict=False))
+        laws = np.array([whole, same, nested, full, capped, found.left_out == np.count_nonzero(~finite)], float)
+        return Outcome({"laws": laws}, {}, {"left_out_of_hierarchy": found.left_out})
+
+    def lawful(outcomes: Mapping[str, Outcome]) -> list[str]:
+        names = ("every finite row once", "the same twice", "nested", "none empty", "no more than wished", "counted")
+        laws = outcomes[CPU].values["laws"]
+        return [f"clustering: not {name}" for name, law in zip(names, laws, strict=True) if not law]
+
+    return Step({CPU: on_cpu}, guards=None, more=lawful)
+
+
+MILLION_MB = 600
+"""Most that clustering a million Gaussians may take beside what the process has before."""
+
+
+def _megabytes_of_clustering(count: int) -> float:
+    """Peak memory of ``build_hierarchy`` on a surface of so many points, beyond what the process held before."""
+    rng = np.random.default_rng(16)
+    means = rng.normal(size=(count, 3)).astype(np.float32)
+    means /= np.linalg.norm(means, axis=1, keepdims=True)
+    build_hierarchy(means[:2000], np.ones(2000, bool), (16, 64), 8)  # what the libraries hold
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    found = build_hierarchy(means, np.ones(count, bool), (64, 320, 1280), 8)
+    assert len(found.rows) == count
+    return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+
+
+def _million(count: int) -> Step:
+    def on_cpu() -> Outcome:
+        return Outcome({"MB": np.array([in_a_process(_megabytes_of_clustering, count)])})
+
+    def bounded(outcomes: Mapping[str, Outcome]) -> list[str]:
+        took = float(outcomes[CPU].values["MB"][0])
+        return [] if took <= MILLION_MB else [f"clustering {count:,} took {took:.0f} MB, more than {MILLION_MB}"]
+
+    return Step({CPU: on_cpu}, more=bounded)
+
+
+def _graph(points: NDArray[Any]) -> Step:
+    """Neighbours with finite weights and distances, and no one its own."""
+
+    def on_cpu() -> Outcome:
+        graph = build_neighbours(points, 20, 2000.0)
+        return Outcome({"weights": graph.weights, "distances": graph.distances, "index": graph.index})
+
+    def apart_from_itself(outcomes: Mapping[str, Outcome]) -> list[str]:
+        index, weights = outcomes[CPU].values["index"], outcomes[CPU].values["weights"]
+        own = (index == np.arange(len(index))[:, None]) & (weights > 0)
+        return [f"{own.sum()} Gaussians are their own neighbours"] if own.any() else []
+
+    return Step({CPU: on_cpu}, more=apart_from_itself)
+
+
+def _split(lengths: tuple[float, float, float]) -> Step:
+    """Factors split into a rotation and lengths for export: Σ again, also where lengths are nearly equal."""
+
+    def on_cpu() -> Outcome:
+        rng = np.random.default_rng(15)
+        turns = np.linalg.qr(rng.normal(size=(2, 200, 3, 3)))[0]
+        factors = (turns[0] * np.array(lengths) @ turns[1]).astype(np.float32)
+        axes, scales = split_factors(factors)
+        found = axes * np.square(scales)[:, None, :] @ np.swapaxes(axes, 1, 2)
+        wide = factors.astype(np.float64)
+        truth = wide @ np.swapaxes(wide, 1, 2)
+        off = np.abs(found - truth).max() / np.abs(truth).max()
+        return Outcome({"off": np.array([off]), "hands": np.linalg.det(axes)})
+
+    def same(outcomes: Mapping[str, Outcome]) -> list[str]:
+        off, hands = float(outcomes[CPU].values["off"][0]), outcomes[CPU].values["hands"]
+        return ([] if off < 1e-6 else [f"Σ is {off:.2g} off after the split"]) + (
+            [] if np.abs(hands - 1).max() < 1e-6 else ["a split's axes are no rotation"]
+        )
+
+    return Step({CPU: on_cpu}, more=same)
+
+
+QUATERNION, SCALE, OPACITY = slice(3, 7), slice(7, 10), slice(10, 11)
+
+CASES = (
+    HardCase(
+        "NaN gradient",
+        "of one number, once or in every step: it is 0 there, no other moves",
+        "gsplat#248",
+        (True, False),
+        lambda once: _adam(_spoil(np.nan, once), 1 if once else STEPS),
+    ),
+    HardCase(
+        "huge gradient",
+        "of one number, once: the parameter goes on as after 1e18",
+        "gsplat#248",
+        (1e20, 1e30, np.inf, -np.inf),
+        lambda v: _adam(_spoil(v, True), 1),
+    ),
+    HardCase(
+        "tiny gradients",
+        "of all: no denormal number among the moments",
+        "denormals",
+        (1e-18, 1e-25, 1e-40),
+        lambda v: _adam(
+            _tiny(v), 0, STEPS * 9900 if v < 1e-19 else 0, agreement=None if v < 1e-19 else 1e-2, more=_no_denormals
+        ),
+    ),
+    HardCase(
+        "moments that fade",
+        "one gradient, then none: the first moment does not end as denormals",
+        "denormals",
+        (1e-19, 1.5e-19),
+        lambda v: _adam(
+            lambda step, table: table.fill(v if step == 0 else 0),
+            0,
+            9900 if v <= 1e-19 else 0,
+            agreement=None,
+            more=_decaying,
+        ),
+    ),
+    HardCase(
+        "no gradient",
+        "of anything in twenty steps: nothing moves, nothing is 0/0",
+        "Adam's epsilon",
+        (0.0,),
+        lambda v: _adam(_tiny(v), 0),
+    ),
+    HardCase(
+        "zero quaternion",
+        "of length 0 or this: no rotation, no gradient, counted",
+        "oppo-us-research/SpacetimeGaussians#96",
+        (0.0, 1e-20, 1e-16),
+        lambda v: _activation(QUATERNION, v, {"quaternion_floor": 30}),
+    ),
+    HardCase(
+        "short and long quaternions",
+        "entries of this",
+        "oppo-us-research/SpacetimeGaussians#96",
+        (1e-14, 1e-6, 1e6, 1e15),
+        lambda v: _activation(QUATERNION, v, {}, 1e-3),
+    ),
+    HardCase(
+        "q against −q",
+        "quaternions of this length: the same Gaussian",
+        "double cover of rotations",
+        (1e-6, 1.0, 1e6),
+        _opposite,
+    ),
+    HardCase(
+        "log scales",
+        "clamped beyond 87",
+        "gsplat#613, graphdeco-inria/gaussian-splatting#41",
+        (-200.0, -80.0, 20.0),
+        lambda v: _activation(SCALE, v, {"exponent": 30} if abs(v) > 87 else {}, None if v < -87 else 1e-4),
+    ),
+    HardCase(
+        "log scale beyond e^87",
+        "of one axis in ten Gaussians: clamped, finite",
+        "gsplat#613",
+        (88.0, 200.0),
+        lambda v: _activation(slice(7, 8), v, {"exponent": 30}, 1e-3, 1e-3),
+    ),
+    HardCase(
+        "opacity logits",
+        "saturated at either end",
+        "fastgs/FastGS#58",
+        (-200.0, -30.0, 30.0, 200.0),
+        lambda v: _activation(OPACITY, v, {"exponent": 30} if abs(v) > 87 else {}),
+    ),
+    HardCase(
+        "black on black",
+        "height and width",
+        "lights off",
+        ((40, 37), (1, 1), (5, 100)),
+        lambda size: _pictures(0, 0, size),
+    ),
+    HardCase(
+        "flat pictures",
+        "a grey of this against the same",
+        "SSIM without contrast",
+        (1e-6, 0.5, 1.0),
+        lambda v: _pictures(v, v, agreement=None),
+    ),
+    HardCase(
+        "white on black", "a render of this on black", "lights off and on", (1.0, 100.0), lambda v: _pictures(v, 0)
+    ),
+    HardCase("black on white", "a render of 0 on this", "lights off and on", (1.0, 0.004), lambda v: _pictures(0, v)),
+    HardCase(
+        "saturated noise",
+        "0 and 1 at random, another each",
+        "sensor faults",
+        (1, 2),
+        lambda seed: _pictures(_noise(seed), _noise(seed + 100)),
+    ),
+    HardCase(
+        "colours without bounds",
+        "a render of this against noise",
+        "colours are not clamped",
+        (1e3, 1e6, 1e9),
+        lambda v: _pictures(v * _noise(3), _noise(4), agreement=2e-2),
+    ),
+    HardCase(
+        "fewer Gaussians than clusters",
+        "so many, for layers of 64, 320 and 1280",
+        "edge of K-means",
+        (1, 2, 9, 63),
+        lambda n: _clustering(lambda rng: rng.normal(size=(n, 3)), (64, 320, 1280)),
+    ),
+    HardCase(
+        "clustering coincident points",
+        "so many in one place",
+        "coincident points",
+        (20, 2000),
+        lambda n: _clustering(lambda rng: np.ones((n, 3)), (2, 16, 64)),
+    ),
+    HardCase(
+        "clustering collinear points",
+        "so many on a line",
+        "collinear points",
+        (100, 2000),
+        lambda n: _clustering(lambda rng: rng.normal(size=(n, 1)) * np.array([1, 2, 3]), (2, 16, 64)),
+    ),
+    HardCase(
+        "clustering two places",
+        "so many, half here, half 1 km away",
+        "outliers",
+        (200,),
+        lambda n: _clustering(lambda rng: rng.normal(size=(n, 3)) + 1e3 * (np.arange(n) % 2)[:, None], (2, 8)),
+    ),
+    HardCase(
+        "clustering NaN",
+        "so many of 300 not finite: they stand, counted",
+        "gsplat#248",
+        (1, 299, 300),
+        lambda n: _clustering(
+            lambda rng: np.where((np.arange(300) < n)[:, None], np.nan, rng.normal(size=(300, 3))), (4, 16)
+        ),
+    ),
+    HardCase(
+        "a million to cluster",
+        f"so many, layers of 64, 320 and 1280, within {MILLION_MB} MB",
+        "uynitsuj/POGS#3",
+        (1_000_000,),
+        _million,
+        slow=True,
+    ),
+    HardCase(
+        "neighbours in one place",
+        "so many Gaussians",
+        "coincident points",
+        (2, 19, 200),
+        lambda n: _graph(np.ones((n, 3))),
+    ),
+    HardCase(
+        "neighbours far apart",
+        "metres between them: weights that are 0",
+        "users' units",
+        (1.0, 1e6, 1e18),
+        lambda d: _graph(d * np.arange(60)[:, None] * np.ones(3)),
+    ),
+    HardCase(
+        "one neighbour or none",
+        "so many Gaussians",
+        "edge of the graph",
+        (1, 2, 3),
+        lambda n: _graph(np.random.default_rng(0).normal(size=(n, 3))),
+    ),
+    HardCase(
+        "nearly equal axes",
+        "relative difference of the lengths: Σ again after the split, a proper rotation",
+        "re-splitting Σ",
+        (0.0, 1e-7, 1e-4),
+        lambda d: _split((1.0, 1.0 + d, 1.0 - d)),
+    ),
+    HardCase(
+        "axes far from equal", "shortest over longest", "re-splitting Σ", (1e-3, 1e-6), lambda d: _split((1.0, 0.5, d))
+    ),
+)

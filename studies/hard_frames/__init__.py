@@ -1,0 +1,1 @@
+"""Hard frames: pictures that should not be believed, long runs."""

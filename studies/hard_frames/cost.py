@@ -1,0 +1,50 @@
+"""What the checks cost: share of an update, by its stage timers, the bar against it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from scas4d_core.frame_report import FrameReport
+from studies.hard_frames.footage import Filmed, MadeUp
+
+BAR = 0.03
+"""Share of an update that the checks may cost."""
+
+Share = tuple[float, float, float]
+
+
+def shares(reports: Sequence[FrameReport]) -> Share:
+    """Medians over updates: seconds of one, share of the checks, share of comparing its start and its end.
+
+    The checks are the stage ``judge``: the light of the pictures, the gate, what is plausible, who fits, and views of
+    cameras that are left out. Start and end are compared by the witnesses, which are a part of the update: it may
+    end at any moment for them.
+    """
+    totals = [sum(report.seconds.values()) for report in reports]
+    checks = [report.seconds["judge"] / total for report, total in zip(reports, totals, strict=True)]
+    witness = [
+        (report.seconds["start"] + report.seconds["end"]) / total for report, total in zip(reports, totals, strict=True)
+    ]
+    return float(np.median(totals)), float(np.median(checks)), float(np.median(witness))
+
+
+def cost(footage: MadeUp | Filmed, updates: int = 8) -> Share:
+    """Of so many updates of a footage after the first, which starts cold."""
+    with TemporaryDirectory() as folder:
+        scene = footage.start(Path(folder) / "states")
+        reports = [scene.step(footage.frame(index)) for index in range(1, updates + 2)]
+    return shares(reports[1:])
+
+
+def in_words(footage: MadeUp | Filmed, found: Share) -> str:
+    """One line."""
+    seconds, checks, witness = found
+    verdict = f"{'reached' if checks <= BAR else 'missed'}: {100 * BAR:.0f} %"
+    return (
+        f"{footage.name}: the checks take {100 * checks:.1f} % of an update of {seconds:.2f} s ({verdict}), "
+        f"comparing its start and end {100 * witness:.1f} %"
+    )

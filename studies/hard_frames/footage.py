@@ -1,0 +1,149 @@
+"""Footages for the frame cases: one made up, which can do anything, and captures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Camera, Rig
+from scas4d_core.captures import Capture
+from scas4d_core.captures.frame import Frame, InitialPoints
+from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings
+from scas4d_core.storage.history import History
+from studies.hard_frames.scene import BALL, cameras, first_state, gone
+from studies.kernels.synthetic import photograph
+from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
+
+Pictures = Mapping[str, NDArray[np.uint8]]
+
+CAMERAS, SIZE = 10, 64
+"""Of the made-up rig, and pixels of a picture's side."""
+ANGLE = 0.08
+"""Radians that the ball goes around in a frame: 11 mm and 5 degrees."""
+NOISE = 3.0
+"""Levels of 255, standard deviation, of the noise in the pictures that are learnt from."""
+RATE = 30.0
+"""Frames a second."""
+
+
+class MadeUp:
+    """A ball that goes around over a floor, beside one that lies there; frame 0 is known, but for a few millimetres.
+
+    Attributes:
+        name, rig, held_out, settings, count: of the footage.
+    """
+
+    name = "made up"
+    count = 24
+
+    def __init__(self, settings: Settings | None = None) -> None:
+        self.settings = settings or Settings(
+            scene=SceneSettings(metres_per_unit=1.0),
+            static=StaticSettings(iterations=600, max_gaussians=1200),
+            update=UpdateSettings(iterations=60, clusters=(2, 12, 48), neighbour_falloff=200.0),
+        )
+        self.rig = cameras(CAMERAS, SIZE)
+        self._others = cameras(4, SIZE, turned=0.4, names="h")
+        self._true = first_state(resting_may_move=False)
+        self.frame = cache(self.frame)  # type: ignore[method-assign]
+        self.truth = cache(self.truth)  # type: ignore[method-assign]
+
+    @property
+    def held_out(self) -> tuple[Camera, ...]:
+        """Between those of the rig."""
+        return self._others.cameras
+
+    def frame(self, index: int) -> Frame:
+        """See ``frames.Footage``."""
+        return self._shown(index, (0.0, 0.0, 0.0))[0]
+
+    def truth(self, index: int) -> Pictures:
+        """See ``frames.Footage``."""
+        return self._shown(index, (0.0, 0.0, 0.0))[1]
+
+    def jumped(self, index: int, sizes: float) -> tuple[Frame, Pictures]:
+        """See ``frames.Footage``; it jumps to where it is seen by all cameras."""
+        return self._shown(index, (-0.8 * sizes * 2 * BALL, 0.0, -0.6 * sizes * 2 * BALL))
+
+    @property
+    def points(self) -> InitialPoints:
+        """For who fits frame 0."""
+        true = self._true
+        return InitialPoints(true.means.astype(np.float64), true.colours.copy(), true.foreground.copy())
+
+    def start(self, folder: Path) -> Reconstruction:
+        """Frame 0 committed."""
+        history = History.open(folder)
+        return Reconstruction.start(
+            self.rig, self.frame(0), self.settings, history=history, static=StaticResult(self._fitted(), {}, [])
+        )
+
+    def _fitted(self) -> Gaussians:
+        """The truth of frame 0 as a fit would leave it: nearly."""
+        rng, true = np.random.default_rng(1), self._true
+        means = true.means + rng.normal(0, 0.004, true.means.shape)
+        factors = true.factors * np.exp(rng.normal(0, 0.1, (len(true), 1, 3)))
+        colours = (true.colours + rng.normal(0, 0.04, true.colours.shape)).clip(0, 1)
+        return true.replace(
+            means=means.astype(np.float32), factors=factors.astype(np.float32), colours=colours.astype(np.float32)
+        )
+
+    def _shown(self, index: int, shift: tuple[float, float, float]) -> tuple[Frame, Pictures]:
+        state, rng = gone(self._true, ANGLE * index, shift), np.random.default_rng(index)
+        shown = photograph(state, self.rig)
+        images = {
+            name: (picture + rng.normal(0, NOISE, picture.shape)).round().clip(0, 255).astype(np.uint8)
+            for name, picture in shown.images.items()
+        }
+        return Frame(index, index / RATE, images, shown.masks), photograph(state, self._others).images
+
+
+class Filmed:
+    """A capture with test cameras; its frame 0 is fitted once and kept.
+
+    Args:
+        settings: of the scene. kept: folder for frames 0, as that of ``scripts/bench quality``.
+    """
+
+    def __init__(self, capture: Capture, settings: Settings, kept: Path) -> None:
+        self._capture = capture
+        self.points = capture.points
+        self.name, self.count, self.settings = capture.name, capture.frame_count, settings
+        self.rig: Rig = capture.full_rig
+        self._kept = kept / f"{first_frame_key(capture, settings)}.npz"
+
+    @property
+    def held_out(self) -> tuple[Camera, ...]:
+        """The test cameras."""
+        rig = self._capture.full_test_rig
+        return () if rig is None else rig.cameras
+
+    def frame(self, index: int) -> Frame:
+        """See ``frames.Footage``."""
+        return self._capture.frame(index)
+
+    def truth(self, index: int) -> Pictures:
+        """See ``frames.Footage``."""
+        return self._capture.test_frame(index).images
+
+    def jumped(self, index: int, sizes: float) -> tuple[Frame, Pictures] | None:
+        """Nobody has filmed that."""
+        return None
+
+    def start(self, folder: Path) -> Reconstruction:
+        """Frame 0 committed."""
+        found = load_first_frame(self._kept)
+        scene = Reconstruction.start(
+            self.rig, self.frame(0), self.settings, points=self._capture.points, history=History.open(folder),
+            static=None if found is None else found[0],
+        )  # fmt: skip
+        if found is None and scene.static is not None and scene.report is not None:
+            save_first_frame(self._kept, scene.static, scene.report.seconds["fit"])
+        return scene

@@ -1,0 +1,238 @@
+"""Thousands of frames of a small scene: what time must not do to what stands, to rotations, to sizes and to memory.
+
+A ball goes six times around a vertical axis in 500 frames and turns about itself as often, then all the way back, and
+again. Beside it lies a ball that is labelled as moving and never moves, and a floor that stands. After each way there
+and back the truth is that of frame 0, bit by bit.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.captures.frame import Frame
+from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings
+from scas4d_core.storage.history import History
+from studies.hard_frames.scene import cameras, first_state, gone, rows
+from studies.kernels.synthetic import photograph
+
+SIZE = 48
+"""Pixels, side of the six pictures."""
+OUT = 500
+"""Frames of the way there."""
+ROUNDS = 6
+"""Turns around the axis on the way there."""
+RATE = 30.0
+"""Frames a second."""
+
+SETTINGS = Settings(
+    scene=SceneSettings(metres_per_unit=1.0),
+    static=StaticSettings(iterations=1),
+    update=UpdateSettings(iterations=20, clusters=(2, 12, 48), neighbour_falloff=200.0),
+)
+"""Few iterations: what one of them leaves wrong has thousands of frames to add up."""
+
+PIXEL_M = 0.023
+"""Metres that a pixel sees at the middle of the scene: what the pictures can tell."""
+RESTING_M = 4 * PIXEL_M
+"""Bar: root mean square of how far Gaussians that rest, but may move, are from where they were, in any row: an update
+finds where a ball of ten pixels is with some error, and a few in a row may err to the same side."""
+RESTING_MEAN_M = PIXEL_M
+"""Bar: the mean of that over a run."""
+RETURN_M = PIXEL_M
+"""Bar: the same of those that move, when they are back where they began."""
+TREND = 1.5
+"""Bar: times as far as in the first half that what rests may be from where it was in the second half, on average."""
+UNIT = 1e-5
+"""Bar: how far from 1 the norm of a rotation may be."""
+GROWTH = 10.5
+"""Bar: times longer or shorter than in frame 0 that an axis may be; ``attempts.SHRUNK`` holds them, less rounding."""
+HALF = 10
+"""Rows that a half needs for that."""
+MEMORY = 1.1
+"""Bar: times the memory of the first tenth that the last tenth may take."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """The scene after a frame.
+
+    Attributes:
+        frame: index. seconds: of an update, mean since the row before. psnr: dB, training views of the update.
+        still: whether nothing of what stands has changed but its colours, bit by bit. finite: whether all is.
+        resting, moving: metres, root mean square distance from the truth, of what rests and of what moves.
+        unit: largest distance of a rotation's norm from 1. longest, shortest: times an axis is as long as in frame 0.
+        memory: MB resident. degraded: frames since the row before that were held or degraded.
+    """
+
+    frame: int
+    seconds: float
+    psnr: float
+    still: bool
+    finite: bool
+    resting: float
+    moving: float
+    unit: float
+    longest: float
+    shortest: float
+    memory: float
+    degraded: int
+
+
+def true_state(state: Gaussians, index: int) -> Gaussians:
+    """The truth of frame ``index``; ``state`` is that of frame 0."""
+    on = index % (2 * OUT)
+    share = min(on, 2 * OUT - on) / OUT
+    return gone(state, 2 * np.pi * ROUNDS * (1 - np.cos(np.pi * share)) / 2)
+
+
+class Soak:
+    """A run in a folder; made again over the same folder it goes on where it was."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.first = first_state(resting_may_move=True)
+        self._goes, self._rests = rows()
+        self._rig = cameras(6, SIZE)
+        history = History.open(folder / "states")
+        if history.indices:
+            self.scene = Reconstruction.resume(self._rig, SETTINGS, history)
+        else:
+            static = StaticResult(self.first, {}, [])
+            self.scene = Reconstruction.start(self._rig, self.frame(0), SETTINGS, history=history, static=static)
+
+    @property
+    def done(self) -> int:
+        """Frames after the first."""
+        return self.scene.history.indices[-1]
+
+    @property
+    def rows(self) -> list[Row]:
+        """Those up to where the scene is."""
+        file = self.folder / "rows.jsonl"
+        told = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+        return [Row(**row) for row in told if row["frame"] <= self.done]
+
+    def frame(self, index: int) -> Frame:
+        """What the cameras see."""
+        shown = photograph(true_state(self.first, index), self._rig)
+        return Frame(index, index / RATE, shown.images, shown.masks)
+
+    def run(self, frames: int, every: int = 100, told: Callable[[Row], None] = lambda row: None) -> list[Row]:
+        """Go on until so many frames after the first are done, a row every so many of them; all rows."""
+        rows, began, degraded, since = self.rows, 0.0, 0, 0
+        while self.done < frames:
+            frame, began = self.frame(self.done + 1), began - perf_counter()
+            report = self.scene.step(frame)
+            began, since = began + perf_counter(), since + 1
+            degraded += report.degraded is not None
+            if frame.index % every == 0 or frame.index == frames:
+                rows.append(self._measured(began / since, report.psnr, degraded))
+                with (self.folder / "rows.jsonl").open("a") as file:
+                    file.write(json.dumps(asdict(rows[-1])) + "\n")
+                told(rows[-1])
+                self.scene.history.retain(last=2)
+                began, degraded, since = 0.0, 0, 0
+        return rows
+
+    def _measured(self, seconds: float, psnr: float, degraded: int) -> Row:
+        before, now = self.first, self.scene.history.gaussians(self.done)
+        true = true_state(before, self.done)
+        stands = ~before.moving
+        same = [
+            np.array_equal(getattr(before, name)[stands], getattr(now, name)[stands])
+            for name in ("means", "factors", "rotations")
+        ]
+        off = np.linalg.norm(now.means.astype(np.float64) - true.means, axis=1)
+        axes = np.linalg.svd(now.factors, compute_uv=False) / np.linalg.svd(before.factors, compute_uv=False)
+        return Row(
+            frame=self.done,
+            seconds=seconds,
+            psnr=psnr,
+            still=all(same),
+            finite=all(bool(np.isfinite(array).all()) for array in now.arrays().values()),
+            resting=_rms(off[self._rests]),
+            moving=_rms(off[self._goes]),
+            unit=float(np.abs(np.linalg.norm(now.rotations.astype(np.float64), axis=1) - 1).max()),
+            longest=float(axes.max()),
+            shortest=float(axes.min()),
+            memory=resident_mb(),
+            degraded=degraded,
+        )
+
+
+def violations(rows: Sequence[Row]) -> list[str]:
+    """What does not hold, a sentence each."""
+    found = []
+    for row in rows:
+        at = f"frame {row.frame}: "
+        if not row.finite:
+            found.append(at + "something is not finite")
+        if not row.still:
+            found.append(at + "what stands has moved")
+        if not row.resting <= RESTING_M:
+            found.append(at + f"what rests is {1000 * row.resting:.1f} mm from where it was, the bar is {RESTING_M} m")
+        if row.frame % (2 * OUT) == 0 and not row.moving <= RETURN_M:
+            found.append(at + f"it came back {1000 * row.moving:.1f} mm from where it began, the bar is {RETURN_M} m")
+        if not row.unit <= UNIT:
+            found.append(at + f"a rotation's norm is {row.unit:.1e} from 1")
+        if not (row.longest <= GROWTH and row.shortest >= 1 / GROWTH):
+            found.append(at + f"axes are {row.shortest:.2f} to {row.longest:.2f} times as long as in frame 0")
+    half = len(rows) // 2
+    if half >= HALF:
+        early, late = (float(np.mean([row.resting for row in part])) for part in (rows[:half], rows[half:]))
+        if not early + late <= 2 * RESTING_MEAN_M:
+            found.append(f"what rests is {500 * (early + late):.1f} mm from where it was on average")
+        if late > TREND * early:
+            found.append(
+                f"what rests wanders: {1000 * early:.1f} mm in the first half, {1000 * late:.1f} mm in the second"
+            )
+    tenth = max(1, len(rows) // 10)
+    began, ended = max(row.memory for row in rows[:tenth]), max(row.memory for row in rows[-tenth:])
+    if ended > MEMORY * began:
+        found.append(f"memory grew from {began:.0f} to {ended:.0f} MB")
+    return found
+
+
+def resident_mb() -> float:
+    """Of this process, MB; NaN where the system does not tell."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return float("nan")
+    return pages * 4096 / 1e6
+
+
+def _rms(distances: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.square(distances))))
+
+
+def table(rows: Sequence[Row], most: int = 10) -> str:
+    """As Markdown; of many rows so many, spread evenly."""
+    lines = [
+        "| frame | ms | degraded | what rests, mm off | what moves, mm off | norm of rotations | axes | MB |",
+        "|" + "---|" * 8,
+    ]
+    for part in np.array_split(np.arange(len(rows)), min(most, len(rows))):
+        of = [rows[index] for index in part]
+        last = of[-1]
+        lines.append(
+            f"| {last.frame} | {1000 * np.mean([row.seconds for row in of]):.0f} | {sum(row.degraded for row in of)} "
+            f"| {_range([1000 * row.resting for row in of])} | {_range([1000 * row.moving for row in of])} "
+            f"| 1 ± {max(row.unit for row in of):.0e} "
+            f"| {min(row.shortest for row in of):.2f}…{max(row.longest for row in of):.2f} | {last.memory:.0f} |"
+        )
+    return "\n".join(lines)
+
+
+def _range(values: Sequence[float]) -> str:
+    return f"{min(values):.1f}…{max(values):.1f}"

@@ -1,0 +1,169 @@
+"""The frame cases run: each goes on from the same committed state, and is held against a run that nothing disturbs."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.metrics import psnr
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.storage.history import History
+from studies.hard_frames.footage import Filmed, MadeUp
+from studies.hard_frames.frames import FrameCase, Pictures, Sent, Step, named, violations
+
+AT = 5
+"""The frame at which each case begins: by then it is known what is usual."""
+UNIT = 1e-5
+"""How far from 1 the norm of a rotation may be."""
+
+
+@dataclass
+class Line:
+    """A case in one size.
+
+    Attributes:
+        said: what the reports say of the faulty frames. against: dB of each frame against the undisturbed run, the good
+            ones last. violations: what does not hold.
+    """
+
+    case: FrameCase
+    size: Any
+    said: list[str] = field(default_factory=list)
+    against: list[float] = field(default_factory=list)
+    violations: list[str] = field(default_factory=list)
+
+
+class FrameStudy:
+    """Runs cases on a footage.
+
+    Args:
+        folder: for committed states; what is there goes.
+    """
+
+    def __init__(self, footage: MadeUp | Filmed, folder: Path) -> None:
+        self.footage, self.folder = footage, folder
+        self.cases = named(footage)
+        shutil.rmtree(folder, ignore_errors=True)
+        scene = footage.start(folder / "before")
+        self._interval = footage.frame(1).time - footage.frame(0).time
+        for index in range(1, AT):
+            scene.step(footage.frame(index))
+        self.usual = {index: self._measured(scene, index, footage.truth(index)) for index in range(1, AT)}
+        self._scene = self._branch("undisturbed")
+
+    def undisturbed(self, index: int) -> float:
+        """DB of the held-out cameras in the run that nothing disturbs."""
+        for at in range(max(self.usual) + 1, index + 1):
+            self._scene.step(self.footage.frame(at))
+            self.usual[at] = self._measured(self._scene, at, self.footage.truth(at))
+        return self.usual[index]
+
+    def run(self, case: FrameCase, size: Any) -> Line | None:
+        """None where the footage cannot show it, or is too short."""
+        try:
+            sent = case.make(self.footage, AT, size)
+        except IndexError:
+            return None
+        if sent is None:
+            return None
+        line = Line(case, size)
+        steps = self._steps(sent)
+        line.against = [step.psnr - step.usual for step in steps]
+        line.said = list(dict.fromkeys(_said(step) for step in steps if not step.sent.good))
+        line.violations = violations(case, steps, size)
+        return line
+
+    def _steps(self, sent: Sequence[Sent]) -> list[Step]:
+        scene, steps = self._branch("case"), []
+        for number, one in enumerate(sent):
+            index = AT + number
+            before = scene.history.gaussians(index - 1)
+            report = scene.step(replace(one.frame, index=index, time=index * self._interval))
+            after = scene.history.gaussians(index)
+            steps.append(
+                Step(
+                    one, report, _same(before, after), sound(after), self._measured(scene, index, one.truth),
+                    self.undisturbed(one.like),
+                )
+            )  # fmt: skip
+        return steps
+
+    def _branch(self, name: str) -> Reconstruction:
+        """The scene as it was before the case; taken up again, it goes on with the same bits."""
+        folder = self.folder / name
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(self.folder / "before", folder)
+        return Reconstruction.resume(self.footage.rig, self.footage.settings, History.open(folder))
+
+    def _measured(self, scene: Reconstruction, index: int, truth: Pictures) -> float:
+        return float(
+            np.mean([psnr(scene.render(camera, index).colour, truth[camera.name]) for camera in self.footage.held_out])
+        )
+
+
+def study(
+    footage: MadeUp | Filmed, folder: Path, names: Sequence[str] = (), told: Callable[[str], None] = print
+) -> list[Line]:
+    """All cases whose name holds one of ``names``, or all, in all sizes; tells each as it is done."""
+    of, lines = FrameStudy(footage, folder), []
+    told(f"{footage.name}, undisturbed: {', '.join(f'{of.undisturbed(index):.1f}' for index in range(1, AT + 4))} dB")
+    for case in of.cases:
+        if names and not any(name in case.name for name in names):
+            continue
+        for size in case.sizes:
+            line = of.run(case, size)
+            if line is None:
+                told(f"-      {case.name}, {size}: {footage.name} cannot show it")
+                continue
+            lines.append(line)
+            told(f"{'holds' if not line.violations else 'FAILS'}  {case.name}, {size}  {_decibels(line.against)} dB")
+            for sentence in [*line.said, *(f"! {violation}" for violation in line.violations)]:
+                told(f"       {sentence}")
+    failed = sum(bool(line.violations) for line in lines)
+    told(f"{len({line.case.name for line in lines})} frame cases, {len(lines)} with sizes, {failed} do not hold")
+    return lines
+
+
+def table(lines: Sequence[Line]) -> str:
+    """As Markdown, one row a case and size."""
+    rows = ["| case | size | what | the reports say | dB against undisturbed | holds |", "|" + "---|" * 6]
+    for line in lines:
+        verdict = "yes" if not line.violations else f"**no**: {'; '.join(line.violations)}"
+        said = "; ".join(line.said)
+        rows.append(
+            f"| {line.case.name} | {line.size} | {line.case.what} | {said} | {_decibels(line.against)} | {verdict} |"
+        )
+    return "\n".join(rows)
+
+
+def _decibels(values: Sequence[float]) -> str:
+    return " ".join(f"{value:+.1f}" for value in values)
+
+
+def _said(step: Step) -> str:
+    """What a report says, in one line."""
+    report = step.report
+    words = [] if report.degraded is None else [report.degraded]
+    if report.dropped:
+        words.append("without " + ", ".join(f"{name} ({why})" for name, why in report.dropped.items()))
+    if report.exposure != 1.0 and report.used:
+        words.append(f"{report.exposure:.2g} times as bright")
+    return "; ".join(words or report.attempts)
+
+
+def _same(before: Gaussians, after: Gaussians) -> bool:
+    there = after.arrays()
+    return all(np.array_equal(array, there[name]) for name, array in before.arrays().items())
+
+
+def sound(state: Gaussians) -> bool:
+    """Whether a state is finite and its rotations are units."""
+    finite = all(bool(np.isfinite(array).all()) for array in state.arrays().values())
+    norms = np.linalg.norm(state.rotations.astype(np.float64), axis=1)
+    return finite and bool(np.abs(norms - 1).max() <= UNIT)

@@ -1,0 +1,1 @@
+"""Costs of the kernels, and the CPU against the GPU."""

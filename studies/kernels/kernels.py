@@ -1,0 +1,332 @@
+"""``scripts/bench kernels``: what the kernels cost against what they cannot do without.
+
+1. The rasterizer, forward and backward, against a micro-kernel that does the arithmetic of as many blended pairs and
+   nothing else (``bench.pairs``); both in turn, in this process, on the same threads. On all views of frame 0, and on a
+   cloud of wider Gaussians, where the cost of a pair outweighs that of a Gaussian.
+2. Updates against their own rasterizer passes: seconds of ``Reconstruction.step``, pictures decoded and state
+   committed, over those of its stages "render" and "render backward".
+3. Peak memory of that run, frame 0 fitted in it, in a fresh process.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import time
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from scas4d_core.cameras import Camera, rig_inside
+from scas4d_core.captures import open_capture
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.kernels.jit import threads
+from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
+from scas4d_core.rasterize.limits import DEFAULT, Limits, scene_limits
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.settings import Settings
+from studies.kernels.pairs import MicroKernel, blended_pairs
+from studies.machine import core_version, in_words, machine
+from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
+from studies.quality.quality import peak_megabytes
+from studies.quality.store import Row
+from studies.quality.targets import BARS, KERNELS
+
+Report = Callable[[str], None]
+
+PASSES = ("render", "render backward")
+"""Stages of an update that are the rasterizer's."""
+CLOUD_GAUSSIANS, CLOUD_SIZE = 20_000, 256
+"""Of the cloud, and of its square picture in pixels."""
+CLOUD_WIDTH = 2.1
+"""Pixels, standard deviation: about 145 pixels a Gaussian, 2.9 million pairs in a picture."""
+
+
+def study(
+    folder: Path, settings: Settings, store: Path, *, frames: int = 8, repeats: int = 9, report: Report = print
+) -> Row:
+    """Measures all three on a capture, prints them, and leaves them in ``store/kernels.json``.
+
+    Args:
+        folder: of the capture.
+        settings: of frame 0 and the updates; on the CPU.
+        store: folder of the study.
+        frames: of the run; the first update compiles or loads kernels and is not counted, so at least 3.
+        repeats: of the rasterizer and the micro-kernel.
+
+    Raises:
+        ValueError: fewer than 3 frames, or another device.
+        RuntimeError: the run's process ended before its time.
+    """
+    if frames < 3:
+        raise ValueError(f"frames is {frames}; give at least 3: the first update is not counted")
+    if settings.device != "cpu":
+        raise ValueError(f"device is {settings.device!r}; this study is of the CPU kernels: give cpu")
+    capture = open_capture(folder)
+    first_file = store / "first" / f"{first_frame_key(capture, settings)}.npz"
+    report(f"a run of {min(frames, capture.frame_count)} frames, frame 0 first, in a process of its own")
+    timed = _run_apart(folder, settings, frames, first_file)
+    kept = load_first_frame(first_file)
+    assert kept is not None  # the run has left it there
+    world = capture.rig.world_frame(settings.scene.metres_per_unit)
+    rig = rig_inside(world, capture.rig.scaled(settings.scene.image_scale).cameras)
+    report(f"the rasterizer and the micro-kernel, {repeats} times in turn")
+    limits = scene_limits(settings.scene.near, rig.radius)
+    on_frame_0 = measure_rasterizer(kept[0].gaussians, rig.cameras, repeats, limits)
+    cloud, camera = make_cloud()
+    on_cloud = measure_rasterizer(cloud, [camera] * 4, repeats)
+    row: Row = {
+        "capture": capture.name,
+        "measured": datetime.now(UTC).isoformat(timespec="seconds"),
+        "core": core_version(),
+        "machine": {**machine(), "threads": threads()},
+        "settings": settings.model_dump(mode="json"),
+        "frame_0": on_frame_0,
+        "cloud": on_cloud,
+        "ratio_rasterizer": on_frame_0["ratio"]["median"],
+        "ratio_rasterizer_cloud": on_cloud["ratio"]["median"],
+        **update_figures(timed["updates"]),
+        "iterations": settings.update.iterations,
+        "frames": timed["frames"],
+        "peak_mb": timed["peak_mb"],
+    }
+    store.mkdir(parents=True, exist_ok=True)
+    (store / f"{KERNELS}.json").write_text(json.dumps(row, indent=1))
+    report(table(row))
+    return row
+
+
+def measure_rasterizer(gaussians: Gaussians, cameras: Sequence[Camera], repeats: int, limits: Limits = DEFAULT) -> Row:
+    """Nanoseconds a pair of the rasterizer (colour and label: four channels) and of the micro-kernel.
+
+    Args:
+        gaussians: what is rendered. cameras: of the inside world. repeats: each gives one figure.
+        limits: of the scene.
+    """
+    rasterizer = CpuRasterizer(limits)
+    features = np.concatenate([gaussians.colours, gaussians.foreground[:, None]], axis=1)
+    background = np.zeros(4, np.float32)
+    views = [CameraArrays.of(camera) for camera in cameras]
+    pairs = lanes = 0
+
+    def forward(view: CameraArrays) -> None:
+        rasterizer.forward(gaussians.means, gaussians.factors, gaussians.opacities, features, view, background)
+
+    for view in views:
+        forward(view)
+        found = blended_pairs(rasterizer.splats, rasterizer.counts, view.width, view.height, limits)
+        pairs, lanes = pairs + found[0], lanes + found[1]
+    micro = MicroKernel(threads())
+    # One thread's own time is not disturbed by others who want its core; several threads also wait for each other.
+    clock = time.process_time if threads() == 1 else time.perf_counter
+    rounds = max(1, round(pairs / micro.run(1)))
+    seconds: dict[str, list[float]] = {"forward": [], "backward": [], "micro": []}
+    for _ in range(repeats + 1):
+        spent = dict.fromkeys(seconds, 0.0)
+        for view in views:
+            started = clock()
+            forward(view)
+            spent["forward"] += clock() - started
+            g_image, g_alpha = rasterizer.gradient_buffers()
+            g_image[:, : view.height, : view.width] = 1e-3
+            g_alpha[: view.height, : view.width] = 1e-3
+            started = clock()
+            rasterizer.backward(g_image, g_alpha)
+            spent["backward"] += clock() - started
+        started = clock()
+        done = micro.run(rounds)
+        spent["micro"] = (clock() - started) * pairs / done
+        for name, value in spent.items():
+            seconds[name].append(value)
+    nanoseconds = {name: 1e9 * np.array(values[1:]) / pairs for name, values in seconds.items()}  # the first warms up
+    nanoseconds["rasterizer"] = nanoseconds["forward"] + nanoseconds["backward"]
+    return {
+        "gaussians": len(gaussians),
+        "views": len(views),
+        "picture": [views[0].width, views[0].height],
+        "pairs_per_view": pairs / len(views),
+        "lanes_filled": pairs / lanes,
+        "repeats": repeats,
+        "ns_per_pair": {name: spread(values) for name, values in nanoseconds.items()},
+        "ratio": spread(nanoseconds["rasterizer"] / nanoseconds["micro"]),
+        "ratio_places": spread(nanoseconds["rasterizer"] / nanoseconds["micro"] * pairs / lanes),
+    }
+
+
+def make_cloud(seed: int = 0) -> tuple[Gaussians, Camera]:
+    """Round Gaussians spread evenly over a picture, at depths of 3 to 5 m, opacities 0.1 to 0.9; and its camera."""
+    rng = np.random.default_rng(seed)
+    focal, middle = float(CLOUD_SIZE), CLOUD_SIZE / 2
+    depth = rng.uniform(3, 5, CLOUD_GAUSSIANS)
+    places = (rng.uniform(0, CLOUD_SIZE, (CLOUD_GAUSSIANS, 2)) - middle) * depth[:, None] / focal
+    gaussians = Gaussians(
+        means=np.column_stack([places, depth]).astype(np.float32),
+        factors=(np.eye(3) * (CLOUD_WIDTH / focal * depth)[:, None, None]).astype(np.float32),
+        rotations=np.tile(np.array([1, 0, 0, 0], np.float32), (CLOUD_GAUSSIANS, 1)),
+        opacities=rng.uniform(0.1, 0.9, CLOUD_GAUSSIANS).astype(np.float32),
+        colours=rng.uniform(0, 1, (CLOUD_GAUSSIANS, 3)).astype(np.float32),
+        foreground=np.ones(CLOUD_GAUSSIANS, np.float32),
+        ids=np.arange(CLOUD_GAUSSIANS, dtype=np.int64),
+    )
+    intrinsics = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
+    return gaussians, Camera("cloud", intrinsics, np.eye(4), CLOUD_SIZE, CLOUD_SIZE)
+
+
+def update_figures(updates: Sequence[Row]) -> Row:
+    """Seconds of updates and of their rasterizer passes, and their ratio; the first update is left out.
+
+    Args:
+        updates: ``seconds`` of the whole step and ``stages`` by name, in order.
+    """
+    counted = updates[1:]
+    passes = np.array([sum(update["stages"][name] for name in PASSES) for update in counted])
+    whole = np.array([update["seconds"] for update in counted])
+    names = dict.fromkeys(name for update in counted for name in update["stages"])
+    return {
+        "updates": len(counted),
+        "seconds_update": spread(whole),
+        "seconds_passes": spread(passes),
+        "seconds_stages": {n: float(np.median([u["stages"].get(n, 0.0) for u in counted])) for n in names},
+        "ratio_update": float(np.median(whole / passes)),
+        "ratio_update_spread": spread(whole / passes),
+    }
+
+
+def spread(values: Any) -> dict[str, float]:
+    """Smallest and median."""
+    return {"min": float(np.min(values)), "median": float(np.median(values))}
+
+
+def table(row: Row) -> str:
+    """The figures as one Markdown table."""
+    bars = {bar.metric: bar for bar in BARS if bar.run == KERNELS}
+
+    def line(what: str, of: dict[str, float], unit: str, metric: str | None = None, digits: int = 2) -> str:
+        must, word = "", ""
+        if metric is not None:
+            threshold, sense = bars[metric].threshold, bars[metric].sense
+            assert threshold is not None
+            reached = of["median"] < threshold or (sense == "≤" and of["median"] == threshold)
+            must, word = f"{sense} {threshold:g} {unit}", "reached" if reached else "**missed**"
+        smallest = f"{of['min']:.{digits}f}" if "min" in of else ""
+        return f"| {what} | {of['median']:.{digits}f} | {smallest} | {unit} | {must} | {word} |"
+
+    lines = []
+    for name, on, metric in (
+        ("frame 0", row["frame_0"], "ratio_rasterizer"),
+        ("cloud", row["cloud"], "ratio_rasterizer_cloud"),
+    ):
+        ns = on["ns_per_pair"]
+        lines += [
+            line(f"rasterizer on {name}, forward", ns["forward"], "ns per pair"),
+            line(f"rasterizer on {name}, backward", ns["backward"], "ns per pair"),
+            line(f"rasterizer on {name}, both", ns["rasterizer"], "ns per pair"),
+            line("the same arithmetic alone, both", ns["micro"], "ns per pair"),
+            line(f"rasterizer on {name} over arithmetic", on["ratio"], "×", metric),
+            line("the same, by place in a block", on["ratio_places"], "×"),
+        ]
+    iterations = row["iterations"]
+    lines += [
+        line(f"update of {iterations} iterations", row["seconds_update"], "s", digits=3),
+        line(f"its {iterations} rasterizer passes", row["seconds_passes"], "s", digits=3),
+        line("update over passes", row["ratio_update_spread"], "×", "ratio_update"),
+        line("peak memory of the run", {"median": row["peak_mb"]}, "MB", "peak_mb", 0),
+    ]
+    return "\n".join(["| | median | smallest | unit | must be | |", "|---|---|---|---|---|---|", *lines])
+
+
+def page(row: Row) -> str:
+    """The page of the documentation: command, machine, date, table, and what it was measured on."""
+    stages = sorted(row["seconds_stages"].items(), key=lambda item: -item[1])
+    lines = "\n".join(f"| {name} | {seconds:.3f} |" for name, seconds in stages)
+    return f"""# What the kernels cost
+
+Written by `scripts/bench kernels CAPTURES/{row["capture"]} --out docs/kernels.md` on {row["measured"][:10]}
+({in_words(row["machine"])}; sources of the core {row["core"]}).
+
+{table(row)}
+
+- A pair is one pixel that one Gaussian is blended into: its alpha there is at least 1/255 and the pixel is not
+  finished. Pairs are counted one by one (`studies/kernels/pairs.py`).
+- Frame 0: {_scene_words(row["frame_0"])}.
+- Cloud: {_scene_words(row["cloud"])}.
+- The rasterizer's time is all of it: projection, depth order, tile lists, blending, and the backward of these. It works
+  in blocks of 4×4 pixels; "places" are the pixels of the blocks that a support meets, pairs or not: "by place" is how
+  far the rasterizer is from the arithmetic of the blocks that it has to compute.
+- "The same arithmetic alone" does the exp and the multiply-adds of as many pairs, forward and backward with four
+  channels, in the same blocks, on Gaussians that cover them wholly and stay in cache. Both ran in turn; the ratio
+  is the median of the ratios.
+- With one thread, times of the rasterizer and of its arithmetic are the process's own, with more they are of the clock.
+- How the rasterizer came to this, and what was tried without gain: [rasterizer.md](rasterizer.md).
+- The update is the whole `Reconstruction.step`, decoding and commit included; medians over {row["updates"]} updates.
+  Its passes are its own stages "render" and "render backward".
+- Peak memory is that of a fresh process that fits frame 0 and runs {row["frames"] - 1} updates.
+
+Median seconds of an update by stage:
+
+| stage | s |
+|---|---|
+{lines}
+"""
+
+
+def _scene_words(on: Row) -> str:
+    width, height = on["picture"]
+    return (
+        f"{on['gaussians']:,} Gaussians, {on['views']} pictures of {width}×{height} with "
+        f"{on['pairs_per_view']:,.0f} pairs on average; {100 * on['lanes_filled']:.0f} % of the places are pairs"
+    )
+
+
+def run_and_time(folder: Path, settings: Settings, frames: int, first_file: Path) -> Row:
+    """Reconstructs so many frames, keeps frame 0, and tells seconds by update and this process's peak memory."""
+    capture = open_capture(folder)
+    count = min(frames, capture.frame_count)
+    updates: list[Row] = []
+    with Progress(console=Console(stderr=True), transient=True) as bars:
+        bar = bars.add_task("frame 0")
+
+        def moved(now: Any) -> None:
+            bars.update(bar, description=f"frame 0, {now.stage}", completed=now.done, total=now.total)
+
+        started = time.perf_counter()
+        reconstruction = Reconstruction.start(
+            capture.rig, capture.frame(0), settings, points=capture.points, progress=moved
+        )
+        assert reconstruction.static is not None
+        save_first_frame(first_file, reconstruction.static, time.perf_counter() - started)
+        bars.update(bar, description="updates", completed=0, total=count - 1)
+        for index in range(1, count):
+            frame = capture.frame(index)
+            started = time.perf_counter()
+            done = reconstruction.step(frame)
+            updates.append({"seconds": time.perf_counter() - started, "stages": dict(done.seconds)})
+            bars.advance(bar)
+    return {"updates": updates, "frames": count, "peak_mb": peak_megabytes()}
+
+
+def _run_apart(folder: Path, settings: Settings, frames: int, first_file: Path) -> Row:
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_child, args=(sender, folder, settings, frames, first_file))
+    process.start()
+    sender.close()
+    try:
+        answer: Row = receiver.recv()
+    except EOFError:
+        process.join()
+        raise RuntimeError(
+            f"the run of {folder} ended with exit code {process.exitcode}; its messages are above"
+        ) from None
+    process.join()
+    return answer
+
+
+def _child(sender: Any, folder: Path, settings: Settings, frames: int, first_file: Path) -> None:
+    sender.send(run_and_time(folder, settings, frames, first_file))
+    sender.close()

@@ -1,0 +1,59 @@
+"""What a figure was measured on, in words."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import scas4d_core
+
+CPU_INFO = Path("/proc/cpuinfo")
+"""Where Linux names the processor; other systems tell Python."""
+
+
+def machine() -> dict[str, Any]:
+    """Processor, cores this process may use, memory, system and Python, for a row of a study."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    found: dict[str, Any] = {"processor": processor(), "cores": cores}
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        found["memory_gb"] = round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1)
+    return found | {"system": platform.system(), "python": platform.python_version()}
+
+
+def in_words(of: Mapping[str, Any]) -> str:
+    """One line of what ``machine`` returned; what is not known is left out."""
+    words = [str(of.get("processor", "unknown processor"))]
+    if "cores" in of:
+        words.append(f"{of['cores']} core{'s' if of['cores'] != 1 else ''}")
+    if "threads" in of:
+        words.append(f"{of['threads']} thread{'s' if of['threads'] != 1 else ''} used")
+    if "memory_gb" in of:
+        words.append(f"{of['memory_gb']:g} GB")
+    words += [str(of["system"])] if "system" in of else []
+    words += [f"Python {of['python']}"] if "python" in of else []
+    return ", ".join(words)
+
+
+def processor() -> str:
+    """The processor's name."""
+    if CPU_INFO.exists():
+        for line in CPU_INFO.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def core_version() -> str:
+    """Eight hexadecimal digits of the sources of the method (all of ``scas4d_core``).
+
+    Settings name a row; this says which rows come from the same code.
+    """
+    root = Path(scas4d_core.__file__).parent
+    hasher = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        hasher.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return hasher.hexdigest()[:8]

@@ -1,0 +1,186 @@
+"""The page of the paper's tables: each experiment beside the paper's figures, and where the outcome agrees."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from studies.frontier.frontier import UPDATES, Variant
+from studies.frontier.tradeoff import read_points
+from studies.machine import in_words
+from studies.paper.figures import SCENES
+from studies.paper.paper import (
+    EXPERIMENTS,
+    FACTOR,
+    SMALL,
+    Experiment,
+    Measured,
+    Outcome,
+    iteration_ratio,
+    judge,
+    measured,
+)
+from studies.quality.store import Store
+
+DIGITS: Mapping[str, int] = {"psnr": 2, "ssim": 3, "mte_2d_oracle": 2, "parts_ari": 3}
+"""By score."""
+
+
+def write_paper_page(
+    out: Path, captures: Sequence[str], page: Path, updates: int = UPDATES, quality: Path | None = None
+) -> str:
+    """Writes the page from what the study holds; the page's text.
+
+    Args:
+        out: folder of the frontier. captures: names. page: Markdown file. updates: that the rows cover.
+        quality: folder of the study of the bars, for captures that the frontier has no rows of.
+    """
+    ours = measured(out, captures, updates, quality)
+    points = read_points(out, captures, updates)
+    ratio = iteration_ratio(points)
+    there = [name for name in captures if any(point.capture == name for point in points)]
+    outcomes = {experiment.title: judge(experiment, ours) for experiment in EXPERIMENTS}
+    sections = "\n\n".join(
+        section(experiment, outcomes[experiment.title], ours, captures, ratio) for experiment in EXPERIMENTS
+    )
+    text = f"""# The paper's tables
+
+Each experiment of the paper on the captures at hand. A cell holds our figure and, in brackets, the paper's. The scenes
+share their names and kinds of motion with the paper's, not their pictures: it is differences that can agree, not
+figures.
+
+```
+{_commands(captures, there, page)}
+```
+
+{_provenance(out, captures)} PSNR and the other scores are means over the first {updates} updates of each capture, from
+a frame 0 that all its rows share{_elsewhere(captures, there)}.
+
+## Where the outcome agrees
+
+{summary([outcome for found in outcomes.values() for outcome in found], outcomes)}
+
+The gain is the first setting's mean less the second's, over the captures that both the paper and we have. It agrees in
+size where the two gains lie within a factor of {FACTOR:g} of each other; gains that are small on both sides
+({", ".join(f"{name} {value:g}" for name, value in SMALL.items() if name in DIGITS)}) agree as well, and a small gain
+does not agree with one that is not. Where the paper shows a picture only, its claim is the sign.
+
+{sections}
+
+## Left out
+
+- LPIPS: its weights are a download that the studies do without.
+- The offline methods of the paper's second table: other programs.
+- Robot-Task and five scenes of Panoptic: no such captures.
+"""
+    page.parent.mkdir(parents=True, exist_ok=True)
+    page.write_text(text)
+    return text
+
+
+def section(
+    experiment: Experiment, outcomes: Sequence[Outcome], ours: Measured, captures: Sequence[str], ratio: float | None
+) -> str:
+    """An experiment as Markdown: table, outcome, note."""
+    names = [name for name in SCENES if name in captures]
+    digits = DIGITS[experiment.score]
+    unit = f" {experiment.unit}" if experiment.unit else ""
+    lines = ["| | " + " | ".join(names) + " | mean |", "|" + "---|" * (len(names) + 2)]
+    for side in experiment.sides:
+        own = ours.get((side.variant, experiment.score), {})
+        cells = [_cell(own.get(name), side.paper.get(name), digits) for name in names]
+        shared = [name for name in names if name in own and (name in side.paper or not side.paper)]
+        mean = _mean([own[name] for name in shared])
+        paper = _mean([side.paper[name] for name in shared]) if side.paper else None
+        lines.append("| " + " | ".join([side.name, *cells, _cell(mean, paper, digits)]) + " |")
+    told = "\n".join(f"- {sentence(outcome, digits, unit)}" for outcome in outcomes)
+    note = experiment.note.format(ratio="–" if ratio is None else f"{ratio:.2f} times that")
+    parts = [
+        f"## {experiment.title}",
+        f"Paper: {experiment.source}." + (f" In{unit}." if unit else ""),
+        "\n".join(lines),
+        told,
+        note,
+    ]
+    return "\n\n".join(part for part in parts if part)
+
+
+def sentence(outcome: Outcome, digits: int, unit: str) -> str:
+    """A claim and how it came out."""
+    what = f"{outcome.claim.what[0].upper()}{outcome.claim.what[1:]} ({outcome.claim.first} – {outcome.claim.second})"
+    if outcome.own is None:
+        return f"{what}: not measured."
+    own = f"{outcome.own:+.{digits}f}"
+    if outcome.paper is None:
+        figures = f"{own}{unit}, in the paper only shown"
+    else:
+        figures = f"{own}, in the paper {outcome.paper:+.{digits}f}{unit}"
+    return f"{what}: {figures}; {_word(outcome)}, on {outcome.same_sign} of {len(outcome.captures)} captures alone."
+
+
+def summary(outcomes: Sequence[Outcome], by_title: Mapping[str, Sequence[Outcome]]) -> str:
+    """Counts, and a line for each claim that does not agree."""
+    told = [outcome for outcome in outcomes if outcome.agrees != "not measured"]
+    counts = {word: sum(o.agrees == word for o in told) for word in ("sign and size", "sign", "no")}
+    lines = [
+        f"Of {len(outcomes)} comparisons {counts['sign and size']} agree in sign and size, {counts['sign']} in sign, "
+        f"{counts['no']} do not, and {len(outcomes) - len(told)} are not measured.",
+        "",
+        "| experiment | comparison | here | paper | agrees in |",
+        "|---|---|---|---|---|",
+    ]
+    for experiment in EXPERIMENTS:
+        digits = DIGITS[experiment.score]
+        for outcome in by_title[experiment.title]:
+            own = "–" if outcome.own is None else f"{outcome.own:+.{digits}f}"
+            paper = "–" if outcome.paper is None else f"{outcome.paper:+.{digits}f}"
+            comparison = f"{outcome.claim.first} – {outcome.claim.second}"
+            word = outcome.agrees if outcome.agrees != "no" else "**nothing**"
+            lines.append(f"| {experiment.title} | {comparison} | {own} | {paper} | {word} |")
+    return "\n".join(lines)
+
+
+def _commands(captures: Sequence[str], there: Sequence[str], page: Path) -> str:
+    """What measures the rows and writes the page."""
+    command = "scripts/bench paper " + " ".join(f"CAPTURES/{name}" for name in there)
+    more = " ".join(f"CAPTURES/{name}" for name in captures if name not in there)
+    if not more:
+        return f"{command} --page docs/{page.name}"
+    return f"{command}\n{command} {more} --no-measure --page docs/{page.name}"
+
+
+def _elsewhere(captures: Sequence[str], there: Sequence[str]) -> str:
+    """Where the figures of captures come from that the study has no rows of."""
+    others = [name for name in captures if name not in there]
+    if not others:
+        return ""
+    names = ", ".join(others)
+    return f"; of {names}, PSNR alone, from the rows of [quality.md](quality.md), over the updates that both have"
+
+
+def needed() -> list[Variant]:
+    """The settings that the experiments compare, each once."""
+    return list(dict.fromkeys(side.variant for experiment in EXPERIMENTS for side in experiment.sides))
+
+
+def _word(outcome: Outcome) -> str:
+    if outcome.agrees == "no":
+        return "does not agree"
+    return f"agrees in {outcome.agrees}"
+
+
+def _cell(own: float | None, paper: float | None, digits: int) -> str:
+    mine = "–" if own is None else f"{own:.{digits}f}"
+    return mine if paper is None else f"{mine} ({paper:g})" if digits != 2 else f"{mine} ({paper:.2f})"
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return sum(values) / len(values) if values else None
+
+
+def _provenance(out: Path, captures: Sequence[str]) -> str:
+    rows = [row for row in Store(out).rows() if "error" not in row and row["capture"] in captures]
+    days = sorted({str(row["measured"])[:10] for row in rows})
+    when = " to ".join(dict.fromkeys((days[0], days[-1]))) if days else "never"
+    machines = "; ".join(sorted({in_words(row["machine"]) for row in rows})) or "–"
+    return f"Measured {when} on: {machines}."

@@ -1,0 +1,1 @@
+"""Reconstruction quality: captures by settings and seeds against the ground truth."""

@@ -1,0 +1,80 @@
+"""Frame 0, fitted once and shared by all rows of a capture that ask for the same one.
+
+What is compared then differs in its updates alone, and only the first row pays for frame 0.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scas4d_core.captures import Capture
+from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.settings import Settings
+
+VERSION = 2
+"""Raise this when frame 0 comes out different from the same pictures and settings: what is kept is then fitted anew."""
+
+CLOUD_VERSION = 3
+"""The same, where the first cloud is made from the pictures."""
+
+ARRAYS = tuple(field.name for field in fields(Gaussians))
+
+
+def first_frame_key(capture: Capture, settings: Settings) -> str:
+    """Names the frame 0 of a capture; other cameras, pictures, masks, points or settings have another name.
+
+    Args:
+        capture: as the method gets it: without what is withheld.
+        settings: those of the scene and of frame 0 count.
+    """
+    hasher = hashlib.sha256()
+    told = [VERSION, settings.scene.model_dump(mode="json"), settings.static.model_dump(mode="json")]
+    hasher.update(json.dumps(told, sort_keys=True).encode())
+    for camera in capture.full_rig.cameras:
+        hasher.update(f"{camera.name} {camera.width} {camera.height}".encode())
+        hasher.update(camera.intrinsics.tobytes() + camera.world_to_camera.tobytes())
+    for kind, files in (("image", capture.image_files[0]), ("mask", capture.mask_files[0])):
+        for name in sorted(files):
+            hasher.update(f"{kind} {name} ".encode() + files[name].read_bytes())
+    if capture.points is None:
+        hasher.update(f"cloud {CLOUD_VERSION}".encode())
+    else:
+        for array in (capture.points.positions, capture.points.colours, capture.points.foreground):
+            hasher.update(b"points" if array is None else array.tobytes())
+    return f"{capture.name}-{hasher.hexdigest()[:12]}"
+
+
+def load_first_frame(path: Path) -> tuple[StaticResult, float] | None:
+    """A frame 0 and the seconds that it took; None where it was not kept yet."""
+    if not path.exists():
+        return None
+    with np.load(path, allow_pickle=False) as file:
+        gaussians = Gaussians(**{name: file[name] for name in ARRAYS})
+        names, exposures = file["exposure_names"].tolist(), file["exposures"]
+        result = StaticResult(gaussians, dict(zip(names, exposures, strict=True)), file["losses"].tolist())
+        return result, float(file["seconds"])
+
+
+def save_first_frame(path: Path, result: StaticResult, seconds: float) -> None:
+    """Keeps a frame 0; the file is whole or not there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    names = sorted(result.exposures)
+    beside = path.with_suffix(f".{os.getpid()}.part")
+    arrays: dict[str, Any] = {
+        "exposure_names": np.array(names, dtype=np.str_),
+        "exposures": np.array([result.exposures[name] for name in names], np.float32).reshape(-1, 3, 2),
+        "losses": np.array(result.losses),
+        "seconds": np.float64(seconds),
+        **result.gaussians.arrays(),
+    }
+    with beside.open("wb") as file:
+        np.savez(file, **arrays)
+    beside.replace(path)

@@ -1,0 +1,218 @@
+"""Measures a reconstruction against what a capture knows: pictures, tracks, parts.
+
+Definitions, beside those in ``scas4d_core.metrics``:
+
+- A *moving* ground-truth point moves more than 1 % of the extent away from its place at frame 0 at some time.
+- *Foreground* pixels are those of the test camera's mask; *changed* pixels differ by more than 0.1 in some channel
+  from the true picture of frame 0.
+- 3D tracks start from the true points at frame 0. 2D tracks start from the pixels where a test camera has the moving
+  points that it sees at frame 0, go through rendered depth, and count where the camera truly sees the point.
+- Parts are rendered with as many labels as the scene has foreground parts, and compared where the true label is a part.
+- *Still* pixels of a test camera show something, and their true values stay within 6 of 255 levels over the frames that
+  are measured. *Flicker* is the standard deviation over time of what is rendered there, in levels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from scas4d_core import metrics
+from scas4d_core.cameras import Camera
+from scas4d_core.captures import Capture, GroundTruth
+from scas4d_core.query.tracks import depth_tolerance
+
+if TYPE_CHECKING:
+    from scas4d_core.reconstruction import Reconstruction
+
+MOVING_SHARE = 0.01
+"""Of the extent: a true point that moves less than this counts as standing."""
+CHANGED = 0.1
+"""In 0…1: a pixel that differs more from frame 0 in some channel has changed."""
+STILL_LEVELS = 6
+"""Of 255: the true pictures' own noise; a pixel that stays within them in every channel does not change."""
+FEWEST_STILL = 500
+"""Still pixels over all test cameras from which flicker is told; fewer are chance."""
+DIFFERENCE_GAIN = 4.0
+"""Differences are this much brighter in comparison pictures."""
+
+Scores = dict[str, float | None]
+
+
+def measure_pictures(
+    reconstruction: Reconstruction, capture: Capture, index: int, *, with_lpips: bool = False
+) -> tuple[Scores, dict[str, Scores]]:
+    """Scores of one committed frame on the test cameras: their mean, and by camera.
+
+    Args:
+        reconstruction: has committed the frame.
+        capture: opened at the scale at which it is measured, with masks.
+        index: the frame.
+        with_lpips: also LPIPS, which loads torch.
+    """
+    rig, truth, first = capture.test_rig, capture.test_frame(index), capture.test_frame(0)
+    assert rig is not None
+    by_camera: dict[str, Scores] = {}
+    for camera in rig.cameras:
+        true = truth.images[camera.name]
+        colour = reconstruction.render(camera, index).colour
+        mask = truth.masks.get(camera.name)
+        changed = np.abs(true / 255.0 - first.images[camera.name] / 255.0).max(axis=-1) > CHANGED
+        by_camera[camera.name] = {
+            "psnr": metrics.psnr(colour, true),
+            "psnr_foreground": None if mask is None else _finite(metrics.psnr(colour, true, mask)),
+            "psnr_changed": _finite(metrics.psnr(colour, true, changed)),
+            "ssim": metrics.ssim(colour, true),
+            "flip": metrics.flip(colour, true).value,
+            "lpips": metrics.lpips(colour, true).value if with_lpips else None,
+        }
+    return mean_scores(by_camera.values()), by_camera
+
+
+def measure_tracks(reconstruction: Reconstruction, capture: Capture, indices: Sequence[int]) -> Scores:
+    """3D error, 2D error without and with oracle, and visibility accuracy over committed frames; the first is 0."""
+    truth, rig = capture.ground_truth, capture.test_rig
+    assert truth is not None
+    assert rig is not None
+    points = truth.points[list(indices)]
+    extent = capture.extent or float(np.ptp(points.reshape(-1, 3), axis=0).max())
+    moving = moving_points(points, extent)
+    if len(indices) < 2 or not moving.any():
+        return {}
+    tracks = reconstruction.tracks_of_points(points[0], indices[0], list(indices))
+    error = metrics.track_error_3d(tracks.positions, points, moving, extent)
+    sorted_errors = metrics.error_by_confidence(tracks.positions, points, tracks.confidence, moving, extent)
+    at_last = metrics.track_error_3d(tracks.positions[[0, -1]], points[[0, -1]], moving, extent)
+
+    def depth(camera: Camera, index: int) -> tuple[NDArray[Any], NDArray[Any]]:
+        view = reconstruction.render(camera, index)
+        return view.depth, view.alpha
+
+    tolerance = depth_tolerance(reconstruction.history, reconstruction.world, indices[0])
+    centroids = reconstruction.world.to_user(reconstruction.history.stacked("means", list(indices)))
+    by_camera: list[Scores] = []
+    for camera in rig.cameras:
+        true_uv, visible = camera.project(points)[0], truth.visible_in(camera.name)[list(indices)]
+        seen = tracks.with_visibility(camera, depth, tolerance).visibility[camera.name]
+        scores: Scores = {"visibility_accuracy": metrics.visibility_accuracy(seen, visible)}
+        asked = moving & visible[0]
+        if asked.any():
+            uv, counted = true_uv[:, asked], visible[:, asked]
+            diagonal = math.hypot(camera.width, camera.height)
+            found = reconstruction.tracks_of_pixels(camera, uv[0], indices[0], list(indices))
+            oracle = metrics.oracle_tracks(camera.project(centroids)[0], uv, counted)
+            scores["mte_2d"] = _finite(metrics.median_trajectory_error(found.pixels(camera), uv, counted, diagonal))
+            scores["mte_2d_oracle"] = _finite(metrics.median_trajectory_error(oracle, uv, counted, diagonal))
+        by_camera.append(scores)
+    return {
+        "track_3d_median": _finite(error.median),
+        "track_3d_p90": _finite(error.percentile_90),
+        "track_3d_last": _finite(at_last.median),
+        "track_points": float(moving.sum()),
+        **{f"track_3d_confidence_{k}": _finite(error) for k, error in enumerate(sorted_errors, 1)},
+        **mean_scores(by_camera),
+    }
+
+
+def measure_parts(reconstruction: Reconstruction, capture: Capture, indices: Sequence[int]) -> Scores:
+    """Adjusted Rand index of rendered part labels, pooled over the test cameras that have labels and the frames."""
+    truth, rig = capture.ground_truth, capture.test_rig
+    assert truth is not None
+    assert rig is not None
+    cameras = [camera for camera in rig.cameras if camera.name in truth.label_cameras]
+    count = sum(part.foreground for part in truth.parts)
+    if count < 2 or not cameras:
+        return {}
+    labels = reconstruction.parts(count)
+    rendered, true = [], []
+    for camera in cameras:
+        for index in indices:
+            rendered.append(render_parts(reconstruction, camera, index, labels))
+            true.append(truth.labels(camera.name, index))
+    return {"parts_ari": metrics.adjusted_rand_index(np.stack(rendered), np.stack(true)), "parts_count": float(count)}
+
+
+def measure_flicker(reconstruction: Reconstruction, capture: Capture, indices: Sequence[int]) -> Scores:
+    """Mean temporal standard deviation, in 255ths, of the still pixels of the test cameras; how many there are."""
+    rig = capture.test_rig
+    assert rig is not None
+    deviations: list[NDArray[Any]] = []
+    for camera in rig.cameras:
+        true = np.stack([capture.test_frame(index).images[camera.name] for index in indices])
+        lowest, highest = true.min(axis=0).astype(np.int16), true.max(axis=0).astype(np.int16)
+        still = ((highest - lowest).max(axis=-1) <= STILL_LEVELS) & (highest.max(axis=-1) > 0)
+        shown = np.stack([np.clip(reconstruction.render(camera, index).colour[still], 0, 1) for index in indices])
+        deviations.append(255 * shown.std(axis=0, dtype=np.float64))
+    found = np.concatenate(deviations)
+    return {"still_pixels": float(len(found)), "flicker": float(found.mean()) if len(found) >= FEWEST_STILL else None}
+
+
+def render_parts(reconstruction: Reconstruction, camera: Camera, index: int, labels: NDArray[Any]) -> NDArray[np.uint8]:
+    """[H, W] part labels of one view."""
+    parts: NDArray[np.uint8] | None = reconstruction.render(camera, index, labels=labels).parts
+    assert parts is not None  # labels were given
+    return parts
+
+
+def moving_points(points: NDArray[np.float64], extent: float) -> NDArray[np.bool_]:
+    """[P] of [T, P, 3]: which points leave their place of the first frame by more than 1 % of the extent."""
+    moving: NDArray[np.bool_] = np.linalg.norm(points - points[:1], axis=-1).max(axis=0) > MOVING_SHARE * extent
+    return moving
+
+
+def save_comparison(reconstruction: Reconstruction, capture: Capture, index: int, folder: Path) -> list[Path]:
+    """Truth | render | difference (4 times brighter) of every test camera as PNG files; the paths."""
+    rig, truth = capture.test_rig, capture.test_frame(index)
+    assert rig is not None
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for camera in rig.cameras:
+        true = truth.images[camera.name] / 255.0
+        colour = np.clip(reconstruction.render(camera, index).colour, 0, 1)
+        row = np.concatenate([true, colour, np.clip(DIFFERENCE_GAIN * np.abs(true - colour), 0, 1)], axis=1)
+        paths.append(folder / f"frame{index:04d}_camera{camera.name}.png")
+        Image.fromarray((row * 255 + 0.5).astype(np.uint8)).save(paths[-1])
+    return paths
+
+
+def save_parts(
+    reconstruction: Reconstruction, capture: Capture, index: int, labels: NDArray[Any], folder: Path
+) -> list[Path]:
+    """True | rendered part labels of every labelled test camera in colours, as PNG files; the paths."""
+    truth, rig = capture.ground_truth, capture.test_rig
+    assert isinstance(truth, GroundTruth)
+    assert rig is not None
+    folder.mkdir(parents=True, exist_ok=True)
+    palette = np.random.default_rng(1).integers(60, 256, size=(256, 3), dtype=np.uint8)
+    palette[0] = palette[255] = 0
+    paths = []
+    for camera in rig.cameras:
+        if camera.name in truth.label_cameras:
+            true = truth.labels(camera.name, index)
+            found = np.where(true > 0, render_parts(reconstruction, camera, index, labels), 0)
+            paths.append(folder / f"parts{index:04d}_camera{camera.name}.png")
+            Image.fromarray(palette[np.concatenate([true, found], axis=1)]).save(paths[-1])
+    return paths
+
+
+def mean_scores(of: Iterable[Scores]) -> Scores:
+    """The mean of every score over those that have it."""
+    table = list(of)
+    names = dict.fromkeys(name for scores in table for name in scores)
+    return {name: _mean([scores.get(name) for scores in table]) for name in names}
+
+
+def _mean(values: list[float | None]) -> float | None:
+    there = [value for value in values if value is not None]
+    return float(np.mean(there)) if there else None
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no NaN; infinity (identical pixels, everything lost) would spoil a mean."""
+    return value if math.isfinite(value) else None

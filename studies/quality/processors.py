@@ -1,0 +1,147 @@
+"""``scripts/bench processors``: how much of a capture's result is luck, of the processor and of the seed.
+
+The first frames of a capture on this processor, on it as one with AVX2 alone, and as one of 2008, where kernels
+(``NUMBA_CPU_NAME``), numpy (``NPY_DISABLE_CPU_FEATURES``) and BLAS (``OPENBLAS_CORETYPE``) are concerned; beside them
+other seeds of the updates. Each row runs in a process of its own, frame 0 included; rows on disk are not run again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import os
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scas4d_core.captures import open_capture
+from scas4d_core.metrics import psnr
+from studies.machine import core_version, machine
+from studies.quality.job import settings_of
+from studies.quality.store import Row, Store, digest
+
+Report = Callable[[str], None]
+
+TARGETS: Mapping[str, Mapping[str, str]] = {
+    "this processor": {},
+    "AVX2 and FMA": {
+        "NUMBA_CPU_NAME": "x86-64-v3",
+        "NUMBA_CPU_FEATURES": "",
+        "OPENBLAS_CORETYPE": "Haswell",
+        "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
+    },
+    "as of 2008": {
+        "NUMBA_CPU_NAME": "generic",
+        "NUMBA_CPU_FEATURES": "",
+        "OPENBLAS_CORETYPE": "Nehalem",
+        "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR",
+    },
+}
+"""What makes this processor compute as a lesser one; an x86-64."""
+
+
+def run(
+    captures: Sequence[Path], out: Path, *, frames: int, seeds: int, changes: Sequence[str] = (), report: Report = print
+) -> bool:
+    """Measures each capture on each target with seed 0, and on this processor with the other seeds.
+
+    Args:
+        captures: folders with test cameras. out: folder of the study; run again with the same one to go on.
+        frames: updates of each run. seeds: of the updates, 0 among them. changes: settings, as
+            ``update.iterations=20``.
+
+    Returns:
+        Whether every capture has the same bits on all targets.
+
+    Raises:
+        RuntimeError: a run failed; its last words are in the message.
+    """
+    store, rows = Store(out), []
+    for capture in captures:
+        for target, seed in [*((name, 0) for name in TARGETS), *(("this processor", k) for k in range(1, seeds))]:
+            key = f"{capture.resolve().name}-{target.replace(' ', '-')}-s{seed}-{digest(frames, list(changes))}"
+            row = store.row(key)
+            if row is None or row["core"] != core_version():
+                report(key)
+                row = {"key": key, "capture": capture.resolve().name, "target": target, "seed": seed}
+                row |= _apart(capture, TARGETS[target], frames, seed, changes)
+                store.put(row)
+            rows.append(row)
+    text = table(rows)
+    (out / "table.md").write_text(text + "\n")
+    report(text)
+    return all(same_bits(rows, name) for name in {row["capture"] for row in rows})
+
+
+def same_bits(rows: Sequence[Row], capture: str) -> bool:
+    """Whether the states of a capture are the same on all targets that were measured."""
+    own = [row for row in rows if row["capture"] == capture and row["seed"] == 0]
+    return len({json.dumps(row["states"]) for row in own}) == 1
+
+
+def table(rows: Sequence[Row]) -> str:
+    """A line a capture: decibels by target, whether the bits are the same, and the spread over seeds."""
+    lines = [
+        f"| capture | {' | '.join(TARGETS)} | states | seeds: spread (standard deviation) |",
+        "|---" * (len(TARGETS) + 3) + "|",
+    ]
+    for name in dict.fromkeys(row["capture"] for row in rows):
+        own = [row for row in rows if row["capture"] == name]
+        by_target = {row["target"]: row for row in own if row["seed"] == 0}
+        means = [f"{statistics.fmean(by_target[target]['psnr']):.2f} dB" for target in TARGETS]
+        by_seed = [statistics.fmean(row["psnr"]) for row in own if row["target"] == "this processor"]
+        spread = f"{max(by_seed) - min(by_seed):.2f} dB"
+        if len(by_seed) > 1:
+            spread += f" ({statistics.stdev(by_seed):.2f} dB, {len(by_seed)} seeds)"
+        lines.append(
+            f"| {name} | {' | '.join(means)} | {'the same bits' if same_bits(rows, name) else 'differ'} | {spread} |"
+        )
+    return "\n".join(lines)
+
+
+def measure(capture: Path, frames: int, seed: int, changes: Sequence[str]) -> Row:
+    """Frame 0 and updates in this process: test cameras' mean PSNR of each update, and a digest of each state."""
+    from scas4d_core.reconstruction import Reconstruction
+
+    opened = open_capture(capture)
+    if opened.test_rig is None:
+        raise ValueError(f"{capture} has no test cameras, so there is nothing to measure on")
+    settings = settings_of("scas4d", overrides=changes)
+    settings = settings.model_copy(update={"update": settings.update.model_copy(update={"seed": seed})})
+    scene = Reconstruction.start(opened.rig, opened.frame(0), settings, points=opened.points)
+    row: Row = {"psnr": [], "states": [], "core": core_version(), "machine": machine()}
+    for index in range(min(frames + 1, opened.frame_count)):
+        if index:
+            scene.step(opened.frame(index))
+            truth = opened.test_frame(index)
+            views = [scene.render(camera, index).colour for camera in opened.test_rig.cameras]
+            truths = [truth.images[camera.name] / np.float32(255) for camera in opened.test_rig.cameras]
+            row["psnr"].append(float(np.mean([psnr(a, b) for a, b in zip(views, truths, strict=True)])))
+        found = hashlib.sha256()
+        for array in scene.history.gaussians(index).arrays().values():
+            found.update(np.ascontiguousarray(array).tobytes())
+        row["states"].append(found.hexdigest()[:16])
+    return row
+
+
+def _apart(capture: Path, target: Mapping[str, str], frames: int, seed: int, changes: Sequence[str]) -> dict[str, Any]:
+    present = os.environ | dict(target)
+    if "NPY_DISABLE_CPU_FEATURES" in target:  # numpy warns of those that are not there
+        numpy_core: Any = importlib.import_module("numpy._core._multiarray_umath")
+        features: Mapping[str, bool] = numpy_core.__cpu_features__
+        wanted = target["NPY_DISABLE_CPU_FEATURES"].split()
+        present["NPY_DISABLE_CPU_FEATURES"] = " ".join(name for name in wanted if features.get(name))
+    program = "import json, sys; from studies.quality import processors as p; from pathlib import Path; "
+    program += "a = json.loads(sys.argv[1]); print(json.dumps(p.measure(Path(a[0]), *a[1:])))"
+    given = json.dumps([str(capture), frames, seed, list(changes)])
+    done = subprocess.run([sys.executable, "-c", program, given], env=present, capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(f"{capture} failed: {done.stderr.strip().splitlines()[-1:]}")
+    row: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return row

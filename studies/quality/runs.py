@@ -1,0 +1,165 @@
+"""The runs that the bars need: which captures, with which preset and changes. ``scripts/bench bars`` measures them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from scas4d_core.presets import preset
+from scas4d_core.settings import Settings
+from studies.quality.job import Job, settings_of
+from studies.quality.quality import Report, run_jobs
+from studies.quality.store import Row, Store
+from studies.quality.table import OBJECT_CAPTURES
+
+CAPTURES = (*OBJECT_CAPTURES, "stage", "basketball")
+"""Every capture of the bars, by the name of its folder."""
+
+CAPTURE_CHANGES: Mapping[str, tuple[str, ...]] = {}
+"""What a scene itself asks for in every run of it (its budget of Gaussians, its floor), never what tunes a method."""
+
+LATER: Mapping[str, Mapping[str, Any]] = {
+    "static": {"stop_gain": 0.0},
+    "update": {"budget_ms": None, "stop_gain": 0.0, "cold_longer": 1.0, "views": 1, "covariance": "entangled"},
+}
+"""Settings that rows measured before do not name, by group, with the value that they had in effect."""
+
+IDLE = {"update": ("still", "judge", "patience")}
+"""Settings that rows measured before do not name and that change nothing on captures without faults: taken as today."""
+
+OTHER_MAP = "published" if preset("scas4d").update.cluster_map == "centred" else "centred"
+"""The cluster map that is not the default."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One way to reconstruct, over some captures.
+
+    Attributes:
+        captures: names of folders. preset: name. iterations: of an update.
+        changes: further settings, as ``"update.clusters=[64]"``.
+        masks, points: whether the method gets them.
+        frames: only so many frames; None: all.
+    """
+
+    captures: tuple[str, ...]
+    preset: str = "scas4d"
+    iterations: int = 100
+    changes: tuple[str, ...] = ()
+    masks: bool = True
+    points: bool = True
+    frames: int | None = None
+
+    def settings(self, capture: str) -> Settings:
+        """What is run on a capture, complete."""
+        return settings_of(self.preset, self.iterations, overrides=[*CAPTURE_CHANGES.get(capture, ()), *self.changes])
+
+    def job(self, folder: Path, frames: int | None = None) -> Job:
+        """The row of one capture, of at most so many frames."""
+        limits = [limit for limit in (frames, self.frames) if limit is not None]
+        return Job(
+            capture=folder,
+            preset=self.preset,
+            settings=self.settings(folder.resolve().name),
+            frames=min(limits) if limits else None,
+            masks=self.masks,
+            points=self.points,
+        )
+
+
+RUNS: Mapping[str, Run] = {
+    "scas4d": Run(CAPTURES),
+    "robot-unaided": Run(("robot",), masks=False, points=False, frames=1),
+    "basketball-cloudless": Run(("basketball",), points=False, frames=1),
+    "dynamic3dgs": Run(CAPTURES, "dynamic3dgs"),
+    "clusters-64": Run(OBJECT_CAPTURES, changes=("update.clusters=[64]",)),
+    "clusters-320": Run(OBJECT_CAPTURES, changes=("update.clusters=[320]",)),
+    "clusters-1280": Run(OBJECT_CAPTURES, changes=("update.clusters=[1280]",)),
+    "other-map": Run(CAPTURES, changes=(f"update.cluster_map={OTHER_MAP}",)),
+    "dynamic3dgs-2000": Run(OBJECT_CAPTURES, "dynamic3dgs", 2000),
+}
+"""By name, in the order in which they are measured: the costliest last."""
+
+
+def measure_runs(
+    captures: Path,
+    out: Path,
+    names: Sequence[str] = (),
+    *,
+    only: Sequence[str] = (),
+    frames: int | None = None,
+    again: bool = False,
+    report: Report = print,
+) -> list[Row]:
+    """Measures runs on the captures that are there; rows that are on disk are not measured again.
+
+    Args:
+        captures: folder of the captures' folders.
+        out: folder of the study.
+        names: of ``RUNS``; none: all.
+        only: captures by name; none: all of each run.
+        frames: only so many frames of each; None: all.
+        again: measure rows anew that are on disk.
+        report: takes the lines that are printed.
+
+    Raises:
+        ValueError: an unknown run or capture, or no capture of any run in the folder.
+    """
+    for name in names:
+        if name not in RUNS:
+            raise ValueError(f"run {name!r} is unknown; choose of {', '.join(RUNS)}")
+    for name in only:
+        if name not in CAPTURES:
+            raise ValueError(f"capture {name!r} has no bars; choose of {', '.join(CAPTURES)}")
+    jobs: list[Job] = []
+    missing: dict[str, None] = {}
+    for name in names or RUNS:
+        for capture in RUNS[name].captures:
+            if only and capture not in only:
+                continue
+            if (captures / capture).is_dir():
+                jobs.append(RUNS[name].job(captures / capture, frames))
+            else:
+                missing[capture] = None
+    for capture in missing:
+        report(f"{captures / capture}: no such folder; left out")
+    if not jobs:
+        raise ValueError(f"{captures} holds none of the captures asked for; give the folder that holds their folders")
+    return run_jobs(jobs, out, again=again, report=report)
+
+
+def completed(settings: Mapping[str, Any], today: Mapping[str, Any]) -> dict[str, Any]:
+    """A row's settings with what came later, at the value that leaves all as it was. ``today``: those of its run."""
+    return {
+        group: {**LATER.get(group, {}), **{name: today[group][name] for name in IDLE.get(group, ())}, **given}
+        if isinstance(given, dict)
+        else given
+        for group, given in settings.items()
+    }
+
+
+def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
+    """The rows on disk by run and capture; of several, the one with most frames. Rows with other settings are left out.
+
+    A row belongs to a run where its settings are, to the last number, those the run has today; where only frame 0 is
+    asked for, those of updates do not count.
+    """
+    rows = [row for row in store.rows() if "error" not in row]
+    found: dict[tuple[str, str], Row] = {}
+    for name, run in RUNS.items():
+        for capture in run.captures:
+            settings = run.settings(capture).model_dump(mode="json")
+            groups = ("scene", "static") if run.frames == 1 else tuple(settings)
+            for row in rows:
+                given = row["given"]
+                withheld = (given["masks"], given["points"])
+                told = completed(row["settings"], settings)
+                same = all(told.get(group) == settings[group] for group in groups)
+                if row["capture"] != capture or not same or withheld != (run.masks, run.points):
+                    continue
+                best = found.get((name, capture))
+                if best is None or given["frames"] > best["given"]["frames"]:
+                    found[name, capture] = row
+    return found

@@ -1,0 +1,321 @@
+"""The bars that the method has to reach, as data, and whether measured rows reach them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from scas4d_core.presets import preset
+from studies.machine import in_words
+from studies.quality.runs import CAPTURES, OTHER_MAP, RUNS, measured_runs
+from studies.quality.store import Row, Store
+from studies.quality.table import OBJECT_CAPTURES, markdown, stage_table
+
+KERNELS = "kernels"
+"""Stands for the study of ``bench.kernels`` where a bar names a run."""
+MAPS = f"the {preset('scas4d').update.cluster_map} cluster map over the {OTHER_MAP} one"
+K1 = ("clusters-64", "clusters-320", "clusters-1280")
+
+Rows = Mapping[tuple[str, str], Row]
+"""By run and capture."""
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One figure that has to be reached.
+
+    Attributes:
+        what: in words.
+        run: of ``RUNS``, or ``KERNELS``.
+        metric: name of a value in the row; "psnr" is taken over the updates that all compared rows have, "loss" and
+            "loss_worst" are what the updates lose against frame 0, their mean and their worst.
+        captures: each of them has to reach it, or their mean.
+        sense: how the figure has to lie to the threshold.
+        threshold: in ``unit``; None: the figure is only reported.
+        over: the figure is the difference to the best of these runs (higher is better).
+        mean: of the captures.
+    """
+
+    what: str
+    run: str
+    metric: str
+    captures: tuple[str, ...]
+    sense: Literal["≥", ">", "≤", "<", ""] = ""
+    threshold: float | None = None
+    unit: str = "dB"
+    over: tuple[str, ...] = ()
+    mean: bool = False
+
+
+BARS: tuple[Bar, ...] = (
+    Bar("frame 0, test cameras", "scas4d", "psnr_first", ("robot",), "≥", 36.0),
+    Bar("frame 0, test cameras", "scas4d", "psnr_first", ("wheel", "pendulums", "spring"), "≥", 34.5),
+    Bar("frame 0, test cameras", "scas4d", "psnr_first", ("cloth",), "≥", 30.5),
+    Bar("frame 0, test cameras", "scas4d", "psnr_first", ("stage",), "≥", 30.0),
+    Bar("frame 0 without points and masks, within 1 dB of 36", "robot-unaided", "psnr_first", ("robot",), "≥", 35.0),
+    Bar(
+        "frame 0 without points and masks over that with them",
+        "robot-unaided", "psnr_first", ("robot",), "≥", -1.0, over=("scas4d",),
+    ),
+    Bar("Gaussians", "scas4d", "gaussians", ("robot",), "≤", 25_000, ""),
+    Bar("updates", "scas4d", "psnr", ("robot",), "≥", 31.0),
+    Bar("updates", "scas4d", "psnr", OBJECT_CAPTURES, "≥", 30.5, mean=True),
+    Bar("updates (room, shadows)", "scas4d", "psnr", ("stage",), "≥", 27.0),
+    Bar("scas4d over dynamic3dgs, both at 100", "scas4d", "psnr", ("robot",), "≥", 8.0, over=("dynamic3dgs",)),
+    Bar(
+        "scas4d over dynamic3dgs, both at 100",
+        "scas4d", "psnr", ("wheel", "pendulums", "cloth", "spring", "stage", "basketball"), ">", 0.0,
+        over=("dynamic3dgs",),
+    ),
+    Bar("scas4d at 100 over dynamic3dgs at 2000", "scas4d", "psnr", ("robot",), ">", 0.0, over=("dynamic3dgs-2000",)),
+    Bar(
+        "scas4d at 100 over dynamic3dgs at 2000",
+        "scas4d", "psnr", OBJECT_CAPTURES, "≥", -0.5, over=("dynamic3dgs-2000",), mean=True,
+    ),
+    Bar("dynamic3dgs at 2000", "dynamic3dgs-2000", "psnr", ("robot",), "≥", 28.5),
+    Bar("three layers over the best single one (64, 320, 1280)", "scas4d", "psnr", OBJECT_CAPTURES, ">", 0.0, over=K1),
+    Bar(MAPS, "scas4d", "psnr", OBJECT_CAPTURES, ">", 0.0, over=("other-map",), mean=True),
+    Bar(MAPS, "scas4d", "psnr", CAPTURES, over=("other-map",)),
+    Bar("frame 0, from its cloud (the paper has 30.25)", "scas4d", "psnr_first", ("basketball",), "≥", 29.0),
+    Bar("mean loss of the updates against frame 0", "scas4d", "loss", ("basketball",), "≤", 0.5),
+    Bar("worst loss of an update against frame 0", "scas4d", "loss_worst", ("basketball",), "≤", 1.0),
+    Bar("pixels that changed since frame 0", "scas4d", "psnr_changed", ("basketball",)),
+    Bar("frame 0 without its cloud", "basketball-cloudless", "psnr_first", ("basketball",), "≥", 24.0),
+    Bar(
+        "3D tracks, median error", "scas4d", "track_3d_median", ("robot", "pendulums", "cloth", "spring"),
+        "≤", 0.8, "% of the extent",
+    ),
+    Bar("3D tracks, median error", "scas4d", "track_3d_median", ("wheel",), "≤", 2.0, "% of the extent"),
+    Bar(
+        "2D tracks without oracle, median error", "scas4d", "mte_2d", ("robot", "pendulums", "cloth", "spring"),
+        "≤", 0.5, "% of the diagonal",
+    ),
+    Bar("parts, adjusted Rand index", "scas4d", "parts_ari", ("robot", "pendulums"), "≥", 0.7, ""),
+    Bar("parts over dynamic3dgs at 100", "scas4d", "parts_ari", ("robot", "pendulums"), ">", 0.0, "", ("dynamic3dgs",)),
+    Bar(
+        "parts over dynamic3dgs at 2000",
+        "scas4d", "parts_ari", ("robot", "pendulums"), ">", 0.0, "", ("dynamic3dgs-2000",),
+    ),
+    Bar("rasterizer over its arithmetic, on frame 0", KERNELS, "ratio_rasterizer", ("robot",), "≤", 2.0, "×"),
+    Bar("rasterizer over its arithmetic, on a cloud", KERNELS, "ratio_rasterizer_cloud", ("robot",), "≤", 2.0, "×"),
+    Bar("update over its rasterizer passes", KERNELS, "ratio_update", ("robot",), "≤", 3.0, "×"),
+    Bar("peak memory of a run, frame 0 included", KERNELS, "peak_mb", ("robot",), "<", 1500.0, "MB"),
+)  # fmt: skip
+"""In the order of the table."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One line of the table.
+
+    Attributes:
+        capture: name, or "mean of …". value: the figure, None where not all of it is measured.
+        parts: the figures of the run and of what it is compared with, where the bar is a difference.
+        updates: how many updates the figure covers, in words; "frame 0" where none.
+        reached: None where there is no figure or no threshold.
+    """
+
+    bar: Bar
+    capture: str
+    value: float | None
+    parts: tuple[float, float] | None
+    updates: str
+    reached: bool | None
+
+    @property
+    def word(self) -> str:
+        """Of the verdict."""
+        if self.value is None:
+            return "not measured"
+        return "" if self.reached is None else "reached" if self.reached else "**missed**"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """What a bar is about on one capture: the value, the two it is the difference of, and the updates covered."""
+
+    value: float
+    parts: tuple[float, float] | None
+    updates: str
+
+
+def judge(rows: Rows, bars: Sequence[Bar] = BARS) -> list[Verdict]:
+    """Every bar, one verdict a capture, or one for a mean."""
+    verdicts = []
+    for bar in bars:
+        figures = {capture: figure_of(bar, capture, rows) for capture in bar.captures}
+        if bar.mean:
+            verdicts.append(_verdict(bar, "mean of " + ", ".join(bar.captures), _mean(list(figures.values()))))
+        else:
+            verdicts += [_verdict(bar, capture, figure) for capture, figure in figures.items()]
+    return verdicts
+
+
+def figure_of(bar: Bar, capture: str, rows: Rows) -> Figure | None:
+    """What the rows of a capture say; None where one that is needed is missing or lacks the value."""
+    needed = [rows.get((run, capture)) for run in (bar.run, *bar.over)]
+    there = [row for row in needed if row is not None]
+    if len(there) < len(needed):
+        return None
+    updates = min(int(row.get("updates", 0)) for row in there)
+    values = [_value(row, bar.metric, updates) for row in there]
+    known = [value for value in values if value is not None]
+    if len(known) < len(values):
+        return None
+    own, others = known[0], known[1:]
+    words = _updates(bar.metric, there, updates)
+    if not others:
+        return Figure(own, None, words)
+    return Figure(own - max(others), (own, max(others)), words)
+
+
+def bar_table(verdicts: Sequence[Verdict]) -> str:
+    """A Markdown table of verdicts."""
+    lines = ["| bar | capture | must be | is | | updates |", "|---|---|---|---|---|---|"]
+    for verdict in verdicts:
+        bar = verdict.bar
+        must = "–" if bar.threshold is None else f"{bar.sense} {_number(bar, bar.threshold)} {bar.unit}".strip()
+        measured = "–" if verdict.value is None else _number(bar, verdict.value)
+        if verdict.value is not None and verdict.parts is not None:
+            measured += f" ({_plain(bar, verdict.parts[0])} against {_plain(bar, verdict.parts[1])})"
+        cells = [bar.what, verdict.capture, must, measured, verdict.word, verdict.updates]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def count_words(verdicts: Sequence[Verdict]) -> str:
+    """How many bars are reached, missed, and not measured."""
+    judged = [verdict for verdict in verdicts if verdict.bar.threshold is not None]
+    reached, missed = (sum(verdict.reached is answer for verdict in judged) for answer in (True, False))
+    return f"{reached} reached, {missed} missed, {len(judged) - reached - missed} not measured, of {len(judged)}"
+
+
+def read_study(folder: Path) -> dict[tuple[str, str], Row]:
+    """The rows of the runs in the folder of a study and, where it was made, of the study of the kernels."""
+    rows = measured_runs(Store(folder))
+    file = folder / f"{KERNELS}.json"
+    if file.exists():
+        kernels: Row = json.loads(file.read_text())
+        rows[KERNELS, kernels["capture"]] = kernels
+    return rows
+
+
+def left_out(folder: Path, rows: Rows) -> int:
+    """How many finished rows in the folder of a study belong to no run as it is set today, or are not its longest."""
+    used = {row.get("key") for row in rows.values()}
+    return sum("error" not in row and row["key"] not in used for row in Store(folder).rows())
+
+
+def page(rows: Rows) -> str:
+    """The page of the documentation: commands, machine, date, the table of the bars, and the rows behind it."""
+    verdicts = judge(rows)
+    known = list(rows.values())
+    days = sorted({str(row["measured"])[:10] for row in known if "measured" in row})
+    machines = sorted({in_words(row["machine"]) for row in known if "machine" in row})
+    cores = sorted({str(row["core"]) for row in known if "core" in row})
+    behind = [rows[run, capture] for run in RUNS for capture in RUNS[run].captures if (run, capture) in rows]
+    return f"""# Quality
+
+How good pictures, tracks and parts are on the test cameras and ground truth of the captures, against the bars that the
+method has to reach. Everything below is written by the last of these commands, from rows that the others measured
+(`CAPTURES` is the folder that holds the captures' folders; what was measured is not measured again):
+
+```
+scripts/bench bars CAPTURES
+scripts/bench kernels CAPTURES/robot --store out/quality --out docs/kernels.md
+scripts/bench table out/quality --out docs/quality.md
+```
+
+- Measured: {" to ".join(dict.fromkeys((days[0], days[-1]))) if days else "nothing yet"}.
+- On: {"; ".join(machines) if machines else "–"}.
+- Code: {f"{len(cores)} state(s) of the core's sources ({', '.join(cores)})" if cores else "–"}.
+
+An iteration is one forward and backward render of one training view. Figures are means over all updates and test
+cameras; "updates" says how many updates of the capture they cover. A difference is taken over the updates that both
+sides have. The definitions of the metrics are in `scas4d_core/metrics` and `studies/quality/measure.py`.
+
+## Bars
+
+{count_words(verdicts)}.
+
+{bar_table(verdicts)}
+
+## Rows
+
+{_behind(behind)}
+"""
+
+
+def _behind(rows: Sequence[Row]) -> str:
+    if not rows:
+        return "None yet."
+    stages = stage_table(rows)
+    return markdown(rows) + (f"\n\nMedian seconds of an update by stage:\n\n{stages}" if stages else "")
+
+
+def _value(row: Row, metric: str, updates: int) -> float | None:
+    if metric in ("psnr", "loss", "loss_worst"):
+        by_frame = row.get("psnr_by_frame")
+        if not by_frame or updates < 1:
+            return None
+        chosen = np.array(by_frame[1 : 1 + updates])
+        if metric == "psnr":
+            return float(chosen.mean())
+        return float(by_frame[0] - (chosen.mean() if metric == "loss" else chosen.min()))
+    value = row.get(metric)
+    return None if value is None else float(value)
+
+
+def _updates(metric: str, rows: Sequence[Row], shared: int) -> str:
+    """Which updates a figure covers; those of each row where their values are not taken over the shared ones."""
+    if metric == "psnr_first":
+        return "frame 0"
+    if "capture_frames" not in rows[0]:
+        return "–"
+    covered = [shared] if metric == "psnr" else list(dict.fromkeys(int(row["updates"]) for row in rows))
+    return " and ".join(str(n) for n in covered) + f" of {int(rows[0]['capture_frames']) - 1}"
+
+
+def _mean(figures: Sequence[Figure | None]) -> Figure | None:
+    known = [figure for figure in figures if figure is not None]
+    if not known or len(known) < len(figures):
+        return None
+    parts = [figure.parts for figure in known if figure.parts is not None]
+    both = (float(np.mean([a for a, _ in parts])), float(np.mean([b for _, b in parts]))) if parts else None
+    words = ", ".join(figure.updates for figure in known)
+    return Figure(float(np.mean([figure.value for figure in known])), both, words)
+
+
+def _verdict(bar: Bar, capture: str, figure: Figure | None) -> Verdict:
+    if figure is None:
+        return Verdict(bar, capture, None, None, "–", None)
+    return Verdict(bar, capture, figure.value, figure.parts, figure.updates, _reached(bar, figure.value))
+
+
+def _reached(bar: Bar, value: float) -> bool | None:
+    """Figures are judged as measured, not as they are rounded for the table."""
+    if bar.threshold is None:
+        return None
+    return {
+        "≥": value >= bar.threshold,
+        ">": value > bar.threshold,
+        "≤": value <= bar.threshold,
+        "<": value < bar.threshold,
+    }[bar.sense]
+
+
+def _number(bar: Bar, value: float) -> str:
+    return f"{value:+.{_digits(bar)}f}" if bar.over else _plain(bar, value)
+
+
+def _plain(bar: Bar, value: float) -> str:
+    return f"{value:,.{_digits(bar)}f}"
+
+
+def _digits(bar: Bar) -> int:
+    return 0 if bar.metric in ("gaussians", "peak_mb") else 3 if bar.metric == "parts_ari" else 2

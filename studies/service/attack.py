@@ -1,0 +1,104 @@
+"""Connections of a stranger without a token, held open by one light process: `python -m studies.service.attack`.
+
+One endless header, headers that are half sent, uploads that stop; all at once. It writes one line of JSON when the last
+of them has been closed by the service, or its patience is over.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import json
+import selectors
+import socket
+import time
+from dataclasses import dataclass
+
+PIECE = b"a" * (256 << 10)
+HALF = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: aaaa"
+EVERY_S = 0.2
+
+
+@dataclass
+class Hold:
+    """One connection: what it sends first, and how many bytes of header after that."""
+
+    connection: socket.socket
+    first: bytes
+    more: int = 0
+
+
+def upload(path: str) -> bytes:
+    """The begin of a body that never ends."""
+    return (
+        (
+            f"PUT {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/vnd.scas4d.frame\r\n"
+            "Content-Length: 1000000\r\n\r\n"
+        ).encode()
+        + b"S4DF"
+        + bytes(60)
+    )
+
+
+def attack(port: int, path: str, header: int, halves: int, uploads: int, patience: float) -> dict[str, float]:
+    """Opens all, and waits until the service has closed them.
+
+    Args:
+        port: of the service, on the loopback. path: of the uploads. header: bytes of the endless header; 0 is none.
+        halves: half-sent headers. uploads: hanging uploads. patience: seconds.
+
+    Returns:
+        seconds: from the first connection until the last was closed. open: those that were not. sent: bytes of the
+        endless header that the system took.
+    """
+    began = time.monotonic()
+    ended, sent = began, 0
+    with selectors.DefaultSelector() as waiting:
+        # The endless header comes last: the first ones give way where a cap is reached.
+        plans = [(HALF, 0)] * halves + [(upload(path), 0)] * uploads + [(HALF, header)] * (header > 0)
+        for first, more in plans:
+            connection = socket.socket()
+            connection.setblocking(False)
+            if connection.connect_ex(("127.0.0.1", port)) not in (0, errno.EINPROGRESS):
+                connection.close()
+                continue
+            waiting.register(connection, selectors.EVENT_READ | selectors.EVENT_WRITE, Hold(connection, first, more))
+        while waiting.get_map() and time.monotonic() - began < patience:
+            for key, events in waiting.select(EVERY_S):
+                hold: Hold = key.data
+                try:
+                    if events & selectors.EVENT_WRITE:
+                        sent += _send(hold)
+                        if not hold.first and hold.more <= 0:
+                            waiting.modify(hold.connection, selectors.EVENT_READ, hold)
+                    if not events & selectors.EVENT_READ or hold.connection.recv(1 << 16):
+                        continue
+                except BlockingIOError:
+                    continue
+                except OSError:
+                    pass
+                waiting.unregister(hold.connection)
+                hold.connection.close()
+                ended = time.monotonic()
+        left = len(waiting.get_map())
+        for key in list(waiting.get_map().values()):
+            key.data.connection.close()
+    return {"seconds": (time.monotonic() if left else ended) - began, "open": left, "sent": sent}
+
+
+def _send(hold: Hold) -> int:
+    if hold.first:
+        hold.first = hold.first[hold.connection.send(hold.first) :]
+        return 0
+    sent = hold.connection.send(PIECE[: hold.more])
+    hold.more -= sent
+    return sent
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    for name in ("port", "header", "halves", "uploads"):
+        parser.add_argument(f"--{name}", type=int, required=True)
+    parser.add_argument("--path", required=True)
+    parser.add_argument("--patience", type=float, required=True)
+    print(json.dumps(attack(**vars(parser.parse_args()))), flush=True)

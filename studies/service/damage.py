@@ -1,0 +1,246 @@
+"""What single flipped bits cost, wherever they are: each is noticed or harmless, and no picture is wrong.
+
+One scene, frame after frame. Before each frame one bit of one file is flipped, under the service as it runs, or while
+it is down; then views are asked for, the next frame is sent, and all is compared with a run that nothing disturbed.
+The bit is put right again where the service could not do that: the next is to be a single one too.
+"""
+
+from __future__ import annotations
+
+import io
+import random
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+import numpy as np
+from PIL import Image
+
+from scas4d_core.storage.history import NEWEST_KEPT
+from scas4d_core.storage.npz import read_npz
+from server.storage.frame_store import FrameDamage, read_pictures
+from server.storage.journal import read_journal
+from studies.service.process import Service, StudyError
+from studies.service.study import AGAIN_S, Sender, Study, digests
+
+KINDS = ("state", "checkpoint", "fixed", "journal", "frame")
+BEFORE = 6
+"""Frames that are committed before the first bit is flipped."""
+NOTICED_S = 60.0
+"""So long a bit may stay unnoticed: the scrub runs without pauses here."""
+KEPT = 100
+"""Frames whose pictures are held: states older than that cannot be made again, and are named."""
+CLOSE_DB = 3.0
+"""A state that was made again may show the frame so much worse than the one that was lost."""
+SCRUB = {"SCAS4D_SCRUB_MB_PER_SECOND": "1000", "SCAS4D_SCRUB_PAUSE_SECONDS": "0.2"}
+
+Pictures = dict[int, bytes]
+
+
+@dataclass
+class Flips:
+    """What came of the flipped bits.
+
+    Attributes:
+        counts: noticed or harmless, by kind. remade, lost: frames whose state is another one, or gone.
+        unreported: frames whose state is as it was and whose report is gone.
+        faults: what should not be.
+    """
+
+    counts: Counter[str] = field(default_factory=Counter)
+    remade: set[int] = field(default_factory=set)
+    lost: set[int] = field(default_factory=set)
+    unreported: set[int] = field(default_factory=set)
+    faults: list[str] = field(default_factory=list)
+
+
+def frames_for(count: int) -> int:
+    """How many frames a study of so many flips sends."""
+    return BEFORE + count
+
+
+def undisturbed(study: Study) -> tuple[dict[int, str], Pictures]:
+    """States and views of a run that nothing disturbs."""
+    service = study.service("undisturbed_views")
+    service.start()
+    try:
+        scene = study.create(service)
+        sender = Sender(study, service, scene)
+        for index in range(len(study.frames)):
+            sender.send(index)
+        service.finish(scene, len(study.frames))
+        views = {index: _view(service, study, scene, index).content for index in range(len(study.frames))}
+        return digests(service.data / "scenes" / scene / "states"), views
+    finally:
+        service.stop()
+
+
+def flips(study: Study, count: int, seed: int, told: Callable[[str], None]) -> Flips:
+    """Flips `count` bits, as many of each kind, half of them while the service is down."""
+    random_ = random.Random(seed)
+    expected, views = undisturbed(study)
+    service = study.service("flips", SCRUB)
+    service.start()
+    found = Flips()
+    try:
+        scene = study.create(service, keep_frames={"last": KEPT})
+        sender = Sender(study, service, scene)
+        for index in range(BEFORE):
+            sender.send(index)
+        service.finish(scene, BEFORE)
+        for number in range(count):
+            kind, down = KINDS[number % len(KINDS)], number // len(KINDS) % 2 == 0
+            one = _Flip(study, service, scene, kind, BEFORE + number, random_)
+            said = f"{number + 1} of {count}: {one.said}{', while the service is down' if down else ''}"
+            try:
+                outcome = one.run(down, found, views)
+                sender.send(BEFORE + number)
+                service.finish(scene, BEFORE + number + 1)
+                told(f"{said}: {outcome}")
+            except StudyError as error:
+                one.faults.append(str(error))
+            found.faults += [f"{said}: {fault}" for fault in one.faults]
+        found.faults += sender.check()
+        states = digests(service.data / "scenes" / scene / "states")
+        others = found.remade | found.lost | found.unreported
+        wrong = [index for index in expected if index not in others and states.get(index) != expected[index]]
+        if wrong:
+            found.faults.append(f"states {wrong} are not bit-identical")
+        return found
+    finally:
+        service.stop()
+
+
+class _Flip:
+    """One bit of one file."""
+
+    def __init__(
+        self, study: Study, service: Service, scene: str, kind: str, frames: int, random_: random.Random
+    ) -> None:
+        self.study, self.service, self.scene, self.kind = study, service, scene, kind
+        self.folder = service.data / "scenes" / scene
+        self.frames = frames
+        self.index, self.file = self._choose(random_)
+        self.whole = self.file.read_bytes()
+        self.at, self.bit = random_.randrange(len(self.whole)), 1 << random_.randrange(8)
+        self.said = f"{kind}, bit {self.bit} of byte {self.at} of {self.file.name}"
+        self.faults: list[str] = []
+
+    def _choose(self, random_: random.Random) -> tuple[int, Path]:
+        """A file of the kind, and the frame that it is of."""
+        newest, states = self.frames - 1, self.folder / "states"
+        match self.kind:
+            case "state":
+                index = random_.choice([newest, newest - 1, 0, random_.randrange(1, newest - 1)])
+                return index, states / f"frame_{index:06d}.npz"
+            case "checkpoint":
+                files = sorted(states.glob("checkpoint_*.npz")) or [states / "fixed.npz"]
+                return newest, random_.choice(files[-NEWEST_KEPT:])
+            case "fixed":
+                return newest, states / random_.choice(["fixed.npz", "fixed.copy.npz", "first.copy.npz"])
+            case "journal":
+                return newest, self.folder / "journal.log"
+            case _:
+                return newest, random_.choice(sorted((self.folder / "frames").glob("*.frame")))
+
+    def run(self, down: bool, found: Flips, views: Pictures) -> str:
+        """Flips it, asks for everything, and puts it right where the service has not."""
+        service = self.service
+        if down:
+            service.kill()
+        before = set() if down else set(service.status(self.scene).damage)
+        data = bytearray(self.whole)
+        data[self.at] ^= self.bit
+        with self.file.open("r+b") as opened:
+            opened.seek(self.at)
+            opened.write(data[self.at : self.at + 1])
+        harmless = self._harmless()
+        if down:
+            service.start()
+        until = time.monotonic() + NOTICED_S
+        while not (noticed := bool(set(service.status(self.scene).damage) - before)):
+            if harmless or time.monotonic() > until:
+                break
+            time.sleep(AGAIN_S)
+        if not noticed and not harmless:
+            self.faults.append("it was not noticed, and it is not harmless")
+        while service.status(self.scene).error is not None and time.monotonic() < until:
+            time.sleep(AGAIN_S)
+        if (error := service.status(self.scene).error) is not None:
+            self.faults.append(f"the scene is left with: {error}")
+        for index in sorted({0, self.index, self.frames // 2, self.frames - 1}):
+            self._look(index, found, views)
+        self._put_right(bytes(data))
+        outcome = "noticed" if noticed else "harmless"
+        found.counts[f"{self.kind} {outcome}"] += 1
+        return outcome
+
+    def _harmless(self) -> bool:
+        """Whether everything that can be read of the file is what was written."""
+        try:
+            if self.kind == "frame":
+                return bool(read_pictures(self.file.parent, self.file.name).images)
+            if self.kind == "journal":
+                return not read_journal(self.file).damage
+            now, then = read_npz(self.file), np.load(io.BytesIO(self.whole), allow_pickle=False)
+            return now.keys() == set(then.files) and all(now[name].tobytes() == then[name].tobytes() for name in now)
+        except (FrameDamage, ValueError):
+            return False
+
+    def _look(self, index: int, found: Flips, views: Pictures) -> None:
+        """A view of a frame and its report: as undisturbed, or marked, or refused with a reason."""
+        until = time.monotonic() + NOTICED_S
+        while (answer := _view(self.service, self.study, self.scene, index)).status_code == 503:
+            self._no_path(answer)
+            if time.monotonic() > until:
+                self.faults.append(f"a view of frame {index} is put off for ever: {answer.text}")
+                return
+            time.sleep(AGAIN_S)
+        self._no_path(answer)
+        report = self.service.frame(self.scene, index)
+        if answer.status_code == 404 and report.deleted and not report.held:
+            found.lost.add(index)
+        elif answer.status_code != 200:
+            self.faults.append(f"a view of frame {index} is answered {answer.status_code}: {answer.text}")
+        elif report.remade:
+            found.remade.add(index)
+            truth = self.study.frames[index][0][self.study.capture.full_rig.names[0]]
+            loss = _psnr(views[index], truth) - _psnr(answer.content, truth)
+            if loss > CLOSE_DB:
+                self.faults.append(f"frame {index}, made again, is {loss:.1f} dB worse")
+        elif report.iterations is None:
+            found.unreported.add(index)
+        if answer.status_code == 200 and not report.remade and answer.content != views[index]:
+            self.faults.append(f"the view of frame {index} is another one")
+
+    def _no_path(self, answer: httpx.Response) -> None:
+        texts = [answer.text if answer.status_code != 200 else "", self.service.http.get("/v1/scenes").text]
+        if any(str(self.service.data) in text for text in texts):
+            self.faults.append("an answer names a path of the server")
+
+    def _put_right(self, flipped: bytes) -> None:
+        """What the service could not mend is whole again, so that the next bit is the only one."""
+        try:
+            with self.file.open("r+b") as opened:
+                opened.seek(self.at)
+                if opened.read(1) == flipped[self.at : self.at + 1] and self.file.stat().st_size == len(flipped):
+                    opened.seek(self.at)
+                    opened.write(self.whole[self.at : self.at + 1])
+        except FileNotFoundError:  # a checkpoint that was replaced
+            return
+
+
+def _view(service: Service, study: Study, scene: str, index: int) -> httpx.Response:
+    return service.http.get(
+        f"/v1/scenes/{scene}/render",
+        params={"camera": study.capture.full_rig.names[0], "frame": index, "format": "png"},
+    )
+
+
+def _psnr(picture: bytes, truth: bytes) -> float:
+    images = [np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), np.float64) for data in (picture, truth)]
+    error = float(np.mean((images[0] - images[1]) ** 2))
+    return 99.0 if error == 0 else 10 * float(np.log10(255**2 / error))

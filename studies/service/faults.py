@@ -1,0 +1,283 @@
+"""What kills, cuts, flipped bits and a full disk cost: nothing acknowledged, and not a bit of the states. And what
+strangers without a token cost (`studies.service.strangers`).
+
+Each scenario runs the whole service as a process of its own. The undisturbed run comes first; the others are compared
+with it, state by state and bit by bit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import resource
+import shutil
+import signal
+import threading
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from client.wire import FrameState
+from server.storage.events import Taken
+from server.storage.journal import read_journal
+from studies.service import damage
+from studies.service.outcome import Outcome, Told
+from studies.service.process import PATIENCE_S, Service, StudyError
+from studies.service.strangers import Attack, strangers
+from studies.service.study import AGAIN_S, Sender, Study, compare, digests, encoded_frames, undisturbed
+
+TURN_S = 15.0
+"""Of updates without strangers; with them, until the last connection is closed."""
+KILLS_OF_A_WORKER_AT_A_FRAME = 4
+"""The sixth sets a frame aside, as it should: the study stays below, and kills again when the next is at work."""
+
+PARTS = ("kills", "log", "disk", "bits", "strangers")
+"""The scenarios by name."""
+
+
+def kills(study: Study, expected: Mapping[int, str], update_s: float, count: int, seed: int, told: Told) -> Outcome:
+    """`kill -9` of the worker or the whole service, `count` times, at random moments of the capture."""
+    random_ = random.Random(seed)
+    moments: dict[int, list[str]] = {}
+    while sum(map(len, moments.values())) < count:
+        index, victim = random_.randrange(len(study.frames)), random_.choice(("worker", "service"))
+        moments.setdefault(index, []).append(victim)
+    killed: Counter[int] = Counter()
+    service = study.service("kills")
+    service.start()
+    scene = study.create(service)
+    sender = Sender(study, service, scene)
+    done = {"worker": 0, "service": 0}
+    try:
+        for index in range(len(study.frames)):
+            thread = threading.Thread(target=sender.send, args=(index,))
+            thread.start()
+            for victim in moments.get(index, ()):
+                time.sleep(random_.uniform(0, 1.5 * update_s))
+                if victim == "service":
+                    service.kill()
+                    service.start()
+                else:
+                    _kill_worker(service, scene, killed)
+                done[victim] += 1
+                told(f"killed the {victim} at frame {index}: {sum(done.values())} of {count}")
+            thread.join()
+        service.finish(scene, len(study.frames))
+        service.kill()
+        service.start()  # and once more: all is found again
+        service.finish(scene, len(study.frames))
+        faults = sender.check() + compare(digests(service.data / "scenes" / scene / "states"), expected)
+        lost = len(study.frames) - len(sender.receipts)
+        found = (
+            f"{done['worker']} of the worker, {done['service']} of the service; {lost} acknowledged frames lost, "
+            f"{len(expected)} states compared"
+        )
+        bar = "0 acknowledged frames lost, final state bit-identical"
+        return Outcome(f"kill -9 at {count} random moments over {len(study.frames)} frames", bar, found, faults)
+    finally:
+        service.stop()
+
+
+def _kill_worker(service: Service, scene: str, killed: Counter[int]) -> None:
+    """As soon as there is one (after a death it is away for a moment) and its frame has not had its share of kills."""
+    until = time.monotonic() + PATIENCE_S
+    while time.monotonic() < until:
+        status = service.status(scene)
+        at_work = status.next_frame - status.queued
+        pid = service.worker_pid(scene)
+        if pid is not None and killed[at_work] < KILLS_OF_A_WORKER_AT_A_FRAME:
+            killed[at_work] += 1
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+            return
+        time.sleep(AGAIN_S)
+    raise StudyError("there was no worker to kill")
+
+
+def damaged_log(study: Study, expected: Mapping[int, str], cuts: int, flips: int, seed: int, told: Told) -> Outcome:
+    """Files of the log cut, or a bit flipped, under a service that is down; then it starts, says so, and goes on.
+
+    Half of the frames are committed, the other half wait, as after a kill.
+    """
+    random_ = random.Random(seed)
+    service = study.service("log")
+    service.start()
+    half = len(study.frames) // 2
+    scene = study.create(service)
+    sender = Sender(study, service, scene)
+    for index in range(half):
+        sender.send(index)
+    service.finish(scene, half)
+    service.http.post(f"/v1/scenes/{scene}/pause")
+    for index in range(half, len(study.frames)):
+        sender.send(index)
+    service.kill()
+    service.stop()
+    faults = list(sender.faults)
+    dropped = 0
+    for number in range(cuts + flips):
+        kind = "cut" if number < cuts else "flip"
+        victim = study.service("damaged")
+        shutil.rmtree(victim.data)
+        shutil.copytree(service.data, victim.data)
+        folder = victim.data / "scenes" / scene
+        said, hit = _damage(folder, kind, random_, half)
+        victim.start()
+        try:
+            victim.http.post(f"/v1/scenes/{scene}/resume")
+            status = victim.finish(scene, len(study.frames) if hit is None else 0)
+            told(f"{said}: {'; '.join(status.damage) or 'nothing to say'}")
+            wrong = _check_damaged(victim, scene, sender, hit)
+            wrong += compare(digests(folder / "states"), expected, range(hit, len(study.frames)) if hit else ())
+            if hit is not None:
+                report = victim.frame(scene, hit)
+                dropped += 1
+                if report.state != FrameState.SET_ASIDE or not report.error:
+                    wrong.append(f"frame {hit} is {report.state}, its record is damaged")
+            elif not status.damage:
+                wrong.append("the damage was not said")
+            faults += [f"{said}: {fault}" for fault in wrong]
+        except StudyError as error:
+            faults.append(f"{said}: {error}")
+        finally:
+            victim.stop()
+    found = f"started {cuts + flips} times; {dropped} frames set aside with their reason, all others committed"
+    bar = "starts, loses nothing acknowledged before the damage, says what it dropped"
+    return Outcome(f"{cuts} cuts and {flips} flipped bytes of journal and frame log", bar, found, faults)
+
+
+def _damage(folder: Path, kind: str, random_: random.Random, half: int) -> tuple[str, int | None]:
+    """Damages the journal or the record of a frame that waits; says how, and which frame is hit."""
+    journal = folder / "journal.log"
+    taken = {fact.index: fact for fact in read_journal(journal).facts if isinstance(fact, Taken)}
+    waiting = [index for index in taken if index >= half]
+    hit = random_.choice([None, random_.choice(waiting)])
+    file = journal if hit is None else folder / "frames" / taken[hit].files[0]
+    at = random_.randrange(1, file.stat().st_size)
+    with file.open("r+b") as opened:
+        if kind == "cut":
+            opened.truncate(at)
+        else:
+            opened.seek(at)
+            byte = opened.read(1)[0]
+            opened.seek(at)
+            opened.write(bytes([byte ^ (1 << random_.randrange(8))]))
+    return f"{kind} of {file.name} at byte {at}", hit
+
+
+def _check_damaged(service: Service, scene: str, sender: Sender, hit: int | None) -> list[str]:
+    faults = []
+    for index, receipt in sender.receipts.items():
+        report = service.frame(scene, index)
+        if index != hit and report.state != FrameState.COMMITTED:
+            faults.append(f"frame {index} is {report.state}: {report.error}")
+        if report.identity != receipt["identity"]:
+            faults.append(f"frame {index} has another identity")
+    return faults
+
+
+def full_disk(study: Study, expected: Mapping[int, str], told: Told) -> Outcome:
+    """No file may grow: first for the service, then for the worker; then there is room again.
+
+    The limit on the size of files is set on the running processes (RLIMIT_FSIZE), so that every write fails where a
+    full disk would make it fail.
+    """
+    service = study.service("full")
+    service.start()
+    faults: list[str] = []
+    try:
+        scene = study.create(service)
+        sender = Sender(study, service, scene)
+        half = len(study.frames) // 2
+        for index in range(half):
+            sender.send(index)
+        service.finish(scene, half)
+        with _no_room(service.pid):
+            answers = [service.put(scene, half, *study.frames[half]) for _ in range(3)]
+            told(f"while the disk is full: {[answer.status_code for answer in answers]}")
+            faults += [f"answered {answer.status_code}, not 507" for answer in answers if answer.status_code != 507]
+            if service.status(scene).next_frame != half:
+                faults.append("a frame was taken that was not acknowledged")
+        worker = service.worker_pid(scene)
+        assert worker is not None
+        with _no_room(worker):
+            sender.send(half)
+            until = time.monotonic() + PATIENCE_S
+            while "room" not in (service.status(scene).error or "") and time.monotonic() < until:
+                time.sleep(AGAIN_S)
+            told(f"while the worker has no room: {service.status(scene).error}")
+            if service.frame(scene, half).state != FrameState.UPDATING:
+                faults.append("the worker did not wait for room")
+        for index in range(half + 1, len(study.frames)):
+            sender.send(index)
+        service.finish(scene, len(study.frames))
+        faults += sender.check() + compare(digests(service.data / "scenes" / scene / "states"), expected)
+    finally:
+        service.stop()
+    bar = "starts, loses nothing acknowledged before the damage, says what it dropped"
+    return Outcome("disk full while ingesting", bar, "507 meanwhile; all committed once there was room", faults)
+
+
+@contextlib.contextmanager
+def _no_room(pid: int) -> Any:
+    soft, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, hard))
+    try:
+        yield
+    finally:
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def flipped_bits(study: Study, count: int, seed: int, told: Told) -> Outcome:
+    """Single bits over everything on disk, with and without a restart (`studies.service.damage`)."""
+    longer = replace(study, frames=encoded_frames(study.capture, damage.frames_for(count)))
+    found = damage.flips(longer, count, seed, told)
+    counts = Counter(kind.rpartition(" ")[2] for kind in found.counts.elements())
+    said = (
+        f"{counts['noticed']} noticed, {counts['harmless']} harmless; {len(found.remade)} states made again from "
+        f"pictures, {len(found.lost)} named as lost, {len(found.unreported)} without their report"
+    )
+    bar = "each noticed or harmless; no wrong picture, no 500, the scene goes on"
+    return Outcome(f"{count} flipped bits of {', '.join(damage.KINDS)}, half while down", bar, said, found.faults)
+
+
+def run(
+    study: Study,
+    *,
+    moments: int = 30,
+    cuts: int = 20,
+    flips: int = 1,
+    bits: int = 200,
+    seed: int = 0,
+    attack: Attack | None = None,
+    turns: int = 3,
+    parts: Sequence[str] = PARTS,
+    told: Told = print,
+) -> list[Outcome]:
+    """The scenarios of `parts`.
+
+    Args:
+        study: what is sent, and where to. moments: kills. cuts, flips: damaged files.
+        bits: flipped over everything on disk. seed: of the random moments.
+        attack: of the strangers, the whole of it where not given. turns: without and with it.
+    """
+    outcomes = []
+    if set(parts) & {"kills", "log", "disk"}:
+        expected, update_s = undisturbed(study)
+        told(f"undisturbed: {len(expected)} states, {update_s:.2f} s an update")
+        if "kills" in parts:
+            outcomes.append(kills(study, expected, update_s, moments, seed, told))
+        if "log" in parts:
+            outcomes.append(damaged_log(study, expected, cuts, flips, seed, told))
+        if "disk" in parts:
+            outcomes.append(full_disk(study, expected, told))
+    if "bits" in parts:
+        outcomes.append(flipped_bits(study, bits, seed, told))
+    if "strangers" in parts:
+        for token in (False, True):
+            outcomes.append(strangers(study, attack or Attack(), turns=turns, seconds=TURN_S, token=token, told=told))
+    return outcomes

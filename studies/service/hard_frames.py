@@ -1,0 +1,265 @@
+"""The frame cases pushed through a running service: no answer above 499, no dead worker, explained, and recovered.
+
+All cases go into one scene, one after the other with good frames between them; a scene beside it gets the good frames
+alone. What was committed is read from the scenes' folders and held against each other.
+"""
+
+from __future__ import annotations
+
+import io
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from client.wire import FRAME_MEDIA_TYPE, FrameState, frame_chunks
+from scas4d_core.captures.frame import Frame
+from scas4d_core.frame_report import FrameReport
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.metrics import psnr
+from scas4d_core.query.committed import Committed
+from scas4d_core.storage.history import History
+from studies.hard_frames.footage import Filmed, MadeUp
+from studies.hard_frames.frames import FrameCase, Pictures, Sent, Step, good, named, teleported, violations
+from studies.hard_frames.study import AT, sound
+from studies.service.process import PATIENCE_S, Service, StudyError
+
+FARTHEST = 1.0
+"""Sizes that the object jumps: where it is by then, twice its size is out of the pictures."""
+BETWEEN = 2
+"""Good frames between the last that counts for one case and the first of the next."""
+AGAIN_S = 0.05
+
+Told = Callable[[str], None]
+
+
+class BackAndForth:
+    """A footage without an end: it turns round at both."""
+
+    def __init__(self, footage: MadeUp | Filmed) -> None:
+        self._footage = footage
+
+    def frame(self, index: int) -> Frame:
+        """See ``frames.Footage``."""
+        return self._footage.frame(self._inside(index))
+
+    def truth(self, index: int) -> Pictures:
+        """See ``frames.Footage``."""
+        return self._footage.truth(self._inside(index))
+
+    def jumped(self, index: int, sizes: float) -> tuple[Frame, Pictures] | None:
+        """See ``frames.Footage``."""
+        return self._footage.jumped(self._inside(index), sizes)
+
+    def _inside(self, index: int) -> int:
+        last = self._footage.count - 1
+        turn = index % (2 * last)
+        return min(turn, 2 * last - turn)
+
+
+@dataclass
+class Line:
+    """A case in one size, through the service."""
+
+    case: FrameCase
+    size: Any
+    said: str
+    last: float
+    violations: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Part:
+    """What is sent for one case, from which index of the scene on."""
+
+    case: FrameCase
+    size: Any
+    first: int
+    sent: Sequence[Sent]
+
+
+def script(footage: BackAndForth, cases: Sequence[FrameCase]) -> tuple[list[Sent], list[Part]]:
+    """All that is sent, and the parts of it that are cases; a jump for good is followed by one back."""
+    sent = [good(footage, index) for index in range(AT)]
+    parts: list[Part] = []
+    for case in cases:
+        for size in case.sizes:
+            like = sent[-1].like + 1
+            found = case.make(footage, like, size)
+            if found is None or (case.make is teleported and size > FARTHEST):
+                continue
+            parts.append(Part(case, size, len(sent), found))
+            sent += found
+            sent += [good(footage, sent[-1].like + 1 + number) for number in range(BETWEEN if found[-1].good else 6)]
+    return sent, parts
+
+
+def study(
+    footage: MadeUp | Filmed, folder: Path, names: Sequence[str] = (), told: Told = print
+) -> tuple[list[Line], list[str]]:
+    """Runs the cases whose name holds one of ``names``, or all.
+
+    Returns:
+        Each case, and what went wrong with the service itself.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    (folder / "data").mkdir(parents=True)
+    endless = BackAndForth(footage)
+    cases = [case for case in named(footage) if not names or any(name in case.name for name in names)]
+    sent, parts = script(endless, cases)
+    service = Service(folder / "data")
+    service.start()
+    try:
+        usual, faults = _push(service, footage, [good(endless, index) for index in range(sent[-1].like + 1)], told)
+        told(f"undisturbed: {usual.count} frames")
+        scene, more = _push(service, footage, sent, told)
+        lines = [_judged(part, scene, usual, footage) for part in parts]
+    finally:
+        service.stop()
+    faults += more
+    for line in lines:
+        told(f"{'holds' if not line.violations else 'FAILS'}  {line.case.name}, {line.size}  {line.last:+.1f} dB")
+        told(f"       {line.said}")
+        for violation in line.violations:
+            told(f"       ! {violation}")
+    failed = sum(bool(line.violations) for line in lines)
+    told(f"{len(lines)} cases with sizes in {len(sent)} frames, {failed} do not hold; faults: {faults or 'none'}")
+    return lines, faults
+
+
+@dataclass(frozen=True)
+class Pushed:
+    """A scene of the service, read from its folder."""
+
+    committed: Committed
+    count: int
+
+    def state(self, index: int) -> Gaussians:
+        """Of a frame."""
+        return self.committed.history.gaussians(index)
+
+    def report(self, index: int) -> FrameReport:
+        """Of a frame, as it was committed."""
+        record = self.committed.history.report(index)
+        return FrameReport(**{item.name: record[item.name] for item in fields(FrameReport) if item.name in record})
+
+    def psnr(self, footage: MadeUp | Filmed, index: int, truth: Pictures) -> float:
+        """DB of the held-out cameras."""
+        return float(
+            np.mean(
+                [psnr(self.committed.render(camera, index).colour, truth[camera.name]) for camera in footage.held_out]
+            )
+        )
+
+
+def _push(service: Service, footage: MadeUp | Filmed, sent: Sequence[Sent], told: Told) -> tuple[Pushed, list[str]]:
+    """Frames pushed into a new scene, one after the other; and what went wrong on the way."""
+    faults: list[str] = []
+    scene = service.create(
+        footage.rig, footage.settings.model_dump(mode="json"), ingest={"keep_frames": {}, "minimum_cameras": 1}
+    )
+    points = footage.points
+    if points is not None:
+        body = io.BytesIO()
+        arrays: dict[str, Any] = {"positions": points.positions, "colours": points.colours}
+        if points.foreground is not None:
+            arrays["foreground"] = points.foreground
+        np.savez(body, **arrays)
+        answer = service.http.put(f"/v1/scenes/{scene}/points", content=body.getvalue())
+        if answer.status_code >= 300:
+            raise StudyError(answer.text)
+    pids = set()
+    for index, one in enumerate(sent):
+        until = time.monotonic() + PATIENCE_S
+        files, whole = encoded(one.frame), len(one.frame.images) == len(footage.rig)
+        while (answer := _send(service, scene, index, whole, *files)).status_code == 429 and time.monotonic() < until:
+            time.sleep(AGAIN_S)
+        if answer.status_code != 202:
+            faults.append(f"frame {index} was answered {answer.status_code}: {answer.text}")
+            break
+        if index % 20 == 0:
+            service.finish(scene, index + 1)
+            pids.add(service.worker_pid(scene))
+    status = service.finish(scene, len(sent) if not faults else 0)
+    pids.add(service.worker_pid(scene))
+    if len(pids) != 1 or None in pids:
+        faults.append(f"the worker died: its processes were {pids}")
+    for index in range(status.next_frame):
+        report = service.frame(scene, index)
+        if report.state != FrameState.COMMITTED or report.attempts:
+            faults.append(f"frame {index} is {report.state} after {report.attempts} deaths: {report.error}")
+    told(f"scene {scene}: {status.next_frame} frames, {len(faults)} faults")
+    history = History.load(service.data / "scenes" / scene / "states")
+    return Pushed(
+        Committed(history, footage.rig.world_frame(footage.settings.scene.metres_per_unit)), len(sent)
+    ), faults
+
+
+def _send(
+    service: Service, scene: str, index: int, whole: bool, images: dict[str, bytes], masks: dict[str, bytes]
+) -> httpx.Response:
+    """A frame of all cameras, or what there is of one camera by camera; the first answer that is no success."""
+    if whole:
+        return service.put(scene, index, images, masks)
+    address = f"/v1/scenes/{scene}/frames/{index}"
+    for name, image in images.items():
+        body = b"".join(frame_chunks(index, {name: image}, {name: masks[name]} if name in masks else {}))
+        answer = service.http.put(f"{address}/cameras/{name}", content=body, headers={"Content-Type": FRAME_MEDIA_TYPE})
+        if answer.status_code >= 300:
+            return answer
+    return service.http.post(f"{address}/close")
+
+
+def encoded(frame: Frame) -> tuple[dict[str, bytes], dict[str, bytes]]:
+    """Its pictures and masks as PNG files."""
+    images = {name: _png(np.asarray(frame.images[name])) for name in frame.images}
+    return images, {name: _png(255 * np.asarray(frame.masks[name])) for name in frame.masks}
+
+
+def _png(picture: NDArray[np.uint8]) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "PNG", compress_level=1)
+    return file.getvalue()
+
+
+def _judged(part: Part, scene: Pushed, usual: Pushed, footage: MadeUp | Filmed) -> Line:
+    """The frames of one case, against the same of the undisturbed scene."""
+    steps = []
+    for number, sent in enumerate(part.sent):
+        index = part.first + number
+        before, after = scene.state(index - 1).arrays(), scene.state(index).arrays()
+        like = BackAndForth(footage).truth(sent.like)
+        steps.append(
+            Step(
+                replace(sent, frame=Frame(index, 0.0, {}, {})),
+                scene.report(index),
+                all(np.array_equal(before[name], after[name]) for name in before),
+                sound(scene.state(index)),
+                scene.psnr(footage, index, sent.truth),
+                usual.psnr(footage, sent.like, like),
+            )
+        )
+    faulty = [step for step in steps if not step.sent.good]
+    said = "; ".join(
+        dict.fromkeys(
+            step.report.degraded or ", ".join(step.report.dropped.values()) or "; ".join(step.report.attempts)
+            for step in faulty
+        )
+    )
+    return Line(part.case, part.size, said, steps[-1].psnr - steps[-1].usual, violations(part.case, steps, part.size))
+
+
+def table(lines: Sequence[Line]) -> str:
+    """As Markdown."""
+    rows = ["| case | size | the reports say | dB, last frame | holds |", "|" + "---|" * 5]
+    for line in lines:
+        verdict = "yes" if not line.violations else f"**no**: {'; '.join(line.violations)}"
+        rows.append(f"| {line.case.name} | {line.size} | {line.said} | {line.last:+.1f} | {verdict} |")
+    return "\n".join(rows)

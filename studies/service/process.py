@@ -1,0 +1,127 @@
+"""A service as a process of its own, to be killed, and the few requests that a study makes of it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from client.wire import FRAME_MEDIA_TYPE, FrameReportModel, RigModel, SceneStatus, frame_chunks
+from scas4d_core.cameras import Rig
+
+START_S, PATIENCE_S = 120.0, 900.0
+EVERY_S = 0.05
+
+
+class StudyError(RuntimeError):
+    """The service did not do what the study needs."""
+
+
+class Service:
+    """Started by `start`, killed by `kill`, as often as one likes, over the same data folder.
+
+    Args:
+        data: its folder. environment: further variables, as SCAS4D_ENGINE.
+    """
+
+    def __init__(self, data: Path, environment: Mapping[str, str] | None = None) -> None:
+        self.data = data
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = int(free.getsockname()[1])
+        token = (environment or {}).get("SCAS4D_TOKEN")
+        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        self.http = httpx.Client(base_url=f"http://127.0.0.1:{self.port}", timeout=60, headers=headers)
+        own = {"SCAS4D_DATA": str(data), "SCAS4D_WARM_UP": "false", "SCAS4D_LOG_LEVEL": "error"}
+        self._environment = {**os.environ, **own, **(environment or {})}
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def pid(self) -> int:
+        """Of the process that answers."""
+        assert self._process is not None
+        return self._process.pid
+
+    def start(self) -> None:
+        """Starts it and waits until it answers."""
+        program = [sys.executable, "-m", "client.cli.main", "serve"]
+        with (self.data.parent / f"{self.data.name}.log").open("ab") as log:
+            self._process = subprocess.Popen(
+                [*program, "--port", str(self.port)], env=self._environment, stdout=log, stderr=log
+            )
+        until = time.monotonic() + START_S
+        while True:
+            with contextlib.suppress(httpx.TransportError):
+                if self.http.get("/health/ready").status_code == 200:
+                    return
+            if self._process.poll() is not None or time.monotonic() > until:
+                raise StudyError(f"the service does not start; {self.data.name}.log beside its folder says why")
+            time.sleep(EVERY_S)
+
+    def kill(self) -> None:
+        """`kill -9`."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
+    def stop(self) -> None:
+        """Asks it to end, as Ctrl-C would; for good."""
+        self.http.close()
+        if self._process is not None:
+            self._process.send_signal(signal.SIGTERM)
+            self._process.wait(60)
+            self._process = None
+
+    def worker_pid(self, scene: str) -> int | None:
+        """Of the worker of a scene, or None while there is none."""
+        try:
+            pid = int((self.data / "scenes" / scene / "worker.lock").read_text())
+            os.kill(pid, 0)
+        except (OSError, ValueError):
+            return None
+        return pid
+
+    def create(self, rig: Rig, settings: Mapping[str, Any], **more: Any) -> str:
+        """A new scene's id."""
+        body = {"rig": RigModel.of(rig).model_dump(mode="json"), "settings": settings, **more}
+        answer = self.http.post("/v1/scenes", json=body)
+        if answer.status_code != 201:
+            raise StudyError(answer.text)
+        return str(answer.json()["id"])
+
+    def put(self, scene: str, index: int, images: Mapping[str, bytes], masks: Mapping[str, bytes]) -> httpx.Response:
+        """One try."""
+        body = b"".join(frame_chunks(index, images, masks))
+        return self.http.put(
+            f"/v1/scenes/{scene}/frames/{index}", content=body, headers={"Content-Type": FRAME_MEDIA_TYPE}
+        )
+
+    def status(self, scene: str) -> SceneStatus:
+        """Of a scene."""
+        return SceneStatus.model_validate_json(self.http.get(f"/v1/scenes/{scene}").content)
+
+    def frame(self, scene: str, index: int) -> FrameReportModel:
+        """What became of a frame."""
+        return FrameReportModel.model_validate_json(self.http.get(f"/v1/scenes/{scene}/frames/{index}").content)
+
+    def finish(self, scene: str, frames: int) -> SceneStatus:
+        """Waits until so many frames are finished."""
+        until = time.monotonic() + PATIENCE_S
+        while time.monotonic() < until:
+            status = self.status(scene)
+            if status.next_frame >= frames and status.queued == 0:
+                return status
+            if status.state == "failed":
+                raise StudyError(f"the scene failed: {status.error}")
+            time.sleep(EVERY_S)
+        raise StudyError(f"frames were not finished within {PATIENCE_S:g} s")

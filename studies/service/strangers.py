@@ -1,0 +1,215 @@
+"""What strangers without a token cost: `/health/live`, memory and updates with an attack and without, in turns.
+
+The attack is `studies.service.attack`, in a process of its own; a service runs with a token and one without. The scene
+goes on updating all the time, in the turns with the attack until its last connection is closed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import statistics
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from client.wire import FrameState
+from studies.service.outcome import Outcome, Told
+from studies.service.process import Service, StudyError
+from studies.service.study import Study
+
+P99_MS, MEMORY_MB, CLOSED_S, SLOWER = 50.0, 50.0, 60.0, 1.1
+TOKEN = "of-the-study-and-of-nobody-else"
+EVERY_S = 0.05
+"""Between two questions to `/health/live`, each over a connection of its own."""
+PATIENCE_S = 120.0
+AT_ONCE = 4
+WARM_UP = 3
+"""Updates before anything is measured: the first ones compile or load kernels and start cold."""
+
+
+@dataclass(frozen=True)
+class Attack:
+    """How much at once: bytes of one endless header, half-sent headers, hanging uploads."""
+
+    header: int = 300_000_000
+    halves: int = 300
+    uploads: int = 300
+
+
+@dataclass
+class Side:
+    """All turns without the attack, or with it.
+
+    Attributes:
+        health: ms of each answer of `/health/live`. lost: questions without an answer of 200. memory: largest MB of the
+            process that answers. updates: seconds of each.
+    """
+
+    health: list[float] = field(default_factory=list)
+    lost: int = 0
+    memory: float = 0.0
+    updates: list[float] = field(default_factory=list)
+
+    def p(self, percent: float) -> float:
+        """Percentile of the health check, ms."""
+        return float(np.percentile(self.health, percent))
+
+
+class Watch:
+    """Asks `/health/live` and reads the service's memory, from a thread, while the block runs."""
+
+    def __init__(self, service: Service, side: Side) -> None:
+        self._service, self._side = service, side
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Watch:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stop.wait(EVERY_S):
+            began = time.perf_counter()
+            connection = http.client.HTTPConnection("127.0.0.1", self._service.port, timeout=PATIENCE_S)
+            try:
+                connection.request("GET", "/health/live")
+                answer = connection.getresponse()
+                answer.read()
+                self._side.lost += answer.status != 200
+            except (OSError, http.client.HTTPException):
+                self._side.lost += 1
+            finally:
+                connection.close()
+            self._side.health.append(1000 * (time.perf_counter() - began))
+            self._side.memory = max(self._side.memory, resident_mb(self._service.pid))
+
+
+def resident_mb(pid: int) -> float:
+    """Memory of a process, MB; 0 where it cannot be read."""
+    with contextlib.suppress(OSError):
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+            if line.startswith("VmRSS"):
+                return int(line.split()[1]) * 1024 / 1e6
+    return 0.0
+
+
+class Updates:
+    """Frames of the study, sent one after the other for as long as is asked."""
+
+    def __init__(self, study: Study, service: Service) -> None:
+        self._study, self._service = study, service
+        self.scene = study.create(service, queue_frames=AT_ONCE + 1)
+        self._next = 0
+
+    def run(self, count: int) -> list[float]:
+        """Sends so many frames and waits until they are committed; seconds that each took."""
+        first = self._next
+        for index in range(first, first + count):
+            # The frames of a study go back and forth: behind the last comes the last but one.
+            turn = index % max(1, 2 * len(self._study.frames) - 2)
+            files = self._study.frames[min(turn, 2 * len(self._study.frames) - 2 - turn)]
+            answer = self._service.put(self.scene, index, *files)
+            if not answer.is_success:
+                raise StudyError(answer.text)
+        self._next += count
+        self._service.finish(self.scene, self._next)
+        reports = [self._service.frame(self.scene, index) for index in range(first, self._next)]
+        for report in reports:
+            if report.state != FrameState.COMMITTED:
+                raise StudyError(f"frame {report.index} was not committed: {report.error}")
+        return [report.seconds["total"] for report in reports]
+
+    @property
+    def upload(self) -> str:
+        """The path of the next frame, to which the attack's uploads go."""
+        return f"/v1/scenes/{self.scene}/frames/{self._next + AT_ONCE}"
+
+
+def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token: bool, told: Told) -> Outcome:
+    """The attack on one service.
+
+    Args:
+        study: frames and settings of the scene. attack: how much. turns: without and with the attack.
+        seconds: of a turn without, at least. token: whether the service has one, which the attack does not know.
+    """
+    environment = {**study.environment, **({"SCAS4D_TOKEN": TOKEN} if token else {})}
+    name = "strangers-token" if token else "strangers"
+    service = Study(study.folder, study.capture, study.frames, study.settings, environment).service(name)
+    service.start()
+    without, attacked = Side(), Side()
+    closed, left = 0.0, 0
+    try:
+        updates = Updates(study, service)
+        updates.run(1)
+        updates.run(WARM_UP)
+        for turn in range(turns):
+            with Watch(service, without):
+                until = time.monotonic() + seconds
+                while time.monotonic() < until:
+                    without.updates += updates.run(AT_ONCE)
+            with Watch(service, attacked):
+                attacker = _start(service.port, updates.upload, attack)
+                while attacker.poll() is None:
+                    attacked.updates += updates.run(AT_ONCE)
+            ended = json.loads(attacker.communicate()[0])
+            closed, left = max(closed, ended["seconds"]), left + int(ended["open"])
+            told(
+                f"turn {turn + 1}: all closed after {ended['seconds']:.1f} s, {ended['open']} left; "
+                f"{ended['sent'] / 1e6:.1f} MB of header sent; /health/live p99 {attacked.p(99):.1f} ms"
+            )
+    finally:
+        service.stop()
+    return judge(attack, without, attacked, closed, left, token=token)
+
+
+def _start(port: int, path: str, attack: Attack) -> subprocess.Popen[bytes]:
+    given = {"port": port, "path": path, "patience": PATIENCE_S, **vars(attack)}
+    options = [part for name, value in given.items() for part in (f"--{name}", str(value))]
+    return subprocess.Popen([sys.executable, "-m", "studies.service.attack", *options], stdout=subprocess.PIPE)
+
+
+def judge(attack: Attack, without: Side, attacked: Side, closed: float, left: int, *, token: bool) -> Outcome:
+    """The row of the table.
+
+    Args:
+        closed: seconds until the last connection was closed. left: connections that were not.
+    """
+    slower = statistics.median(attacked.updates) / statistics.median(without.updates)
+    memory = attacked.memory - without.memory
+    late = attacked.p(99) - without.p(99)
+    faults = [
+        said
+        for missed, said in (
+            (late > P99_MS, f"/health/live p99 {late:+.1f} ms"),
+            (attacked.lost > 0, f"{attacked.lost} health checks without an answer"),
+            (memory > MEMORY_MB, f"memory {memory:+.0f} MB"),
+            (left > 0 or closed > CLOSED_S, f"{left} connections left, the others closed after {closed:.0f} s"),
+            (slower > SLOWER, f"updates {slower:.2f} times"),
+        )
+        if missed
+    ]
+    found = (
+        f"/health/live p50 {without.p(50):.1f} → {attacked.p(50):.1f} ms, p99 {without.p(99):.1f} → "
+        f"{attacked.p(99):.1f} ms, {attacked.lost} of {len(attacked.health)} without an answer; memory "
+        f"{without.memory:.0f} → {attacked.memory:.0f} MB; all closed after {closed:.0f} s; an update "
+        f"{statistics.median(without.updates):.3f} → {statistics.median(attacked.updates):.3f} s ({slower:.2f} times)"
+    )
+    return Outcome(
+        f"strangers, {'a token' if token else 'no token'}: an endless header of {attack.header / 1e6:.0f} MB, "
+        f"{attack.halves} half-sent headers, {attack.uploads} hanging uploads at once",
+        f"/health/live answers, p99 + {P99_MS:.0f} ms; memory + {MEMORY_MB:.0f} MB; closed within {CLOSED_S:.0f} s; "
+        f"update ≤ {SLOWER:g} times",
+        found,
+        faults,
+    )

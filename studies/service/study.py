@@ -1,0 +1,159 @@
+"""What a study of the service sends, to which service, and what it compares: the frames, their sender, the states."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from client.wire import FrameState
+from scas4d_core.captures import Capture
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.storage.history import History
+from studies.service.process import PATIENCE_S, Service, StudyError
+
+AGAIN_S = 0.05
+
+Files = tuple[dict[str, bytes], dict[str, bytes]]
+
+
+@dataclass(frozen=True)
+class Study:
+    """What is sent, and where to.
+
+    Attributes:
+        folder: for data folders and logs. frames: encoded pictures and masks of each. settings: of the scene.
+        environment: of the service.
+    """
+
+    folder: Path
+    capture: Capture
+    frames: Sequence[Files]
+    settings: Mapping[str, Any]
+    environment: Mapping[str, str]
+
+    def service(self, name: str, environment: Mapping[str, str] | None = None) -> Service:
+        """Over a new folder; `environment`: more of it."""
+        data = self.folder / name
+        shutil.rmtree(data, ignore_errors=True)
+        data.mkdir(parents=True)
+        return Service(data, {**self.environment, **(environment or {})})
+
+    def create(self, service: Service, **more: Any) -> str:
+        """A scene that keeps all its pictures."""
+        rules = {"keep_frames": {}, "queue_frames": 100, **more}
+        return service.create(self.capture.full_rig, self.settings, ingest=rules)
+
+
+def encoded_frames(capture: Capture, count: int) -> list[Files]:
+    """So many frames of a capture; where it has fewer, it goes back and forth, so that the motion stays one."""
+    there = capture.frame_count
+    read: dict[int, Files] = {}
+    frames = []
+    for number in range(count):
+        turn = number % max(1, 2 * there - 2)
+        index = min(turn, 2 * there - 2 - turn) if there > 1 else 0
+        if index not in read:
+            read[index] = _files(capture, index)
+        frames.append(read[index])
+    return frames
+
+
+def _files(capture: Capture, index: int) -> Files:
+    images = {name: capture.encoded(index, name) for name in capture.full_rig.names}
+    found = {name: capture.encoded_mask(index, name) for name in capture.full_rig.names}
+    masks = {name: mask for name, mask in found.items() if mask is not None}
+    return images, masks if len(masks) == len(images) else {}
+
+
+def digests(states: Path) -> dict[int, str]:
+    """SHA-256 over every array of each committed state, and over what its report says of decisions."""
+    history = History.load(states)
+    found = {}
+    for index in history.indices:
+        digest = hashlib.sha256()
+        for name, array in sorted(Gaussians.arrays(history.gaussians(index)).items()):
+            digest.update(f"{name} {array.dtype} {array.shape}".encode())
+            digest.update(array.tobytes())
+        report = history.report(index)
+        decided = {name: report.get(name) for name in ("index", "time", "iterations", "loss", "used", "dropped")}
+        digest.update(repr(decided).encode())
+        found[index] = digest.hexdigest()
+    return found
+
+
+def compare(found: Mapping[int, str], expected: Mapping[int, str], but: Sequence[int] = ()) -> list[str]:
+    """Faults of a run's states against the undisturbed one's; those in `but` may be gone."""
+    wrong = [index for index in expected if index not in but and found.get(index) != expected[index]]
+    missing = [index for index in wrong if index not in found]
+    faults = [f"frames {missing} are not committed"] if missing else []
+    others = [index for index in wrong if index in found]
+    return faults + ([f"states {others} are not bit-identical"] if others else [])
+
+
+class Sender:
+    """Sends frames as a rig would that never gives up, and keeps what was acknowledged."""
+
+    def __init__(self, study: Study, service: Service, scene: str) -> None:
+        self.study, self.service, self.scene = study, service, scene
+        self.receipts: dict[int, dict[str, Any]] = {}
+        self.faults: list[str] = []
+
+    def send(self, index: int) -> None:
+        """Until it is acknowledged."""
+        until = time.monotonic() + PATIENCE_S
+        while time.monotonic() < until:
+            try:
+                answer = self.service.put(self.scene, index, *self.study.frames[index])
+            except httpx.TransportError:
+                time.sleep(AGAIN_S)
+                continue
+            if answer.status_code == 202:
+                self.receipts[index] = answer.json()
+                return
+            if answer.status_code not in (429, 507):
+                self.faults.append(f"frame {index} was answered {answer.status_code}: {answer.text}")
+                return
+            time.sleep(AGAIN_S)
+        self.faults.append(f"frame {index} was never acknowledged")
+
+    def check(self) -> list[str]:
+        """Every acknowledged frame is committed and has the identity that was acknowledged; faults."""
+        faults = list(self.faults)
+        for index, receipt in self.receipts.items():
+            report = self.service.frame(self.scene, index)
+            if report.state != FrameState.COMMITTED:
+                faults.append(f"frame {index} was acknowledged and is {report.state}: {report.error}")
+            if report.identity != receipt["identity"]:
+                faults.append(f"frame {index} has another identity than was acknowledged")
+            again = self.service.put(self.scene, index, *self.study.frames[index])
+            if again.status_code != 202 or again.json() != receipt:
+                faults.append(f"frame {index}, sent again, is answered {again.status_code}: {again.text}")
+        return faults
+
+
+def undisturbed(study: Study) -> tuple[dict[int, str], float]:
+    """States of a run that nothing disturbs, and the seconds that an update took."""
+    service = study.service("undisturbed")
+    service.start()
+    try:
+        scene = study.create(service)
+        sender = Sender(study, service, scene)
+        sender.send(0)
+        service.finish(scene, 1)
+        began = time.monotonic()
+        for index in range(1, len(study.frames)):
+            sender.send(index)
+        service.finish(scene, len(study.frames))
+        seconds = (time.monotonic() - began) / max(1, len(study.frames) - 1)
+        if faults := sender.check():
+            raise StudyError(f"the undisturbed run: {'; '.join(faults)}")
+        return digests(service.data / "scenes" / scene / "states"), seconds
+    finally:
+        service.stop()

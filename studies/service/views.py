@@ -1,0 +1,247 @@
+"""What live views cost an update, and an update the views: a scene under an open-loop load of renders.
+
+A service runs in a process of its own. For each rate: views while nothing is updated, updates while nobody looks, and
+both together, in turns, because a machine's speed drifts. Arrivals are at fixed times whatever came of the requests
+before, and latency counts from the time that a request was due: a service that falls behind shows.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+import shutil
+import statistics
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+
+from client.wire import FrameState
+from scas4d_core.captures import Capture
+from studies.machine import in_words, machine
+from studies.service.process import Service, StudyError
+from studies.service.study import encoded_frames
+
+BAR_RATE, BAR_LATENCY, BAR_SLOWER = 5.0, 2.0, 0.25
+IDLE_S = 6.0
+"""Of views while nothing is updated, a turn."""
+WARM_UP = 3
+"""Updates before anything is measured: the first ones compile or load kernels and start cold."""
+
+Told = Callable[[str], None]
+
+
+@dataclass
+class Measured:
+    """One rate.
+
+    Attributes:
+        idle, loaded: ms, latency of each view without and during updates. alone, together: seconds of each update
+            without and with views. refused: views without an answer of 200.
+    """
+
+    rate: float
+    idle: list[float] = field(default_factory=list)
+    loaded: list[float] = field(default_factory=list)
+    alone: list[float] = field(default_factory=list)
+    together: list[float] = field(default_factory=list)
+    refused: int = 0
+
+    @property
+    def latency(self) -> float:
+        """Median during updates over the median without."""
+        return statistics.median(self.loaded) / statistics.median(self.idle)
+
+    @property
+    def slower(self) -> float:
+        """Share by which the median update takes longer under load."""
+        return statistics.median(self.together) / statistics.median(self.alone) - 1
+
+
+class Load:
+    """Views at a rate, from a thread, until told to stop."""
+
+    def __init__(self, url: str, cameras: Sequence[str], rate: float, width: int) -> None:
+        self.latencies: list[float] = []
+        self.refused = 0
+        self._url, self._cameras, self._rate, self._width = url, cameras, rate, width
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), daemon=True)
+
+    def __enter__(self) -> Load:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    async def _run(self) -> None:
+        limits = httpx.Limits(max_connections=256, max_keepalive_connections=256)
+        async with httpx.AsyncClient(base_url=self._url, timeout=60, limits=limits) as http:
+            began, number = time.perf_counter(), 0
+            asked: set[asyncio.Task[None]] = set()
+            while not self._stop.is_set():
+                due = began + number / self._rate
+                await asyncio.sleep(max(0.0, due - time.perf_counter()))
+                task = asyncio.ensure_future(self._ask(http, self._cameras[number % len(self._cameras)], due))
+                asked.add(task)
+                task.add_done_callback(asked.discard)
+                number += 1
+            await asyncio.gather(*asked)
+
+    async def _ask(self, http: httpx.AsyncClient, camera: str, due: float) -> None:
+        try:
+            answer = await http.get("render", params={"camera": camera, "format": "jpeg", "width": self._width})
+        except httpx.HTTPError:
+            self.refused += 1
+            return
+        if answer.status_code != 200:
+            self.refused += 1
+            return
+        self.latencies.append(1000 * (time.perf_counter() - due))
+
+
+class Sender:
+    """Frames of a capture that are sent to a scene, some at a time."""
+
+    def __init__(self, service: Service, scene: str, capture: Capture, count: int) -> None:
+        self._service, self._scene = service, scene
+        self._frames = encoded_frames(capture, count)
+        self.next = 0
+
+    def update(self, count: int) -> list[float]:
+        """Sends so many frames at once and waits until they are committed; seconds that each took."""
+        first = self.next
+        for index in range(first, first + count):
+            answer = self._service.put(self._scene, index, *self._frames[index])
+            if not answer.is_success:
+                raise StudyError(answer.text)
+        self.next += count
+        self._service.finish(self._scene, self.next)
+        reports = [self._service.frame(self._scene, index) for index in range(first, self.next)]
+        for report in reports:
+            if report.state != FrameState.COMMITTED:
+                raise StudyError(f"frame {report.index} was not committed: {report.error}")
+        return [report.seconds["total"] for report in reports]
+
+
+def measure(
+    capture: Capture,
+    folder: Path,
+    *,
+    rates: Sequence[float],
+    updates: int,
+    turns: int,
+    width: int,
+    settings: Mapping[str, Any],
+    environment: Mapping[str, str],
+    told: Told,
+) -> list[Measured]:
+    """Runs the study.
+
+    Args:
+        folder: for the service's data; what is there goes.
+        rates: views a second. updates: a turn, without and with views. turns: of each rate.
+        width: pixels of a view. settings: of the scene. environment: of the service.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    data = folder / "data"
+    data.mkdir(parents=True)
+    service = Service(data, environment)
+    service.start()
+    try:
+        many = 1 + WARM_UP + 2 * updates * turns * len(rates)
+        scene = service.create(capture.rig, settings, ingest={"queue_frames": updates + 1})
+        if capture.points is not None:
+            put_points(service, scene, capture)
+        frames = Sender(service, scene, capture, many)
+        told("frame 0 …")
+        frames.update(1)
+        frames.update(WARM_UP)
+        url = f"http://127.0.0.1:{service.port}/v1/scenes/{scene}/"
+        names = capture.rig.names
+        with Load(url, names, 2.0, width):  # connections, the reader's kernels
+            time.sleep(3.0)
+        found = [Measured(rate) for rate in rates]
+        for _ in range(turns):
+            for row in found:
+                with Load(url, names, row.rate, width) as load:
+                    time.sleep(IDLE_S)
+                row.idle += load.latencies
+                row.refused += load.refused
+                row.alone += frames.update(updates)
+                with Load(url, names, row.rate, width) as load:
+                    row.together += frames.update(updates)
+                row.loaded += load.latencies
+                row.refused += load.refused
+                told(line(row))
+        return found
+    finally:
+        with contextlib.suppress(Exception):
+            service.stop()
+        service.kill()
+
+
+def put_points(service: Service, scene: str, capture: Capture) -> None:
+    """The capture's first cloud."""
+    points = capture.points
+    assert points is not None
+    arrays: dict[str, Any] = {"positions": points.positions, "colours": points.colours}
+    if points.foreground is not None:
+        arrays["foreground"] = points.foreground
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    answer = service.http.put(f"/v1/scenes/{scene}/points", content=file.getvalue())
+    if answer.status_code != 200:
+        raise StudyError(answer.text)
+
+
+def line(row: Measured) -> str:
+    """One row of the table."""
+    cells = [
+        f"{row.rate:g}",
+        *(f"{statistics.median(times):.0f} ({np.percentile(times, 95):.0f})" for times in (row.idle, row.loaded)),
+        f"{row.latency:.2f}",
+        f"{statistics.median(row.alone):.2f}",
+        f"{statistics.median(row.together):.2f}",
+        f"{100 * row.slower:+.0f} %",
+        str(row.refused),
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def table(rows: Sequence[Measured]) -> str:
+    """As Markdown, with the bar."""
+    head = [
+        "| views a second | idle, ms (95 %) | during updates, ms (95 %) | ratio | update alone, s | under views, s | "
+        "slower | no answer |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    text = "\n".join([*head, *map(line, rows)])
+    for row in rows:
+        if row.rate == BAR_RATE:
+            reached = row.latency <= BAR_LATENCY and row.slower <= BAR_SLOWER and row.refused == 0
+            text += (
+                f"\n\nBar at {BAR_RATE:g} a second: median at most {BAR_LATENCY:g} times the idle one, updates at most "
+                f"{100 * BAR_SLOWER:.0f} % slower: {'reached' if reached else '**missed**'} "
+                f"({row.latency:.2f} times, {100 * row.slower:+.0f} %)."
+            )
+    return text
+
+
+def page(rows: Sequence[Measured], capture: str, width: int, updates: int, turns: int) -> str:
+    """The table with what it was measured on."""
+    day = datetime.now(UTC).date().isoformat()
+    return (
+        f"Measured {day} on {in_words(machine())}: `{capture}`, views {width} pixels wide as JPEG, every camera of the "
+        f"rig in turn; {turns} turns of {updates} updates alone and {updates} under views. Medians; in brackets the "
+        f"95th percentile.\n\n{table(rows)}\n"
+    )

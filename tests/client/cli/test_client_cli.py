@@ -1,0 +1,200 @@
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from running import HEIGHT, WIDTH, make_rig
+
+from client.cli.overrides import overrides
+from client.cli.pictures import coloured, comparison, psnr
+from client.rig import push
+from client.sdk import Client
+from client.wire import part_colour
+from scas4d_core.captures import open_capture
+
+FAKES = str(Path(__file__).parents[2] / "helpers")
+
+
+def scas4d(*arguments, cwd=None, **environment):
+    path = os.pathsep.join([FAKES, os.getcwd()])
+    return subprocess.run(
+        [sys.executable, "-m", "client.cli.main", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": path, "COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb", **environment},
+    )
+
+
+def test_the_command_is_light():
+    code = "import client.cli.main, client.rig, client.sdk, sys; print(*[m for m in sys.modules if '.' not in m])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert "client" in loaded
+    assert not loaded & {"torch", "numba", "scipy", "sklearn", "fastapi", "uvicorn", "server", "matplotlib"}
+
+
+def test_push_to_a_running_service(service, capture_folder):
+    done = scas4d("push", str(capture_folder), "--url", service.url, "--frames", "2", "--set", "update.iterations=9")
+    assert done.returncode == 0, done.stderr
+    assert "2 of 2 frames committed, ready" in done.stdout
+    assert service.url in done.stdout
+    with Client(service.url) as client:
+        for status in client.scenes():
+            client.delete_scene(status.id)
+
+
+def test_push_as_a_rig_scenes_and_going_on(service, capture_folder):
+    rig = ("--fps", "20", "--jitter", "0.01", "--loop", "--frames", "6", "--per-camera", "--websocket", "--drop", "0")
+    done = scas4d("push", str(capture_folder), "--url", service.url, *rig)
+    assert done.returncode == 0, done.stderr
+    assert "6 of 6 frames committed, ready" in done.stdout
+    assert re.search(r"sent 6 frames, those after frame 0 at [\d.]+ of 20 a second", done.stdout), done.stdout
+    id = re.search(r"scene (\w+):", done.stdout)[1]
+    listed = scas4d("scenes", "--url", service.url)
+    assert re.search(rf"{id}\s+tiny\s+ready\s+2\s+6\s+0\s+6", listed.stdout), listed.stdout
+    more = scas4d("push", str(capture_folder), "--scene", id, "--loop", "--frames", "8", SCAS4D_URL=service.url)
+    assert "8 of 8 frames committed" in more.stdout, more.stderr
+    with Client(service.url) as client:
+        client.delete_scene(id)
+
+
+def test_watch_prints_frames_until_the_scene_is_gone(service, capture_folder):
+    with Client(service.url) as client:
+        scene = client.create_scene(open_capture(capture_folder).rig)
+        command = [sys.executable, "-m", "client.cli.main", "watch", scene.id, "--url", service.url]
+        watching = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "TERM": "dumb"})
+        assert watching.stdout.readline() == "scene is awaiting_first_frame\n"
+        push(open_capture(capture_folder), client, scene=scene.id, frames=1)
+        client.declare_missing(scene.id, 1, "gone for ever")
+        client.delete_scene(scene.id)
+        said, _ = watching.communicate(timeout=30)
+    assert watching.returncode == 0
+    assert re.search(r"frame 0: committed .* s$", said, re.MULTILINE) or "frame 1: missing" in said
+    missing = scas4d("watch", "nowhere", "--url", service.url)
+    assert missing.returncode == 1
+    assert "Traceback" not in missing.stderr
+
+
+def test_import_makes_a_capture_that_can_be_pushed(service, tmp_path):
+    pytest.importorskip("cv2")
+    studio = tmp_path / "studio"
+    k = {"w": WIDTH, "h": HEIGHT, "fl_x": 20, "fl_y": 20, "cx": 12, "cy": 8, "k1": -0.05, "camera_model": "OPENCV"}
+    frames = []
+    for i in range(3):
+        (studio / f"images/c{i}").mkdir(parents=True)
+        for t in range(2):
+            Image.new("RGB", (WIDTH, HEIGHT), (0, i, t)).save(studio / f"images/c{i}/{t}.png")
+        matrix = [[1, 0, 0, i], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
+        frames.append({"file_path": f"images/c{i}/0.png", "transform_matrix": matrix})
+    (studio / "transforms.json").write_text(json.dumps({**k, "frames": frames}))
+    out = tmp_path / "out"
+    done = scas4d("import", str(studio), str(out), "--test", "c1", "--encoding", "png")
+    assert done.returncode == 0, done.stderr
+    assert (out / "test_meta.json").exists()
+    for folder, cameras in ((out, 2), (studio, 3)):
+        pushed = scas4d("push", str(folder), "--url", service.url)
+        assert "2 of 2 frames committed" in pushed.stdout, pushed.stderr
+        with Client(service.url) as client:
+            (status,) = client.scenes()
+            assert len(status.cameras) == cameras
+            client.delete_scene(status.id)
+    broken = scas4d("push", str(studio), "--pictures", "videos")
+    assert broken.returncode == 1
+    assert "put each camera's video into videos/<camera>.mp4" in broken.stderr
+
+
+def test_scenes_are_listed_whole_in_a_narrow_terminal(service):
+    with Client(service.url) as client:
+        rig = make_rig(2)
+        long = client.create_scene(rig, name="a name that is longer than the terminal is wide " * 2)
+        try:
+            lines = scas4d("scenes", "--url", service.url, COLUMNS="40").stdout.splitlines()
+        finally:
+            client.delete_scene(long.id)
+    assert len(lines) == 2
+    assert lines[1].startswith(f"{long.id}  {long.name}")
+    assert "awaiting_first_frame" in lines[1]
+    assert lines[0].index("state") == lines[1].index("awaiting_first_frame")
+
+
+def test_a_budget_is_told_set_and_taken_back(service):
+    def said(*arguments):
+        done = scas4d("budget", scene, *arguments, "--url", service.url, COLUMNS="200")
+        assert done.returncode == 0, done.stderr
+        return done.stdout.strip()
+
+    with Client(service.url) as client:
+        scene = client.create_scene(make_rig(2)).id
+        try:
+            made = said()
+            assert made.startswith("100 iterations a frame")
+            assert "fit into 500 ms a frame, or fewer: stop gain 0.02" in said(
+                "--milliseconds", "500", "--stop-gain", "0.02"
+            )
+            assert client.budget(scene).asked.budget_ms == 500
+            assert said("--iterations", "50").startswith("50 iterations a frame")
+            assert said("--as-made") == made
+            refused = scas4d("budget", scene, "--as-made", "--iterations", "5", "--url", service.url)
+            assert (refused.returncode, "leave it out" in refused.stderr) == (1, True)
+        finally:
+            client.delete_scene(scene)
+
+
+def test_serve_refuses_to_listen_beyond_this_machine():
+    done = scas4d("serve", "--host", "0.0.0.0")
+    assert done.returncode == 1
+    assert "SCAS4D_TOKEN" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("push", "nowhere"), "nowhere: no such folder"),
+        (("push", "TINY", "--url", "http://127.0.0.1:9"), "start one with: scas4d serve"),
+        (("push", "TINY", "--set", "iterations"), "update.iterations=200"),
+    ],
+)
+def test_what_a_user_can_mend_is_one_line(capture_folder, arguments, said):
+    done = scas4d(*(str(capture_folder) if word == "TINY" else word for word in arguments))
+    assert done.returncode == 1
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_setting_the_service_refuses_is_named(service, capture_folder):
+    done = scas4d("push", str(capture_folder), "--url", service.url, "--set", "update.iteration=1")
+    assert done.returncode == 1
+    assert "settings.update.iteration" in done.stderr
+
+
+def test_overrides():
+    changes = ["update.iterations=200", "device=cuda", "update.clusters=[64]", "scene.metres_per_unit=auto"]
+    assert overrides(changes) == {
+        "update": {"iterations": 200, "clusters": [64]},
+        "device": "cuda",
+        "scene": {"metres_per_unit": "auto"},
+    }
+    for bad in (["update"], ["a=1", "a.b=2"]):
+        with pytest.raises(ValueError, match="setting"):
+            overrides(bad)
+
+
+def test_pictures():
+    truth, render = np.zeros((2, 3, 3), np.uint8), np.full((2, 3, 3), 100, np.uint8)
+    side = comparison(truth, render)
+    assert side.shape == (2, 9, 3)
+    assert side[0, [0, 3, 6], 0].tolist() == [0, 100, 255]
+    assert psnr(truth, render) == pytest.approx(20 * np.log10(2.55))
+    assert psnr(truth, truth) == float("inf")
+    colours = coloured(np.array([[0, 1, 8]], np.uint8))
+    assert colours[0, 0].tolist() == [0, 0, 0]
+    assert [tuple(colour) for colour in colours[0, 1:].tolist()] == [part_colour(0), part_colour(7)]

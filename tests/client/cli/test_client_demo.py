@@ -1,0 +1,111 @@
+"""`scas4d demo`: what it waits for, what it leaves, and what it says where it cannot go on."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from running import HEIGHT, WIDTH
+
+from client.cli.demo import running_service
+from client.sdk import Client
+from scas4d_core.captures import open_capture
+from server.storage.disk import FolderLock
+
+FAKES = str(Path(__file__).parents[2] / "helpers")
+SLOW = """
+import time
+from fakes import FakeEngine
+
+class Slow(FakeEngine):
+    def warm_up(self):
+        time.sleep(3)
+
+def engine():
+    return Slow()
+"""
+
+
+def demo(capture, out, *more, before=(), **environment):
+    path = os.pathsep.join([*map(str, before), FAKES, os.getcwd()])
+    return subprocess.run(
+        [sys.executable, "-m", "client.cli.main", "demo", "--capture", str(capture), "--out", str(out), *more],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        env={**os.environ, "PYTHONPATH": path, "SCAS4D_ENGINE": "fakes:engine", "TERM": "dumb", **environment},
+    )
+
+
+@pytest.fixture(scope="module")
+def done(capture_folder, tmp_path_factory):
+    """A demo whose kernels take their time; the folder it left, and what it said."""
+    folder = tmp_path_factory.mktemp("demo")
+    (folder / "slow.py").write_text(SLOW)
+    ended = demo(capture_folder, folder / "out", before=[folder], SCAS4D_ENGINE="slow:engine")
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    return folder / "out", ended.stdout
+
+
+def test_it_waits_for_the_kernels_and_leaves_pictures(done):
+    out, said = done
+    assert said.startswith("making the kernels ready\n")
+    assert "http://127.0.0.1:" in said
+    assert "dB PSNR" in said
+    pictures = sorted(path.relative_to(out).as_posix() for path in out.rglob("*.png"))
+    assert pictures == [*(f"camera_2/{t:06d}.png" for t in range(4)), "depth.png", "parts.png"]
+    with Image.open(out / "camera_2/000001.png") as picture:
+        assert picture.size == (3 * WIDTH, HEIGHT)
+
+
+def test_its_scene_can_be_looked_at_later_and_its_parts_have_the_colours_of_the_service(
+    done, capture_folder, tmp_path, monkeypatch
+):
+    out, said = done
+    id = re.search(rf"scas4d serve --data {out / 'data'}, and open \S+/#scene=(\w+)", said)[1]
+    monkeypatch.setenv("SCAS4D_ENGINE", "fakes:engine")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([FAKES, os.getcwd()]))
+    camera = open_capture(capture_folder).full_test_rig.cameras[0]
+    with running_service(out / "data", tmp_path / "log") as url, Client(url) as client:
+        assert client.scene(id).committed == 4
+        file = client.render_file(id, camera, None, kind="parts", format="png")
+    with Image.open(io.BytesIO(file)) as found, Image.open(out / "parts.png") as left:
+        assert np.array_equal(found.convert("RGB"), left.convert("RGB"))
+        assert np.any(left)
+
+
+def test_another_demo_takes_the_place_of_the_one_before(capture_folder, tmp_path):
+    for _ in range(2):
+        ended = demo(capture_folder, tmp_path / "out", "--frames", "1", SCAS4D_MAX_SCENES="1")
+        assert ended.returncode == 0, ended.stdout + ended.stderr
+
+
+def test_a_token_in_the_environment_is_used(capture_folder, tmp_path):
+    token = "a-token-of-thirty-two-characters"
+    ended = demo(capture_folder, tmp_path / "out", "--frames", "1", SCAS4D_TOKEN=token)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+
+
+def test_a_service_that_ends_is_told_with_its_reason(capture_folder, tmp_path):
+    (tmp_path / "out" / "data").mkdir(parents=True)
+    lock = FolderLock(tmp_path / "out" / "data" / "service.lock", wait=False)
+    ended = demo(capture_folder, tmp_path / "out")
+    lock.release()
+    assert ended.returncode == 1
+    assert ended.stderr.startswith("scas4d: the service has ended: another service is at work in ")
+    assert ended.stderr.count("\n") == 1
+
+
+def test_kernels_that_cannot_be_made_are_not_waited_for(capture_folder, tmp_path):
+    ended = demo(capture_folder, tmp_path / "out", SCAS4D_FAKE_FAULT="1")
+    assert ended.returncode == 1
+    assert ended.stderr.startswith("scas4d: the service cannot become ready: 503")
+    assert "the fake was told to raise" in ended.stderr
+    assert ended.stderr.count("\n") == 1

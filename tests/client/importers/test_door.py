@@ -1,0 +1,215 @@
+"""The door: layouts found, frames synchronized by name, and what a folder lacks said by name."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from lenses import HEIGHT, WIDTH, dot_at, painted, seen
+from PIL import Image
+from rigs import NAMES, lenses, transforms, write, write_pictures
+
+from client.importers.calibration import natural
+from client.importers.open_source import open_source
+from scas4d_core.captures import CaptureError, decode_image, decode_mask
+
+
+@pytest.fixture
+def straight(tmp_path):
+    """Pinhole cameras, two frames."""
+    write(tmp_path / "transforms.json", transforms(lenses("PINHOLE"), "PINHOLE", fps=25))
+    write_pictures(tmp_path / "images")
+    return tmp_path
+
+
+def test_pictures_of_straight_lenses_go_as_they_are(straight):
+    source = open_source(straight)
+    assert source.rig.names == ("cam1", "cam2", "cam10")
+    assert (source.frame_count, source.fps, source.time(1)) == (2, 25, 1 / 25)
+    assert source.encoded(1, "cam10") == (straight / "images/cam10/000001.png").read_bytes()
+    assert source.encoded_mask(0, "cam1") is None
+    assert source.points is None
+    assert open_source(straight, fps=50).time(1) == 1 / 50
+
+
+def test_frames_are_in_natural_order_and_one_name_is_one_frame(straight):
+    names = ("f1", "f2", "f10", "f9")
+    for camera in NAMES:
+        for path in (straight / "images" / camera).iterdir():
+            path.unlink()
+    write_pictures(straight / "images", frames=names)
+    for i, camera in enumerate(NAMES):
+        (straight / "images" / camera / "notes.txt").write_text("not a picture")
+        (straight / "images" / camera / ".f3.png").write_text("hidden")
+        if i == 0:
+            path = straight / "images" / camera / "f9.png"
+            Image.open(path).save(path.with_suffix(".webp"), lossless=True)
+            path.unlink()
+    source = open_source(straight)
+    shades = [decode_image(source.encoded(t, "cam2"))[0, 0, 1] for t in range(source.frame_count)]
+    assert shades == [0, 40, 120, 80]  # f1, f2, f9, f10
+    assert sorted(["cam10", "cam2", "a1b10", "a1b9"], key=natural) == ["a1b9", "a1b10", "cam2", "cam10"]
+
+
+def test_undistorted_pictures_and_masks_fit_their_cameras(tmp_path):
+    pytest.importorskip("cv2")
+    rig = lenses("OPENCV")
+    write(tmp_path / "transforms.json", transforms(rig))
+    points = np.random.default_rng(0).uniform(-0.4, 0.4, (4, 3)) * [1, 1, 0.3] + [0, 0, 0.2]
+    for name, lens in rig.items():
+        for kind in ("images", "masks"):
+            (tmp_path / kind / name).mkdir(parents=True)
+        dots = painted(seen(lens, points))
+        Image.fromarray(dots).save(tmp_path / "images" / name / "0.png")
+        Image.fromarray(255 * (dots[..., 0] > 60).astype(np.uint8)).save(tmp_path / "masks" / name / "0.png")
+    for encoding, magic in (("png", b"\x89PNG"), ("jpeg", b"\xff\xd8")):
+        source = open_source(tmp_path, encoding=encoding)
+        for camera in source.rig.cameras:
+            file = source.encoded(0, camera.name)
+            assert file.startswith(magic)
+            picture = decode_image(file, size=(camera.width, camera.height))
+            mask = decode_mask(source.encoded_mask(0, camera.name), size=(camera.width, camera.height))
+            for uv in camera.project(points)[0]:
+                assert np.linalg.norm(dot_at(picture, uv) - uv) < 0.1
+                assert mask[int(uv[1]), int(uv[0])] == 1
+            assert 0 < mask.mean() < 0.1
+
+
+def test_the_files_that_the_calibration_names(tmp_path):
+    meta = transforms(lenses("PINHOLE"), "PINHOLE", path="photos/{}.png")
+    write(tmp_path / "transforms.json", meta)
+    (tmp_path / "photos").mkdir()
+    for name in NAMES:
+        Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "photos" / f"{name}.png")
+    assert open_source(tmp_path).frame_count == 1
+    (tmp_path / "photos/cam10.png").unlink()
+    with pytest.raises(CaptureError, match=r"photos/cam10.png: no such file, but .*transforms.json names it"):
+        open_source(tmp_path)
+
+
+def timed(tmp_path, times=(0.0, 0.04, 0.1)):
+    meta = transforms(lenses("PINHOLE"), "PINHOLE")
+    meta["frames"] = []
+    for t, time in enumerate(times):
+        more = transforms(lenses("PINHOLE"), "PINHOLE", path=f"images/{{}}/{t:06d}.png")["frames"]
+        meta["frames"] += [one | {"time": time} for one in more]
+    write_pictures(tmp_path / "images", frames=[f"{t:06d}" for t in range(len(times))])
+    return meta
+
+
+def test_times_of_the_calibration_are_taken(tmp_path):
+    write(tmp_path / "transforms.json", timed(tmp_path))
+    source = open_source(tmp_path)
+    assert [source.time(t) for t in range(source.frame_count)] == [0.0, 0.04, 0.1]
+
+
+def test_times_and_numbers_of_pictures_must_fit(tmp_path):
+    meta = timed(tmp_path)
+    meta["frames"][4]["time"] = 0.05
+    write(tmp_path / "transforms.json", meta)
+    with pytest.raises(CaptureError, match=r"frame 1 has pictures of different times .*0.05"):
+        open_source(tmp_path)
+    del meta["frames"][4]
+    write(tmp_path / "transforms.json", meta)
+    with pytest.raises(CaptureError, match=r"camera 'cam10' has 2 pictures and 'cam2' 3"):
+        open_source(tmp_path)
+    write(tmp_path / "transforms.json", timed(tmp_path, (0.0, 0.04, 0.04)))
+    with pytest.raises(CaptureError, match=r"frame 2 is at 0.04 s, not after the one before"):
+        open_source(tmp_path)
+
+
+def test_a_path_cannot_lead_out_of_the_capture(tmp_path):
+    inner = tmp_path / "capture"
+    inner.mkdir()
+    Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "cam1.png")
+    meta = transforms({"cam1": lenses("PINHOLE")["cam1"]}, "PINHOLE", path="../{}.png")
+    write(inner / "transforms.json", meta)
+    with pytest.raises(CaptureError, match="no such file"):
+        open_source(inner)
+
+
+def test_the_sample_goes_through_the_same_door(capture_folder):
+    source = open_source(capture_folder)
+    assert (source.rig.names, source.frame_count, source.fps) == (("0", "1"), 4, 30)
+    assert source.encoded(0, "0").startswith(b"\x89PNG")
+    assert source.encoded_mask(0, "0") is not None
+    assert open_source(capture_folder, use_masks=False).encoded_mask(0, "0") is None
+    assert len(source.points) == 5
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", ".", "colmap/sparse/0"])
+def test_a_colmap_model_is_found(tmp_path, place):
+    pytest.importorskip("pycolmap")
+    from test_colmap import model
+
+    model(lenses("PINHOLE"), tmp_path / place, "PINHOLE", True)
+    write_pictures(tmp_path / "images")
+    source = open_source(tmp_path)
+    assert len(source.points) == 3
+    elsewhere = tmp_path / "other"
+    (tmp_path / place).rename(elsewhere) if place != "." else None
+    if place != ".":
+        assert open_source(tmp_path, calibration=elsewhere).rig.names == source.rig.names
+
+
+def cut(folder):
+    (folder / "images/cam2/000001.png").unlink()
+
+
+def resize(folder):
+    Image.new("RGB", (WIDTH // 2, HEIGHT // 2)).save(folder / "images/cam10/000000.png")
+
+
+def empty(folder):
+    for path in (folder / "images/cam1").iterdir():
+        path.unlink()
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (cut, r"images/cam2: has no pictures of 1 of 2 frames \(000001\), which 'cam1' has"),
+        (resize, r"cam10/000000.png: is 160x120 pixels, but camera 'cam10' was calibrated for 320x240"),
+        (empty, r"images/cam1: has no pictures; give files ending in .jpg"),
+        (
+            lambda f: (f / "images/cam10").rename(f / "images/ten"),
+            r"images/cam10: no such folder.* images/ has cam1, cam2",
+        ),
+        (lambda f: (f / "images/cam1/000000.tif").write_bytes(b""), r"000000.tif: .tif is not read; give JPEG"),
+        (lambda f: (f / "images/cam1/000000.jpg").write_bytes(b""), r"000000.png: 000000.jpg is the same frame"),
+        (lambda f: (f / "images/cam1/000000.png").write_bytes(b"x"), r"cam1/000000.png: cannot be read as a picture"),
+        (lambda f: (f / "transforms.json").unlink(), r"no known capture layout: no train_meta.json .*--calibration"),
+        (lambda f: (f / "videos").mkdir(), r"pictures in images/ and in videos/.*--pictures images"),
+        (lambda f: (f / "masks").mkdir(), r"masks/cam1: no such folder"),
+        (lambda f: write_pictures(f / "masks", frames=("000000",)), r"frame 1: its picture is .* and its mask None"),
+        (
+            lambda f: write_pictures(f / "masks", frames=("000000", "7")),
+            r"frame 1: .*masks/cam1/7.png; call masks like the pictures",
+        ),
+    ],
+)
+def test_what_a_folder_lacks_is_named(straight, damage, said):
+    damage(straight)
+    with pytest.raises(CaptureError, match=said):
+        open_source(straight)
+
+
+def test_choices_that_cannot_be_are_named(straight):
+    with pytest.raises(CaptureError, match="no such folder"):
+        open_source(straight / "nowhere")
+    with pytest.raises(CaptureError, match=r"videos: no such folder; put each camera's video into videos/<camera>.mp4"):
+        open_source(straight, pictures="videos")
+    with pytest.raises(CaptureError, match=r"neither a transforms.json nor the folder of a COLMAP model"):
+        open_source(straight, calibration=straight / "images")
+    with pytest.raises(CaptureError, match="fps -1"):
+        open_source(straight, fps=-1)
+
+
+def test_bmp_files_are_encoded_for_the_way(straight):
+    for camera in NAMES:
+        for path in (straight / "images" / camera).iterdir():
+            Image.open(path).save(path.with_suffix(".bmp"))
+            path.unlink()
+    with Image.open(io.BytesIO(open_source(straight, encoding="png").encoded(1, "cam1"))) as picture:
+        assert (picture.format, picture.getpixel((0, 0))) == ("PNG", (80, 40, 99))

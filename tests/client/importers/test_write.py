@@ -1,0 +1,98 @@
+"""`scas4d import`: what was undistorted is read back by the core's own reader, without any importer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from lenses import HEIGHT, WIDTH, dot_at, painted, seen
+from PIL import Image
+from rigs import lenses, transforms, write
+
+from client.importers.open_source import open_source
+from client.importers.write import write_dynamic3dgs
+from scas4d_core.captures import CaptureError, open_capture
+
+pytest.importorskip("cv2")
+
+POINTS = np.random.default_rng(0).uniform(-0.4, 0.4, (4, 3)) * [1, 1, 0.3] + [0, 0, 0.2]
+
+
+@pytest.fixture
+def distorted(tmp_path):
+    """Three distorted cameras, two frames, masks; the dots move by 0.05."""
+    rig = lenses("OPENCV")
+    folder = tmp_path / "studio"
+    write(folder / "transforms.json", transforms(rig, fps=12))
+    for name, lens in rig.items():
+        for kind in ("images", "masks"):
+            (folder / kind / name).mkdir(parents=True)
+        for t in range(2):
+            dots = painted(seen(lens, POINTS + np.array([0.05 * t, 0, 0])))
+            Image.fromarray(dots).save(folder / "images" / name / f"{t}.png")
+            Image.fromarray(255 * (dots[..., 0] > 60).astype(np.uint8)).save(folder / "masks" / name / f"{t}.png")
+    return folder
+
+
+def test_what_was_imported_is_a_capture(distorted, tmp_path):
+    source = open_source(distorted, encoding="png")
+    told = []
+    write_dynamic3dgs(source, tmp_path / "out", test=["cam2"], told=lambda *now: told.append(now))
+    capture = open_capture(tmp_path / "out")
+    assert told == [("frames", 1, 2), ("frames", 2, 2)]
+    assert (capture.full_rig.names, capture.full_test_rig.names) == (("cam1", "cam10"), ("cam2",))
+    assert (capture.frame_count, capture.fps, capture.points) == (2, 12, None)
+    for camera in capture.full_rig.cameras:
+        assert np.array_equal(camera.intrinsics, source.rig[camera.name].intrinsics)
+        for t in range(2):
+            frame = capture.frame(t)
+            for uv in camera.project(POINTS + np.array([0.05 * t, 0, 0]))[0]:
+                assert np.linalg.norm(dot_at(frame.images[camera.name], uv) - uv) < 0.1
+                assert frame.masks[camera.name][int(uv[1]), int(uv[0])] == 1
+    again = open_source(tmp_path / "out")
+    assert again.encoded(1, "cam1") == source.encoded(1, "cam1")
+    assert again.time(1) == pytest.approx(1 / 12)
+
+
+def test_a_cloud_of_unknown_foreground_comes_along(tmp_path):
+    pytest.importorskip("pycolmap")
+    from rigs import write_pictures
+    from test_colmap import model
+
+    model(lenses("PINHOLE"), tmp_path / "in/sparse/0", "PINHOLE", True)
+    write_pictures(tmp_path / "in/images")
+    source = open_source(tmp_path / "in")
+    write_dynamic3dgs(source, tmp_path / "out", frames=1)
+    capture = open_capture(tmp_path / "out")
+    assert capture.frame_count == 1
+    assert np.allclose(capture.points.positions, source.points.positions)
+    assert np.allclose(capture.points.colours, source.points.colours)
+    assert capture.points.foreground is None
+
+
+def test_what_cannot_be_written_is_named(distorted, tmp_path):
+    source = open_source(distorted)
+    with pytest.raises(CaptureError, match=r"test camera 'cam3' is not one of cam1, cam2, cam10"):
+        write_dynamic3dgs(source, tmp_path / "out", test=["cam3"])
+    with pytest.raises(CaptureError, match="every camera is a test camera"):
+        write_dynamic3dgs(source, tmp_path / "out", test=source.rig.names)
+    with pytest.raises(CaptureError, match="is not empty; name a new folder"):
+        write_dynamic3dgs(source, distorted)
+    assert not (tmp_path / "out").exists()
+
+
+def test_cameras_of_different_sizes_are_named(tmp_path):
+    meta = transforms(lenses("PINHOLE"), "PINHOLE", path="{}.png", per_frame=True)
+    meta["frames"][0] |= {"w": 100, "h": 80}
+    write(tmp_path / "transforms.json", meta)
+    for frame in meta["frames"]:
+        Image.new("RGB", (frame["w"], frame["h"])).save(tmp_path / frame["file_path"])
+    with pytest.raises(CaptureError, match=rf"cam1 {WIDTH}x{HEIGHT}, cam2 100x80"):
+        write_dynamic3dgs(open_source(tmp_path), tmp_path / "out")
+
+
+def test_a_folder_that_was_not_finished_is_no_capture(distorted, tmp_path):
+    (distorted / "images/cam10/1.png").write_bytes(b"damaged")
+    with pytest.raises(ValueError, match=r"images/cam10/1.png: cannot be read as a picture"):
+        write_dynamic3dgs(open_source(distorted), tmp_path / "out")
+    with pytest.raises(CaptureError, match="no known capture layout"):
+        open_capture(tmp_path / "out")

@@ -1,0 +1,180 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from scas4d_core.cameras import Camera, Rig
+from scas4d_core.first_frame.initial_points import initial_points
+from scas4d_core.first_frame.posed_pictures import (
+    InitialPointsError,
+    View,
+    collect_views,
+    look_at_point,
+    observe,
+    visible_from,
+)
+from scas4d_core.first_frame.settings import InitialPointsSettings
+from scas4d_core.first_frame.stereo import DepthMap, fused_points, halved, looked_through
+from scas4d_core.first_frame.triangulation import fundamental_matrix, triangulate
+
+HALF = np.array([0.5, 0.35, 0.4])
+PIXEL = 2.6 / 190.0
+"""World units across one pixel at the middle of the stage."""
+
+
+@pytest.fixture(scope="module")
+def box(scene) -> tuple[Rig, dict[str, np.ndarray], dict[str, np.ndarray]]:
+    rig = scene.ring(14)
+    pairs = {camera.name: scene.picture(camera) for camera in rig.cameras}
+    return rig, {name: image for name, (image, _) in pairs.items()}, {name: mask for name, (_, mask) in pairs.items()}
+
+
+@pytest.fixture(scope="module")
+def cloud(box):
+    rig, images, _ = box
+    return initial_points(rig, images, {})
+
+
+def test_points_lie_on_the_box_and_cover_it(scene, cloud):
+    distance = scene.distance_to_box(cloud.positions)
+    assert np.percentile(distance, [50, 95]) == pytest.approx([0, 0], abs=1.2 * PIXEL)
+    assert np.median(distance) < 0.35 * PIXEL
+    gap = cKDTree(cloud.positions).query(scene.points_on_box(2000))[0]
+    assert np.percentile(gap, 95) < 3 * PIXEL
+
+
+def test_colours_are_those_of_the_surface(scene, cloud):
+    assert cloud.colours.dtype == np.float32
+    assert np.abs(cloud.colours - scene.texture(cloud.positions)).mean() < 0.06
+
+
+def test_without_masks_nobody_said_what_is_foreground(cloud):
+    assert cloud.foreground is None
+
+
+def test_masks_label_the_points(box):
+    rig, images, masks = box
+    labelled = initial_points(rig, images, masks, InitialPointsSettings(stereo_iterations=2))
+    assert labelled.foreground is not None
+    assert (labelled.foreground > 0.5).mean() > 0.95
+
+
+def test_same_seed_same_points(box):
+    rig, images, _ = box
+    settings = InitialPointsSettings(stereo_iterations=1, seed=4)
+    one, two = (initial_points(rig, images, {}, settings) for _ in range(2))
+    assert np.array_equal(one.positions, two.positions)
+    assert np.array_equal(one.colours, two.colours)
+
+
+def test_budget_of_points_is_kept(box):
+    rig, images, _ = box
+    few = initial_points(rig, images, {}, InitialPointsSettings(stereo=False, max_points=300))
+    assert 100 < len(few) <= 300
+
+
+def test_triangulation_has_no_half_pixel_offset(scene, box):
+    rig, images, _ = box
+    found = triangulate(collect_views(rig, images, {}))
+    assert len(found.positions) > 60
+    assert found.views.sum(1).min() >= 3
+    assert np.median(found.error) < 0.3
+    assert np.median(scene.distance_to_box(found.positions)) < 0.2 * PIXEL
+
+
+def test_fundamental_matrix_holds_for_projections(scene):
+    one, two = scene.ring(4).cameras[:2]
+    points = scene.points_on_box(20)
+    a, b = (np.hstack([camera.project(points)[0], np.ones((20, 1))]) for camera in (one, two))
+    lines = a @ fundamental_matrix(one, two).T
+    distance = (lines * b).sum(1) / np.linalg.norm(lines[:, :2], axis=1)
+    assert np.abs(distance).max() < 1e-6
+
+
+def _flat_maps(depths: list[float]) -> list[DepthMap]:
+    """Cameras side by side that look along z and all but agree on a wall at z = 3; agreement counted by hand."""
+    maps = []
+    agree = sum(abs(depth - 3) < 0.01 for depth in depths) - 1
+    for i, depth in enumerate(depths):
+        pose = np.eye(4)
+        pose[0, 3] = -0.2 * i
+        camera = Camera(f"c{i}", np.array([[60.0, 0, 20], [0, 60.0, 20], [0, 0, 1]]), pose, 40, 40)
+        view = View(camera, np.zeros((40, 40, 3), np.uint8))
+        others = agree if abs(depth - 3) < 0.01 else 0
+        maps.append(DepthMap(view, np.full((40, 40), depth), np.full((40, 40), others)))
+    return maps
+
+
+def test_a_point_seen_by_one_camera_only_is_refused():
+    assert len(fused_points(_flat_maps([3.0, 5.0, 7.0]), 3)) == 0
+    assert len(fused_points(_flat_maps([3.0, 3.0, 3.0]), 3)) == 3 * 1600
+
+
+def test_two_cameras_do_not_outvote_min_views():
+    assert len(fused_points(_flat_maps([3.0, 3.0, 7.0]), 3)) == 0
+
+
+def test_what_cameras_look_through_is_found():
+    maps = _flat_maps([3.0, 3.0, 3.0])
+    points = np.array([[0.2, 0.0, 2.0], [0.2, 0.0, 3.0], [0.2, 0.0, 3.5], [90.0, 0.0, 2.0]])
+    assert looked_through(maps, points, 3).tolist() == [3, 0, 0, 0]
+
+
+def test_halved_pictures_keep_their_geometry(scene):
+    camera = scene.ring(2, size=65).cameras[0]
+    view = halved(View(camera, np.zeros((65, 65, 3), np.uint8), np.ones((65, 65), bool)), 40)
+    assert (view.camera.width, view.image.shape) == (32, (32, 32, 3))
+    point = np.array([0.1, -0.2, 0.05])
+    assert view.camera.project(point)[0] == pytest.approx(camera.project(point)[0] / 2)
+
+
+def test_hidden_points_are_not_seen_and_colours_are_medians(scene):
+    rig = scene.ring(6)
+    views = [View(c, np.full((128, 128, 3), 40 * i, np.uint8)) for i, c in enumerate(rig.cameras)]
+    points = scene.points_on_box(20_000)
+    visible = visible_from(views, points, 0.02)
+    for row, camera in zip(visible, rig.cameras, strict=True):
+        uv, depth = camera.project(points)
+        face = np.abs(points / HALF).argmax(1)
+        towards = (camera.centre - points) / np.linalg.norm(camera.centre - points, axis=1, keepdims=True)
+        in_front = depth <= scene.box_depth(camera, uv) + 1e-6
+        in_front &= np.abs(towards[np.arange(len(points)), face]) > np.cos(np.radians(55))
+        assert (row[in_front]).mean() > 0.97
+        deep = depth > scene.box_depth(camera, uv) + 0.25
+        assert row[deep].mean() < 0.02
+    seen = observe(
+        views, points[:3], np.array([[1, 0, 0], [1, 0, 0], [1, 1, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]], bool)
+    )
+    assert seen.count.tolist() == [3, 1, 0]
+    assert seen.colours[0] == pytest.approx(np.full(3, 40 / 255))
+    assert np.isnan(seen.colours[2]).all()
+
+
+def test_look_at_point_is_where_the_axes_meet(scene):
+    offset = np.array([10.0, -3.0, 4.0])
+    rig = scene.ring(6, offset=offset)
+    centred = [
+        View(Camera(c.name, np.array([[190.0, 0, 64], [0, 190.0, 64], [0, 0, 1]]), c.world_to_camera, 128, 128),
+             np.zeros((128, 128, 3), np.uint8))
+        for c in rig.cameras
+    ]  # fmt: skip
+    assert look_at_point(centred) == pytest.approx(offset, abs=1e-5)
+
+
+def test_pictures_that_show_nothing_in_common_are_an_error(box):
+    rig, _, _ = box
+    rng = np.random.default_rng(0)
+    noise = {c.name: rng.integers(0, 255, (128, 128, 3)).astype(np.uint8) for c in rig.cameras[:4]}
+    with pytest.raises(InitialPointsError, match="calibration"):
+        initial_points(rig, noise, {}, InitialPointsSettings(stereo_iterations=1))
+
+
+def test_wrong_size_and_too_few_pictures_are_named(box):
+    rig, images, masks = box
+    with pytest.raises(InitialPointsError, match=r"images\['c0'\].*\(128, 128, 3\)"):
+        initial_points(rig, {**images, "c0": images["c0"][:64]}, {})
+    with pytest.raises(InitialPointsError, match=r"masks\['c1'\].*\(128, 128\)"):
+        initial_points(rig, images, {"c1": masks["c1"][:, :9]})
+    with pytest.raises(InitialPointsError, match="1 of the rig's 14 cameras"):
+        initial_points(rig, {"c3": images["c3"]}, {})

@@ -1,0 +1,201 @@
+"""Frame 0 of a tiny scene: it is fitted, within its budget, and so are the cameras' exposures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from box_scene import held_out_camera, make_box, make_rig, photograph, take_frame
+
+from scas4d_core.captures.frame import Frame
+from scas4d_core.first_frame.static_scene import (
+    EXPOSURE_SPREAD,
+    STOP_ROUNDS,
+    StaticResult,
+    StaticTrainer,
+    fit_static_scene,
+    initial_parameters,
+    logit,
+)
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.settings import SceneSettings, StaticSettings
+from scas4d_core.update.views import ViewFactory
+
+RIG = make_rig()
+BOX = make_box()
+SETTINGS = StaticSettings(
+    iterations=1000, max_gaussians=900, densify_from=50, densify_every=50, rate_colour=1e-2, rate_position=8e-4,
+    exposure=False,
+)  # fmt: skip
+
+
+def cloud() -> tuple[np.ndarray, np.ndarray]:
+    """Points near the surfaces (1 cm off), two thirds of them, with noisy colours."""
+    rng = np.random.default_rng(3)
+    rows = rng.permutation(len(BOX))[: 2 * len(BOX) // 3]
+    noise = rng.normal(0, 0.1, (len(rows), 3))
+    colours = np.clip(BOX.colours[rows] + noise, 0, 1).astype(np.float32)
+    return BOX.means[rows] + rng.normal(0, 0.01, (len(rows), 3)), colours
+
+
+def fit(settings: StaticSettings = SETTINGS, frame: Frame | None = None, masks: bool = True) -> StaticResult:
+    factory = ViewFactory(RIG)
+    frame = frame or take_frame(0, 0.0, BOX, RIG, masks)
+    return fit_static_scene(factory, factory.views(frame, {}), *cloud(), None, SceneSettings(), settings)
+
+
+def psnr(gaussians: Gaussians) -> float:
+    """dB of the camera that no fit has seen."""
+    camera = held_out_camera()
+    found, truth = (photograph(state, camera)[0] / 255.0 for state in (gaussians, BOX))
+    return float(-10 * np.log10(np.square(found - truth).mean()))
+
+
+@pytest.fixture(scope="module")
+def fitted() -> StaticResult:
+    return fit()
+
+
+def test_loss_falls_and_a_held_out_view_is_close(fitted: StaticResult) -> None:
+    assert len(fitted.losses) == SETTINGS.iterations
+    assert np.mean(fitted.losses[-20:]) < 0.5 * np.mean(fitted.losses[:20])
+    start = fit(SETTINGS.model_copy(update={"iterations": 1})).gaussians
+    assert psnr(fitted.gaussians) > 21
+    assert psnr(fitted.gaussians) > psnr(start) + 4
+
+
+def test_the_state_is_well_formed(fitted: StaticResult) -> None:
+    state = fitted.gaussians
+    count = len(state)
+    assert len(cloud()[0]) < count <= SETTINGS.max_gaussians
+    for name, array in state.arrays().items():
+        assert len(array) == count, name
+        assert np.isfinite(array).all(), name
+        assert array.dtype == (np.int64 if name == "ids" else np.float32), name
+    assert (np.linalg.det(state.factors) > 0).all()
+    assert ((state.opacities > 0) & (state.opacities < 1)).all()
+    np.testing.assert_array_equal(state.ids, np.arange(count))
+    np.testing.assert_array_equal(state.rotations, np.tile(np.float32([1, 0, 0, 0]), (count, 1)))
+    assert fitted.exposures == {}
+
+
+def test_masks_tell_what_moves(fitted: StaticResult) -> None:
+    state = fitted.gaussians
+    opaque = state.opacities > 0.5
+    in_box = (np.abs(state.means) < 0.19).all(axis=1) | ((np.abs(state.means) < 0.22).all(axis=1))
+    on_plate = state.means[:, 1] > 0.3
+    assert state.moving[opaque & in_box].mean() > 0.9
+    assert state.moving[opaque & on_plate].mean() < 0.1
+
+
+def test_without_masks_everything_moves() -> None:
+    state = fit(SETTINGS.model_copy(update={"iterations": 3}), masks=False).gaussians
+    np.testing.assert_array_equal(state.foreground, 1)
+    assert state.moving.all()
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_others() -> None:
+    short = SETTINGS.model_copy(update={"iterations": 120})
+    one, two, other = fit(short), fit(short), fit(short.model_copy(update={"seed": 1}))
+    assert one.losses == two.losses
+    for name, array in one.gaussians.arrays().items():
+        np.testing.assert_array_equal(array, getattr(two.gaussians, name))
+    assert one.losses != other.losses
+
+
+@pytest.mark.parametrize("limit", [50, 250, 320])
+def test_the_budget_is_kept_also_where_the_cloud_exceeds_it(limit: int) -> None:
+    settings = SETTINGS.model_copy(update={"iterations": 160, "max_gaussians": limit})
+    assert len(fit(settings).gaussians) <= limit
+
+
+def test_faint_gaussians_are_removed_but_never_all() -> None:
+    factory = ViewFactory(RIG)
+    views = factory.views(take_frame(0, 0.0, BOX, RIG), {})
+    parameters = initial_parameters(*cloud(), None, 1000, np.random.default_rng(0))
+    trainer = StaticTrainer(factory, views, parameters, SceneSettings(), SETTINGS)
+    trainer._allocate()
+    trainer.step(views[0], 0)
+    count = len(trainer.parameters)
+    trainer.parameters[5:25, 10] = logit(np.array(0.5 * SETTINGS.prune_opacity))
+    trainer.control_density(0)  # no room: nothing is added
+    assert len(trainer.parameters) == count - 20
+    assert trainer.gaussians().opacities.min() >= SETTINGS.prune_opacity
+    trainer.parameters[:, 10] = -9
+    trainer.control_density(0)
+    assert len(trainer.parameters) > 0
+
+
+def test_exposures_of_the_cameras_are_recovered() -> None:
+    frame = take_frame(0, 0.0, BOX, RIG)
+    gains = dict(zip(RIG.names, (1.2, 0.85, 1.0, 1.1, 0.9, 0.95), strict=True))
+    dimmed = {name: image * (0.75 * gains[name]) for name, image in frame.images.items()}
+    images = {name: image.round().astype(np.uint8) for name, image in dimmed.items()}
+    settings = SETTINGS.model_copy(update={"exposure": True, "rate_exposure": 5e-3})
+    result = fit(settings, Frame(0, 0.0, images, frame.masks))
+    assert set(result.exposures) == set(RIG.names)
+    found = np.array([result.exposures[name][:, 0].mean() for name in RIG.names])
+    truth = np.array(list(gains.values())) / np.mean(list(gains.values()))
+    assert found.mean() == pytest.approx(1, abs=1e-3)
+    np.testing.assert_allclose(found, truth, atol=0.07)  # of up to 0.2 at the start
+    assert np.abs([result.exposures[name][:, 1] for name in RIG.names]).max() < 0.02
+
+
+@pytest.mark.parametrize(("spread", "kept"), [(0.5 * EXPOSURE_SPREAD, False), (2.0 * EXPOSURE_SPREAD, True)])
+def test_exposures_are_given_up_where_the_cameras_are_alike(spread: float, kept: bool) -> None:
+    views = ViewFactory(RIG).views(take_frame(0, 0.0, BOX, RIG), {})
+    parameters = initial_parameters(*cloud(), None, 1000, np.random.default_rng(0))
+    settings = SETTINGS.model_copy(update={"exposure": "auto"})
+    trainer = StaticTrainer(ViewFactory(RIG), views, parameters, SceneSettings(), settings)
+    for view, side in zip(views, (-1, 1, -1, 1, -1, 1), strict=True):
+        view.exposure[:3] = (1 + side * spread, 0.02 * side)
+    trainer._judge_exposure()
+    assert trainer.exposing == kept
+    assert all((view.exposure == (1, 0)).all() for view in views) != kept
+
+
+def test_first_gaussians_are_as_wide_as_their_neighbours_are_far() -> None:
+    line = np.zeros((10, 3))
+    line[:, 0] = 0.1 * np.arange(10)
+    colours = np.full((10, 3), 0.25, np.float32)
+    table = initial_parameters(line, colours, None, 100, np.random.default_rng(0))
+    # In the middle the three nearest are at 0.1, 0.1 and 0.2 m.
+    np.testing.assert_allclose(np.exp(table[5, 7:10]), np.sqrt((0.01 + 0.01 + 0.04) / 3), rtol=1e-5)
+    np.testing.assert_allclose(table[:, 11:14], colours)
+    assert len(initial_parameters(line, colours, None, 4, np.random.default_rng(0))) == 4
+    alone = initial_parameters(line[:1], colours[:1], np.ones(1, np.float32), 4, np.random.default_rng(0))
+    assert np.isfinite(alone).all()
+    assert alone[0, 14] > 1
+
+
+def test_an_empty_cloud_is_refused() -> None:
+    factory = ViewFactory(RIG)
+    views = factory.views(take_frame(0, 0.0, BOX, RIG), {})
+    nothing = np.zeros((0, 3)), np.zeros((0, 3), np.float32)
+    with pytest.raises(ValueError, match="holds no point; give points"):
+        fit_static_scene(factory, views, *nothing, None, SceneSettings(), SETTINGS)
+
+
+def test_progress_counts_every_iteration() -> None:
+    factory = ViewFactory(RIG)
+    views = factory.views(take_frame(0, 0.0, BOX, RIG), {})
+    seen: list[tuple[int, float]] = []
+    short = SETTINGS.model_copy(update={"iterations": 5})
+    result = fit_static_scene(
+        factory, views, *cloud(), None, SceneSettings(), short, lambda done, loss: seen.append((done, loss))
+    )
+    assert seen == list(enumerate(result.losses, start=1))
+
+
+def test_frame_0_ends_early_once_nothing_is_gained() -> None:
+    """The verdict comes after densification, at the end of some rounds, and one more round follows it."""
+    settings = SETTINGS.model_copy(update={"iterations": 120, "densify_until": 0.3, "exposure": False})
+    whole = fit(settings)
+    assert len(whole.losses) == 120
+    never = fit(settings.model_copy(update={"stop_gain": 0.0}))
+    np.testing.assert_array_equal(never.losses, whole.losses)
+    cameras = len(RIG.cameras)
+    early = fit(settings.model_copy(update={"stop_gain": 0.99}))
+    assert 0.3 * 120 < len(early.losses) - cameras < 120  # 60, in fact: the first end of rounds with as many before
+    assert (len(early.losses) - cameras) % (STOP_ROUNDS * cameras) == 0
+    np.testing.assert_array_equal(early.losses[:-cameras], whole.losses[: len(early.losses) - cameras])
+    assert set(early.cameras) == set(RIG.names)

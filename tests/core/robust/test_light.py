@@ -1,0 +1,119 @@
+"""A light that changes for ever: it is taken on within the scene's patience, with masks or without."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scas4d_core.captures.frame import Frame
+from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.frame_report import FrameReport
+from scas4d_core.metrics import psnr
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.robust import outliers as judge
+from scas4d_core.robust.outliers import Look, Past
+from scas4d_core.settings import Settings
+from scas4d_core.storage.history import History
+from studies.hard_frames import footage as frames_footage
+from studies.hard_frames.footage import MadeUp
+
+PATIENCE = 4
+FROM = 4
+"""The first frame in the other light."""
+LAST = FROM + PATIENCE + 1
+"""The third one in which it is the usual light."""
+WITHIN_DB = 0.5
+
+
+NOISE = 1.0
+"""Levels of 255: with more of it, what seems to move without masks differs from light to light."""
+
+GIVEN: Settings = MadeUp().settings
+SETTINGS = GIVEN.model_copy(update={"update": GIVEN.update.model_copy(update={"patience": PATIENCE})})
+FOOTAGE = MadeUp(SETTINGS)
+
+
+@pytest.fixture(autouse=True)
+def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frames_footage, "NOISE", NOISE)
+
+
+def lit(pictures: dict[str, np.ndarray], light: float) -> dict[str, np.ndarray]:
+    return {name: (light * picture).round().clip(0, 255).astype(np.uint8) for name, picture in pictures.items()}
+
+
+def sent(index: int, light: float, masks: bool) -> Frame:
+    frame = FOOTAGE.frame(index)
+    return replace(frame, images=lit(dict(frame.images), light), masks=frame.masks if masks else {})
+
+
+def started(light: float, masks: bool) -> Reconstruction:
+    state = FOOTAGE._fitted()
+    state = state.replace(colours=(light * state.colours).clip(0, 1).astype(np.float32))
+    if not masks:
+        state = state.replace(foreground=np.zeros(len(state), np.float32))
+    static = StaticResult(state, {}, [])
+    return Reconstruction.start(FOOTAGE.rig, sent(0, light, masks), SETTINGS, history=History(), static=static)
+
+
+def run(lights: list[float], masks: bool) -> tuple[list[float], list[FrameReport], Reconstruction]:
+    """DB of the cameras held out in each frame's own light, and the reports."""
+    scene, found, reports = started(lights[0], masks), [], []
+    for index in range(1, len(lights)):
+        reports.append(scene.step(sent(index, lights[index], masks)))
+        truth = lit(dict(FOOTAGE.truth(index)), lights[index])
+        shown = {camera.name: scene.render(camera, index).colour for camera in FOOTAGE.held_out}
+        found.append(float(np.mean([psnr(shown[name], truth[name]) for name in shown])))
+    return found, reports, scene
+
+
+@pytest.mark.parametrize("light", [0.3, 0.7, 1.4, 2.5])
+@pytest.mark.parametrize("masks", [False, True])
+def test_a_light_that_stays_is_taken_on(light: float, masks: bool) -> None:
+    found, reports, scene = run([1.0] * FROM + [light] * (LAST - FROM + 1), masks)
+    usual, _, other = run([light] * (LAST + 1), masks)
+    accepted = reports[FROM - 1 + PATIENCE - 1]
+    assert "the light, for good" in accepted.attempts[0]
+    for report in reports[FROM - 1 + PATIENCE :]:
+        assert (report.exposure, report.degraded, report.dropped) == (1.0, None, {})
+    assert found[-1] >= usual[-1] - WITHIN_DB
+    assert scene.history.gaussians(LAST).moving.sum() >= 0.9 * other.history.gaussians(LAST).moving.sum()
+
+
+def test_a_light_that_flickers_is_not_taken_on() -> None:
+    """Nor is darkness; saturated pictures make a light seem less at first, it may change a while."""
+    past = Past()
+    for light in (1.3, 0.8, 1.3, 1.3, 1.31, 1.0):
+        past = judge.lit(past, Look(light))
+    assert past.lit == 0
+    counts = []
+    for light in (1.3, 0.8, 1.3, 1.3, 1.33, 2.4, 2.5, 0.02, 0.0):
+        past = judge.lit(past, Look(light))
+        counts.append(past.lit)
+    assert counts == [1, 1, 1, 2, 3, 4, 5, 0, 0]
+
+
+def test_the_light_is_part_of_what_is_carried_on() -> None:
+    past = judge.lit(judge.lit(Past(), Look(1.4)), Look(1.41))
+    again = Past.of_arrays(past.arrays())
+    assert (again.light, again.lit) == (1.41, 2)
+    older = {name: array[:6] if name == "scene" else array for name, array in past.arrays().items()}
+    assert (Past.of_arrays(older).light, Past.of_arrays(older).lit) == (1.0, 0)
+
+
+def test_frames_that_were_held_or_stood_are_told_as_they_are() -> None:
+    scene = started(1.0, True)
+    moved = scene.step(sent(1, 1.0, True))
+    again = scene.step(replace(sent(1, 1.0, True), index=2, time=2 / 30))
+    dark = scene.step(sent(3, 0.02, True))
+    assert (moved.used, moved.kept) == (list(FOOTAGE.rig.names), "end")
+    assert (again.used, again.iterations, again.kept, again.exposure) == ([], 0, "still", 1.0)
+    assert (dark.used, dark.iterations, dark.kept, dark.errors) == ([], 0, "still", {})
+    assert dark.exposure == pytest.approx(0.02, abs=0.01)
+    upside_down = {name: image[::-1].copy() for name, image in sent(4, 1.2, True).images.items()}
+    held = scene.step(replace(sent(4, 1.0, True), images=upside_down))
+    assert (held.used, held.kept, str(held.degraded)[:15]) == ([], "still", "held as it was:")
+    assert held.exposure > 1.0
+    assert held.errors["end"] < held.errors["still"]

@@ -1,0 +1,66 @@
+"""What is usual goes through a checkpoint: after a held frame, and with a camera left out, a scene taken up again goes
+on with the same bits."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scas4d_core.captures.frame import Frame
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.storage.history import History
+from studies.hard_frames import frames
+from studies.hard_frames.footage import MadeUp
+from studies.hard_frames.frames import Sent, each
+
+FOOTAGE = MadeUp()
+AT = 2
+
+
+def shown(sent: Sequence[Sent]) -> list[Frame]:
+    """Two good frames, what is sent, numbered on."""
+    given = [FOOTAGE.frame(1), *(one.frame for one in sent)]
+    return [replace(frame, index=k + 1, time=(k + 1) / 30) for k, frame in enumerate(given)]
+
+
+SEQUENCES = {
+    "held": shown(frames.filled(0)(FOOTAGE, AT, 2) or []),
+    "left out": shown(frames.swapped(FOOTAGE, AT, 2)),
+    "bumped": shown(frames.bumped(FOOTAGE, AT, 4)),
+    "flickers": shown(
+        frames.replaced(
+            FOOTAGE, AT, 2,
+            lambda number, frame: each(frame, lambda name, picture: (0.7 * picture).astype(np.uint8)),
+        )
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", SEQUENCES)
+def test_a_scene_taken_up_again_goes_on_with_the_same_bits(kind: str, tmp_path: Path) -> None:
+    sent = SEQUENCES[kind]
+    whole = FOOTAGE.start(tmp_path / "whole")
+    reports = []
+    for frame in sent:
+        reports.append(whole.step(frame))
+        shutil.copytree(tmp_path / "whole", tmp_path / f"after{frame.index}")
+    assert any(report.degraded or report.dropped or report.exposure != 1 for report in reports)
+    for index in range(1, len(sent)):
+        scene = Reconstruction.resume(FOOTAGE.rig, FOOTAGE.settings, History.open(tmp_path / f"after{index}"))
+        assert scene.resumed is not None
+        assert (scene.resumed.index, scene.resumed.cold) == (index, False)
+        report = scene.step(sent[index])
+        assert (report.degraded, report.dropped, report.exposure, report.loss) == (
+            reports[index].degraded,
+            reports[index].dropped,
+            reports[index].exposure,
+            reports[index].loss,
+        )
+        expected, found = whole.history.gaussians(index + 1).arrays(), scene.history.gaussians(index + 1).arrays()
+        for name, array in expected.items():
+            np.testing.assert_array_equal(found[name], array, err_msg=f"{kind}, after frame {index}: {name}")

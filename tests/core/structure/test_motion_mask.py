@@ -1,0 +1,82 @@
+"""Labels from motion: what moves is told apart from what stands without any mask."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from box_scene import MOVING, make_box, make_rig, moved, take_frame
+
+from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.settings import Settings, UpdateSettings
+from scas4d_core.structure.motion_mask import changed_pixels, settled
+
+RIG = make_rig()
+BOX = make_box()
+SETTINGS = Settings(update=UpdateSettings(iterations=20, clusters=(2, 12, 48), neighbour_falloff=200.0))
+
+
+def start() -> Reconstruction:
+    everything: Gaussians = BOX.replace(foreground=np.ones(len(BOX), np.float32))
+    frame = take_frame(0, 0.0, BOX, RIG, False)
+    return Reconstruction.start(RIG, frame, SETTINGS, static=StaticResult(everything, {}, []))
+
+
+def test_what_moves_is_found_and_committed() -> None:
+    scene = start()
+    assert scene.history.gaussians(0).moving.all()
+    report = scene.step(take_frame(1, 1.0, moved(BOX), RIG, False))
+    moving = scene.history.gaussians(1).moving
+    assert moving[:MOVING].mean() > 0.9
+    assert moving[MOVING:].mean() < 0.1
+    assert report.moving == moving.sum()
+    standing = ~moving
+    np.testing.assert_array_equal(
+        scene.history.gaussians(1).means[standing], scene.history.gaussians(0).means[standing]
+    )
+
+
+def test_nothing_is_decided_while_nothing_moves() -> None:
+    scene = start()
+    scene.step(take_frame(1, 1.0, BOX, RIG, False))
+    assert scene.history.gaussians(1).moving.all()
+    scene.step(take_frame(2, 2.0, moved(BOX), RIG, False))
+    assert scene.history.gaussians(2).moving[MOVING:].mean() < 0.1
+
+
+def test_what_has_moved_stays_in_the_hierarchy() -> None:
+    scene = start()
+    after = moved(BOX)
+    scene.step(take_frame(1, 1.0, after, RIG, False))
+    scene.step(take_frame(2, 2.0, after, RIG, False))
+    np.testing.assert_array_equal(scene.history.gaussians(2).moving, scene.history.gaussians(1).moving)
+
+
+def test_masks_have_the_word_where_there_are_any() -> None:
+    frame = take_frame(0, 0.0, BOX, RIG, True)
+    scene = Reconstruction.start(RIG, frame, SETTINGS, static=StaticResult(BOX, {}, []))
+    scene.step(take_frame(1, 1.0, moved(BOX), RIG, True))
+    np.testing.assert_array_equal(scene.history.gaussians(1).foreground, BOX.foreground)
+
+
+def test_a_changed_pixel_marks_its_surroundings() -> None:
+    before, now = np.zeros((3, 20, 20), np.float32), np.zeros((3, 20, 20), np.float32)
+    now[1, 10, 4] = 0.5
+    now[2, 0, 19] = 0.01
+    marked = changed_pixels(before, now)
+    assert marked.sum() == 25
+    assert marked[8:13, 2:7].all()
+
+
+@pytest.mark.parametrize(("standing", "all_move"), [(0, True), (5, True), (10, False), (50, False)])
+def test_the_few_that_stand_in_an_object_move_with_it(standing: int, all_move: bool) -> None:
+    rows = np.linspace(0, len(BOX) - 1, 100).astype(int)
+    labels = np.full(100, 0.9, np.float32)
+    labels[:standing] = 0.2
+    hundred = Gaussians(**{name: array[rows] for name, array in BOX.arrays().items()}).replace(foreground=labels)
+    after = settled(hundred)
+    assert after.moving.all() == all_move
+    np.testing.assert_array_equal(after.foreground[standing:], labels[standing:])
+    if not all_move:
+        assert after is hundred

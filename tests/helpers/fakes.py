@@ -1,0 +1,227 @@
+"""An engine without a method: it honours the contract of the real one and does what the first picture's red says."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import asdict, dataclass, field
+from types import SimpleNamespace
+
+import numpy as np
+
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.query import tracks
+from scas4d_core.storage.history import History, HistoryError
+
+SLOW, SLOW_RAISES, RAISES, DIES, HELD, LEAVES_OUT, STANDS = 200, 201, 250, 251, 240, 241, 242
+ITERATIONS = 100
+MS_EACH = 2.0
+RAISES_IN_REPLAY, DIES_IN_REPLAY = 666, 667
+SLOW_S = 2.0
+STEP_M = 0.125
+HANGS, KILLS = 777_001, 777_002
+"""Ids that the reader never finds, or dies of."""
+
+
+@dataclass
+class Progress:
+    stage: str
+    done: int
+    total: int
+    detail: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class Report:
+    index: int
+    time: float
+    iterations: int
+    seconds: dict[str, float]
+    loss: list[float]
+    psnr: float
+    moving: int
+    gaussians: int
+
+
+def obey(frame):
+    time.sleep(float(os.environ.get("FAKE_UPDATE_S", "0")))
+    red = int(next(iter(frame.images.values()))[0, 0, 0])
+    if red in (SLOW, SLOW_RAISES):
+        time.sleep(SLOW_S)
+    if red in (RAISES, SLOW_RAISES):
+        raise FloatingPointError("the fake was told to raise")
+    if red == DIES:
+        os._exit(7)
+    return red
+
+
+def state(points, index, before=None, red=0):
+    """What depends on all frames so far is in the colours: a frame lost, or done twice, shows."""
+    count = len(points)
+    colour = np.float32(0.5 if before is None else before * np.float32(0.5) + np.float32(red / 512) + 0.125)
+    offset = np.array([STEP_M * index, 0, 0])
+    return Gaussians(
+        means=(points + offset).astype(np.float32),
+        factors=np.tile(0.05 * np.eye(3, dtype=np.float32), (count, 1, 1)),
+        rotations=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        opacities=np.full(count, 0.9, np.float32),
+        colours=np.full((count, 3), colour, np.float32),
+        foreground=np.ones(count, np.float32),
+        ids=np.arange(count),
+    )
+
+
+@dataclass
+class Resumed:
+    index: int
+    undone: list[int]
+    faults: list[str]
+    cold: bool
+
+
+class FakeReconstruction:
+    def __init__(self, points, history, resumed=None):
+        self.points = points
+        self.history = history
+        self.resumed = resumed
+        self.iterations = ITERATIONS
+
+    def commit(self, frame, dropped, notes):
+        count = len(self.points)
+        report = Report(frame.index, frame.time, self.iterations, {"update": 0.01}, [0.5, 0.25], 31.5, count, count)
+        known = self.history.indices
+        before = self.history.gaussians(known[-1]).colours[0, 0] if known else None
+        red = int(next(iter(frame.images.values()))[0, 0, 0])
+        record = {**asdict(report), "used": list(frame.images), "dropped": dropped or {}, **(notes or {})}
+        if red == HELD:
+            record |= {"degraded": "held as it was: the fake was told so", "kept": "still", "used": []}
+        if red == STANDS:
+            record |= {"iterations": 0, "kept": "still", "used": []}
+        if red == LEAVES_OUT:
+            record["dropped"] = {**record["dropped"], "c1": "it shows nothing"}
+        first = self.iterations // 2
+        record["curve"] = [
+            {"iterations": first, "milliseconds": MS_EACH * first, "loss": 0.5},
+            {"iterations": self.iterations, "milliseconds": MS_EACH * self.iterations, "loss": 0.25},
+        ]
+        record["errors"] = {"still": 0.5, "end": 1 / self.iterations}
+        record |= {"kept": record.get("kept", "end"), "attempts": ["as set"], "threads": 2}
+        self.history.append(frame.index, frame.time, state(self.points, frame.index, before, red), record)
+        return report
+
+    def step(self, frame, *, dropped=None, notes=None, started=None):
+        assert started is None or started <= time.perf_counter()
+        obey(frame)
+        return self.commit(frame, dropped, notes)
+
+    def spend(self, *, iterations=None, budget_ms=None, stop_gain=None, still=None):
+        self.iterations = int(budget_ms / MS_EACH) if budget_ms else iterations or ITERATIONS
+
+    def write_checkpoint(self, index):
+        return False  # it needs none
+
+
+class FakeReader:
+    def __init__(self, rig, history):
+        self.history = history
+        self.world = rig.world_frame()
+
+    def render(self, camera, index, *, background, labels=None):
+        self.history.gaussians(index)
+        colour = np.broadcast_to(np.array(background, np.float32), (camera.height, camera.width, 3)).copy()
+        colour[0, 0] = min(1, index / 10)  # which frame this is
+        depth = np.full(colour.shape[:2], 2.0)
+        depth[0, 0], depth[0, 1:2] = np.nan, 4.0
+        parts = None if labels is None else np.full(colour.shape[:2], labels.max() + 1, np.uint8)
+        return SimpleNamespace(colour=colour, alpha=np.ones(colour.shape[:2]), depth=depth, parts=parts)
+
+    def _depth(self, camera, index):
+        return np.full((camera.height, camera.width), np.inf), np.zeros((camera.height, camera.width))
+
+    def tracks_of_points(self, points, index, indices):
+        return tracks.tracks_of_points(self.history, self.world, points, index, indices)
+
+    def tracks_of_pixels(self, camera, uv, index, indices):
+        return tracks.tracks_of_pixels(self.history, self.world, camera, uv, index, indices, self._depth)
+
+    def tracks_of_ids(self, ids, indices):
+        if HANGS in ids:
+            time.sleep(600)
+        if KILLS in ids:
+            os._exit(9)
+        return tracks.tracks_of_ids(self.history, self.world, ids, indices)
+
+    def with_visibility(self, found, camera, index):
+        return found.with_visibility(camera, self._depth, 0.01)
+
+    def parts(self, count, previous=None):
+        return np.arange(len(self.history.gaussians(0))) % (count or 2)
+
+    def write_ply(self, path, index):
+        path.write_bytes(b"ply\n" + str(index).encode())
+
+
+class FakeEngine:
+    def start(self, rig, frame, settings, *, points, progress, history, dropped=None, notes=None, started=None):
+        assert started is None or started <= time.perf_counter()
+        obey(frame)
+        for done in range(3):
+            progress(Progress("fitting", done + 1, 3, {"psnr": 30.0}))
+        given = points.positions if points is not None else np.array([[0.0, 0, 0], [0.5, 0, 0]])
+        scene = FakeReconstruction(rig.world_frame().to_inside(given), history)
+        scene.commit(frame, dropped, notes)
+        return scene
+
+    def resume(self, rig, settings, history, *, held=lambda index: True):
+        first, faults = history.indices[0], list(history.damaged.values())
+        for last in reversed(history.indices):
+            try:
+                history.gaussians(last)
+                history.report(last)
+                break
+            except HistoryError as error:
+                faults.append(str(error))
+        offset = np.array([STEP_M * first, 0, 0])
+        points = history.gaussians(first).means - offset
+        return FakeReconstruction(points, history, Resumed(last, history.cut(last), faults, False))
+
+    def remake(self, rig, settings, history, base, frame, budget, *, dropped=None, notes=None):
+        obey(frame)
+        first = history.indices[0]
+        copy = History()
+        copy.append(base, history.time(base), history.gaussians(base), history.report(base))
+        points = history.gaussians(first).means - np.array([STEP_M * first, 0, 0])
+        scene = FakeReconstruction(points, copy)
+        scene.spend(**budget)
+        scene.commit(frame, dropped, {**(notes or {}), "remade": True})
+        report = copy.report(frame.index)
+        history.replace(frame.index, frame.time, copy.gaussians(frame.index).arrays(), report)
+        return report
+
+    def replay(self, rig, settings, history, base, frames, iterations, over):
+        history.gaussians(base)
+        indices = []
+        for decode in frames:
+            frame, _ = decode()
+            obey(frame)
+            indices.append(frame.index)
+            over()
+        if iterations == RAISES_IN_REPLAY:
+            raise FloatingPointError("the fake was told to raise")
+        if iterations == DIES_IN_REPLAY:
+            os._exit(7)
+        return SimpleNamespace(
+            iterations=iterations, milliseconds=3.0 * iterations, error=1 / iterations, psnr=30.0,
+            frames=len(indices) - 1,
+        )  # fmt: skip
+
+    def reader(self, rig, settings, history):
+        return FakeReader(rig, history)
+
+    def warm_up(self):
+        if "SCAS4D_FAKE_FAULT" in os.environ:
+            raise FloatingPointError("the fake was told to raise")
+
+
+def engine():
+    return FakeEngine()

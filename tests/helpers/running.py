@@ -1,0 +1,96 @@
+"""A real service on a free port of the loopback with the fake engine, small rigs and pictures."""
+
+from __future__ import annotations
+
+import io
+import socket
+import threading
+import time
+
+import numpy as np
+import uvicorn
+from PIL import Image
+
+from scas4d_core.cameras import Camera, Rig
+from server.app import create_app
+from server.connections.config import guarded
+from server.problems import Problem
+from server.settings import ServerSettings
+
+WIDTH, HEIGHT = 24, 16
+
+
+class Running:
+    """A uvicorn server in a thread."""
+
+    def __init__(self, settings, port=None, ready=True):
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = port or free.getsockname()[1]
+        self.app = create_app(settings)
+        config = guarded(self.app, port=self.port, log_level="error")
+        self.server = uvicorn.Server(config)
+        self.thread = threading.Thread(target=self.server.run)
+        self.thread.start()
+        until = time.monotonic() + 20
+        while not (self.server.started and self.recovered(ready)):
+            assert time.monotonic() < until
+            time.sleep(0.02)
+        self.url = f"http://127.0.0.1:{self.port}"
+
+    def recovered(self, asked):
+        try:
+            if asked:
+                self.app.state.scenes.check_recovered()
+        except Problem:
+            return False
+        return True
+
+    def stop(self):
+        self.server.should_exit = True
+        self.thread.join(20)
+
+
+def fake_settings(folder, **changes):
+    """Small limits, so that tests reach them."""
+    given = dict(
+        data=folder,
+        engine="fakes:engine",
+        queue_frames=2,
+        max_body_mb=2,
+        max_scenes=4,
+        max_points=1000,
+        max_track_points=5000,
+        max_track_json_points=4000,
+        max_track_views=60,
+        max_ingest_sockets=3,
+        warm_up=False,
+    )
+    return ServerSettings(**given | changes)
+
+
+def make_rig(count=2):
+    pose = np.eye(4)
+    pose[2, 3] = 3
+    k = np.array([[20.0, 0, WIDTH / 2], [0, 20, HEIGHT / 2], [0, 0, 1]])
+    return Rig(tuple(Camera(f"c{i}", k, pose, WIDTH, HEIGHT) for i in range(count)))
+
+
+def picture(red=0, size=(WIDTH, HEIGHT), format="PNG", mode="RGB", **options):
+    file = io.BytesIO()
+    Image.new("RGB", size, (red, 10, 20)).convert(mode).save(file, format, **options)
+    return file.getvalue()
+
+
+def pictures(red=0, count=2):
+    return {f"c{i}": picture(red) for i in range(count)}
+
+
+def problem(response, status):
+    """The problem document of an error, checked for what every one has."""
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/problem+json"
+    document = response.json()
+    assert document["status"] == status
+    assert document["detail"]
+    return document

@@ -1,0 +1,59 @@
+"""The estimate of what a scene takes: against a measurement, and as a limit."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import httpx
+import pytest
+from running import Running, fake_settings, make_rig, problem
+
+from client.wire import RigModel
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.mark.parametrize("arguments", [("--cameras", "16", "--size", "384"), ("--gaussians", "60000", "--masks")])
+def test_the_estimate_is_near_what_is_measured(arguments):
+    command = [sys.executable, str(ROOT / "scripts/measure_memory.py"), *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    measured = json.loads(done.stdout.splitlines()[-1])
+    assert 0.6 <= measured["ratio"] <= 1.1, measured
+
+
+def rig(width, count=2):
+    model = RigModel.of(make_rig(count)).model_dump(mode="json")
+    for camera in model["cameras"]:
+        camera["width"] = camera["height"] = width
+    return model
+
+
+def test_an_estimate_creates_nothing(http):
+    before = http.get("/v1/scenes").json()
+    small, large = (http.post("/v1/estimate", json={"rig": rig(width)}).json() for width in (100, 2000))
+    assert http.get("/v1/scenes").json() == before
+    assert large["pixels"] == 2 * 2000**2
+    assert large["gaussians"] == 100_000
+    assert large["memory_mb"] > small["memory_mb"] > 500
+    scaled = {"rig": rig(2000), "settings": {"scene": {"image_scale": 0.5}, "static": {"max_gaussians": 5000}}}
+    found = http.post("/v1/estimate", json=scaled).json()
+    assert (found["scaled_pixels"], found["gaussians"]) == (2 * 1000**2, 5000)
+    assert found["worker_mb"] == pytest.approx(280 + found["pictures_mb"] + found["gaussians_mb"], abs=0.1)
+    problem(http.post("/v1/estimate", json={"rig": {}}), 422)
+
+
+def test_what_will_not_fit_is_refused_with_what_would(tmp_path):
+    running = Running(fake_settings(tmp_path, max_scene_memory_mb=1500))
+    try:
+        refused = httpx.post(f"{running.url}/v1/scenes", json={"rig": rig(2000)})
+        document = problem(refused, 422)
+        assert document["field"] == "rig.cameras"
+        assert "image_scale to 0.5" in document["remedy"]
+        assert document["estimate"]["memory_mb"] > 1500
+        body = {"rig": rig(2000), "settings": {"scene": {"image_scale": 0.5}}}
+        assert httpx.post(f"{running.url}/v1/scenes", json=body, timeout=30).status_code == 201
+    finally:
+        running.stop()

@@ -1,0 +1,151 @@
+"""What is cut short in the middle: senders that go, requests that are cancelled, facts that race, folders half lost."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+
+import pytest
+from running import picture, problem
+from test_ingest import finished, framed, make, put, put_camera, status, wait_for  # noqa: F401  (make is a fixture)
+from test_restart import create, serving
+from test_restart import put as put_form
+
+from client.wire import FRAME_MEDIA_TYPE
+from server.ingest import receive as door
+from server.ingest import upload
+from server.scene import scene
+from server.storage.events import SetAside, Taken
+from server.storage.journal import Journal
+from server.storage.recovery import recover
+
+
+def test_a_refused_sender_that_goes_in_the_middle_leaves_the_frame_free(http, make, service, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(upload, "BATCH", 1)  # file by file: the first is refused while the third is on its way
+    id = make(3)
+    body = framed(0, {"c0": picture()[:-9], "c1": picture(), "c2": picture() + bytes(500_000)})
+    head = f"PUT /v1/scenes/{id}/frames/0 HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: {FRAME_MEDIA_TYPE}\r\n"
+    ingest = service.app.state.scenes[id].ingest
+    with socket.create_connection(("127.0.0.1", service.port)) as sender:
+        sender.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body[:-400_000])
+        time.sleep(0.5)
+    time.sleep(0.2)
+    assert ingest._coming == {}
+    assert http.post(f"/v1/scenes/{id}/frames/0/missing").json()["state"] == "missing"
+
+
+def on_the_loop(scene, coroutine):
+    return asyncio.run_coroutine_threadsafe(coroutine, scene._worker._loop)
+
+
+@pytest.mark.parametrize("part", [False, True])
+def test_a_request_cancelled_while_its_fact_is_written_keeps_its_pictures(http, make, service, monkeypatch, part):  # noqa: F811
+    id = make(1)
+    http.post(f"/v1/scenes/{id}/pause")
+    scene = service.app.state.scenes[id]
+    real = Journal._write
+
+    def slow(self, data):
+        time.sleep(0.5)
+        real(self, data)
+
+    async def body():
+        yield framed(0, {"c0": picture()}, part=part)
+
+    monkeypatch.setattr(Journal, "_write", slow)
+    take = door.take_camera(scene, 0, "c0", body(), None) if part else door.take_framed(scene, 0, body(), None)
+    request = on_the_loop(scene, take)
+    time.sleep(0.25)
+    request.cancel()
+    wait_for(lambda: scene.next_frame == 1)
+    time.sleep(0.2)
+    assert len(list(scene.spec.frames.iterdir())) == 1
+    http.post(f"/v1/scenes/{id}/resume")
+    assert finished(http, id, 0)["state"] == "committed"
+
+
+def test_a_frame_taken_while_the_first_one_fails_does_not_wait_for_ever(http, make, service, monkeypatch):  # noqa: F811
+    id = make(queue_frames=9)
+    scene = service.app.state.scenes[id]
+    real = Journal._write
+
+    def slow(self, data):
+        time.sleep(0.3)
+        real(self, data)
+
+    async def race():
+        fact = SetAside(index=0, reason="told to", fatal=True)
+        setting = asyncio.ensure_future(scene._set_aside(fact))
+        await asyncio.sleep(0.1)
+
+        async def body():
+            yield framed(1)
+
+        await asyncio.gather(setting, door.take_framed(scene, 1, body(), None))
+
+    http.post(f"/v1/scenes/{id}/pause")
+    put(http, id, 0)
+    monkeypatch.setattr(Journal, "_write", slow)
+    on_the_loop(scene, race()).result(20)
+    wait_for(lambda: status(http, id)["queued"] == 0)
+    assert http.get(f"/v1/scenes/{id}/frames/1").json()["state"] == "set_aside"
+
+
+def test_a_scene_that_failed_is_found_with_nothing_waiting(tmp_path):
+    async def write():
+        journal = Journal(tmp_path / "journal.log")
+        taken = [
+            Taken(index=index, time=index / 10, identity="ab" * 32, files=(f"{index:010d}-{0:012x}.frame",))
+            for index in (0, 1)
+        ]
+        await journal.append(taken[0], SetAside(index=0, reason="told to", fatal=True), taken[1])
+        await journal.close()
+
+    asyncio.run(write())
+    found = recover(tmp_path, "s")
+    assert found.ledger.waiting() == []
+    assert [(fact.index, fact.fact) for fact in found.facts] == [(1, "set_aside")]
+    assert "told to" in found.ledger.frames[1].report.error
+
+
+def test_a_lost_definition_does_not_cost_the_frames(tmp_path):
+    with serving(tmp_path) as (http, sdk):
+        id, empty = create(http), create(http)
+        put_form(http, id, 0)
+        sdk.wait(id, 0)
+    for name in (id, empty):
+        (tmp_path / "scenes" / name / "scene.json").unlink()
+    with serving(tmp_path) as (http, sdk):
+        after = http.get(f"/v1/scenes/{id}").json()
+        assert (after["committed"], after["name"]) == (1, "studio")
+        assert "scene.json" in after["damage"][0]
+        assert put_form(http, id, 1).status_code == 202
+        problem(http.get(f"/v1/scenes/{empty}"), 404)  # a scene that was never acknowledged looks the same
+
+
+def test_a_journal_that_cannot_be_written_costs_its_scene_only(tmp_path, monkeypatch):
+    with serving(tmp_path) as (http, _):
+        bad, good = create(http), create(http)
+
+    def journal(path, *more):
+        if bad in path.parts:
+            raise PermissionError(13, "Permission denied", str(path))
+        return Journal(path, *more)
+
+    monkeypatch.setattr(scene, "Journal", journal)
+    with serving(tmp_path) as (http, _):
+        assert http.get(f"/v1/scenes/{good}").status_code == 200
+        assert "Permission denied" in problem(http.get(f"/v1/scenes/{bad}"), 404)["detail"]
+
+
+def test_parts_again_after_retention_get_the_same_answer(http, make):  # noqa: F811
+    id = make(2, queue_frames=8, keep_frames={"last": 0})
+    first = []
+    for index in range(4):
+        put_camera(http, id, index, "c0", picture(index))
+        first.append(put_camera(http, id, index, "c1", picture(index + 20)).json())
+        finished(http, id, index)
+    wait_for(lambda: status(http, id)["frames_held"] == 1)
+    assert put_camera(http, id, 0, "c1", picture(20)).json() == first[0]
+    assert problem(put_camera(http, id, 0, "c1", picture(9)), 409)["field"] == "c1"

@@ -1,0 +1,232 @@
+"""What a service finds again in its data folder: everything, or a sentence about it."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import threading
+import time
+
+import fakes
+import httpx
+import numpy as np
+import pytest
+from running import Running, fake_settings, make_rig, picture, pictures, problem
+
+from client.sdk import Client
+from client.wire import RigModel
+from scas4d_core.captures import InitialPoints
+from server.storage import recovery
+from server.storage.ledger import LOST
+
+
+@contextlib.contextmanager
+def serving(folder):
+    running = Running(fake_settings(folder))
+    try:
+        with httpx.Client(base_url=running.url, timeout=30) as http, Client(running.url, patience=20) as sdk:
+            yield http, sdk
+    finally:
+        running.stop()
+
+
+def create(http, **ingest):
+    body = {"rig": RigModel.of(make_rig()).model_dump(mode="json"), "ingest": ingest, "name": "studio"}
+    return http.post("/v1/scenes", json={**body, "frames_per_second": 10}).json()["id"]
+
+
+def put(http, id, index, images=None):
+    files = {name: (name, data) for name, data in (images or pictures()).items()}
+    return http.put(f"/v1/scenes/{id}/frames/{index}", files=files)
+
+
+def without(document, *names):
+    return {name: value for name, value in document.items() if name not in names}
+
+
+def settled(http, id):
+    until = time.monotonic() + 30
+    while (status := http.get(f"/v1/scenes/{id}").json())["queued"] and status["state"] != "paused":
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    return status
+
+
+def test_everything_is_found_again(tmp_path):
+    with serving(tmp_path) as (http, sdk):
+        id = create(http, queue_frames=9, part_seconds=3600)
+        sdk.put_points(id, InitialPoints(np.zeros((3, 3)), np.zeros((3, 3), np.float32)))
+        receipts = [put(http, id, index, pictures(index)).json() for index in range(3)]
+        sdk.wait(id, 2)
+        http.post(f"/v1/scenes/{id}/frames/3/missing", json={"reason": "cable"})
+        assert put(http, id, 4, pictures(fakes.RAISES)).status_code == 202
+        sdk.wait(id, 4)
+        http.post(f"/v1/scenes/{id}/pause")
+        receipts.append(put(http, id, 5).json())
+        part = http.put(f"/v1/scenes/{id}/frames/6/cameras/c0", content=picture(6)).json()
+        before = http.get(f"/v1/scenes/{id}").json()
+        reports = [http.get(f"/v1/scenes/{id}/frames/{index}").json() for index in range(7)]
+    with serving(tmp_path) as (http, sdk):
+        after = http.get(f"/v1/scenes/{id}").json()
+        assert without(after, "error", "gaussians") == without(before, "error", "gaussians")
+        assert after["damage"] == []
+        again = [http.get(f"/v1/scenes/{id}/frames/{index}").json() for index in range(7)]
+        assert again == reports
+        assert put(http, id, 2, pictures(2)).json() == receipts[2]
+        assert problem(put(http, id, 2, pictures(9)), 409)["expected"] == 6
+        assert http.put(f"/v1/scenes/{id}/frames/6/cameras/c0", content=picture(6)).json() == part
+        assert http.put(f"/v1/scenes/{id}/frames/6/cameras/c1", content=picture(7)).json()["absent"] == []
+        assert sdk.render(id, "c0", 1)[0, 0, 0] == round(255 * 0.1)
+        http.post(f"/v1/scenes/{id}/resume")
+        sdk.wait(id, 6)
+        assert settled(http, id)["last_committed"] == 6
+        assert http.get(f"/v1/scenes/{id}").json()["gaussians"] == 3
+
+
+def test_a_first_frame_that_failed_stays_failed(tmp_path):
+    with serving(tmp_path) as (http, sdk):
+        id = create(http)
+        put(http, id, 0, pictures(fakes.RAISES))
+        sdk.wait(id, 0)
+    with serving(tmp_path) as (http, _):
+        status = http.get(f"/v1/scenes/{id}").json()
+        assert status["state"] == "failed"
+        assert "told to raise" in status["error"]
+
+
+def test_deaths_at_a_frame_are_counted_over_restarts(tmp_path):
+    with serving(tmp_path) as (http, sdk):
+        id = create(http)
+        put(http, id, 0)
+        sdk.wait(id, 0)
+        put(http, id, 1, pictures(fakes.DIES))
+        until = time.monotonic() + 20
+        while not http.get(f"/v1/scenes/{id}/frames/1").json()["attempts"]:
+            assert time.monotonic() < until
+            time.sleep(0.02)
+    with serving(tmp_path) as (http, sdk):
+        report = sdk.wait(id, 1)
+        assert (report.state, report.attempts) == ("set_aside", 2)
+
+
+def test_a_deletion_that_was_cut_short_is_finished_and_half_a_scene_is_none(tmp_path):
+    with serving(tmp_path) as (http, _):
+        kept, gone = create(http), create(http)
+        assert http.delete(f"/v1/scenes/{gone}").status_code == 204
+        assert list((tmp_path / "deleted").iterdir()) == []
+    shutil.copytree(tmp_path / "scenes" / kept, tmp_path / "deleted" / "abc")  # renamed, not yet removed
+    (tmp_path / "scenes" / "half" / "frames").mkdir(parents=True)  # made, never acknowledged
+    with serving(tmp_path) as (http, _):
+        assert [scene["id"] for scene in http.get("/v1/scenes").json()["scenes"]] == [kept]
+        until = time.monotonic() + 20
+        while list((tmp_path / "deleted").iterdir()):  # behind the service that answers already
+            assert time.monotonic() < until
+            time.sleep(0.02)
+        assert sorted(path.name for path in (tmp_path / "scenes").iterdir()) == [kept]
+
+
+def test_a_damaged_definition_comes_back_from_the_journal_and_without_it_is_left_alone(tmp_path):
+    with serving(tmp_path) as (http, _):
+        id = create(http)
+        before = http.get(f"/v1/scenes/{id}").json()
+    file = tmp_path / "scenes" / id / "scene.json"
+    text = file.read_text()
+    assert "studio" in text
+    file.write_text(text.replace("studio", "studia"))
+    with serving(tmp_path) as (http, _):
+        after = http.get(f"/v1/scenes/{id}").json()
+        assert without(after, "damage") == without(before, "damage")
+        assert "taken from the journal" in after["damage"][0]
+    assert file.read_text() == text
+    file.write_text("{")
+    (tmp_path / "scenes" / id / "journal.log").write_bytes(b"")
+    with serving(tmp_path) as (http, _):
+        assert "scene.json is damaged" in problem(http.get(f"/v1/scenes/{id}"), 404)["detail"]
+    assert file.read_text() == "{"  # whoever knows more may still repair it
+
+
+def test_a_lost_journal_costs_the_facts_and_no_state(tmp_path):
+    with serving(tmp_path) as (http, sdk):
+        id = create(http, keep_frames={"last": 0})
+        for index in range(4):
+            put(http, id, index)
+            sdk.wait(id, index)
+    (tmp_path / "scenes" / id / "journal.log").write_bytes(b"\0" * 100)
+    with serving(tmp_path) as (http, sdk):
+        status = http.get(f"/v1/scenes/{id}").json()
+        assert (status["committed"], status["next_frame"]) == (4, 4)
+        assert status["damage"]
+        assert LOST in problem(put(http, id, 0), 409)["detail"]
+        assert sdk.render(id, "c0", 0).shape
+        put(http, id, 4)
+        assert sdk.wait(id, 4).state == "committed"
+
+
+def test_it_answers_while_scenes_are_recovered(tmp_path, monkeypatch):
+    with serving(tmp_path) as (http, _):
+        first, second = create(http), create(http)
+        put(http, first, 0)
+    go_on = threading.Semaphore(0)
+
+    def recover(*given):
+        assert go_on.acquire(timeout=60)
+        return recovery.recover(*given)
+
+    monkeypatch.setattr("server.scene.scenes.recover", recover)
+    running = Running(fake_settings(tmp_path), ready=False)
+    try:
+        with httpx.Client(base_url=running.url, timeout=30) as http:
+            assert http.get("/health/live").json()["status"] == "live"
+            answer = http.get("/health/ready")
+            assert "recovering 0 of 2 scenes" in problem(answer, 503)["detail"]
+            assert answer.headers["Retry-After"]
+            for call in (http.get(f"/v1/scenes/{first}"), http.get("/v1/scenes"), http.delete(f"/v1/scenes/{second}")):
+                assert "recovering" in problem(call, 503)["detail"]
+            assert problem(put(http, second, 0), 503)["value"] == second
+            problem(http.get("/v1/scenes/none"), 404)
+            problem(http.post("/v1/scenes", json={"rig": RigModel.of(make_rig()).model_dump(mode="json")}), 503)
+            go_on.release()
+            until = time.monotonic() + 20
+            while not (found := [id for id in (first, second) if http.get(f"/v1/scenes/{id}").status_code == 200]):
+                assert time.monotonic() < until
+                time.sleep(0.02)
+            assert len(found) == 1
+            assert problem(http.get("/health/ready"), 503)["recovering"] == [({first, second} - set(found)).pop()]
+            go_on.release()
+            while http.get("/health/ready").status_code != 200:
+                assert time.monotonic() < until
+                time.sleep(0.02)
+            assert [scene["id"] for scene in http.get("/v1/scenes").json()["scenes"]] == [first, second]
+    finally:
+        go_on.release(5)
+        running.stop()
+
+
+def test_a_service_that_ends_while_scenes_are_recovered_leaves_them_as_they_are(tmp_path, monkeypatch):
+    with serving(tmp_path) as (http, _):
+        id = create(http)
+    go_on = threading.Semaphore(0)
+    monkeypatch.setattr(
+        "server.scene.scenes.recover", lambda *given: go_on.acquire(timeout=60) and recovery.recover(*given)
+    )
+    running = Running(fake_settings(tmp_path), ready=False)
+    threading.Timer(0.5, go_on.release).start()
+    running.stop()
+    monkeypatch.undo()
+    with serving(tmp_path) as (http, _):
+        assert http.get(f"/v1/scenes/{id}").json()["damage"] == []
+
+
+def test_two_services_do_not_share_a_folder(tmp_path):
+    with serving(tmp_path), pytest.raises(RuntimeError, match="another service"):
+        _start_second(tmp_path)
+
+
+def _start_second(folder):
+    import asyncio
+
+    from server.processes.local_placement import LocalPlacement
+    from server.scene.scenes import Scenes
+    from server.stream.hub import Hub
+
+    asyncio.run(Scenes(fake_settings(folder), LocalPlacement(), Hub(1, 1)).open())

@@ -1,0 +1,87 @@
+"""The prediction of when a queue has room."""
+
+from __future__ import annotations
+
+import pytest
+
+from server.scene.work_clock import FIRST_GUESS_S, OVERDUE, SHORTEST_S, UPDATES_KEPT, WorkClock
+
+
+class Hand:
+    """A clock that is set by hand."""
+
+    def __init__(self):
+        self.at = 100.0
+
+    def __call__(self):
+        return self.at
+
+
+@pytest.fixture
+def hand():
+    return Hand()
+
+
+@pytest.fixture
+def clock(hand):
+    return WorkClock(hand)
+
+
+def run(clock, hand, seconds, first=False):
+    clock.begin(first=first)
+    hand.at += seconds
+    clock.end(committed=True)
+
+
+def test_frame_0_is_never_taken_for_an_update(clock, hand):
+    run(clock, hand, 300, first=True)
+    assert clock.remaining() == FIRST_GUESS_S
+    run(clock, hand, 0.7)
+    assert clock.remaining() == pytest.approx(0.7)
+
+
+def test_an_update_is_the_median_of_the_last_ones_less_what_has_gone(clock, hand):
+    for seconds in (9, 9, 9, *[0.5] * UPDATES_KEPT):
+        run(clock, hand, seconds)
+    clock.begin(first=False)
+    hand.at += 0.2
+    assert clock.remaining() == pytest.approx(0.3)
+    hand.at += 0.29
+    assert clock.remaining() == SHORTEST_S
+    hand.at += 10
+    assert clock.remaining() == pytest.approx(OVERDUE * (10.49 - 0.5))
+
+
+def test_frame_0_is_predicted_from_its_progress(clock, hand):
+    clock.begin(first=True)
+    hand.at += 8
+    assert clock.remaining() == pytest.approx(2)  # nothing is known yet
+    clock.progress("fitting", 0, 100)
+    hand.at += 10
+    clock.progress("fitting", 25, 100)
+    assert clock.remaining() == pytest.approx(30)
+    hand.at += 25
+    clock.progress("fitting", 90, 100)
+    assert clock.remaining() == pytest.approx(35 / 9)
+    clock.progress("fitting", 100, 100)
+    assert clock.remaining() == pytest.approx(OVERDUE * 43)
+
+
+def test_a_full_disk_is_waited_for_and_says_nothing_of_updates(clock, hand):
+    run(clock, hand, 0.5)
+    clock.begin(first=False)
+    clock.stall(8)
+    hand.at += 3
+    assert clock.remaining() == pytest.approx(5.5)
+    hand.at += 20
+    assert clock.remaining() == pytest.approx(0.5)
+    clock.end(committed=True)
+    assert clock.update_seconds == 0.5
+
+
+def test_a_frame_set_aside_says_nothing_of_updates(clock, hand):
+    clock.begin(first=False)
+    hand.at += 30
+    clock.end(committed=False)
+    clock.end(committed=True)  # nothing is at work: nothing is measured
+    assert clock.remaining() == FIRST_GUESS_S

@@ -1,0 +1,335 @@
+"""The study of accuracy against time on rows made of formulas, and its watch over updates of a small scene."""
+
+import json
+import types
+
+import numpy as np
+import pytest
+from box_scene import held_out_camera, make_box, make_rig, moved, photograph
+from made_frontier import made_psnr, made_row, made_seconds, made_study
+from PIL import Image
+from typer.testing import CliRunner
+
+from client.cli.main import app
+from scas4d_core.captures import open_capture
+from scas4d_core.first_frame.static_scene import StaticResult
+from studies.frontier import convergence, frontier, timing
+from studies.frontier.frontier import AXES, DEFAULT, Variant, measure_frontier, row_of, variants
+from studies.frontier.page import chosen, equal_table, equal_words, write_page
+from studies.frontier.tradeoff import (
+    curve,
+    equal_seconds,
+    mean_points,
+    of_axis,
+    psnr_at,
+    read_points,
+    spread,
+    undominated,
+)
+from studies.quality import measure as measures
+from studies.quality.first_frame import first_frame_key, save_first_frame
+from studies.quality.store import Store
+
+FRAMES = 4
+
+
+@pytest.fixture(scope="module")
+def box_capture(tmp_path_factory):
+    """The box on its plate, moved a little every frame, as a capture with one test camera."""
+    folder = tmp_path_factory.mktemp("captures") / "box"
+    boxes = [make_box()]
+    for _ in range(FRAMES - 1):
+        boxes.append(moved(boxes[-1]))
+    for file, cameras in (("train_meta.json", make_rig().cameras), ("test_meta.json", (held_out_camera(),))):
+        names = [c.name for c in cameras]
+        meta = {
+            "w": cameras[0].width,
+            "h": cameras[0].height,
+            "k": [[c.intrinsics.tolist() for c in cameras]] * FRAMES,
+            "w2c": [[c.world_to_camera.tolist() for c in cameras]] * FRAMES,
+            "fn": [[f"{name}/{t:06d}.png" for name in names] for t in range(FRAMES)],
+            "cam_id": [names] * FRAMES,
+        }
+        folder.mkdir(exist_ok=True)
+        (folder / file).write_text(json.dumps(meta))
+        for t, box in enumerate(boxes):
+            for camera in cameras:
+                for kind, image in zip(("ims", "seg"), photograph(box, camera), strict=True):
+                    (folder / kind / camera.name).mkdir(parents=True, exist_ok=True)
+                    Image.fromarray(image).save(folder / kind / camera.name / f"{t:06d}.png")
+    return folder
+
+
+@pytest.fixture
+def with_frame_0(box_capture, tmp_path):
+    """A study that holds frame 0 of the box, exact, for every setting with the usual frame 0."""
+    file = tmp_path / "first" / f"{first_frame_key(open_capture(box_capture), DEFAULT.settings)}.npz"
+    save_first_frame(file, StaticResult(make_box(), {}, [0.1]), 1.0)
+    return tmp_path
+
+
+def test_every_setting_is_another_and_the_default_comes_first():
+    everything = variants()
+    assert everything[0] == DEFAULT
+    settings = [(v.settings.model_dump_json(), v.whole) for v in everything]
+    assert len(set(settings)) == len(settings)
+    assert {len(v.settings.update.clusters) for v in AXES["layers"]} == {1, 2, 4, 5}  # the default has three
+    assert [v.settings.update.clusters[0] for v in AXES["clusters"]] == [16, 32, 48]
+    assert [(v.settings.update.iterations, v.settings.update.views) for v in (DEFAULT, *AXES["views"])] == [
+        (100, 1), (100, 2), (100, 4), (50, 2),
+    ]  # fmt: skip
+    assert [(v.settings.update.covariance, v.settings.update.own_start) for v in (DEFAULT, *AXES["covariance"])] == [
+        ("entangled", 0.4), ("separate", 0.0),
+    ]  # fmt: skip
+    seeds = AXES["seeds"]
+    assert {(v.settings.static.seed, v.settings.update.seed) for v in seeds} == {(0, 1), (0, 2)}
+    assert variants(["iterations"], most_iterations=25)[0] == DEFAULT
+    assert max(v.iterations for v in variants(["iterations"], most_iterations=25)[1:]) == 25
+    with pytest.raises(ValueError, match="axis 'layer' is unknown; choose of iterations"):
+        variants(["layer"])
+
+
+def test_only_what_is_missing_is_measured_the_cheapest_first(tmp_path, monkeypatch):
+    (tmp_path / "robot").mkdir()
+    store = Store(tmp_path / "out")
+    there = Variant("scas4d 25", "scas4d", 25)
+    row = made_row(there, "robot", 5)
+    del row["settings"]["static"]["stop_gain"]  # came later
+    del row["settings"]["update"]["views"], row["settings"]["update"]["covariance"]
+    store.put(row)
+    store.put(made_row(Variant("scas4d 10", "scas4d", 10), "robot", 3))  # other updates
+    store.put(made_row(Variant("scas4d 50", "scas4d", 50), "robot", 5) | {"error": "killed"})
+    asked = []
+    monkeypatch.setattr(frontier, "run_jobs", lambda jobs, out, report: asked.extend(jobs) or [])
+    lines: list[str] = []
+    measure_frontier(
+        [tmp_path / "robot"], tmp_path / "out", ["iterations"], updates=5, most_iterations=100, report=lines.append
+    )
+    done = [(job.preset, job.settings.update.iterations, job.frames) for job in asked]
+    assert done == [
+        ("scas4d", 10, 6),
+        ("dynamic3dgs", 10, 6),
+        ("dynamic3dgs", 25, 6),
+        ("scas4d", 50, 6),
+        ("dynamic3dgs", 50, 6),
+        ("scas4d", 100, 6),
+        ("dynamic3dgs", 100, 6),
+    ]
+    assert lines == ["8 rows, 1 of them measured already"]
+
+
+def test_a_whole_capture_is_another_row_than_its_first_updates():
+    whole = next(v for v in AXES["drift"] if v.label == DEFAULT.label)
+    rows = [made_row(DEFAULT, "robot", 5), made_row(whole, "robot", 5)]
+    assert row_of(rows, whole, "robot", 5) is rows[1]
+    assert row_of(rows, DEFAULT, "robot", 5) is rows[0]
+    assert row_of(rows, DEFAULT, "robot", 9) is None
+    assert row_of(rows, DEFAULT, "wheel", 5) is None
+
+
+def test_dominated_is_what_is_no_faster_and_no_better(tmp_path):
+    made_study(tmp_path, ("robot",), axes=("iterations", "clusters"))
+    points = read_points(tmp_path, ["robot"], 5)
+    best = undominated(points)
+    assert [p.variant.label for p in best][:3] == ["dynamic3dgs 10", "scas4d 10", "scas4d 25"]
+    for point in points:
+        beaten = any(q.seconds <= point.seconds and q.psnr > point.psnr for q in points)
+        assert beaten == (point not in best)
+
+
+def test_at_equal_seconds_the_curve_is_read_between_its_points(tmp_path):
+    made_study(tmp_path, ("robot", "wheel"), axes=("iterations",))
+    points = read_points(tmp_path, ["robot", "wheel"], 5)
+    ours = curve(points, "scas4d", "robot")
+    at_75 = psnr_at(ours, np.sqrt(0.5 * 1.0))  # half way in the logarithm from 50 to 100 iterations
+    assert at_75 == pytest.approx((made_psnr(Variant("", "scas4d", 50)) + made_psnr(DEFAULT)) / 2)
+    assert psnr_at(ours, 0.05) is None
+    compared = equal_seconds(points, ["robot", "wheel"])
+    assert [one.iterations for one in compared] == [25, 50, 100, 200, 300] * 2
+    at_100 = next(one for one in compared if one.iterations == 100)
+    assert at_100.seconds == pytest.approx(0.5)  # as long as 50 of ours
+    assert at_100.lead == pytest.approx(
+        made_psnr(Variant("", "scas4d", 50)) - made_psnr(Variant("", "dynamic3dgs", 100))
+    )
+    assert equal_words(compared).startswith("`scas4d` is ahead at 10 of 10 budgets; the smallest lead is +3.08 dB.")
+    assert equal_table(compared).splitlines()[2].startswith("| robot | +")
+    behind = [frontier_lead(one, -1.0) for one in compared[:1]] + compared[1:]
+    assert "ahead at 9 of 10 budgets; the smallest lead is -1.00 dB" in equal_words(behind)
+
+
+def frontier_lead(one, lead):
+    return type(one)(one.capture, one.iterations, one.seconds, one.baseline_psnr + lead, one.baseline_psnr)
+
+
+def test_seconds_are_those_measured_in_turns_where_there_are_any(tmp_path):
+    made_study(tmp_path, ("robot", "wheel"), axes=("iterations",))
+    entry = {
+        "settings": Variant("", seed=7).settings.model_dump(mode="json"),  # seeds do not change the time
+        "seconds": 0.125,
+        "cpu_seconds": 0.25,
+        "stages": {"render": 0.1},
+    }
+    (tmp_path / "timing").mkdir()
+    (tmp_path / "timing" / "robot.json").write_text(json.dumps({"settings": [entry]}))
+    points = read_points(tmp_path, ["robot", "wheel"], 5)
+    timed = {p.capture: p for p in points if p.variant == DEFAULT}
+    assert (timed["robot"].seconds, timed["robot"].cpu_seconds, timed["robot"].timed) == (0.125, 0.25, True)
+    assert (timed["wheel"].seconds, timed["wheel"].timed) == (made_seconds(DEFAULT), False)
+    (beside,) = [p for p in points if p.capture == "robot" and p.variant.label == "scas4d 300"]
+    assert beside.seconds == pytest.approx(3 * 0.125)  # not timed itself: as its row is to the default's
+    assert not beside.timed
+    assert sum(beside.stages.values()) == pytest.approx(beside.seconds / 7)  # as its row's were of its row's seconds
+    (mean,) = [p for p in mean_points(points, ["robot", "wheel"]) if p.variant == DEFAULT]
+    assert mean.seconds == pytest.approx((0.125 + made_seconds(DEFAULT)) / 2)
+    assert mean.cpu_seconds == pytest.approx((0.25 + made_seconds(DEFAULT)) / 2)
+    assert not mean.timed
+    Store(tmp_path).put(made_row(DEFAULT, "wheel", 5, machine={"system": "Linux", "threads": 2}))
+    (on_two,) = [p for p in read_points(tmp_path, ["wheel"], 5) if p.variant == DEFAULT]
+    assert on_two.seconds == pytest.approx(7 * made_seconds(DEFAULT))  # two threads: the wall clock
+
+
+def test_a_mean_needs_the_row_of_every_capture(tmp_path):
+    store = made_study(tmp_path, ("robot",), axes=("iterations", "seeds"))
+    store.put(made_row(DEFAULT, "cloth", 5))
+    points = read_points(tmp_path, ["robot", "cloth"], 5)
+    (mean,) = mean_points(points, ["robot", "cloth"])
+    assert mean.variant == DEFAULT
+    assert mean.scores["parts_ari"] == pytest.approx(0.02 * made_psnr(DEFAULT))  # cloth has no parts
+    assert spread(points, "scas4d", "robot") == (pytest.approx(0.2), 3)
+    assert spread(points, "scas4d", "cloth") is None
+
+
+def test_the_choice_follows_its_rules(tmp_path):
+    made_study(tmp_path, ("robot",), axes=("iterations", "seeds"))
+    found = chosen(read_points(tmp_path, ["robot"], 5))
+    assert {purpose: point.variant.label for purpose, point in found.items()} == {
+        "preview": "scas4d 50",  # loses 2.9 dB, 25 iterations lose 6.3
+        "live show": "scas4d 200",  # gains 1.06 dB over 100 for twice the time, 300 nothing worth it
+        "archive": "scas4d 200",  # 0.094 dB below the best
+    }
+
+
+def test_the_page_has_its_plots_and_tables(tmp_path):
+    made_study(tmp_path / "study", ("robot", "cloth"))
+    (tmp_path / "robot").mkdir()
+    (tmp_path / "cloth").mkdir()
+    curves = [{"label": "scas4d 10", "preset": "scas4d", "iterations": [0, 5, 10], "psnr": [20.0, 24.0, 26.0]}]
+    (tmp_path / "study" / "convergence").mkdir()
+    (tmp_path / "study" / "convergence" / "cloth.json").write_text(
+        json.dumps({"capture": "cloth", "updates": 5, "curves": curves})
+    )
+    page = tmp_path / "docs" / "page.md"
+    command = ["bench", "frontier", str(tmp_path / "robot"), str(tmp_path / "cloth"), "--out", str(tmp_path / "study")]
+    done = CliRunner().invoke(app, [*command, "--only", "page", "--page", str(page)])
+    assert done.exit_code == 0, done.output
+    text = page.read_text()
+    for name in ("frontier", "captures", "convergence", "drift", "stages"):
+        assert f"(page/{name}.png)" in text
+        with Image.open(tmp_path / "docs" / "page" / f"{name}.png") as picture:
+            colours = np.asarray(picture.convert("RGB")).reshape(-1, 3)
+            assert picture.width > 900
+            drawn = (0x88, 0xCC, 0xEE) if name == "stages" else (0, 0x72, 0xB2)  # a stage, or the line of scas4d
+            assert (colours == drawn).all(axis=1).sum() > 500
+    assert "ahead at 10 of 10 budgets" in text
+    for words, label in (("Views per iteration", "50 iterations of 2 views"), ("Covariance", "separate covariance")):
+        table = text.split(f"**{words}**\n\n")[1].split("\n\n")[0]
+        assert f"| {label} |" in table
+        assert "| scas4d 100 |" in table
+    assert f"| scas4d 100 | 1.00 | 1.00 | 1.00 | {made_psnr(DEFAULT):.2f} |" in text
+    assert "`scas4d` robot 0.20, cloth 0.20 (3 seeds)" in text
+    refused = CliRunner().invoke(app, [*command, "--only", "plots"])
+    assert refused.exit_code == 2
+    assert "choose of rows, times, convergence, page" in " ".join(refused.output.replace("│", " ").split())
+
+
+def test_a_page_of_nothing_says_what_to_do(tmp_path):
+    with pytest.raises(ValueError, match="run scripts/bench frontier"):
+        write_page(tmp_path, ["robot"], tmp_path / "page.md")
+
+
+def test_settings_are_timed_in_turns_and_the_first_round_does_not_count(box_capture, tmp_path, monkeypatch):
+    took: list[str] = []
+    now = [0.0]
+
+    class Paced:
+        def __init__(self, label, seconds):
+            self.label, self.seconds = label, seconds
+            self.history = types.SimpleNamespace(gaussians=lambda index: [0] * 7)
+
+        def step(self, frame):
+            took.append(f"{self.label}:{frame.index}")
+            now[0] += self.seconds * (10 if frame.index == 1 else frame.index)
+            return types.SimpleNamespace(seconds={"render": self.seconds})
+
+    short, long = Variant("short", iterations=10), Variant("long", iterations=1000)
+    paces = {short.settings.update.iterations: 1.0, long.settings.update.iterations: 3.0}
+    monkeypatch.setattr(
+        timing,
+        "started",
+        lambda capture, settings, out: Paced(settings.update.iterations, paces[settings.update.iterations]),
+    )
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
+    seeded = Variant("the same", iterations=10, seed=3)
+    row = timing.measure_times(box_capture, [short, long, seeded], tmp_path, rounds=5, report=lambda line: None)
+    assert took == ["10:1", "1000:1", "1000:2", "10:2", "10:3"]
+    assert row["rounds"] == 2  # the capture has no more frames
+    assert row == timing.read_times(tmp_path, "box")
+    one, other = row["settings"]
+    assert (one["seconds_each"], one["seconds"], one["ratio"]) == ([2.0, 3.0], 2.5, 1.0)
+    assert (other["seconds_each"], other["ratio"], other["gaussians"]) == ([6.0], 3.0, 7)
+    assert timing.time_of(row, seeded.settings)["label"] == "short"
+    assert timing.time_of(row, DEFAULT.settings) is None
+    paces[short.settings.update.iterations] = 2.0  # a busier machine
+    alone = timing.measure_times(box_capture, [short], tmp_path, rounds=5, report=lambda line: None)
+    kept = alone["settings"][1]
+    assert (kept["label"], kept["seconds"], kept["ratio"]) == ("long", 12.0, 3.0)
+    assert kept["stages"] == {"render": 6.0}
+    timing.measure_times(box_capture, [long], tmp_path, rounds=5, report=lambda line: None)
+    assert len(timing.read_times(tmp_path, "box")["settings"]) == 1  # nothing to compare by
+    with pytest.raises(ValueError, match="rounds is 0"):
+        timing.measure_times(box_capture, [short], tmp_path, rounds=0)
+
+
+def test_watching_an_update_does_not_change_it(box_capture, with_frame_0):
+    short = Variant("scas4d 12", "scas4d", 12)
+    row = convergence.measure_convergence(
+        box_capture, with_frame_0, updates=2, variants=[short], report=lambda line: None
+    )
+    (drawn,) = row["curves"]
+    assert drawn["iterations"] == [0, 1, 2, 4, 7, 10, 12]
+    assert drawn["psnr"][-1] > drawn["psnr"][0] + 1
+    capture = open_capture(box_capture)
+    unwatched = timing.started(capture, short.settings, with_frame_0)
+    ends = []
+    for index in (1, 2):
+        unwatched.step(capture.frame(index))
+        ends.append(measures.measure_pictures(unwatched, capture, index)[0]["psnr"])
+    assert drawn["psnr"][-1] == pytest.approx(np.mean(ends), abs=1e-9)
+    assert row == convergence.read_convergence(with_frame_0, "box")
+
+
+def test_flicker_is_told_of_pixels_that_show_something_and_stand(monkeypatch):
+    rng = np.random.default_rng(0)
+    true = np.zeros((4, 60, 40, 3), np.uint8)
+    true[:, :, :20] = 120
+    true[1::2, :10, :20] = 160  # changes
+    shown = true / 255.0
+    shown[:, 10:, :20] += rng.choice([-4, 4], size=(4, 1, 1, 1)) / 255  # all still pixels up and down alike
+    shown[1:, :, 30:] = 0.5  # where nothing is, nothing counts
+    camera = types.SimpleNamespace(name="a")
+    capture = types.SimpleNamespace(
+        test_rig=types.SimpleNamespace(cameras=[camera]),
+        test_frame=lambda index: types.SimpleNamespace(images={"a": true[index]}),
+    )
+    scene = types.SimpleNamespace(render=lambda camera, index: types.SimpleNamespace(colour=shown[index]))
+    found = measures.measure_flicker(scene, capture, range(4))
+    assert found["still_pixels"] == 50 * 20
+    assert found["flicker"] == pytest.approx((255 * shown[:, 30, 5, 0]).std())
+    monkeypatch.setattr(measures, "FEWEST_STILL", 1001)
+    assert measures.measure_flicker(scene, capture, range(4))["flicker"] is None
+
+
+def test_the_drift_goes_through_whole_captures(tmp_path):
+    made_study(tmp_path, ("robot",), axes=("drift",))
+    drift = of_axis(read_points(tmp_path, ["robot"], 5), "drift", "robot")
+    assert [len(p.psnr_by_frame) for p in drift] == [24] * len(AXES["drift"])

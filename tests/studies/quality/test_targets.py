@@ -1,0 +1,216 @@
+"""The table of bars on rows made here: what is reached, missed, not measured, and over which updates."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from client.cli.main import app
+from studies.quality import runs
+from studies.quality.job import Job
+from studies.quality.runs import CAPTURES, RUNS, measure_runs, measured_runs
+from studies.quality.store import Store
+from studies.quality.targets import BARS, KERNELS, Bar, bar_table, count_words, judge, left_out, page, read_study
+
+
+def made_row(name: str, capture: str, psnr: list[float], **more: object) -> dict:
+    """A row as the study leaves it, with a PSNR for every frame."""
+    run = RUNS[name]
+    updates = psnr[1:]
+    return {
+        "key": f"{capture}-{name}-{len(psnr)}",
+        "variant": name,
+        "capture": capture,
+        "preset": run.preset,
+        "iterations": run.iterations,
+        "settings": run.settings(capture).model_dump(mode="json"),
+        "given": {"frames": len(psnr), "masks": run.masks, "points": run.points},
+        "capture_frames": 5,
+        "updates": len(updates),
+        "psnr_first": psnr[0],
+        "psnr_by_frame": psnr,
+        "psnr": sum(updates) / max(len(updates), 1),
+        "measured": "2026-01-02T03:04:05+00:00",
+        "core": "0123abcd",
+        "machine": {"processor": "A Processor", "cores": 2, "threads": 1, "memory_gb": 8.0, "system": "Linux"},
+        "seconds_stages": {"render": 1.0, "cascade": 2.0},
+        "seconds_update": 3.5,
+        **more,
+    }
+
+
+def the_one(verdicts, what: str, capture: str | None = None):
+    (found,) = [v for v in verdicts if v.bar.what == what and capture in (None, v.capture)]
+    return found
+
+
+def test_a_bar_is_judged_as_measured_not_as_rounded():
+    rows = {("scas4d", "robot"): made_row("scas4d", "robot", [36.0, 30.999, 30.9999])}
+    frame_0, updates = judge(rows, [BARS[0], Bar("updates", "scas4d", "psnr", ("robot",), "≥", 31.0)])
+    assert frame_0.reached is True
+    assert frame_0.updates == "frame 0"
+    assert updates.reached is False
+    assert updates.updates == "2 of 4"
+    text = bar_table([frame_0, updates]).splitlines()
+    assert text[2] == "| frame 0, test cameras | robot | ≥ 36.00 dB | 36.00 | reached | frame 0 |"
+    assert text[3] == "| updates | robot | ≥ 31.00 dB | 31.00 | **missed** | 2 of 4 |"
+
+
+def test_a_difference_is_over_the_updates_that_both_have():
+    bar = Bar("ahead", "scas4d", "psnr", ("robot",), ">", 0.0, over=("dynamic3dgs-2000",))
+    rows = {
+        ("scas4d", "robot"): made_row("scas4d", "robot", [36.0, 30.0, 31.0, 20.0, 20.0]),
+        ("dynamic3dgs-2000", "robot"): made_row("dynamic3dgs-2000", "robot", [36.0, 29.0, 29.0]),
+    }
+    (verdict,) = judge(rows, [bar])
+    assert verdict.value == pytest.approx(1.5)  # over all updates it would be behind
+    assert verdict.reached is True
+    assert verdict.updates == "2 of 4"
+    assert "| +1.50 (30.50 against 29.00) | reached | 2 of 4 |" in bar_table([verdict])
+
+
+def test_it_is_the_best_of_the_others_that_counts_and_all_must_be_there():
+    bar = the_one(judge({}), "three layers over the best single one (64, 320, 1280)", "cloth").bar
+    rows = {("scas4d", "cloth"): made_row("scas4d", "cloth", [30.0, 29.0])}
+    for name, psnr in (("clusters-64", 27.0), ("clusters-320", 29.5), ("clusters-1280", 28.0)):
+        verdict = next(v for v in judge(rows, [bar]) if v.capture == "cloth")
+        assert (verdict.value, verdict.word) == (None, "not measured")
+        rows[name, "cloth"] = made_row(name, "cloth", [30.0, psnr])
+    verdict = next(v for v in judge(rows, [bar]) if v.capture == "cloth")
+    assert verdict.value == pytest.approx(-0.5)
+    assert verdict.reached is False
+
+
+def test_a_mean_needs_every_capture_and_weighs_them_alike():
+    bar = Bar("mean", "scas4d", "psnr", ("robot", "wheel"), "≥", 30.5, mean=True)
+    rows = {("scas4d", "robot"): made_row("scas4d", "robot", [36.0, 33.0, 33.0, 33.0])}
+    assert judge(rows, [bar])[0].word == "not measured"
+    rows["scas4d", "wheel"] = made_row("scas4d", "wheel", [34.0, 28.0])
+    (verdict,) = judge(rows, [bar])
+    assert verdict.capture == "mean of robot, wheel"
+    assert verdict.value == pytest.approx(30.5)
+    assert verdict.reached is True
+    assert verdict.updates == "3 of 4, 1 of 4"
+
+
+def test_losses_are_against_frame_0_of_the_same_row():
+    row = made_row("scas4d", "basketball", [29.0, 28.9, 28.2, 28.6], psnr_changed=21.5)
+    verdicts = judge({("scas4d", "basketball"): row})
+    mean = the_one(verdicts, "mean loss of the updates against frame 0")
+    worst = the_one(verdicts, "worst loss of an update against frame 0")
+    assert mean.value == pytest.approx(29.0 - (28.9 + 28.2 + 28.6) / 3)
+    assert worst.value == pytest.approx(0.8)
+    assert mean.reached
+    assert worst.reached
+    reported = the_one(verdicts, "pixels that changed since frame 0")
+    assert (reported.value, reported.reached, reported.word) == (21.5, None, "")
+
+
+def test_frame_0_alone_says_nothing_of_updates():
+    rows = {("scas4d", "robot"): made_row("scas4d", "robot", [36.5])}
+    verdicts = judge(rows)
+    assert the_one(verdicts, "frame 0, test cameras", "robot").reached is True
+    assert the_one(verdicts, "updates", "robot").word == "not measured"
+    assert the_one(verdicts, "3D tracks, median error", "robot").word == "not measured"
+
+
+def test_every_bar_names_a_run_that_is_made():
+    for bar in BARS:
+        for name in (bar.run, *bar.over):
+            assert name == KERNELS or set(bar.captures) <= set(RUNS[name].captures)
+        assert (bar.threshold is None) == (bar.sense == "")
+
+
+def test_only_rows_of_todays_settings_count_and_the_longest_of_them(tmp_path):
+    store = Store(tmp_path)
+    store.put(made_row("scas4d", "robot", [36.0, 30.0]))
+    store.put(made_row("scas4d", "robot", [36.0, 31.0, 31.0]))
+    other = made_row("scas4d", "robot", [36.0, 40.0, 40.0, 40.0])
+    other["settings"]["update"]["warm_start"] = 0.123
+    store.put(other)
+    unmasked = made_row("scas4d", "wheel", [36.0, 40.0])
+    unmasked["given"]["masks"] = False
+    store.put(unmasked)
+    store.put(made_row("scas4d", "cloth", [36.0, 40.0]) | {"error": "out of memory"})
+    first_alone = made_row("robot-unaided", "robot", [35.5])
+    first_alone["settings"]["update"]["warm_start"] = 0.123
+    store.put(first_alone)
+    found = measured_runs(store)
+    assert {place: row["psnr"] for place, row in found.items()} == {
+        ("scas4d", "robot"): 31.0,
+        ("robot-unaided", "robot"): 0,
+    }
+    assert left_out(tmp_path, found) == 3
+
+
+def test_a_setting_that_came_later_makes_no_row_stale(tmp_path):
+    row = made_row("scas4d", "robot", [36.0, 30.0])
+    del row["settings"]["static"]["stop_gain"]
+    Store(tmp_path).put(row)
+    assert ("scas4d", "robot") in measured_runs(Store(tmp_path))
+    row["settings"]["static"]["stop_gain"] = 0.01
+    Store(tmp_path).put(row)
+    assert not measured_runs(Store(tmp_path))
+
+
+def test_runs_differ_in_what_they_say_they_do(tmp_path):
+    jobs = {name: run.job(tmp_path / "robot") for name, run in RUNS.items() if "robot" in run.captures}
+    assert len({job.key for job in jobs.values()}) == len(jobs)
+    assert jobs["clusters-320"].settings.update.clusters == (320,)
+    assert jobs["dynamic3dgs-2000"].settings.update.iterations == 2000
+    assert jobs["robot-unaided"].frames == 1
+    assert not jobs["robot-unaided"].points
+    assert RUNS["scas4d"].job(tmp_path / "robot", 3).frames == 3
+    assert RUNS["robot-unaided"].job(tmp_path / "robot", 3).frames == 1
+    assert jobs["other-map"].settings.update.cluster_map != jobs["scas4d"].settings.update.cluster_map
+
+
+def test_the_runs_are_measured_where_captures_are(tmp_path, monkeypatch):
+    (tmp_path / "robot").mkdir()
+    asked: list[Job] = []
+    monkeypatch.setattr(runs, "run_jobs", lambda jobs, out, **options: asked.extend(jobs) or [])
+    lines: list[str] = []
+    measure_runs(tmp_path, tmp_path / "out", ["scas4d", "clusters-64"], frames=4, report=lines.append)
+    assert [(job.capture.name, job.settings.update.clusters, job.frames) for job in asked] == [
+        ("robot", (64, 320, 1280), 4),
+        ("robot", (64,), 4),
+    ]
+    assert len(lines) == len(CAPTURES) - 1
+    with pytest.raises(ValueError, match="run 'scas' is unknown"):
+        measure_runs(tmp_path, tmp_path / "out", ["scas"])
+    with pytest.raises(ValueError, match="capture 'robots' has no bars"):
+        measure_runs(tmp_path, tmp_path / "out", only=["robots"])
+    with pytest.raises(ValueError, match="holds none of the captures"):
+        measure_runs(tmp_path, tmp_path / "out", only=["cloth"], report=lines.append)
+
+
+def test_the_command_writes_the_page(tmp_path):
+    study = tmp_path / "study"
+    Store(study).put(made_row("scas4d", "robot", [36.0, 31.5, 31.25], gaussians=20_000))
+    kernels = {
+        "capture": "robot",
+        "ratio_rasterizer": 1.5,
+        "ratio_rasterizer_cloud": 2.5,
+        "ratio_update": 3.25,
+        "peak_mb": 900.0,
+    }
+    (study / "kernels.json").write_text(json.dumps(kernels))
+    done = CliRunner().invoke(app, ["bench", "table", str(study), "--out", str(tmp_path / "docs" / "quality.md")])
+    assert done.exit_code == 0, done.output
+    verdicts = judge(read_study(study))
+    assert sum(v.reached is True for v in verdicts) == 5  # frame 0, Gaussians, updates, rasterizer, memory
+    assert sum(v.reached is False for v in verdicts) == 2
+    assert done.output == bar_table(verdicts) + "\n\n" + count_words(verdicts) + ".\n"
+    text = (tmp_path / "docs" / "quality.md").read_text()
+    assert text == page(read_study(study))
+    assert "- Measured: 2026-01-02." in text
+    assert "- On: A Processor, 2 cores, 1 thread used, 8 GB, Linux." in text
+    assert "| updates | robot | ≥ 31.00 dB | 31.38 | reached | 2 of 4 |" in text
+    assert "| update over its rasterizer passes | robot | ≤ 3.00 × | 3.25 | **missed** | – |" in text
+    assert "| robot | scas4d | 100 | 3.500 | 2.000 | 1.000 |" in text
+
+
+def test_the_table_of_no_study_says_what_to_do(tmp_path):
+    done = CliRunner().invoke(app, ["bench", "table", str(tmp_path / "none")])
+    assert done.exit_code == 2
+    assert "measure first" in done.output

@@ -1,0 +1,72 @@
+"""The fault table, reduced: the whole of it is `scripts/bench faults`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from scas4d_core.captures import open_capture
+from studies.service import faults
+from studies.service import study as of
+from studies.service.strangers import Attack, strangers
+
+ROOT = Path(__file__).parents[3]
+CAPTURE = ROOT / "samples" / "robot"
+SHORT = {
+    "scene": {"image_scale": 0.125},
+    "static": {"iterations": 60, "max_gaussians": 600},
+    "update": {"iterations": 6},
+}
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    capture = open_capture(CAPTURE)
+    fake = {"SCAS4D_ENGINE": "fakes:engine", "PYTHONPATH": f"{ROOT}/tests/helpers:{ROOT}", "FAKE_UPDATE_S": "0.1"}
+    frames = of.encoded_frames(capture, 8)
+    return of.Study(tmp_path_factory.mktemp("faults"), capture, frames, {}, fake)
+
+
+@pytest.fixture(scope="module")
+def expected(study):
+    return of.undisturbed(study)
+
+
+def test_states_of_the_fake_depend_on_every_frame(expected):
+    assert len(set(expected[0].values())) == 8
+
+
+def test_kills(study, expected):
+    outcome = faults.kills(study, *expected, count=4, seed=1, told=lambda said: None)
+    assert outcome.faults == []
+
+
+def test_cuts_and_flipped_bytes(study, expected):
+    outcome = faults.damaged_log(study, expected[0], cuts=1, flips=2, seed=0, told=lambda said: None)
+    assert outcome.faults == []
+
+
+def test_a_full_disk(study, expected):
+    assert faults.full_disk(study, expected[0], told=lambda said: None).faults == []
+
+
+def test_strangers(study):
+    attack = Attack(header=5_000_000, halves=40, uploads=40)  # tests/server/http has it in full
+    found = strangers(study, attack, turns=1, seconds=1, token=False, told=lambda said: None)
+    # Times of a busy machine are not judged here.
+    assert not [fault for fault in found.faults if "p99" not in fault and "times" not in fault]
+
+
+def test_kills_with_the_method_itself(tmp_path):
+    capture = open_capture(CAPTURE)
+    study = of.Study(tmp_path, capture, of.encoded_frames(capture, 4), SHORT, {})
+    expected, seconds = of.undisturbed(study)
+    assert faults.kills(study, expected, seconds, count=2, seed=3, told=lambda said: None).faults == []
+
+
+def test_a_lost_frame_and_another_state_are_noticed():
+    assert of.compare({0: "a", 1: "b"}, {0: "a", 1: "c", 2: "d"}) == [
+        "frames [2] are not committed",
+        "states [1] are not bit-identical",
+    ]
