@@ -1,0 +1,141 @@
+"""Files of the three packages that one frame crosses between PUT and commit, and one render between request and answer.
+
+Both bound how much a reader has to open to follow a frame. A file counts when a function of it runs, in whatever
+process; `__init__` files and the kernels are left aside. The service runs as usual, with a profiler in each process.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from client.sdk import Client
+from client.wire import FrameState
+from scas4d_core.captures import Capture, open_capture
+from studies.service.process import Service
+
+PACKAGES = ("scas4d_core", "server", "client")
+MOST_OF_A_FRAME, MOST_OF_A_RENDER = 45, 18
+LATER = 3
+"""The frame that is followed: frame 0 and the first updates have work of their own."""
+SETTINGS = {
+    "scene": {"image_scale": 0.25},
+    "static": {"iterations": 300, "max_gaussians": 2500},
+    "update": {"iterations": 20},
+}
+POLL_S = 0.05
+SETTLE_S = 1.0
+"""After the commit or the answer, for what a process still does about it; before, for what it did."""
+
+PROFILER = """
+import os, sys, threading, time
+folder, codes = os.environ["CROSSING_FOLDER"], set()
+def profile(frame, event, argument):
+    if event == "call":
+        codes.add(frame.f_code)
+def follow():
+    phase = ""
+    while True:
+        time.sleep(0.02)
+        try:
+            with open(os.path.join(folder, "phase")) as file:
+                now = file.read()
+        except OSError:
+            continue
+        if now != phase:
+            if phase:
+                with open(os.path.join(folder, phase + "." + str(os.getpid())), "w") as file:
+                    file.write("\\n".join({code.co_filename for code in list(codes)}))
+            codes.clear()
+            phase = now
+threading.Thread(target=follow, daemon=True).start()
+threading.setprofile(profile)
+sys.setprofile(profile)
+"""
+"""`sitecustomize.py` of the service's processes: keeps the code that was called, by phase."""
+
+
+def crossed(folder: Path, capture: Capture) -> dict[str, list[str]]:
+    """Paths from the checkout's root, sorted, of the files that a later "frame" crosses, and a "render".
+
+    Args:
+        folder: for the service's data; made when missing.
+        capture: has at least four frames and a test camera.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "sitecustomize.py").write_text(PROFILER)
+    root = Path(__file__).parents[2]
+    path = os.pathsep.join((str(folder), str(root)))
+    environment = {"PYTHONPATH": path, "CROSSING_FOLDER": str(folder), "SCAS4D_SCRUB_MB_PER_SECOND": "0"}
+    assert capture.test_rig is not None
+    camera = capture.test_rig.cameras[0]
+    service = Service(folder / "data", environment)
+    service.start()
+    try:
+        with Client(f"http://127.0.0.1:{service.port}", patience=60) as client:
+            scene = client.create_scene(capture.rig, settings=SETTINGS).id
+            assert capture.points is not None
+            client.put_points(scene, capture.points)
+
+            def put(index: int) -> None:
+                images = {name: capture.encoded(index, name) for name in capture.rig.names}
+                masks = {name: capture.encoded_mask(index, name) for name in capture.rig.names}
+                client.put_frame(scene, index, images, {name: mask for name, mask in masks.items() if mask})
+
+            for index in range(LATER):
+                put(index)
+            client.wait(scene, LATER - 1)
+            client.render(scene, camera, LATER - 1)
+            state = folder / "data" / "scenes" / scene / "states" / f"frame_{LATER:06d}.npz"
+            with _phase(folder, "frame"):
+                put(LATER)
+                _until(state.exists)  # asking the service would cross other files
+            assert client.frame(scene, LATER).state is FrameState.COMMITTED
+            with _phase(folder, "render"):
+                client.render(scene, camera, LATER)
+    finally:
+        service.stop()
+    return {phase: sorted(set(_files(folder, phase, root))) for phase in ("frame", "render")}
+
+
+@contextmanager
+def _phase(folder: Path, name: str) -> Iterator[None]:
+    for text in (name, ""):
+        time.sleep(SETTLE_S)
+        (folder / "phase").write_text(text)
+        time.sleep(SETTLE_S)
+        if text:
+            yield
+
+
+def _until(holds: Callable[[], bool], seconds: float = 120.0) -> None:
+    until = time.monotonic() + seconds
+    while not holds():
+        if time.monotonic() > until:
+            raise TimeoutError(f"the frame was not committed within {seconds:g} s")
+        time.sleep(POLL_S)
+
+
+def _files(folder: Path, phase: str, root: Path) -> Iterator[str]:
+    for found in folder.glob(f"{phase}.*"):
+        for name in found.read_text().splitlines():
+            path = Path(name)
+            if path.is_relative_to(root):
+                inside = path.relative_to(root)
+                if inside.parts[0] in PACKAGES and path.name != "__init__.py" and "kernels" not in inside.parts:
+                    yield inside.as_posix()
+
+
+def run(sample: Path, told: Callable[[str], None] = print) -> bool:
+    """Prints both lists; answers whether both are short enough."""
+    with tempfile.TemporaryDirectory(prefix="scas4d-crossing-") as folder:
+        files = crossed(Path(folder), open_capture(sample))
+    for phase, most in (("frame", MOST_OF_A_FRAME), ("render", MOST_OF_A_RENDER)):
+        told(f"a {phase} crosses {len(files[phase])} files (at most {most}):")
+        for name in files[phase]:
+            told(f"  {name}")
+    return len(files["frame"]) <= MOST_OF_A_FRAME and len(files["render"]) <= MOST_OF_A_RENDER

@@ -1,0 +1,33 @@
+"""The way of a frame and of a render is short: a reader who follows one opens few files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from scas4d_core.captures import open_capture
+from studies.service.crossing import MOST_OF_A_FRAME, MOST_OF_A_RENDER, crossed
+
+SAMPLE = Path(__file__).parents[3] / "samples" / "robot"
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    return crossed(tmp_path_factory.mktemp("crossing"), open_capture(SAMPLE))
+
+
+@pytest.mark.xfail(strict=True, reason="files that always go together are still to be merged")
+def test_a_later_frame_crosses_few_files(files):
+    assert len(files["frame"]) <= MOST_OF_A_FRAME, files["frame"]
+
+
+@pytest.mark.xfail(strict=True, reason="files that always go together are still to be merged")
+def test_a_render_crosses_few_files(files):
+    assert len(files["render"]) <= MOST_OF_A_RENDER, files["render"]
+
+
+def test_the_files_are_those_that_run(files):
+    assert {"server/routes/frames.py", "scas4d_core/reconstruction.py"} <= set(files["frame"])
+    assert {"server/routes/render.py", "scas4d_core/rasterize/cpu.py"} <= set(files["render"])
+    assert not [name for names in files.values() for name in names if not (SAMPLE.parents[1] / name).is_file()]
