@@ -235,8 +235,8 @@ scripts/bench table out/quality --out docs/quality.md
 - Code: {f"{len(cores)} state(s) of the core's sources ({', '.join(cores)})" if cores else "–"}.
 
 An iteration is one forward and backward render of one training view. Figures are means over updates and test cameras;
-"updates" is the number of updates measured. A difference is taken over the updates that both sides have. Definitions of the
-metrics: `scas4d_core/metrics/` and `studies/quality/measure.py`.
+"updates" is the number of updates measured. A difference is taken over the updates that both sides have. Definitions
+of the metrics: `scas4d_core/metrics/` and `studies/quality/measure.py`.
 
 ## Targets
 
