@@ -218,7 +218,8 @@ def page(rows: Rows) -> str:
     days = sorted({str(row["measured"])[:10] for row in known if "measured" in row})
     machines = sorted({in_words(row["machine"]) for row in known if "machine" in row})
     cores = sorted({str(row["core"]) for row in known if "core" in row})
-    behind = [rows[run, capture] for run in RUNS for capture in RUNS[run].captures if (run, capture) in rows]
+    runs = [(name, run) for name, run in RUNS.items() if not run.changes]
+    behind = [rows[name, capture] for name, run in runs for capture in run.captures if (name, capture) in rows]
     return f"""# Quality
 
 Pictures, tracks and parts on the test cameras and ground truth of the captures, against targets. These commands measure
@@ -246,6 +247,8 @@ of the metrics: `scas4d_core/metrics/` and `studies/quality/measure.py`.
 
 ## Rows
 
+Runs with changed settings (single layers, the other cluster map) are in the table above only.
+
 {_behind(behind)}
 """
 
@@ -253,7 +256,7 @@ of the metrics: `scas4d_core/metrics/` and `studies/quality/measure.py`.
 def _behind(rows: Sequence[Row]) -> str:
     if not rows:
         return "None yet."
-    stages = stage_table([row for row in rows if row["preset"] == "scas4d" and not row.get("changes")])
+    stages = stage_table([row for row in rows if row["preset"] == "scas4d"])
     return markdown(rows) + (f"\n\nMedian seconds of an update of `scas4d` by stage:\n\n{stages}" if stages else "")
 
 
