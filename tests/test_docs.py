@@ -1,4 +1,4 @@
-"""Links, anchors and names of files in the README and in docs/."""
+"""Links, anchors, files and studies that the README and docs/ name."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import re
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
+
+from studies.commands import app
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -38,3 +41,10 @@ def test_links_resolve(page: Path) -> None:
 def test_named_files_exist(page: Path) -> None:
     missing = [name for name in FILE.findall(page.read_text()) if not (ROOT / name).exists()]
     assert not missing, f"{page.name} names files that do not exist: {', '.join(missing)}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_named_studies_exist(page: Path) -> None:
+    known = get_command(app).list_commands(None)
+    unknown = set(re.findall(r"scripts/bench ([a-z]+)", page.read_text())) - {*known}
+    assert not unknown, f"{page.name} names studies that do not exist: {', '.join(unknown)}"
