@@ -1,7 +1,7 @@
 # docker build -f docker/cuda.Dockerfile -t scas4d-cuda .
-# The devel image: gsplat compiles its kernels at first use, with the nvcc of the CUDA that torch was built for. Image and
-# torch are pinned together: torch from PyPI is built for CUDA 13, and would not compile with this nvcc.
-# TORCH_CUDA_ARCH_LIST names the GPU (9.0: H100, 8.9: L4).
+# The devel image contains nvcc, with which gsplat compiles its kernels at first use. The CUDA of torch has to match it:
+# torch from PyPI is built for CUDA 13, so a build for CUDA 12.8 is pinned here.
+# TORCH_CUDA_ARCH_LIST is the architecture of the GPU (9.0: H100, 8.9: L4).
 FROM nvidia/cuda:12.8.1-devel-ubuntu24.04
 RUN apt-get update && apt-get install -y --no-install-recommends python3 python3-dev python3-venv ninja-build \
     && rm -rf /var/lib/apt/lists/*

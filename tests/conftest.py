@@ -16,7 +16,7 @@ for shared in SHARED:
 
 WITHOUT_KERNELS = (
     "tests/core/captures", "tests/client/importers", "tests/core/metrics", "tests/server/connections",
-    "tests/test_imports.py"
+    "tests/test_docs.py", "tests/test_imports.py"
 )  # fmt: skip
 """Tests that run no kernel, in no process: they go on while another process compiles."""
 LONGEST = (

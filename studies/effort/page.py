@@ -41,10 +41,10 @@ def _budgets(rows: Sequence[Row]) -> list[str]:
     lines = [
         "## Budgets in milliseconds",
         "",
-        "A capture played back and forth under each budget, `scripts/bench effort`: from before a frame's pictures are",
-        "decoded to the end of its commit, synced on disk; the first two frames teach the scene's speed and are not",
-        f"counted. Allowed is the larger of {100 * TOLERANCE:.0f} % of the budget and one iteration; "
-        f"{100 * KEPT:.0f} % of the frames have to keep it.",
+        "A capture played back and forth under each budget (`scripts/bench effort`), timed from before the decoding to",
+        "the end of the commit on disk, without the first two frames. The tolerance is the larger of "
+        f"{100 * TOLERANCE:.0f} % of the budget",
+        f"and one iteration; {100 * KEPT:.0f} % of the frames have to keep it.",
         "",
         "| capture | budget ms | within, both ways | not over | median off ms | worst over ms | iterations, median | |",
         "|---|---|---|---|---|---|---|---|",
@@ -64,12 +64,10 @@ def _adaptive(rows: Sequence[Row]) -> list[str]:
     lines = [
         "## Adaptive effort",
         "",
-        "Preset `adaptive` against `scas4d` with 100 iterations for every frame, in turns, frame by frame. *Repeated*: "
-        "every frame",
-        "twice, one four times; *repeats* is the time of a frame that is shown again. *Slowed*: a third of the speed, "
-        "drawn from a",
-        "reconstruction, states in between interpolated; its dB compare with each other only. As it is, a",
-        f"capture is run with {SEEDS} seeds; ± is their standard deviation.",
+        "Preset `adaptive` against `scas4d` with 100 iterations for every frame, in turns. *Repeats*: time of a frame",
+        "that is shown again (every frame twice, one four times). *Slowed*: a third of the speed, rendered from",
+        "interpolated states of a reconstruction. Unchanged captures are run with "
+        f"{SEEDS} seeds; ± is their standard deviation.",
         "",
         "| capture | frames | time | dB | repeats | slowed: time | slowed: dB |",
         "|---|---|---|---|---|---|---|",
@@ -90,8 +88,8 @@ def _adaptive(rows: Sequence[Row]) -> list[str]:
     lines += [
         "",
         f"Mean: {100 * np.mean(times):.0f} % of the time, {np.mean(losses):+.2f} dB; "
-        f"repeats {100 * np.mean(repeats):.0f} %. The bar, at most {100 * TIME:.0f} % of the time at {LOSS_DB:g} dB, "
-        f"and {100 * REPEATS:.0f} % for repeats, is "
+        f"repeats {100 * np.mean(repeats):.0f} %. The target, at most {100 * TIME:.0f} % of the time at "
+        f"{LOSS_DB:g} dB, and {100 * REPEATS:.0f} % for repeats, is "
         f"{'reached on every capture' if ok else '**missed** on some captures'}.",
         "",
     ]
@@ -100,11 +98,11 @@ def _adaptive(rows: Sequence[Row]) -> list[str]:
 
 def _report(rows: Sequence[Row]) -> list[str]:
     lines = [
-        "## What the report costs",
+        "## Cost of the report",
         "",
-        "Stage `report` of an update of `scas4d`: the stage timers, losses that nothing but the curve asks for, colour",
-        "shifts, assembling, writing and publishing the record. *With : without* is the CPU time of the same",
-        "updates with and without what can be left out of the iterations, in turns; median and quartiles.",
+        "Stage `report` of an update of `scas4d`: stage timers, losses for the curve alone, colour shifts, and",
+        "assembling, writing and publishing the report. *With : without* is the CPU time of the same updates with and",
+        "without the optional work in the iterations, in turns; median and quartiles.",
         "",
         "| capture | updates | report ms | report: % of an update | worst update | with : without | |",
         "|---|---|---|---|---|---|---|",
@@ -116,7 +114,7 @@ def _report(rows: Sequence[Row]) -> list[str]:
             f"| {row['capture']} | {row['updates']} | {row['milliseconds']:.1f} | {100 * row['share']:.2f} % "
             f"| {100 * row['share_worst']:.2f} % | {row['ratio']:.3f} ({low:.3f} to {high:.3f}) | {verdict} |"
         )
-    return [*lines, "", f"The bar: at most {100 * BAR:.0f} % of an update.", ""]
+    return [*lines, "", f"The target: at most {100 * BAR:.0f} % of an update.", ""]
 
 
 def _gain(one: Row) -> float:

@@ -196,31 +196,30 @@ def _text(
         for found, base in [_axis_means(points, axis, captures)]
         if found
     )
-    return f"""# What accuracy costs in time
+    return f"""# Accuracy against time
 
 {images["frontier"]}
 
 {_provenance(out, captures)}
 
-An iteration is one forward and backward render of one training view, or of several where a line says so. Each row
-covers the first {updates} updates of a capture, from a frame 0 that all its rows share; accuracy is the mean over these
-updates and the test cameras. Definitions: [quality.md](quality.md), `studies/quality/measure.py`. Seconds are medians
-of one update, pictures decoded and state committed. A setting is dominated where another one is at least as fast and
-more accurate.
+An iteration is one forward and backward render of one training view, or of several where a row says so. Each row
+covers the first {updates} updates of a capture, from the same frame 0; accuracy is the mean over these updates and the
+test cameras. Definitions: [quality.md](quality.md), `studies/quality/measure.py`. Seconds are medians of
+one update, decoding and commit included. A setting is dominated if another one is at least as fast and more accurate.
 
-## What to choose
+## Recommended settings
 
 {_choice(means, default)}
 
-The rules, computed from the rows: a preview takes the fastest setting that loses at most {PREVIEW_LOSS_DB:g} dB against
-the default; a live show goes on to slower ones while each doubling of the time gains {LIVE_GAIN_DB:g} dB; an archive
-takes the fastest within {ARCHIVE_GAIN_DB:g} dB of the best.
+Rules: a preview takes the fastest setting that loses at most {PREVIEW_LOSS_DB:g} dB against the default; a live show
+takes slower ones while each doubling of the time gains {LIVE_GAIN_DB:g} dB; an archive takes the fastest within
+{ARCHIVE_GAIN_DB:g} dB of the best.
 
 ## At equal seconds
 
-The baseline's iterations are the budget: its seconds on each capture, and what `scas4d` reaches in as many, on straight
-lines between its measured numbers of iterations over the logarithm of time. dB that `scas4d` is ahead (its PSNR against
-the baseline's). {equal_words(compared)}
+The budget is the time that the baseline `dynamic3dgs` needs for a number of iterations; the PSNR of `scas4d` in that
+time is interpolated between its measured iterations, linearly over the logarithm of time. Cells: lead of `scas4d` in dB
+(its PSNR : the baseline's). {equal_words(compared)}
 
 {equal_table(compared)}
 
@@ -245,14 +244,14 @@ Around the default, 100 iterations of `scas4d`.
         _picture(
             images,
             "convergence",
-            "The test cameras' PSNR within an update. Rates fall, and layers begin, by shares of the "
-            "iterations asked for: a curve does not run through the ends of shorter ones.",
+            "The test cameras' PSNR within an update. Rates and layers follow shares of the iterations, so a curve "
+            "does not pass through the ends of shorter ones.",
         )
     }
 
-{_picture(images, "drift", "Through a whole capture: what one update leaves wrong, the next starts from.")}
+{_picture(images, "drift", "PSNR over a whole capture: errors of an update remain in the next.")}
 
-{_picture(images, "stages", "Where the time of a frame goes.")}
+{_picture(images, "stages", "Time of a frame by stage.")}
 
 ## How it was measured
 
@@ -260,9 +259,9 @@ Around the default, 100 iterations of `scas4d`.
 scripts/bench frontier {" ".join(f"CAPTURES/{name}" for name in captures)} --page docs/{stem}.md
 ```
 
-Accuracy does not depend on what else a machine does; seconds do. They come from a pass of their own in which all
-settings take turns (`--only times`) where it was made, and are CPU seconds of rows on one thread otherwise. A budget of
-Gaussians has a frame 0 of its own, and only "through a whole capture" covers more than the first updates.
+Seconds come from a separate pass in which all settings take turns (`--only times`), or else are CPU seconds of rows on
+one thread. Each budget of Gaussians has its own frame 0, and only the plot over a whole capture covers more than the
+first updates.
 """
 
 

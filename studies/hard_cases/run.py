@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from scas4d_core.guards import CONVENTIONS, GUARDS, OBSERVED, Guard, summed
+from scas4d_core.guards import CONVENTIONS, GUARDS, OBSERVED, Guard
 from studies.hard_cases import cluster_map, geometry, scenes, steps
 from studies.hard_cases.case import CPU, CUDA, REFERENCE, TORCH, HardCase
 from studies.machine import in_words as in_words_of
@@ -109,7 +109,7 @@ def in_words(guards: dict[str, int]) -> str:
 
 
 def catalogue_table(lines: Sequence[Line]) -> str:
-    """One row a case: what is hard, where it is from, its sizes, what acted, and whether it holds."""
+    """One row a case: what is hard, its source, its sizes, and those that do not hold."""
     by_case: dict[str, list[Line]] = {}
     for line in lines:
         by_case.setdefault(line.case, []).append(line)
@@ -118,19 +118,16 @@ def catalogue_table(lines: Sequence[Line]) -> str:
         text += [
             f"### {title}",
             "",
-            "| case | what | from | sizes | on | guards that acted | holds |",
-            "|" + "---|" * 7,
+            "| case | what | from | sizes |",
+            "|" + "---|" * 4,
         ]
         for case in cases:
             found = by_case.get(case.name, [])
             if not found:
                 continue
             failed = [line.size for line in found if line.violations]
-            on = ", ".join(dict.fromkeys(name for line in found for name in line.backends))
-            acted = in_words(summed(line.guards for line in found))
-            verdict = "yes" if not failed else f"**no**: {', '.join(failed)}"
-            sizes = ", ".join(line.size for line in found)
-            text.append(f"| {case.name} | {case.what} | {case.source} | {sizes} | {on} | {acted} | {verdict} |")
+            sizes = ", ".join(line.size for line in found) + (f"; **fails**: {', '.join(failed)}" if failed else "")
+            text.append(f"| {case.name} | {case.what} | {case.source} | {sizes} |")
         text.append("")
     return "\n".join(text)
 
@@ -149,37 +146,37 @@ def guards_table(guards: Iterable[Guard], failing: dict[str, list[str]] | None =
 
 
 def page(lines: Sequence[Line], failing: dict[str, list[str]] | None, on: str, date: str) -> str:
-    """The generated part of docs/stability.md."""
+    """The generated part of docs/hard-cases.md."""
     count, failed = len({line.case for line in lines}), sum(bool(line.violations) for line in lines)
     observed = "\n".join(f"- `{name}`: {words}" for name, words in OBSERVED.items())
     tried = "" if failing is None else (
-        f"`scripts/bench stability --mutate` took each guard and each convention away, in a copy of the sources, and "
-        f"ran the catalogue: {sum(bool(cases) for cases in failing.values())} of {len(failing)} make a case fail."
+        f"`scripts/bench stability --mutate` removed each guard and each convention in turn, in a copy of the sources, "
+        f"and ran the catalogue: {sum(bool(cases) for cases in failing.values())} of {len(failing)} removals make a "
+        f"case fail."
     )  # fmt: skip
     return f"""{BEGIN}
 
-Written by `scripts/bench stability --out docs/stability.md` on {date} ({on}).
+Written by `scripts/bench stability --out docs/hard-cases.md` on {date} ({on}).
 
 ## The catalogue
 
-{count} cases, {len(lines)} with their sizes; {failed} do not hold. "float64" are the torch twins, "cpu" the kernels,
-"torch float32" the twins in the arithmetic of the CUDA path.
+{count} cases, {len(lines)} with their sizes; {failed} do not hold.
+Each runs on every backend that has its stage: the kernels, and the torch twins in float64 and float32.
 
 {catalogue_table(lines)}
 ## Guards
 
-Each is counted; the counts come with `CpuRasterizer.guards`, `CpuDeformation.guards`, the result of `adam` and of
-`activate`, and `Hierarchy.left_out`. {tried}
+A guard is counted each time it acts; `guards` of a frame's report has the counts. {tried}
 
 {guards_table(GUARDS.values(), failing)}
 
-Counted beside them, though nothing is held there:
+Also counted, without a change of the result:
 
 {observed}
 
 ## Conventions
 
-Part of what is computed, acting all the time: not counted, for the reason in the sixth column.
+Conventions are part of the equations and act all the time; the sixth column says why they are not counted.
 
 {guards_table(CONVENTIONS.values(), failing, "why not counted")}
 

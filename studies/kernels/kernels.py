@@ -237,14 +237,14 @@ def table(row: Row) -> str:
         line("update over passes", row["ratio_update_spread"], "×", "ratio_update"),
         line("peak memory of the run", {"median": row["peak_mb"]}, "MB", "peak_mb", 0),
     ]
-    return "\n".join(["| | median | smallest | unit | must be | |", "|---|---|---|---|---|---|", *lines])
+    return "\n".join(["| | median | smallest | unit | target | |", "|---|---|---|---|---|---|", *lines])
 
 
 def page(row: Row) -> str:
     """The page of the documentation: command, machine, date, table, and what it was measured on."""
     stages = sorted(row["seconds_stages"].items(), key=lambda item: -item[1])
     lines = "\n".join(f"| {name} | {seconds:.3f} |" for name, seconds in stages)
-    return f"""# What the kernels cost
+    return f"""# Cost of the kernels
 
 Written by `scripts/bench kernels CAPTURES/{row["capture"]} --out docs/kernels.md` on {row["measured"][:10]}
 ({in_words(row["machine"])}; sources of the core {row["core"]}).
@@ -255,16 +255,16 @@ Written by `scripts/bench kernels CAPTURES/{row["capture"]} --out docs/kernels.m
   finished. Pairs are counted one by one (`studies/kernels/pairs.py`).
 - Frame 0: {_scene_words(row["frame_0"])}.
 - Cloud: {_scene_words(row["cloud"])}.
-- The rasterizer's time is all of it: projection, depth order, tile lists, blending, and the backward of these. It works
-  in blocks of 4×4 pixels; "places" are the pixels of the blocks that a support meets, pairs or not: "by place" is how
-  far the rasterizer is from the arithmetic of the blocks that it has to compute.
-- "The same arithmetic alone" does the exp and the multiply-adds of as many pairs, forward and backward with four
+- The rasterizer's time covers projection, depth order, tile lists, blending, and the backward of these. It works in
+  blocks of 4×4 pixels; "places" are all pixels of the blocks that a support meets: "by place" compares with the
+  arithmetic of these blocks.
+- "The same arithmetic alone" computes the exp and the multiply-adds of as many pairs, forward and backward with four
   channels, in the same blocks, on Gaussians that cover them wholly and stay in cache. Both ran in turn; the ratio
   is the median of the ratios.
-- With one thread, times of the rasterizer and of its arithmetic are the process's own, with more they are of the clock.
-- How the rasterizer came to this, and what was tried without gain: [rasterizer.md](rasterizer.md).
+- Times are CPU times with one thread and wall-clock times with more.
+- The algorithm, and alternatives without gain: [rasterizer.md](rasterizer.md).
 - The update is the whole `Reconstruction.step`, decoding and commit included; medians over {row["updates"]} updates.
-  Its passes are its own stages "render" and "render backward".
+  Its passes are its stages "render" and "render backward".
 - Peak memory is that of a fresh process that fits frame 0 and runs {row["frames"] - 1} updates.
 
 Median seconds of an update by stage:

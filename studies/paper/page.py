@@ -45,9 +45,8 @@ def write_paper_page(
     )
     text = f"""# The paper's tables
 
-Each experiment of the paper on the captures at hand. A cell holds our figure and, in brackets, the paper's. The scenes
-share their names and kinds of motion with the paper's, not their pictures: it is differences that can agree, not
-figures.
+The paper's experiments on our captures. A cell holds our figure and, in brackets, the paper's. The scenes share names
+and kinds of motion with the paper's, not pictures: only differences can be compared.
 
 ```
 {_commands(captures, there, page)}
@@ -56,20 +55,20 @@ figures.
 {_provenance(out, captures)} PSNR and the other scores are means over the first {updates} updates of each capture, from
 a frame 0 that all its rows share{_elsewhere(captures, there)}.
 
-## Where the outcome agrees
+## Agreement
 
 {summary([outcome for found in outcomes.values() for outcome in found], outcomes)}
 
-The gain is the first setting's mean less the second's, over the captures that both the paper and we have. It agrees in
-size where the two gains lie within a factor of {FACTOR:g} of each other; gains that are small on both sides
+The gain is the first setting's mean less the second's, over the captures of both. It agrees in size if the two gains
+are within a factor of {FACTOR:g}; gains that are small on both sides
 ({", ".join(f"{name} {value:g}" for name, value in SMALL.items() if name in DIGITS)}) agree as well, and a small gain
-does not agree with one that is not. Where the paper shows a picture only, its claim is the sign.
+does not agree with one that is not. If the paper shows only a picture, the claim is the sign.
 
 {sections}
 
 ## Left out
 
-- LPIPS: its weights are a download that the studies do without.
+- LPIPS: its weights would have to be downloaded.
 - The offline methods of the paper's second table: other programs.
 - Robot-Task and five scenes of Panoptic: no such captures.
 """

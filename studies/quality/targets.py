@@ -176,7 +176,7 @@ def figure_of(bar: Bar, capture: str, rows: Rows) -> Figure | None:
 
 def bar_table(verdicts: Sequence[Verdict]) -> str:
     """A Markdown table of verdicts."""
-    lines = ["| bar | capture | must be | is | | updates |", "|---|---|---|---|---|---|"]
+    lines = ["| figure | capture | target | measured | | updates |", "|---|---|---|---|---|---|"]
     for verdict in verdicts:
         bar = verdict.bar
         must = "–" if bar.threshold is None else f"{bar.sense} {_number(bar, bar.threshold)} {bar.unit}".strip()
@@ -218,12 +218,12 @@ def page(rows: Rows) -> str:
     days = sorted({str(row["measured"])[:10] for row in known if "measured" in row})
     machines = sorted({in_words(row["machine"]) for row in known if "machine" in row})
     cores = sorted({str(row["core"]) for row in known if "core" in row})
-    behind = [rows[run, capture] for run in RUNS for capture in RUNS[run].captures if (run, capture) in rows]
+    runs = [(name, run) for name, run in RUNS.items() if not run.changes]
+    behind = [rows[name, capture] for name, run in runs for capture in run.captures if (name, capture) in rows]
     return f"""# Quality
 
-How good pictures, tracks and parts are on the test cameras and ground truth of the captures, against the bars that the
-method has to reach. Everything below is written by the last of these commands, from rows that the others measured
-(`CAPTURES` is the folder that holds the captures' folders; what was measured is not measured again):
+Pictures, tracks and parts on the test cameras and ground truth of the captures, against targets. These commands measure
+the rows and write the page; rows that are measured already are kept (`CAPTURES` holds the captures' folders):
 
 ```
 scripts/bench bars CAPTURES
@@ -235,17 +235,19 @@ scripts/bench table out/quality --out docs/quality.md
 - On: {"; ".join(machines) if machines else "–"}.
 - Code: {f"{len(cores)} state(s) of the core's sources ({', '.join(cores)})" if cores else "–"}.
 
-An iteration is one forward and backward render of one training view. Figures are means over all updates and test
-cameras; "updates" says how many updates of the capture they cover. A difference is taken over the updates that both
-sides have. The definitions of the metrics are in `scas4d_core/metrics` and `studies/quality/measure.py`.
+An iteration is one forward and backward render of one training view. Figures are means over updates and test cameras;
+"updates" is the number of updates measured. A difference is taken over the updates that both sides have. Definitions
+of the metrics: `scas4d_core/metrics/` and `studies/quality/measure.py`.
 
-## Bars
+## Targets
 
 {count_words(verdicts)}.
 
 {bar_table(verdicts)}
 
 ## Rows
+
+Runs with changed settings (single layers, the other cluster map) are in the table above only.
 
 {_behind(behind)}
 """
@@ -254,8 +256,8 @@ sides have. The definitions of the metrics are in `scas4d_core/metrics` and `stu
 def _behind(rows: Sequence[Row]) -> str:
     if not rows:
         return "None yet."
-    stages = stage_table(rows)
-    return markdown(rows) + (f"\n\nMedian seconds of an update by stage:\n\n{stages}" if stages else "")
+    stages = stage_table([row for row in rows if row["preset"] == "scas4d"])
+    return markdown(rows) + (f"\n\nMedian seconds of an update of `scas4d` by stage:\n\n{stages}" if stages else "")
 
 
 def _value(row: Row, metric: str, updates: int) -> float | None:

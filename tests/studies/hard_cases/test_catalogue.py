@@ -43,7 +43,7 @@ def test_what_does_not_hold_or_raises_is_told() -> None:
     assert broken.violations == ["raised RuntimeError: cannot be made"]
     page = run.page([wrong, broken], {"half_turn": ["w"]}, "a machine", "a day")
     assert "2 do not hold" in page
-    assert "1 of 1 make a case fail" in page
+    assert "1 of 1 removals make a case fail" in page
 
 
 def test_the_page_keeps_what_stands_beside_its_marks(tmp_path: Path) -> None:

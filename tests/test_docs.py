@@ -1,0 +1,50 @@
+"""Links, anchors, files and studies that the README and docs/ name."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+from studies.commands import app
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+FENCE = re.compile(r"^```.*?^```", re.M | re.S)
+FOLDERS = ("client", "docker", "docs", "samples", "scas4d_core", "scripts", "server", "studies", "tests")
+FILE = re.compile(rf"`((?:{'|'.join(FOLDERS)})/[\w./-]*)`")
+
+
+def anchors(page: Path) -> set[str]:
+    """Anchors of a page: of its headings, as GitHub makes them, and explicit ones."""
+    text = FENCE.sub("", page.read_text())
+    headings = re.findall(r"^#+ (.+)$", text, re.M)
+    named = re.findall(r'<a id="([^"]+)">', text)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings} | {*named}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_resolve(page: Path) -> None:
+    for link in LINK.findall(FENCE.sub("", page.read_text())):
+        if "://" in link:
+            continue
+        name, _, anchor = link.partition("#")
+        target = (page.parent / name).resolve() if name else page
+        assert target.exists(), f"{page.name} links to {link}: there is no such file"
+        assert not anchor or anchor in anchors(target), f"{page.name} links to {link}: there is no such heading"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_named_files_exist(page: Path) -> None:
+    missing = [name for name in FILE.findall(page.read_text()) if not (ROOT / name).exists()]
+    assert not missing, f"{page.name} names files that do not exist: {', '.join(missing)}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_named_studies_exist(page: Path) -> None:
+    known = get_command(app).list_commands(None)
+    unknown = set(re.findall(r"scripts/bench ([a-z]+)", page.read_text())) - {*known}
+    assert not unknown, f"{page.name} names studies that do not exist: {', '.join(unknown)}"
