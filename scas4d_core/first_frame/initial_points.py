@@ -22,21 +22,21 @@ from scas4d_core.first_frame.posed_pictures import (
     pixels_inside,
     visible_from,
 )
-from scas4d_core.first_frame.settings import InitialPointsSettings
 from scas4d_core.first_frame.silhouettes import plain_background, with_silhouettes
-from scas4d_core.first_frame.stereo import DepthMap, depth_maps, fused_points, halved, looked_through
-from scas4d_core.first_frame.surfaces import (
-    Support,
-    fit_surfaces,
-    sample_surfaces,
-    settle,
-    surface_depth,
-)
+from scas4d_core.first_frame.stereo import ITERATIONS, DepthMap, depth_maps, fused_points, halved, looked_through
+from scas4d_core.first_frame.surfaces import TOLERANCE, Support, fit_surfaces, sample_surfaces, settle, surface_depth
 from scas4d_core.first_frame.triangulation import Triangulated, triangulate
-from scas4d_core.first_frame.visual_hull import VisualHull, carve, contradicted, pixel_at
+from scas4d_core.first_frame.visual_hull import MISSES, VisualHull, carve, contradicted, pixel_at
 
 Tell = Callable[[str, int, int], None]
 """progress(stage, done, total)."""
+
+MAX_POINTS = 60_000
+"""Points kept at most; where there are more, the spacing grows."""
+MIN_VIEWS = 3
+"""Cameras that must agree on a point: two always meet somewhere on an epipolar line."""
+SPACING = 1.5
+"""Distance of neighbouring points, pixels at the middle of the stage; twice that on the background."""
 
 COLOUR_SPREAD = 0.12
 """Median deviation of the cameras' colours (0…1) above which a point no stereo has confirmed is in the wrong place."""
@@ -52,13 +52,17 @@ def initial_points(
     rig: Rig,
     images: Mapping[str, NDArray[np.uint8]],
     masks: Mapping[str, NDArray[np.uint8]],
-    settings: InitialPointsSettings | None = None,
     progress: Tell | None = None,
+    *,
+    max_points: int = MAX_POINTS,
+    stereo: bool = True,
+    stereo_iterations: int = ITERATIONS,
+    seed: int = 0,
 ) -> InitialPoints:
     """Points on the surfaces that the pictures of one moment show.
 
     Triangulated features bound the scene and support walls and floors; PatchMatch stereo, kept where at least
-    ``min_views`` cameras agree and few look through, gives what has texture; the visual hull (of the masks, or of
+    ``MIN_VIEWS`` cameras agree and few look through, gives what has texture; the visual hull (of the masks, or of
     silhouettes before a plain background) and the fitted surfaces give the rest. A point that one camera alone supports
     is never made, except on a wall or floor that others have found.
 
@@ -66,8 +70,11 @@ def initial_points(
         rig: calibrated cameras, in the user's world.
         images: [H, W, 3] uint8 by camera name; cameras without a picture are ignored.
         masks: [H, W] uint8 by camera name, 1 = foreground; may be empty.
-        settings: defaults if None.
-        progress: told (stage, done, total).
+        progress: called with (stage, done, total).
+        max_points: points kept at most.
+        stereo: dense stereo where the pictures have texture.
+        stereo_iterations: rounds of propagation and refinement.
+        seed: of every random choice; the same seed gives the same points.
 
     Returns:
         Points in the user's units; ``foreground`` is None where no masks were given.
@@ -75,50 +82,37 @@ def initial_points(
     Raises:
         InitialPointsError: fewer than two pictures, a picture whose size is not its camera's, or nothing found.
     """
-    settings = settings or InitialPointsSettings()
     tell: Tell = progress or (lambda stage, done, total: None)
     labelled = collect_views(rig, images, masks)
-    min_views = min(settings.min_views, len(labelled))
+    min_views = min(MIN_VIEWS, len(labelled))
     middle = look_at_point(labelled)
     pixel = pixel_at(labelled, middle)
 
-    background = plain_background(labelled, settings.plain_border)
+    background = plain_background(labelled)
     plain = background is not None
     views = with_silhouettes(labelled, background) if background is not None else labelled
 
     tell("triangulation", 0, 1)
-    triangulated = triangulate(
-        views,
-        max_features=settings.max_features,
-        epipolar_error=settings.epipolar_error,
-        min_views=min_views,
-        seed=settings.seed,
-    )
+    triangulated = triangulate(views, min_views=min_views, seed=seed)
     tell("hull", 0, 1)
-    hull = carve(
-        views,
-        voxel_pixels=settings.hull_voxel,
-        misses=0.0 if plain else settings.hull_misses,
-        min_views=min_views,
-    )
+    hull = carve(views, misses=0.0 if plain else MISSES, min_views=min_views)
     supports: list[Support] = []
-    if not plain and settings.surfaces and len(triangulated.positions) >= 10:
+    if not plain and len(triangulated.positions) >= 10:
         standing = triangulated.positions[~_in_foreground(views, triangulated)]
         supports = fit_surfaces(
             standing,
             np.array([view.camera.centre for view in views]),
-            settings.surface_tolerance * rig.radius,
-            most=settings.surfaces,
-            seed=settings.seed,
+            TOLERANCE * rig.radius,
+            seed=seed,
         )
 
     maps: list[DepthMap] = []
-    if settings.stereo:
-        maps = _stereo(views, triangulated, hull, supports, plain, middle, settings, tell)
+    if stereo:
+        maps = _stereo(views, triangulated, hull, supports, plain, middle, stereo_iterations, seed, tell)
     tell("merging", 0, 1)
     confirmed = np.concatenate([fused_points(maps, min_views), triangulated.positions])
     if not plain and len(hull.cells):
-        confirmed = confirmed[contradicted(views, hull, confirmed, settings.hull_misses) < CONTRADICTED]
+        confirmed = confirmed[contradicted(views, hull, confirmed, MISSES) < CONTRADICTED]
 
     solid = _free_hull(hull, maps, min_views)
     walls = np.zeros((0, 3))
@@ -126,10 +120,10 @@ def initial_points(
         # One sample for about every four pixels of stereo's pictures is as dense as the thinning below needs.
         stride = max(2, max(view.camera.width for view in views) // 160)
         samples = sample_surfaces(views, supports, stride, rig.radius)
-        samples, _ = thinned(samples, 2.0 * settings.spacing * pixel)
-        samples = settle(samples, supports, confirmed, 4.0 * settings.surface_tolerance * rig.radius)
+        samples, _ = thinned(samples, 2.0 * SPACING * pixel)
+        samples = settle(samples, supports, confirmed, 4.0 * TOLERANCE * rig.radius)
         walls = samples[looked_through(maps, samples, min_views) < LOOKED_THROUGH]
-    return _merged(labelled, views, (confirmed, solid, walls), pixel, plain, settings)
+    return _merged(labelled, views, (confirmed, solid, walls), pixel, plain, stereo, max_points)
 
 
 def _in_foreground(views: Sequence[View], triangulated: Triangulated) -> Bool:
@@ -153,10 +147,11 @@ def _stereo(
     supports: Sequence[Support],
     plain: bool,
     middle: Float,
-    settings: InitialPointsSettings,
+    iterations: int,
+    seed: int,
     tell: Tell,
 ) -> list[DepthMap]:
-    small = [halved(view, settings.stereo_width) for view in views]
+    small = [halved(view) for view in views]
     hull_surface = hull.centres[hull.surface()]
     known = hull_surface if plain else np.concatenate([triangulated.positions, hull_surface])
     ranges, priors, active = [], [], []
@@ -189,9 +184,8 @@ def _stereo(
         priors,
         active,
         middle,
-        neighbours=settings.stereo_neighbours,
-        iterations=settings.stereo_iterations,
-        seed=settings.seed,
+        iterations=iterations,
+        seed=seed,
         hull=hull,
         progress=lambda done, total: tell("stereo", done, total),
     )
@@ -212,21 +206,22 @@ def _merged(
     sources: tuple[Float, Float, Float],
     pixel: float,
     plain: bool,
-    settings: InitialPointsSettings,
+    stereo: bool,
+    max_points: int,
 ) -> InitialPoints:
     """Thin, colour, label; drop what the pictures speak against.
 
     ``sources``: points that cameras agree on, points of the hull, points of fitted surfaces; where an earlier source
     has a point, the later ones are not asked.
     """
-    fine = settings.spacing * pixel
+    fine = SPACING * pixel
     # Cameras that must see a point and agree on its colour: none once more, where stereo or features agree already;
     # two for the hull, which all masks support; one for a wall that is known from elsewhere.
     needed_by = (0, 2, 1)
     points, needed = np.zeros((0, 3)), np.zeros(0, dtype=np.intp)
     for source, (candidates, views_needed) in enumerate(zip(sources, needed_by, strict=True)):
         new, sizes = thinned(candidates, fine)
-        if source == 0 and settings.stereo and len(new):
+        if source == 0 and stereo and len(new):
             # Features are few and checked; what is left of them near no stereo is kept by the hull and the walls.
             crowd = np.asarray(cKDTree(candidates).query_ball_point(new, 1.5 * fine, return_length=True))
             new = new[(crowd >= CROWD) | (sizes >= CROWD)]
@@ -263,7 +258,7 @@ def _merged(
             if len(members) and spacing > fine:
                 chosen[members] = False
                 chosen[members[_spaced(points[members], spacing)]] = True
-        if chosen.sum() <= settings.max_points:
+        if chosen.sum() <= max_points:
             break
         scale *= 1.15
     if not chosen.any():

@@ -73,7 +73,7 @@ def fit_first(
     static = settings.static
     if points is None:
         points = initial_points(
-            factory.rig, frame.images, frame.masks, None,
+            factory.rig, frame.images, frame.masks,
             lambda stage, done, total: tell(Progress(stage, done, total)),
         )  # fmt: skip
         positions = points.positions

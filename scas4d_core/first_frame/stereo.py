@@ -13,6 +13,12 @@ from scas4d_core.first_frame.patch_match import patch_match
 from scas4d_core.first_frame.posed_pictures import Bool, Float, View, pixels_inside
 from scas4d_core.first_frame.visual_hull import VisualHull
 
+WIDTH = 320
+"""Pixels: wider pictures are halved until they are not."""
+NEIGHBOURS = 4
+"""Other cameras that each picture is compared with."""
+ITERATIONS = 4
+"""Rounds of propagation and refinement."""
 MAX_COST = 0.35
 """1 − NCC of a match that is believed (before the cameras are compared)."""
 REPROJECTION = 1.0
@@ -43,7 +49,7 @@ class DepthMap:
         return result
 
 
-def halved(view: View, width: int) -> View:
+def halved(view: View, width: int = WIDTH) -> View:
     """The view at half, a quarter … of its size, until it is no wider than ``width`` pixels."""
     image, mask, camera = view.image.astype(np.float32), view.mask, view.camera
     while camera.width > width and camera.width >= 2 and camera.height >= 2:
@@ -73,8 +79,7 @@ def depth_maps(
     active: Sequence[Bool],
     middle: Float,
     *,
-    neighbours: int = 4,
-    iterations: int = 4,
+    iterations: int = ITERATIONS,
     seed: int = 0,
     hull: VisualHull | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -87,7 +92,6 @@ def depth_maps(
         priors: [H, W] depth of each view to try first, 0 where unknown.
         active: [H, W] pixels wanted of each view.
         middle: [3] about which angles between cameras are measured.
-        neighbours: views each is compared with.
         iterations: rounds of PatchMatch.
         seed: of the random planes.
         hull: of the masks: depths of masked pixels that lie outside it are false.
@@ -100,7 +104,7 @@ def depth_maps(
     tall, wide = max(g.shape[0] for g in greys), max(g.shape[1] for g in greys)
     depths = []
     for i, view in enumerate(views):
-        chosen = [j for j in neighbours_of(views, i, middle, neighbours) if greys[j].shape == (tall, wide)]
+        chosen = [j for j in neighbours_of(views, i, middle, NEIGHBOURS) if greys[j].shape == (tall, wide)]
         camera = view.camera
         if len(chosen) < 2:
             depths.append(np.zeros(greys[i].shape))

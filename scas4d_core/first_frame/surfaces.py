@@ -16,6 +16,10 @@ from scipy.spatial import cKDTree
 
 from scas4d_core.first_frame.posed_pictures import Bool, Float, View
 
+MOST = 3
+"""Planes and spheres fitted to the triangulated points: walls, floor and a dome are rarely more."""
+TOLERANCE = 0.012
+"""Distance of an inlier from a fitted surface, in radii of the rig."""
 TRIALS = 1500
 MIN_SHARE = 0.1
 """Of the triangulated points, that a surface must explain."""
@@ -128,7 +132,7 @@ def fit_sphere(points: Float) -> Sphere | None:
     return Sphere(answer[:3] + middle, float(np.sqrt(square)))
 
 
-def fit_surfaces(points: Float, centres: Float, tolerance: float, *, most: int, seed: int) -> list[Support]:
+def fit_surfaces(points: Float, centres: Float, tolerance: float, *, most: int = MOST, seed: int = 0) -> list[Support]:
     """Planes and spheres that bound the room of the cameras, the best supported first.
 
     Args:

@@ -17,6 +17,11 @@ from scas4d_core.first_frame.posed_pictures import Bool, Float, View, front_dept
 
 SEEN_SHARE = 0.35
 """Share of the masked cameras that must see a voxel: at the edges of the stage few do, and ghosts stay uncarved."""
+VOXEL_PIXELS = 1.5
+"""Edge of the smallest voxel, at most, in pixels at the middle of the stage."""
+MISSES = 0.05
+"""Share of the cameras whose given mask may miss a voxel: automatic masks are ragged. Silhouettes read off a plain
+background are exact and get none."""
 COARSE = 32
 """Voxels along an edge of the first, coarsest grid."""
 MAX_VOXELS = 4_000_000
@@ -88,7 +93,9 @@ def pixel_at(views: Sequence[View], point: Float) -> float:
     return float(np.median(sizes)) if sizes else 1.0
 
 
-def carve(views: Sequence[View], *, voxel_pixels: float = 1.0, misses: float = 0.0, min_views: int = 3) -> VisualHull:
+def carve(
+    views: Sequence[View], *, voxel_pixels: float = VOXEL_PIXELS, misses: float = 0.0, min_views: int = 3
+) -> VisualHull:
     """Carve the hull of the masks.
 
     Args:

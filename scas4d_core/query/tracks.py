@@ -14,14 +14,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.ndimage import distance_transform_edt, maximum_filter
 
 from scas4d_core.cameras import Camera, WorldFrame
 from scas4d_core.gaussians import Gaussians, moving_extent, quaternions_to_matrices
 from scas4d_core.query.ray_depth import ray_depths
 from scas4d_core.rasterize.limits import DEFAULT, Limits
-from scas4d_core.settings import Model
 from scas4d_core.storage.history import History
 
 Float = NDArray[np.float64]
@@ -35,45 +33,22 @@ WEISZFELD_ROUNDS = 12
 BYTES_AT_ONCE = 64e6
 """Working memory of the search for carriers."""
 
-
-class TracksSettings(Model):
-    """How points are carried and seen."""
-
-    carriers: int = Field(
-        default=32,
-        ge=1,
-        description="Gaussians that carry a point; 1 is the single nearest. Against 1, the median 3D error falls by "
-        "6 % (cloth) to 25 % (stage).",
-    )
-    softening: float = Field(
-        default=0.01,
-        ge=0,
-        description="Of the extent; added to the axes of a Gaussian (root of the sum of squares) when asked how near a "
-        "point is: surface Gaussians are flatter than the surface is known, and a wider circle of carriers averages "
-        "more of their noise. Against 0.001, the median 3D error falls by 2 % (cloth) to 18 % (stage).",
-    )
-    ray_softening: float = Field(
-        default=0.003,
-        ge=0,
-        description="Of the extent; the same for where a Gaussian lies along the ray of a pixel query.",
-    )
-    agreement: float = Field(
-        default=0.01,
-        gt=0,
-        description="Of the extent; carriers whose answers lie this far from the track, on average, halve the "
-        "confidence.",
-    )
-    depth_tolerance: float = Field(
-        default=0.0075,
-        gt=0,
-        description="Of the extent; a point counts as seen up to this far behind the rendered depth, which lies about "
-        "that far from the surface.",
-    )
-    pixel_reach: float = Field(
-        default=2.0,
-        ge=0,
-        description="Pixels; a pixel query that misses a silhouette by less takes the nearest covered pixel's depth.",
-    )
+CARRIERS = 32
+"""Gaussians that carry a point; 1 is the single nearest. Against 1, the median 3D error falls by 6 % (cloth) to 25 %
+(stage)."""
+SOFTENING = 0.01
+"""Of the extent; added to the axes of a Gaussian (root of the sum of squares) for its distance to a point: surface
+Gaussians are flatter than the surface is known, and a wider circle of carriers averages more of their noise. Against
+0.001, the median 3D error falls by 2 % (cloth) to 18 % (stage)."""
+RAY_SOFTENING = 0.003
+"""Of the extent; the same for the place of a Gaussian along the ray of a pixel query."""
+AGREEMENT = 0.01
+"""Of the extent; carriers whose answers lie this far from the track, on average, halve the confidence."""
+DEPTH_TOLERANCE = 0.0075
+"""Of the extent; a point counts as seen up to this far behind the rendered depth, which lies about that far from the
+surface."""
+PIXEL_REACH = 2.0
+"""Pixels; a pixel query that misses a silhouette by less takes the nearest covered pixel's depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +59,7 @@ class Tracks:
         positions: [T, Q, 3] float64, user's world and units; NaN for a pixel query that met no surface.
         confidence: [T, Q] float64 in 0…1: (1 − Π(1 − oᵢ exp(−½ mᵢ²))) / (1 + (s/a)²), the opacity of the carriers at
             the query point (m the Mahalanobis distance) over what their disagreement s in that frame takes away: the
-            weighted mean distance of their answers from the track (a = ``TracksSettings.agreement``). 0 for a pixel
+            weighted mean distance of their answers from the track (a = ``AGREEMENT``). 0 for a pixel
             query that met no surface.
         ids: [Q] int64: the Gaussian that carries the point most; −1 for a pixel query that met no surface.
         indices: [T] int64 frames.
@@ -113,7 +88,7 @@ def tracks_of_points(
     points: NDArray[Any],
     index: int,
     indices: Sequence[int],
-    settings: TracksSettings | None = None,
+    count: int = CARRIERS,
 ) -> Tracks:
     """Carries 3D points through the frames.
 
@@ -123,13 +98,12 @@ def tracks_of_points(
         points: [Q, 3] in the user's world at frame ``index``.
         index: the committed frame the points are given in.
         indices: the committed frames to answer for, any order.
-        settings: how many Gaussians carry a point, and tolerances.
+        count: Gaussians that carry a point.
 
     Raises:
         ValueError: points not [Q, 3] or not finite.
         HistoryError: a frame was not committed.
     """
-    settings = settings or TracksSettings()
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points have shape {points.shape}; give [Q, 3]")
@@ -139,7 +113,7 @@ def tracks_of_points(
     theta = history.gaussians(index)
     extent = moving_extent(theta)
     inside = world.to_inside(points)
-    rows, weights, covered = carriers(theta, inside, settings.carriers, settings.softening * extent)
+    rows, weights, covered = carriers(theta, inside, count, SOFTENING * extent)
 
     offsets = np.einsum("qkji,qkj->qki", _matrices(theta.rotations[rows]), inside[:, None] - theta.means[rows])
     result = np.empty((len(indices), len(points), 3))
@@ -150,7 +124,7 @@ def tracks_of_points(
         answers = means + turned
         result[t] = geometric_median(answers, weights)
         apart = np.einsum("qk,qk->q", weights, np.linalg.norm(answers - result[t][:, None], axis=-1))
-        confidence[t] = covered / (1 + np.square(apart / max(settings.agreement * extent, 1e-12)))
+        confidence[t] = covered / (1 + np.square(apart / max(AGREEMENT * extent, 1e-12)))
     return Tracks(world.to_user(result), confidence, theta.ids[rows[:, 0]], np.asarray(indices, dtype=np.int64))
 
 
@@ -162,7 +136,6 @@ def tracks_of_pixels(
     index: int,
     indices: Sequence[int],
     render_depth: RenderDepth,
-    settings: TracksSettings | None = None,
     limits: Limits = DEFAULT,
 ) -> Tracks:
     """Carries the surface points that a camera has at given pixels of one frame; answers with their visibility in it.
@@ -173,17 +146,15 @@ def tracks_of_pixels(
         camera: in the user's world.
         uv: [Q, 2] pixels, continuous: (0.5, 0.5) is the centre of the first pixel. The depth is where half of
             what the ray loses is lost (``ray_depth``). A ray that loses less than half of its light takes the
-            rendered depth of the nearest covered pixel within ``TracksSettings.pixel_reach``.
+            rendered depth of the nearest covered pixel within ``PIXEL_REACH``.
         index: the committed frame that ``uv`` is given in.
         indices: the committed frames to answer for.
         render_depth: rendered depth and alpha.
-        settings: how many Gaussians carry a point, and tolerances.
         limits: the constants that ``render_depth`` renders with.
 
     Raises:
         ValueError: uv not [Q, 2], not finite or outside the picture.
     """
-    settings = settings or TracksSettings()
     uv = np.asarray(uv, dtype=np.float64)
     if uv.ndim != 2 or uv.shape[1] != 2:
         raise ValueError(f"uv has shape {uv.shape}; give [Q, 2] pixels")
@@ -194,18 +165,18 @@ def tracks_of_pixels(
             f"give 0 <= u < {camera.width}, 0 <= v < {camera.height}"
         )
     theta = history.gaussians(index)
-    softening = settings.ray_softening * moving_extent(theta)
+    softening = RAY_SOFTENING * moving_extent(theta)
     depth, covered = ray_depths(theta, world.camera_to_inside(camera), uv, limits, softening)
     depth /= world.metres_per_unit
     met = covered >= ALPHA_OF_A_SURFACE
     if not met.all():
         rendered, alpha = render_depth(camera, index)
         column, row = uv[~met].astype(np.intp).T
-        near, row, column = _covered_near(rendered, alpha, row, column, settings.pixel_reach)
+        near, row, column = _covered_near(rendered, alpha, row, column, PIXEL_REACH)
         beside = np.flatnonzero(~met)[near]
         depth[beside], met[beside] = rendered[row[near], column[near]], True
     points = camera.unproject(uv[met], depth[met])
-    found = tracks_of_points(history, world, points, index, indices, settings)
+    found = tracks_of_points(history, world, points, index, indices)
     tracks = Tracks(
         positions=np.full((len(indices), len(uv), 3), np.nan),
         confidence=np.zeros((len(indices), len(uv))),
@@ -214,7 +185,7 @@ def tracks_of_pixels(
     )
     tracks.positions[:, met], tracks.confidence[:, met] = found.positions, found.confidence
     tracks.ids[met] = found.ids
-    return tracks.with_visibility(camera, render_depth, depth_tolerance(history, world, index, settings))
+    return tracks.with_visibility(camera, render_depth, depth_tolerance(history, world, index))
 
 
 def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indices: Sequence[int]) -> Tracks:
@@ -238,10 +209,9 @@ def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indice
     return Tracks(positions, np.ones(positions.shape[:2]), wanted, np.asarray(indices, dtype=np.int64))
 
 
-def depth_tolerance(history: History, world: WorldFrame, index: int, settings: TracksSettings | None = None) -> float:
-    """The tolerance for ``seen`` in the user's units: the setting times the extent of what moves at one frame."""
-    share = (settings or TracksSettings()).depth_tolerance
-    return share * moving_extent(history.gaussians(index)) / world.metres_per_unit
+def depth_tolerance(history: History, world: WorldFrame, index: int) -> float:
+    """The tolerance for ``seen`` in the user's units: ``DEPTH_TOLERANCE`` of the extent of what moves at one frame."""
+    return DEPTH_TOLERANCE * moving_extent(history.gaussians(index)) / world.metres_per_unit
 
 
 def seen(

@@ -14,7 +14,6 @@ from scas4d_core.first_frame.posed_pictures import (
     observe,
     visible_from,
 )
-from scas4d_core.first_frame.settings import InitialPointsSettings
 from scas4d_core.first_frame.stereo import DepthMap, fused_points, halved, looked_through
 from scas4d_core.first_frame.triangulation import fundamental_matrix, triangulate
 
@@ -55,22 +54,21 @@ def test_without_masks_nobody_said_what_is_foreground(cloud):
 
 def test_masks_label_the_points(box):
     rig, images, masks = box
-    labelled = initial_points(rig, images, masks, InitialPointsSettings(stereo_iterations=2))
+    labelled = initial_points(rig, images, masks, stereo_iterations=2)
     assert labelled.foreground is not None
     assert (labelled.foreground > 0.5).mean() > 0.95
 
 
 def test_same_seed_same_points(box):
     rig, images, _ = box
-    settings = InitialPointsSettings(stereo_iterations=1, seed=4)
-    one, two = (initial_points(rig, images, {}, settings) for _ in range(2))
+    one, two = (initial_points(rig, images, {}, stereo_iterations=1, seed=4) for _ in range(2))
     assert np.array_equal(one.positions, two.positions)
     assert np.array_equal(one.colours, two.colours)
 
 
 def test_budget_of_points_is_kept(box):
     rig, images, _ = box
-    few = initial_points(rig, images, {}, InitialPointsSettings(stereo=False, max_points=300))
+    few = initial_points(rig, images, {}, stereo=False, max_points=300)
     assert 100 < len(few) <= 300
 
 
@@ -167,7 +165,7 @@ def test_pictures_that_show_nothing_in_common_are_an_error(box):
     rng = np.random.default_rng(0)
     noise = {c.name: rng.integers(0, 255, (128, 128, 3)).astype(np.uint8) for c in rig.cameras[:4]}
     with pytest.raises(InitialPointsError, match="calibration"):
-        initial_points(rig, noise, {}, InitialPointsSettings(stereo_iterations=1))
+        initial_points(rig, noise, {}, stereo_iterations=1)
 
 
 def test_wrong_size_and_too_few_pictures_are_named(box):
