@@ -95,6 +95,24 @@ class SceneSettings(Model):
 class StaticSettings(Model):
     """Frame 0: 3D Gaussian Splatting with adaptive density control."""
 
+    constants: ClassVar[Mapping[str, Constant]] = {
+        "initial_share": Constant(0.6, "scas4d_core.first_frame.static_scene.INITIAL_SHARE"),
+        "densify_from": Constant(200, "scas4d_core.first_frame.static_scene.DENSIFY_FROM"),
+        "densify_every": Constant(100, "scas4d_core.first_frame.static_scene.DENSIFY_EVERY"),
+        "densify_until": Constant(0.6, "scas4d_core.first_frame.static_scene.DENSIFY_UNTIL"),
+        "densify_gradient": Constant(1e-6, "scas4d_core.first_frame.static_scene.DENSIFY_GRADIENT"),
+        "prune_opacity": Constant(0.01, "scas4d_core.first_frame.static_scene.PRUNE_OPACITY"),
+        "min_views": Constant(2, "scas4d_core.first_frame.static_scene.MIN_VIEWS"),
+        "seen_pixels": Constant(0.05, "scas4d_core.first_frame.static_scene.SEEN_PIXELS"),
+        "rate_position": Constant(1.6e-4, "scas4d_core.first_frame.static_scene.RATE_POSITION"),
+        "rate_position_end": Constant(1.6e-6, "scas4d_core.first_frame.static_scene.RATE_POSITION_END"),
+        "rate_colour": Constant(2.5e-3, "scas4d_core.first_frame.static_scene.RATE_COLOUR"),
+        "rate_opacity": Constant(5e-2, "scas4d_core.first_frame.static_scene.RATE_OPACITY"),
+        "rate_scale": Constant(5e-3, "scas4d_core.first_frame.static_scene.RATE_SCALE"),
+        "rate_rotation": Constant(2e-3, "scas4d_core.first_frame.static_scene.RATE_ROTATION"),
+        "rate_exposure": Constant(1e-3, "scas4d_core.first_frame.static_scene.RATE_EXPOSURE"),
+        "weight_mask": Constant(3.0, "scas4d_core.first_frame.static_scene.WEIGHT_MASK"),
+    }
     iterations: int = Field(3000, ge=1, description="Iterations of frame 0, one training view each.")
     stop_gain: float = Field(
         0.0,
@@ -111,36 +129,10 @@ class StaticSettings(Model):
         "and 0.27 more for each that is not background, at most 100,000: 25,000 for an object at 256x256, 40,000 for "
         "a room.",
     )
-    initial_share: float = Field(
-        0.6, gt=0, le=1, description="Share of the budget that the first cloud may take; of a larger one a random part."
-    )
-    densify_from: int = Field(200, ge=0, description="First iteration that densifies; before, gradients are noise.")
-    densify_every: int = Field(100, ge=1, description="Iterations between densifications.")
-    densify_until: float = Field(0.6, ge=0, le=1, description="Fraction of the iterations after which none is added.")
-    densify_gradient: Positive = Field(
-        1e-6,
-        description="Mean screen gradient (per half picture, as in 3DGS) above which a Gaussian may be refined; the "
-        "budget decides how many are, hardest pulled first.",
-    )
-    prune_opacity: NotNegative = Field(0.01, description="Less opaque Gaussians are removed while densifying.")
-    min_views: int = Field(2, ge=0, description="What fewer training cameras than this see is removed.")
-    seen_pixels: NotNegative = Field(
-        0.05, description="Pixels' worth of blending weight from which a camera counts as seeing a Gaussian."
-    )
     exposure: bool | Literal["auto"] = Field(
         default="auto",
         description="Learn a colour gain and offset per training camera (held-out cameras are scored raw). 'auto': "
         "give it up after 30 % of the iterations where the cameras turn out alike: then it only fits noise.",
-    )
-    rate_position: Positive = Field(1.6e-4, description="Adam rate of means at the start, per metre of scene radius.")
-    rate_position_end: Positive = Field(1.6e-6, description="The same at the end; the decay is exponential.")
-    rate_colour: Positive = Field(2.5e-3, description="Adam rate of colours.")
-    rate_opacity: Positive = Field(5e-2, description="Adam rate of opacity logits.")
-    rate_scale: Positive = Field(5e-3, description="Adam rate of log scales.")
-    rate_rotation: Positive = Field(2e-3, description="Adam rate of quaternions.")
-    rate_exposure: Positive = Field(1e-3, description="Adam rate of gain and offset.")
-    weight_mask: NotNegative = Field(
-        3.0, description="Weight of the mask loss where masks are given; in frame 0 it teaches the labels only."
     )
     seed: int = Field(0, ge=0, description="Seed of the order of views and of the split of Gaussians.")
 
