@@ -30,9 +30,8 @@ from scas4d_core.robust.attempts import axis_lengths
 from scas4d_core.robust.repeats import fingerprints, same_again
 from scas4d_core.robust.solve_frame import Given, Trial
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.storage.checkpoint import Carried, Checkpoints
+from scas4d_core.storage.checkpoint import Carried, Checkpoints, Resumed, ResumeError, find_commit
 from scas4d_core.storage.history import History, HistoryError
-from scas4d_core.storage.resuming import Resumed, ResumeError, find_commit
 from scas4d_core.structure.motion_mask import labelled, labels_learnt, settled
 from scas4d_core.torch_backend.device import require_device
 from scas4d_core.update.budget import Budget

@@ -1,4 +1,6 @@
-"""What an update needs beside Θ_{t−1}, on disk: a scene whose process died goes on as if nothing had happened.
+"""Checkpoints: the state of an update beside Θ_{t−1}, on disk, and the commit from which a scene is resumed.
+
+A scene whose process died goes on as if nothing had happened.
 
 Beside the frames of a ``History`` lies one ``checkpoint_<index>.npz`` for each of its newest commits. It is written,
 synced and renamed *before* the frame's own rename, which is the commit: a committed frame has its checkpoint, and a
@@ -9,7 +11,7 @@ first frame; clusters and neighbours are built again from the first frame, and a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,7 @@ from scas4d_core.error_text import message_of
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import Outcome
 from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
-from scas4d_core.storage.history import NEWEST_KEPT
+from scas4d_core.storage.history import NEWEST_KEPT, History, HistoryError
 from scas4d_core.storage.npz import read_npz, write_npz
 from scas4d_core.update.views import TrainingView, ViewFactory
 from scas4d_core.update.warm_start import Motion
@@ -175,3 +177,58 @@ def _unpacked(arrays: dict[str, NDArray[Any]]) -> Motion:
             array = arrays[name]
             values[item.name] = array if array.ndim else array.item()
     return Motion(**values)
+
+
+class ResumeError(ValueError):
+    """A history that cannot be gone on from; the message says what is damaged."""
+
+
+@dataclass(frozen=True)
+class Resumed:
+    """Where a scene was taken up again.
+
+    Attributes:
+        index: the commit that it goes on from.
+        undone: committed frames after it that were taken back; each has to be given again, or is lost.
+        faults: why, a sentence for each file that could not be used; empty after an ordinary end.
+        cold: the state is whole, but what the next update needs beside it is not: that starts without a motion, and
+            the scene is no longer bit-identical to one that was not disturbed.
+    """
+
+    index: int
+    undone: list[int]
+    faults: list[str]
+    cold: bool
+
+
+def find_commit(
+    history: History, checkpoints: Checkpoints, factory: ViewFactory, held: Callable[[int], bool]
+) -> tuple[int, Carried | None, list[str]]:
+    """The commit to go on from, what it left to the next update (None: a cold start), and what was found damaged.
+
+    Args:
+        factory: of the scene's views. held: whether the pictures of a committed frame can be given again.
+
+    Raises:
+        ResumeError: no state can be read.
+    """
+    faults = list(history.damaged.values())
+    whole: list[int] = []
+    carried: Carried | None = None
+    for index in reversed(history.indices):
+        try:
+            history.gaussians(index)
+            history.report(index)
+            whole.append(index)
+            carried = checkpoints.load(index, factory)
+            break
+        except (HistoryError, CheckpointError) as error:
+            faults.append(str(error))
+            if index not in checkpoints.indices() and whole:
+                break  # so old that it has none any more: nothing before it has one either
+    if not whole:
+        raise ResumeError("no state can be read: " + "; ".join(faults))
+    later = sorted({*history.indices, *history.damaged})
+    if carried is None or not all(held(index) for index in later if index > whole[-1]):
+        return whole[0], None, faults
+    return whole[-1], carried, faults
