@@ -34,6 +34,16 @@ class Camera:
 
     Raises:
         CameraError: not finite, focal length not positive, skew, no rotation, or empty picture.
+
+    >>> lens = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
+    >>> camera = Camera("front", lens, np.eye(4), width=64, height=48)
+    >>> uv, depth = camera.project([0.1, 0, 2])
+    >>> uv, depth
+    (array([37., 24.]), array(2.))
+    >>> camera.unproject(uv, depth)
+    array([0.1, 0. , 2. ])
+    >>> camera.scaled(0.5).cx
+    16.0
     """
 
     name: str
@@ -153,6 +163,12 @@ class WorldFrame:
     Attributes:
         origin: [3] float64, in the user's units.
         metres_per_unit: metres in one of the user's units.
+
+    >>> world = WorldFrame(origin=np.array([10.0, 0, 0]), metres_per_unit=0.01)  # of centimetres
+    >>> world.to_inside([110.0, 0, 0])
+    array([1., 0., 0.])
+    >>> world.to_user([1.0, 0, 0])
+    array([110.,   0.,   0.])
     """
 
     origin: Float
@@ -183,7 +199,17 @@ ONE_PLACE = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Cameras that look at one scene, names unique."""
+    """Cameras that look at one scene, names unique.
+
+    >>> lens, pose = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
+    >>> beside = pose.copy()
+    >>> beside[0, 3] = -2  # the camera's centre is at x = 2
+    >>> rig = Rig((Camera("left", lens, pose, 64, 48), Camera("right", lens, beside, 64, 48)))
+    >>> rig.names, rig["right"].centre, rig.radius
+    (('left', 'right'), array([2., 0., 0.]), 1.1)
+    >>> rig.world_frame("auto").metres_per_unit  # the rig's radius is taken for 3 m
+    2.727272727272727
+    """
 
     cameras: tuple[Camera, ...]
 
@@ -268,5 +294,10 @@ class Rig:
 
 
 def rig_inside(frame: WorldFrame, cameras: Sequence[Camera]) -> Rig:
-    """The cameras of a rig as the inside world sees them."""
+    """The cameras of a rig as the inside world sees them.
+
+    >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
+    >>> rig_inside(WorldFrame(np.array([0.0, 0, 2]), 0.1), [camera])["front"].centre
+    array([ 0. ,  0. , -0.2])
+    """
     return Rig(tuple(frame.camera_to_inside(camera) for camera in cameras))

@@ -10,12 +10,22 @@ _PATH = re.compile(r"(?<![\w.:/])/(?:[^\s'\"<>|:;,()\[\]]+/)*[^\s'\"<>|:;,()\[\]
 
 
 def without_paths(text: str) -> str:
-    """The text with the last part alone of every path that can be one of this machine; ``/v1/scenes`` cannot."""
+    """The text with the last part alone of every path that can be one of this machine; ``/v1/scenes`` cannot.
+
+    >>> without_paths("cannot read /usr/share/scenes/a.npz of /v1/scenes/a")
+    'cannot read a.npz of /v1/scenes/a'
+    """
     return _PATH.sub(_last_part, text)
 
 
 def message_of(error: BaseException) -> str:
-    """What an error says; of an ``OSError`` what the system says, because its own text names the file with its path."""
+    """What an error says; of an ``OSError`` what the system says, because its own text names the file with its path.
+
+    >>> message_of(OSError(28, "No space left on device", "/usr/share/a.npz"))
+    'No space left on device'
+    >>> message_of(KeyError())
+    'KeyError'
+    """
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return without_paths(str(error)) or type(error).__name__

@@ -32,7 +32,7 @@ from scas4d_core.robust.solve_frame import Given, Trial
 from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.storage.checkpoint import Carried, Checkpoints, Resumed, ResumeError, find_commit
 from scas4d_core.storage.history import History, HistoryError
-from scas4d_core.structure.motion_mask import labelled, labels_learnt, settled
+from scas4d_core.structure.motion_mask import labelled, labels_learnt, with_reliable_labels
 from scas4d_core.torch_backend.device import require_device
 from scas4d_core.update.budget import Budget
 from scas4d_core.update.frame_update import Updater
@@ -125,7 +125,7 @@ class Reconstruction(Committed):
         result = static or fit_first(
             self._scaled(frame), points, self._factory, settings, self.world, progress or (lambda _: None)
         )
-        result = replace(result, gaussians=settled(result.gaussians))
+        result = replace(result, gaussians=with_reliable_labels(result.gaussians))
         fitted = perf_counter()
         self.static = result
         self._fixed = Fixed(len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians))

@@ -62,7 +62,14 @@ def _refusal(name: str, given: Any, constant: Constant) -> InitErrorDetails | No
 
 
 class SceneSettings(Model):
-    """How the outside world enters."""
+    """How the outside world enters.
+
+    >>> SceneSettings(metres_per_unit="auto").image_scale
+    1.0
+    >>> SceneSettings(image_scale=2)
+    Traceback (most recent call last):
+    pydantic_core._pydantic_core.ValidationError: 1 validation error for SceneSettings...
+    """
 
     metres_per_unit: Positive | Literal["auto"] = Field(
         1.0,
@@ -93,7 +100,11 @@ class SceneSettings(Model):
 
 
 class StaticSettings(Model):
-    """Frame 0: 3D Gaussian Splatting with adaptive density control."""
+    """Frame 0: 3D Gaussian Splatting with adaptive density control.
+
+    >>> StaticSettings.model_validate({"seed": 3, "min_views": 2}).seed  # min_views is a constant now: dropped
+    3
+    """
 
     constants: ClassVar[Mapping[str, Constant]] = {
         "initial_share": Constant(0.6, "scas4d_core.first_frame.static_scene.INITIAL_SHARE"),

@@ -37,6 +37,12 @@ def open_capture(folder: Path | str, **options: Any) -> Capture:
 
     Raises:
         CaptureError: no such folder, no known layout, or a fault in one of the files.
+
+    >>> capture = open_capture("samples/robot", image_scale=0.25)
+    >>> capture.rig.names[:3], capture.frame_count
+    (('0', '1', '2'), 14)
+    >>> capture.frame(0).images["0"].shape
+    (64, 64, 3)
     """
     folder = Path(folder)
     if not folder.is_dir():

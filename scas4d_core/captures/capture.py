@@ -52,6 +52,16 @@ class Capture:
         points: a cloud of frame 0, or None.
         ground_truth: tracks and parts, or None.
         extent: longest side of the box of the foreground over the sequence, user's units, or None.
+
+    >>> from scas4d_core.captures import open_capture
+    >>> capture = open_capture("samples/robot")
+    >>> frame = capture.frame(2)
+    >>> round(frame.time, 4), sorted(frame.masks) == sorted(capture.rig.names)
+    (0.0667, True)
+    >>> capture.encoded(2, "0")[:4]  # the file as it is
+    b'\x89PNG'
+    >>> capture.test_rig.names
+    ('4', '11')
     """
 
     name: str

@@ -18,6 +18,11 @@ class Frame:
         time: seconds since the first frame.
         images: by camera name, [H, W, 3] uint8, the sRGB values of the file. May decode when an entry is read.
         masks: by camera name, [H, W] uint8, 1 where the foreground is; empty where the capture has no masks.
+
+    >>> picture = np.zeros((48, 64, 3), np.uint8)
+    >>> frame = Frame(index=3, time=0.1, images={"front": picture, "left": picture}, masks={})
+    >>> sorted(frame.images)
+    ['front', 'left']
     """
 
     index: int
@@ -34,6 +39,10 @@ class InitialPoints:
         positions: [P, 3] float64, user's units and axes.
         colours: [P, 3] float32 in 0…1, sRGB values as in the pictures.
         foreground: [P] float32 in 0…1, or None where nobody said.
+
+    >>> cloud = InitialPoints(np.zeros((5, 3)), np.full((5, 3), 0.5, np.float32))
+    >>> len(cloud), cloud.foreground is None
+    (5, True)
     """
 
     positions: NDArray[np.float64]

@@ -46,6 +46,13 @@ class GroundTruth:
         parts: the table of parts; empty where the capture has none.
         label_files: by camera name, the label picture of every frame; empty where the capture has none.
         image_size: by camera name, (width, height) to which labels are resized.
+
+    >>> from scas4d_core.captures import open_capture
+    >>> truth = open_capture("samples/robot").ground_truth
+    >>> truth.points.shape, truth.visible_in("0").shape, int(truth.moving.sum())
+    ((14, 512, 3), (14, 512), 325)
+    >>> [part.name for part in truth.parts][:3]
+    ['base', 'turret', 'upper_arm']
     """
 
     points: NDArray[np.float64]

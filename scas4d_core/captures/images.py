@@ -62,6 +62,14 @@ def decode_image(
 
     Raises:
         ImageError: no such file, not a picture, or one of the refusals in the head of this module.
+
+    >>> file = io.BytesIO()
+    >>> Image.new("RGB", (4, 2), (255, 128, 0)).save(file, "PNG")
+    >>> decode_image(file.getvalue(), size=(4, 2)).shape
+    (2, 4, 3)
+    >>> decode_image(file.getvalue(), image_scale=0.5)
+    array([[[255, 128,   0],
+            [255, 128,   0]]], dtype=uint8)
     """
     name = name or _name(source)
     picture = _open(source, name, PICTURE_FORMATS, size)
@@ -78,6 +86,11 @@ def decode_mask(
 
     Returns:
         [H, W] uint8, values 0 and 1.
+
+    >>> file = io.BytesIO()
+    >>> Image.fromarray(np.array([[0, 1, 255]], np.uint8)).save(file, "PNG")
+    >>> decode_mask(file.getvalue())
+    array([[0, 1, 1]], dtype=uint8)
     """
     name = name or _name(source)
     picture = _open(source, name, MASK_FORMATS, size)
@@ -109,6 +122,11 @@ def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str |
 
     Raises:
         ImageError: as for `decode_mask`, or more than one channel.
+
+    >>> file = io.BytesIO()
+    >>> Image.fromarray(np.array([[3, 3, 7, 7]], np.uint8)).save(file, "PNG")
+    >>> decode_labels(file.getvalue(), size=(4, 1), target=(2, 1))
+    array([[3, 7]], dtype=uint8)
     """
     name = name or _name(source)
     picture = _open(source, name, MASK_FORMATS, size)
@@ -123,7 +141,13 @@ def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str |
 
 
 def picture_size(source: bytes | Path, name: str | None = None) -> Size:
-    """Width and height in pixels from the head of the file, without decoding it."""
+    """Width and height in pixels from the head of the file, without decoding it.
+
+    >>> file = io.BytesIO()
+    >>> Image.new("RGB", (4, 2)).save(file, "JPEG")
+    >>> picture_size(file.getvalue())
+    (4, 2)
+    """
     name = name or _name(source)
     try:
         with Image.open(_stream(source), formats=PICTURE_FORMATS) as picture:
@@ -137,6 +161,9 @@ def resize_area(picture: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
 
     Edges map to edges, so a pixel position (centres at +0.5) is multiplied by the ratio of the sizes, as in
     `Camera.scaled`. (Pillow's BOX filter takes whole source pixels only: half a pixel off at fractional ratios.)
+
+    >>> resize_area(np.array([[[0], [10], [20]]], np.uint8), size=(2, 1))[..., 0]
+    array([[ 3, 17]], dtype=uint8)
     """
     if size == (picture.shape[1], picture.shape[0]):
         return picture

@@ -81,6 +81,13 @@ def initial_points(
 
     Raises:
         InitialPointsError: fewer than two pictures, a picture whose size is not its camera's, or nothing found.
+
+    >>> from scas4d_core.captures import open_capture
+    >>> capture = open_capture("samples/robot", image_scale=0.5)
+    >>> frame = capture.frame(0)
+    >>> cloud = initial_points(capture.rig, frame.images, frame.masks, stereo=False)
+    >>> cloud.positions.shape == cloud.colours.shape, bool((cloud.foreground <= 1).all())
+    (True, True)
     """
     tell: Tell = progress or (lambda stage, done, total: None)
     labelled = collect_views(rig, images, masks)

@@ -295,6 +295,17 @@ def fit_static_scene(
 
     Raises:
         ValueError: the cloud is empty.
+
+    >>> from scas4d_core.captures import open_capture
+    >>> capture = open_capture("samples/robot", image_scale=0.25)
+    >>> factory, cloud = ViewFactory(capture.rig), capture.points
+    >>> views = factory.views(capture.frame(0), {})
+    >>> few = StaticSettings(iterations=20, max_gaussians=1000)
+    >>> fitted = fit_static_scene(
+    ...     factory, views, cloud.positions, cloud.colours, cloud.foreground, SceneSettings(), few
+    ... )
+    >>> fitted.losses[-1] < fitted.losses[0], len(fitted.gaussians) <= 1000
+    (True, True)
     """
     if len(positions) == 0:
         raise ValueError("the first cloud holds no point; give points, masks, or more overlapping cameras")

@@ -52,6 +52,10 @@ def psnr(image: NDArray[Any], truth: NDArray[Any], mask: NDArray[Any] | None = N
 
     Raises:
         ValueError: shapes differ, or values are not finite.
+
+    >>> truth = np.zeros((8, 8, 3))
+    >>> round(psnr(truth + 0.1, truth), 6), psnr(truth, truth)
+    (20.0, inf)
     """
     first, second = _pair(image, truth)
     squared = (first - second) ** 2
@@ -79,6 +83,10 @@ def ssim(image: NDArray[Any], truth: NDArray[Any]) -> float:
 
     Raises:
         ValueError: shapes differ, or values are not finite.
+
+    >>> picture = np.random.default_rng(0).random((32, 32, 3))
+    >>> ssim(picture, picture), round(ssim(1 - picture, picture), 2)
+    (1.0, -0.73)
     """
     x, y = _pair(image, truth)
     mean_x, mean_y = _window_mean(x), _window_mean(y)
@@ -100,6 +108,10 @@ def flip(image: NDArray[Any], truth: NDArray[Any]) -> Score:
 
     Raises:
         ValueError: shapes differ, or values are not finite.
+
+    >>> picture = np.full((16, 16, 3), 0.5)
+    >>> flip(picture, picture)
+    Score(value=0.0, reason='')
     """
     first, second = _pair(image, truth)
     try:
@@ -130,6 +142,11 @@ def lpips(image: NDArray[Any], truth: NDArray[Any], backbone: str = "vgg") -> Sc
 
     Raises:
         ValueError: shapes differ, values are not finite, or no such backbone.
+
+    >>> picture = np.full((64, 64, 3), 0.5)
+    >>> score = lpips(picture, picture)
+    >>> score.value == 0 or score.reason != ""  # not where the network's weights are missing
+    True
     """
     first, second = _pair(image, truth)
     if backbone not in LPIPS_BACKBONES:

@@ -28,6 +28,10 @@ def adjusted_rand_index(
 
     Raises:
         ValueError: shapes differ, or no pixel is foreground.
+
+    >>> truth = np.array([0, 1, 1, 2, 2])  # the first pixel is background
+    >>> adjusted_rand_index(np.array([5, 7, 7, 4, 4]), truth)
+    1.0
     """
     if labels.shape != truth.shape:
         raise ValueError(f"labels have shape {labels.shape}, the truth {truth.shape}; render at the size of the truth")

@@ -58,6 +58,11 @@ def median_trajectory_error(
 
     Raises:
         ValueError: shapes differ.
+
+    >>> truth = np.zeros((3, 1, 2))
+    >>> tracks = truth + [[[0, 0]], [[3, 4]], [[3, 4]]]
+    >>> median_trajectory_error(tracks, truth, np.ones((3, 1), bool), diagonal=100)
+    5.0
     """
     errors = _percent_of_diagonal(tracks, truth, diagonal)
     medians = _medians(errors, _without_query(counted, errors.shape, query))
@@ -90,6 +95,12 @@ def oracle_tracks(
 
     Raises:
         ValueError: shapes do not fit, or no candidate is in front of the camera.
+
+    >>> truth = np.zeros((2, 1, 2))
+    >>> candidates = np.array([[[1, 0], [2, 0]], [[9, 0], [0, 0]]], float)  # [T, N, 2]
+    >>> oracle_tracks(candidates, truth, np.ones((2, 1), bool))[:, 0]  # the second stays nearer
+    array([[2., 0.],
+           [0., 0.]])
     """
     if candidates.ndim != 3 or candidates.shape[0] != truth.shape[0] or candidates.shape[2] != 2:
         raise ValueError(f"candidates have shape {candidates.shape}; give [T={truth.shape[0]}, N, 2]")
@@ -125,6 +136,10 @@ def track_error_3d(
 
     Raises:
         ValueError: shapes differ, extent not positive, or no point moves.
+
+    >>> truth = np.zeros((3, 4, 3))
+    >>> track_error_3d(truth + [0, 0, 0.25], truth, moving=np.ones(4, bool), extent=2.0)
+    TrackError(median=12.5, percentile_90=12.5, count=8)
     """
     if tracks.shape != truth.shape or truth.ndim != 3 or truth.shape[2] != 3 or moving.shape != truth.shape[1:2]:
         raise ValueError(f"tracks {tracks.shape}, truth {truth.shape} must be [T, P, 3], moving {moving.shape} [P]")
@@ -165,6 +180,12 @@ def error_by_confidence(
 
     Raises:
         ValueError: as ``track_error_3d``, or confidence of another shape.
+
+    >>> truth = np.zeros((2, 4, 3))
+    >>> tracks = truth + np.array([1, 2, 3, 4])[:, None] * [1, 0, 0]
+    >>> confidence = np.broadcast_to([0.9, 0.7, 0.5, 0.1], (2, 4))
+    >>> error_by_confidence(tracks, truth, confidence, np.ones(4, bool), extent=100, groups=2)
+    [1.5, 3.5]
     """
     if confidence.shape != tracks.shape[:2]:
         raise ValueError(f"confidence has shape {confidence.shape}; give [T, P] = {tracks.shape[:2]}")
@@ -187,6 +208,10 @@ def visibility_accuracy(predicted: NDArray[np.bool_], truth: NDArray[np.bool_], 
 
     Raises:
         ValueError: shapes differ.
+
+    >>> truth = np.array([[True, True], [True, False]])
+    >>> visibility_accuracy(np.ones((2, 2), bool), truth)  # the query's frame does not count
+    0.5
     """
     if predicted.shape != truth.shape or truth.ndim != 2:
         raise ValueError(f"predicted {predicted.shape} and truth {truth.shape} must both be [T, Q]")

@@ -36,6 +36,11 @@ class View:
         depth: [H, W] float32, alpha-weighted mean z along the camera's axis in the user's units; NaN where less than
             half of the pixel is covered.
         parts: [H, W] uint8 or None: 0 nothing or standing, else 1 + the label that covers the pixel most.
+
+    >>> black = np.zeros((2, 2), np.float32)
+    >>> view = View(np.zeros((2, 2, 3), np.float32), alpha=black, depth=np.full_like(black, np.nan))
+    >>> view.colour.shape, view.parts is None  # labels were not asked for
+    ((2, 2, 3), True)
     """
 
     colour: Array
@@ -45,7 +50,18 @@ class View:
 
 
 class Committed:
-    """Reads a history. Cameras and points are in the user's world; ``index`` None is the newest frame."""
+    """Reads a history. Cameras and points are in the user's world; ``index`` None is the newest frame.
+
+    >>> history = History()
+    >>> history.append(0, 0.0, Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0]))
+    >>> committed = Committed(history, WorldFrame(np.zeros(3)))
+    >>> camera = Camera("front", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], np.eye(4), 16, 16)
+    >>> view = committed.render(camera, background=(0, 0, 1))
+    >>> view.colour[8, 8].round(1), view.depth[8, 8]
+    (array([0.9, 0. , 0.1], dtype=float32), np.float32(2.0))
+    >>> committed.tracks_of_points(np.array([[0, 0, 2]]), 0, [0]).confidence.round(2)
+    array([[0.9]])
+    """
 
     def __init__(self, history: History, world: WorldFrame, limits: Limits = DEFAULT) -> None:
         self.history = history

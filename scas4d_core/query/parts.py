@@ -72,6 +72,18 @@ def parts(
     Raises:
         ValueError: nothing committed, nothing moves, count below 1 or above the number of moving Gaussians, or
             ``previous`` of another number of Gaussians.
+
+    >>> from scas4d_core.storage.history import History
+    >>> boxes = np.random.default_rng(0).random((40, 3))
+    >>> boxes[20:] += [3, 0, 0]
+    >>> state = Gaussians.of_points(boxes, radius=0.1)
+    >>> apart = np.repeat([[0, 0, 0], [2, 0, 0]], 20, axis=0)
+    >>> history = History()
+    >>> for index in range(3):  # the second box moves away
+    ...     history.append(index, index / 30, state.replace(means=state.means + np.float32(index * apart)))
+    >>> labels = parts(history, count=2)
+    >>> len(set(labels[:20])), len(set(labels[20:])), bool(labels[0] != labels[20])
+    (1, 1, True)
     """
     if not len(history):
         raise ValueError("the history is empty; commit a frame before asking for parts")
@@ -123,6 +135,10 @@ def match_labels(labels: NDArray[Any], previous: NDArray[Any], weights: NDArray[
 
     Returns:
         [N] labels.
+
+    >>> previous = np.array([0, 0, 1, 1])
+    >>> match_labels(np.array([1, 1, 0, 0]), previous, weights=np.ones(4))  # the same parts, numbered otherwise
+    array([0, 0, 1, 1])
     """
     result = labels.astype(np.int64)
     inside = labels >= 0

@@ -74,6 +74,13 @@ def write_ply(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None
 
     Raises:
         PlyError: rows that are not finite or have no volume, named by row and id. None is left out silently.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
+    >>> with TemporaryDirectory() as folder:
+    ...     write_ply(f"{folder}/a.ply", state, WorldFrame(np.zeros(3), metres_per_unit=0.5))
+    ...     read_ply(f"{folder}/a.ply").means
+    array([[0., 0., 4.]])
     """
     data = np.zeros(len(gaussians), dtype=[(name, "<f4") for name in _FIELDS])
     for name, column in _columns(splats(gaussians, world)).items():
@@ -92,6 +99,10 @@ def read_ply(path: Path | str) -> Splats:
 
     Raises:
         PlyError: no splat file, or a property is missing.
+
+    >>> read_ply("README.md")
+    Traceback (most recent call last):
+    scas4d_core.query.ply.PlyError: README.md: no 3D Gaussian Splatting .ply (...)
     """
     try:
         vertex = PlyData.read(str(path))["vertex"]
@@ -138,6 +149,10 @@ def split_factors(factors: NDArray[Any]) -> tuple[Float, Float]:
 
     Args:
         factors: [N, 3, 3], full rank.
+
+    >>> axes, lengths = split_factors(np.diag([3.0, 1.0, 2.0])[None])
+    >>> lengths, bool(np.allclose(axes, np.eye(3)))
+    (array([[3., 1., 2.]]), True)
     """
     start = np.asarray(factors, dtype=np.float64)
     columns = start.copy()

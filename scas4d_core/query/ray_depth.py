@@ -51,6 +51,12 @@ def ray_depths(
 
     Returns:
         z [Q] metres along the camera's axis, NaN where nothing is met; covered [Q] in 0…1, the light that is lost.
+
+    >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
+    >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
+    >>> depth, covered = ray_depths(state, camera, np.array([[32, 24], [0.5, 0.5]]))
+    >>> depth.round(3), covered.round(3)
+    (array([1.936,   nan]), array([0.9, 0. ]))
     """
     uv = np.asarray(uv, dtype=np.float64)
     depth, covered = np.full(len(uv), np.nan), np.zeros(len(uv))

@@ -41,6 +41,11 @@ def tapvid3d(
 
     Raises:
         ValueError: shapes do not fit.
+
+    >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
+    >>> arrays = tapvid3d(np.array([[[0, 0, 2.0]]]), np.array([[True]]), camera, queried=0)
+    >>> arrays["tracks_XYZ"].shape, arrays["queries_xyt"]
+    ((1, 1, 3), array([[32., 24.,  0.]], dtype=float32))
     """
     if positions.ndim != 3 or visibility.shape != positions.shape[:2]:
         raise ValueError(f"positions {positions.shape} must be [T, Q, 3] and visibility {visibility.shape} [T, Q]")

@@ -103,6 +103,18 @@ def tracks_of_points(
     Raises:
         ValueError: points not [Q, 3] or not finite.
         HistoryError: a frame was not committed.
+
+    >>> history = History()
+    >>> state = Gaussians.of_points([[0, 0, 0], [1, 0, 0]], radius=0.2)
+    >>> for index in range(2):
+    ...     history.append(index, index / 30, state.replace(means=state.means + np.float32([0, index, 0])))
+    >>> world = WorldFrame(np.zeros(3))
+    >>> tracks = tracks_of_points(history, world, np.array([[0.1, 0, 0]]), index=0, indices=[0, 1])
+    >>> tracks.positions[:, 0]
+    array([[0.1, 0. , 0. ],
+           [0.1, 1. , 0. ]])
+    >>> tracks.ids
+    array([0])
     """
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -154,6 +166,16 @@ def tracks_of_pixels(
 
     Raises:
         ValueError: uv not [Q, 2], not finite or outside the picture.
+
+    >>> history = History()
+    >>> history.append(0, 0.0, Gaussians.of_points([[0, 0, 2]], radius=0.1))
+    >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
+    >>> def render_depth(camera, index):  # ``Committed`` renders it
+    ...     return np.full((48, 64), 2.0), np.ones((48, 64))
+    >>> world = WorldFrame(np.zeros(3))
+    >>> tracks = tracks_of_pixels(history, world, camera, np.array([[32, 24]]), 0, [0], render_depth)
+    >>> tracks.positions[0, 0].round(3), tracks.visibility["front"]
+    (array([0.   , 0.   , 1.936]), array([[ True]]))
     """
     uv = np.asarray(uv, dtype=np.float64)
     if uv.ndim != 2 or uv.shape[1] != 2:
@@ -194,6 +216,11 @@ def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indice
     Raises:
         ValueError: an id that the history does not hold.
         HistoryError: a frame that was not committed.
+
+    >>> history = History()
+    >>> history.append(7, 0.0, Gaussians.of_points([[0, 0, 0], [1, 0, 0]], radius=0.2))
+    >>> tracks_of_ids(history, WorldFrame(np.zeros(3)), np.array([1]), indices=[7]).positions
+    array([[[1., 0., 0.]]])
     """
     wanted = np.asarray(ids, dtype=np.int64).reshape(-1)
     held = history.gaussians(history.indices[0]).ids if len(history) else np.empty(0, dtype=np.int64)
@@ -257,6 +284,11 @@ def carriers(
     Returns:
         Rows [Q, K], heaviest first; weights [Q, K] that sum to 1, in proportion to o·exp(−½ m²) (so far from
         everything the nearest alone carries); the opacity 1 − Π(1 − o·exp(−½ m²)) of the K at the point, [Q].
+
+    >>> state = Gaussians.of_points([[0, 0, 0], [1, 0, 0]], radius=0.2)
+    >>> rows, weights, opacity = carriers(state, np.array([[0.1, 0, 0]]), count=1, softening=0.0)
+    >>> rows, opacity.round(2)
+    (array([[0]]), array([0.79]))
     """
     count = min(count, len(gaussians))
     factors = gaussians.factors.astype(np.float64)
@@ -289,6 +321,10 @@ def geometric_median(points: Float, weights: Float) -> Float:
     Args:
         points: [Q, K, 3].
         weights: [Q, K], sum 1.
+
+    >>> points = np.array([[[0, 0, 0], [0.1, 0, 0], [9, 9, 9]]])
+    >>> bool(np.linalg.norm(geometric_median(points, np.full((1, 3), 1 / 3))) < 0.2)  # the stray does not count
+    True
     """
     centre: Float = np.einsum("qk,qki->qi", weights, points)
     if points.shape[1] < 3:

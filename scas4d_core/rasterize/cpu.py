@@ -89,6 +89,21 @@ class CpuRasterizer:
 
     Attributes:
         guards: how often each guard acted in all passes since the last ``reset`` of the counts.
+
+    >>> from scas4d_core.gaussians import Gaussians
+    >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
+    >>> camera = Camera("front", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], np.eye(4), 16, 16)
+    >>> features = np.concatenate([state.colours, np.zeros((1, 1), np.float32)], axis=1)  # in groups of four
+    >>> rasterizer = CpuRasterizer()
+    >>> picture = rasterizer.forward(
+    ...     state.means, state.factors, state.opacities, features, CameraArrays.of(camera), np.zeros(4, np.float32)
+    ... )
+    >>> picture.features[:, 8, 8].round(2), round(float(picture.rest[8, 8]), 2)
+    (array([0.89, 0.  , 0.  , 0.  ], dtype=float32), 0.11)
+    >>> g_image, g_alpha = rasterizer.gradient_buffers()
+    >>> g_image[0, :16, :16] = 1  # of the sum of red over the pixels
+    >>> rasterizer.backward(g_image, g_alpha).features.round(0)
+    array([[113.,   0.,   0.,   0.]], dtype=float32)
     """
 
     def __init__(self, limits: Limits = DEFAULT) -> None:

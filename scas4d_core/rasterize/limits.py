@@ -39,6 +39,11 @@ def scene_limits(near: float | str, rig_radius: float) -> Limits:
     Args:
         near: metres, or "auto" for ``NEAR_SHARE`` of the rig's radius.
         rig_radius: metres.
+
+    >>> scene_limits("auto", rig_radius=3.0).near  # metres
+    0.30000000000000004
+    >>> scene_limits(0.05, rig_radius=3.0).near
+    0.05
     """
     if isinstance(near, str):
         # A single camera has no radius; a rig of millimetres still sees what is nearer than 1 cm.

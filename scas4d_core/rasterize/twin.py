@@ -164,6 +164,17 @@ def render(
         camera: of the inside world.
         background: [C].
         limits: of the backend to agree with.
+
+    >>> from scas4d_core.gaussians import Gaussians
+    >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
+    >>> means, factors, opacities, colours = (
+    ...     torch.tensor(array, dtype=torch.float64)
+    ...     for array in (state.means, state.factors, state.opacities, state.colours)
+    ... )
+    >>> camera = Camera("front", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], torch.eye(4).numpy(), 16, 16)
+    >>> picture = render(means, factors, opacities, colours, CameraParams.of(camera), torch.zeros(3))
+    >>> picture.features[8, 8].round(decimals=2), picture.alpha.shape
+    (tensor([0.8900, 0.0000, 0.0000], dtype=torch.float64), torch.Size([16, 16]))
     """
     finite = sound(means, factors, opacities, features)
     if not bool(finite.all()):

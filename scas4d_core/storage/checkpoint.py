@@ -78,7 +78,17 @@ class Carried:
 
 
 class Checkpoints:
-    """The checkpoints in the directory of a history; for the process that appends to it."""
+    """The checkpoints in the directory of a history; for the process that appends to it.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     checkpoints = Checkpoints(Path(folder))
+    ...     checkpoints.save(4, Carried(labels=np.array([True, False])))
+    ...     checkpoints.load(4, factory=None).labels  # without pictures no view is made
+    ...     checkpoints.indices()
+    array([ True, False])
+    [4]
+    """
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory

@@ -42,6 +42,19 @@ class History(HistoryReader):
 
     Raises:
         HistoryError: ``directory`` already holds states.
+
+    >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
+    >>> history = History()  # in memory; History("states") keeps them in a folder
+    >>> history.append(0, 0.0, state, report={"loss": [0.5]})
+    >>> history.append(1, 0.1, state.replace(means=state.means + np.float32([0, 0, 1])))
+    >>> history.indices, history.times
+    ([0, 1], array([0. , 0.1]))
+    >>> history.stacked("means")[:, 0]  # of every frame
+    array([[0., 0., 2.],
+           [0., 0., 3.]], dtype=float32)
+    >>> history.append(1, 0.2, state)
+    Traceback (most recent call last):
+    scas4d_core.storage.frame_files.HistoryError: frame 1 comes after frame 1; append frames in rising order
     """
 
     def __init__(self, directory: Path | str | None = None) -> None:

@@ -37,7 +37,14 @@ PIECE = 1 << 20
 
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Writes an npz that is either whole at ``path`` or not there: temporary file, sync, rename, sync of the folder."""
+    """Writes an npz that is either whole at ``path`` or not there: temporary file, sync, rename, sync of the folder.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     write_npz(Path(folder) / "a.npz", {"means": np.zeros((2, 3))})
+    ...     read_npz(Path(folder) / "a.npz")["means"].shape
+    (2, 3)
+    """
     with written_whole(path, path.with_name(f".{path.name}.{os.getpid()}.part")) as file:
         _save(file, arrays)
 
@@ -122,6 +129,15 @@ def read_npz(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArra
     Raises:
         FileNotFoundError: it is not there.
         ValueError: it is damaged, or lacks a name; says which file, without its folder, and why.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "a.npz"
+    ...     write_npz(file, {"a": np.arange(3)})
+    ...     shortened = file.write_bytes(file.read_bytes()[:-40])
+    ...     read_npz(file)
+    Traceback (most recent call last):
+    ValueError: a.npz is damaged, or no npz file (...)
     """
     try:
         # Opened here, because numpy leaves a damaged file open.

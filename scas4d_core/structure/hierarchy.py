@@ -60,6 +60,14 @@ def build_hierarchy(
 
     Raises:
         ValueError: the wished numbers do not ascend.
+
+    >>> points = np.array([[0, 0, 0], [5, 0, 0], [0.1, 0, 0], [5.1, 0, 0], [9, 9, 9]])
+    >>> moving = np.array([True, True, True, True, False])
+    >>> found = build_hierarchy(points, moving, clusters=(1, 2), smallest=1)
+    >>> found.sizes
+    (1, 2)
+    >>> [found.rows[a:b].tolist() for a, b in pairwise(found.starts[-1])]  # the finest layer's clusters
+    [[0, 2], [1, 3]]
     """
     if any(a >= b for a, b in pairwise(clusters)):
         raise ValueError(f"clusters {clusters} must ascend from the coarsest layer to the finest")

@@ -36,11 +36,16 @@ NEW_LABELS = 0.01
 """Share of all Gaussians that must be found moving anew before the hierarchy is built again."""
 
 
-def settled(gaussians: Gaussians) -> Gaussians:
+def with_reliable_labels(gaussians: Gaussians) -> Gaussians:
     """The Gaussians of frame 0 with labels that can be relied on.
 
     The few Gaussians of an object that no mask taught would stay behind when it moves, and hide it. In a cluster that
     does not move they stand just as well.
+
+    >>> state = Gaussians.of_points([[x, 0, 0] for x in range(100)], radius=0.1)
+    >>> few_stand = state.replace(foreground=np.float32([0] * 5 + [1] * 95))
+    >>> int(with_reliable_labels(few_stand).moving.sum())  # 5 of 100 are noise
+    100
     """
     standing = int((~gaussians.moving).sum())
     if not 0 < standing < STANDING_SHARE * len(gaussians):
@@ -49,7 +54,14 @@ def settled(gaussians: Gaussians) -> Gaussians:
 
 
 def changed_pixels(before: Array, now: Array) -> Array:
-    """[H, W] 1 where the planes [3, H, W] of two frames differ, and around; else 0."""
+    """[H, W] 1 where the planes [3, H, W] of two frames differ, and around; else 0.
+
+    >>> before = np.zeros((3, 7, 7), np.float32)
+    >>> now = before.copy()
+    >>> now[0, 3, 3] = 0.5
+    >>> int(changed_pixels(before, now).sum())  # the pixel, and five by five about it
+    25
+    """
     changed = (np.abs(now - before).max(axis=0) > CHANGE).astype(np.float32)
     marked: Array = maximum_filter(changed, size=REACH_PIXELS)
     return marked

@@ -17,6 +17,11 @@ def require_device(device: str) -> None:
 
     Raises:
         DeviceError: "cuda" without torch, gsplat, a torch built for CUDA, a GPU, or the compiler that gsplat needs.
+
+    >>> require_device("cpu")
+    >>> require_device("cuda")  # doctest: +SKIP
+    Traceback (most recent call last):
+    scas4d_core.torch_backend.device.DeviceError: device 'cuda': ...; or choose device 'cpu'
     """
     if device == "cpu":
         return
