@@ -29,7 +29,7 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "scas4d_core.metrics.tracks": (
         "error_by_confidence", "median_trajectory_error", "oracle_tracks", "track_error_3d", "visibility_accuracy",
     ),
-    "scas4d_core.query.committed": ("Committed", "View"),
+    "scas4d_core.query.committed": ("CommittedScene", "View"),
     "scas4d_core.query.parts": ("match_labels", "parts"),
     "scas4d_core.query.ply": ("read_ply", "split_factors", "write_ply"),
     "scas4d_core.query.ray_depth": ("ray_depths",),

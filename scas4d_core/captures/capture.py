@@ -18,7 +18,7 @@ from scas4d_core.captures.images import decode_image, decode_mask
 Files = Mapping[str, Path]
 
 
-class Decoded(Mapping[str, NDArray[np.uint8]]):
+class LazyPictures(Mapping[str, NDArray[np.uint8]]):
     """Pictures by camera name, decoded anew on every look and not kept: a long capture stays out of memory."""
 
     def __init__(self, files: Files, decode: Callable[[str, Path], NDArray[np.uint8]]) -> None:
@@ -152,8 +152,10 @@ class Capture:
         return Frame(
             index=index,
             time=index / self.fps,
-            images=Decoded(images[index], lambda name, path: decode_image(path, size=sizes[name], image_scale=scale)),
-            masks=Decoded(masks[index], lambda name, path: decode_mask(path, size=sizes[name], image_scale=scale)),
+            images=LazyPictures(
+                images[index], lambda name, path: decode_image(path, size=sizes[name], image_scale=scale)
+            ),
+            masks=LazyPictures(masks[index], lambda name, path: decode_mask(path, size=sizes[name], image_scale=scale)),
         )
 
 

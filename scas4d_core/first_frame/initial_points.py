@@ -15,7 +15,7 @@ from scas4d_core.first_frame.posed_pictures import (
     Bool,
     Float,
     InitialPointsError,
-    View,
+    PosedPicture,
     collect_views,
     look_at_point,
     observe,
@@ -25,7 +25,7 @@ from scas4d_core.first_frame.posed_pictures import (
 from scas4d_core.first_frame.silhouettes import plain_background, with_silhouettes
 from scas4d_core.first_frame.stereo import ITERATIONS, DepthMap, depth_maps, fused_points, halved, looked_through
 from scas4d_core.first_frame.surfaces import TOLERANCE, Support, fit_surfaces, sample_surfaces, settle, surface_depth
-from scas4d_core.first_frame.triangulation import Triangulated, triangulate
+from scas4d_core.first_frame.triangulation import Triangulation, triangulate
 from scas4d_core.first_frame.visual_hull import MISSES, VisualHull, carve, contradicted, pixel_at
 
 Tell = Callable[[str, int, int], None]
@@ -61,7 +61,7 @@ def initial_points(
 ) -> InitialPoints:
     """Points on the surfaces that the pictures of one moment show.
 
-    Triangulated features bound the scene and support walls and floors; PatchMatch stereo, kept where at least
+    Triangulation features bound the scene and support walls and floors; PatchMatch stereo, kept where at least
     ``MIN_VIEWS`` cameras agree and few look through, gives what has texture; the visual hull (of the masks, or of
     silhouettes before a plain background) and the fitted surfaces give the rest. A point that one camera alone supports
     is never made, except on a wall or floor that others have found.
@@ -133,7 +133,7 @@ def initial_points(
     return _merged(labelled, views, (confirmed, solid, walls), pixel, plain, stereo, max_points)
 
 
-def _in_foreground(views: Sequence[View], triangulated: Triangulated) -> Bool:
+def _in_foreground(views: Sequence[PosedPicture], triangulated: Triangulation) -> Bool:
     """[P] whether most of the cameras that saw a triangulated point have it in their mask."""
     points = triangulated.positions
     said, yes = np.zeros(len(points)), np.zeros(len(points))
@@ -148,8 +148,8 @@ def _in_foreground(views: Sequence[View], triangulated: Triangulated) -> Bool:
 
 
 def _stereo(
-    views: Sequence[View],
-    triangulated: Triangulated,
+    views: Sequence[PosedPicture],
+    triangulated: Triangulation,
     hull: VisualHull,
     supports: Sequence[Support],
     plain: bool,
@@ -208,8 +208,8 @@ def _free_hull(hull: VisualHull, maps: Sequence[DepthMap], min_views: int) -> Fl
 
 
 def _merged(
-    labelled: Sequence[View],
-    views: Sequence[View],
+    labelled: Sequence[PosedPicture],
+    views: Sequence[PosedPicture],
     sources: tuple[Float, Float, Float],
     pixel: float,
     plain: bool,
@@ -276,7 +276,7 @@ def _merged(
     return InitialPoints(points[chosen], seen.colours[chosen], None if foreground is None else foreground[chosen])
 
 
-def _foreground(views: Sequence[View], points: Float, visible: Bool) -> NDArray[np.float32] | None:
+def _foreground(views: Sequence[PosedPicture], points: Float, visible: Bool) -> NDArray[np.float32] | None:
     """[P] share of the cameras that may see each point whose mask holds it; None without masks."""
     said, yes = np.zeros(len(points)), np.zeros(len(points))
     for row, view in zip(visible, views, strict=True):

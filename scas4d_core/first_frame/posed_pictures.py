@@ -23,7 +23,7 @@ class InitialPointsError(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class PosedPicture:
     """A camera and its picture.
 
     Attributes:
@@ -39,7 +39,7 @@ class View:
 
 def collect_views(
     rig: Rig, images: Mapping[str, NDArray[np.uint8]], masks: Mapping[str, NDArray[np.uint8]]
-) -> list[View]:
+) -> list[PosedPicture]:
     """The views of every camera of the rig that has a picture, in the rig's order.
 
     Raises:
@@ -60,7 +60,7 @@ def collect_views(
             raise InitialPointsError(
                 f"masks[{camera.name!r}]: shape {mask.shape}; give {image.shape[:2]}, the size of its picture"
             )
-        views.append(View(camera, image, None if mask is None else np.asarray(mask) > 0))
+        views.append(PosedPicture(camera, image, None if mask is None else np.asarray(mask) > 0))
     if len(views) < 2:
         raise InitialPointsError(
             f"images: {len(views)} of the rig's {len(rig)} cameras have a picture; points from pictures need at least 2"
@@ -68,7 +68,7 @@ def collect_views(
     return views
 
 
-def look_at_point(views: Sequence[View]) -> Float:
+def look_at_point(views: Sequence[PosedPicture]) -> Float:
     """[3] the point nearest to all optical axes (least squares); the middle of the stage of an inward-looking rig."""
     axes = np.array([view.camera.rotation[2] for view in views])
     centres = np.array([view.camera.centre for view in views])
@@ -121,7 +121,7 @@ def front_depth(camera: Camera, occluders: Float, spacing: float, points: Float)
     return front
 
 
-def visible_from(views: Sequence[View], points: Float, spacing: float) -> Bool:
+def visible_from(views: Sequence[PosedPicture], points: Float, spacing: float) -> Bool:
     """Which cameras may see which points, the points themselves being the occluders.
 
     A point is hidden if it lies more than four diameters of a disc behind the nearest one; see ``front_depth``.
@@ -139,7 +139,7 @@ def visible_from(views: Sequence[View], points: Float, spacing: float) -> Bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Observed:
+class PointColours:
     """What the cameras that may see each point agree on.
 
     Attributes:
@@ -153,12 +153,12 @@ class Observed:
     count: NDArray[np.intp]
 
 
-def observe(views: Sequence[View], points: Float, visible: Bool) -> Observed:
+def observe(views: Sequence[PosedPicture], points: Float, visible: Bool) -> PointColours:
     """Median colour of points [P, 3] over the cameras in ``visible`` [V, P]; NaN where no camera sees the point."""
     if len(points) > BLOCK:  # bounds the memory of the samples
         blocks = [slice(start, start + BLOCK) for start in range(0, len(points), BLOCK)]
         parts = [observe(views, points[block], visible[:, block]) for block in blocks]
-        return Observed(
+        return PointColours(
             np.concatenate([part.colours for part in parts]),
             np.concatenate([part.spread for part in parts]),
             np.concatenate([part.count for part in parts]),
@@ -175,4 +175,4 @@ def observe(views: Sequence[View], points: Float, visible: Bool) -> Observed:
     if some.any():
         colours[some] = np.nanmedian(samples[:, some], axis=0)
         spread[some] = np.nanmedian(np.abs(samples[:, some] - colours[some]), axis=0).max(-1)
-    return Observed(colours, spread, count)
+    return PointColours(colours, spread, count)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from scas4d_core.first_frame.posed_pictures import Bool, View
+from scas4d_core.first_frame.posed_pictures import Bool, PosedPicture
 
 TOLERANCE = 8
 """Values of 255, in any channel, that are still the background: above resampling and mild compression noise."""
@@ -23,7 +23,7 @@ def _border(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.concatenate([image[0], image[-1], image[1:-1, 0], image[1:-1, -1]])
 
 
-def plain_background(views: Sequence[View]) -> NDArray[np.uint8] | None:
+def plain_background(views: Sequence[PosedPicture]) -> NDArray[np.uint8] | None:
     """The one colour [3] uint8 of the borders of all pictures; None where there is no such colour."""
     borders = [_border(view.image) for view in views]
     colour = np.median(np.concatenate(borders), axis=0)
@@ -46,6 +46,6 @@ def silhouette(image: NDArray[np.uint8], background: NDArray[np.uint8]) -> Bool:
     return result
 
 
-def with_silhouettes(views: Sequence[View], background: NDArray[np.uint8]) -> list[View]:
+def with_silhouettes(views: Sequence[PosedPicture], background: NDArray[np.uint8]) -> list[PosedPicture]:
     """The views with the silhouette as their mask."""
     return [replace(view, mask=silhouette(view.image, background)) for view in views]

@@ -21,7 +21,7 @@ from scas4d_core.update.views import ViewFactory
 
 
 @dataclass(frozen=True, eq=False)
-class Fixed:
+class FirstFrame:
     """What frame 0 leaves to every update.
 
     Attributes:
@@ -41,7 +41,7 @@ class Fixed:
         }
 
     @classmethod
-    def of(cls, history: History) -> Fixed:
+    def of(cls, history: History) -> FirstFrame:
         """What the first frame of a history left.
 
         Raises:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
 from scas4d_core.first_frame.patch_match import patch_match
-from scas4d_core.first_frame.posed_pictures import Bool, Float, View, pixels_inside
+from scas4d_core.first_frame.posed_pictures import Bool, Float, PosedPicture, pixels_inside
 from scas4d_core.first_frame.visual_hull import VisualHull
 
 WIDTH = 320
@@ -39,7 +39,7 @@ class DepthMap:
         agreeing: [H, W] other cameras whose depth agrees.
     """
 
-    view: View
+    view: PosedPicture
     depth: Float
     agreeing: NDArray[np.intp]
 
@@ -49,7 +49,7 @@ class DepthMap:
         return result
 
 
-def halved(view: View, width: int = WIDTH) -> View:
+def halved(view: PosedPicture, width: int = WIDTH) -> PosedPicture:
     """The view at half, a quarter … of its size, until it is no wider than ``width`` pixels."""
     image, mask, camera = view.image.astype(np.float32), view.mask, view.camera
     while camera.width > width and camera.width >= 2 and camera.height >= 2:
@@ -60,10 +60,10 @@ def halved(view: View, width: int = WIDTH) -> View:
         # Blocks of 2 × 2 with pixel centres at +0.5: every pixel coordinate is halved exactly, odd sizes or not.
         matrix = camera.intrinsics * np.array([[0.5], [0.5], [1.0]])
         camera = type(camera)(camera.name, matrix, camera.world_to_camera, w // 2, h // 2)
-    return View(camera, np.rint(image).astype(np.uint8), mask)
+    return PosedPicture(camera, np.rint(image).astype(np.uint8), mask)
 
 
-def neighbours_of(views: Sequence[View], index: int, middle: Float, count: int) -> list[int]:
+def neighbours_of(views: Sequence[PosedPicture], index: int, middle: Float, count: int) -> list[int]:
     """The views to compare one with: nearest in angle about ``middle`` [3], but not too near."""
     rays = np.array([view.camera.centre - middle for view in views])
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
@@ -73,7 +73,7 @@ def neighbours_of(views: Sequence[View], index: int, middle: Float, count: int) 
 
 
 def depth_maps(
-    views: Sequence[View],
+    views: Sequence[PosedPicture],
     ranges: Sequence[tuple[float, float]],
     priors: Sequence[Float],
     active: Sequence[Bool],
@@ -137,7 +137,7 @@ def depth_maps(
     return [DepthMap(view, depths[i], _agreement(views, depths, i)) for i, view in enumerate(views)]
 
 
-def _confine(view: View, depth: Float, hull: VisualHull) -> None:
+def _confine(view: PosedPicture, depth: Float, hull: VisualHull) -> None:
     """Forget, in place, the depths of masked pixels that lie off the hull: no foreground is there."""
     rows, columns = np.nonzero((depth > 0) & np.asarray(view.mask))
     if len(rows) == 0:
@@ -147,7 +147,7 @@ def _confine(view: View, depth: Float, hull: VisualHull) -> None:
     depth[rows[off], columns[off]] = 0.0
 
 
-def _agreement(views: Sequence[View], depths: Sequence[Float], index: int) -> NDArray[np.intp]:
+def _agreement(views: Sequence[PosedPicture], depths: Sequence[Float], index: int) -> NDArray[np.intp]:
     """[H, W] how many other cameras' depths send a pixel's point back to it."""
     camera, depth = views[index].camera, depths[index]
     rows, columns = np.nonzero(depth > 0)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
-from scas4d_core.first_frame.posed_pictures import Bool, Float, View
+from scas4d_core.first_frame.posed_pictures import Bool, Float, PosedPicture
 
 MOST = 3
 """Planes and spheres fitted to the triangulated points: walls, floor and a dome are rarely more."""
@@ -212,7 +212,7 @@ def _refined(surface: Surface, near: Float, tolerance: float) -> Surface | None:
     return Sphere(np.asarray(answer.x[:3]), float(answer.x[3]))
 
 
-def surface_depth(view: View, supports: Sequence[Support], uv: Float) -> tuple[Float, Float]:
+def surface_depth(view: PosedPicture, supports: Sequence[Support], uv: Float) -> tuple[Float, Float]:
     """Where the rays through pixels [R, 2] first meet the surfaces.
 
     Returns:
@@ -230,7 +230,7 @@ def surface_depth(view: View, supports: Sequence[Support], uv: Float) -> tuple[F
     return points, depth
 
 
-def sample_surfaces(views: Sequence[View], supports: Sequence[Support], stride: int, scale: float) -> Float:
+def sample_surfaces(views: Sequence[PosedPicture], supports: Sequence[Support], stride: int, scale: float) -> Float:
     """[P, 3] points of the surfaces where the cameras look, one for each ``stride``-th pixel outside the masks.
 
     Args:

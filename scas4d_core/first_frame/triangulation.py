@@ -16,7 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from scas4d_core.cameras import Camera
-from scas4d_core.first_frame.posed_pictures import Float, View
+from scas4d_core.first_frame.posed_pictures import Float, PosedPicture
 
 RATIO = 0.8
 """Best over second-best descriptor distance among the candidates on the epipolar line (Lowe 2004, section 7.1)."""
@@ -32,7 +32,7 @@ MIN_ANGLE_DEG = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Triangulated:
+class Triangulation:
     """Points and who saw them.
 
     Attributes:
@@ -46,7 +46,7 @@ class Triangulated:
     error: Float
 
 
-def features(views: Sequence[View]) -> list[tuple[Float, NDArray[np.float32]]]:
+def features(views: Sequence[PosedPicture]) -> list[tuple[Float, NDArray[np.float32]]]:
     """SIFT of every view: keypoints [K, 2] (pixel centres at +0.5, as in COLMAP) and unit descriptors [K, 128]."""
     import pycolmap
 
@@ -109,7 +109,7 @@ def guided_matches(
     return np.stack([rows[good], best_b[good]], axis=1)
 
 
-def triangulate(views: Sequence[View], *, min_views: int = 3, seed: int = 0) -> Triangulated:
+def triangulate(views: Sequence[PosedPicture], *, min_views: int = 3, seed: int = 0) -> Triangulation:
     """Match SIFT features over all pairs of views and triangulate each track robustly (LO-RANSAC), poses fixed.
 
     Args:
@@ -179,6 +179,6 @@ def triangulate(views: Sequence[View], *, min_views: int = 3, seed: int = 0) -> 
         positions.append(point)
         seen.append(row)
         errors.append(error)
-    return Triangulated(
+    return Triangulation(
         np.array(positions).reshape(-1, 3), np.array(seen, dtype=bool).reshape(-1, len(views)), np.array(errors)
     )

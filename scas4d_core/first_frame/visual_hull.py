@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt
 
-from scas4d_core.first_frame.posed_pictures import Bool, Float, View, front_depth, look_at_point, pixels_inside
+from scas4d_core.first_frame.posed_pictures import Bool, Float, PosedPicture, front_depth, look_at_point, pixels_inside
 
 SEEN_SHARE = 0.35
 """Share of the masked cameras that must see a voxel: at the edges of the stage few do, and ghosts stay uncarved."""
@@ -85,7 +85,7 @@ class VisualHull:
         return bare
 
 
-def pixel_at(views: Sequence[View], point: Float) -> float:
+def pixel_at(views: Sequence[PosedPicture], point: Float) -> float:
     """World units across one pixel at ``point``, median over the cameras before which it lies (1 where none)."""
     sizes = [
         float(view.camera.project(point)[1]) / view.camera.fx for view in views if view.camera.project(point)[1] > 0
@@ -94,7 +94,7 @@ def pixel_at(views: Sequence[View], point: Float) -> float:
 
 
 def carve(
-    views: Sequence[View], *, voxel_pixels: float = VOXEL_PIXELS, misses: float = 0.0, min_views: int = 3
+    views: Sequence[PosedPicture], *, voxel_pixels: float = VOXEL_PIXELS, misses: float = 0.0, min_views: int = 3
 ) -> VisualHull:
     """Carve the hull of the masks.
 
@@ -127,7 +127,7 @@ def carve(
         voxel /= 2
 
 
-def contradicted(views: Sequence[View], hull: VisualHull, points: Float, misses: float) -> NDArray[np.intp]:
+def contradicted(views: Sequence[PosedPicture], hull: VisualHull, points: Float, misses: float) -> NDArray[np.intp]:
     """[P] masks that speak against each point [P, 3].
 
     A point within the silhouettes is foreground, and nothing speaks against it. Any other is background: it must not
@@ -163,7 +163,7 @@ def _distance(mask: Bool) -> Float:
 
 
 def _kept(
-    views: Sequence[View],
+    views: Sequence[PosedPicture],
     distances: Sequence[Float],
     centres: Float,
     voxel: float,

@@ -49,12 +49,12 @@ class View:
     parts: NDArray[np.uint8] | None = None
 
 
-class Committed:
+class CommittedScene:
     """Reads a history. Cameras and points are in the user's world; ``index`` None is the newest frame.
 
     >>> history = History()
     >>> history.append(0, 0.0, Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0]))
-    >>> committed = Committed(history, WorldFrame(np.zeros(3)))
+    >>> committed = CommittedScene(history, WorldFrame(np.zeros(3)))
     >>> camera = Camera("front", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], np.eye(4), 16, 16)
     >>> view = committed.render(camera, background=(0, 0, 1))
     >>> view.colour[8, 8].round(1), view.depth[8, 8]

@@ -170,7 +170,7 @@ def tracks_of_pixels(
     >>> history = History()
     >>> history.append(0, 0.0, Gaussians.of_points([[0, 0, 2]], radius=0.1))
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
-    >>> def render_depth(camera, index):  # ``Committed`` renders it
+    >>> def render_depth(camera, index):  # ``CommittedScene`` renders it
     ...     return np.full((48, 64), 2.0), np.ones((48, 64))
     >>> world = WorldFrame(np.zeros(3))
     >>> tracks = tracks_of_pixels(history, world, camera, np.array([[32, 24]]), 0, [0], render_depth)

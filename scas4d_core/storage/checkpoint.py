@@ -38,7 +38,7 @@ class CheckpointError(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
+class CarryOver:
     """What one update leaves to the next beside Θ.
 
     Attributes:
@@ -59,7 +59,7 @@ class Carried:
 
     def after(
         self, outcome: Outcome, time: float, views: Sequence[TrainingView] | None, shown: Mapping[str, int]
-    ) -> Carried:
+    ) -> CarryOver:
         """What the next frame leaves in turn; of pictures that were not believed nothing is kept.
 
         Args:
@@ -68,13 +68,13 @@ class Carried:
         """
         learnt = outcome.fresh and not outcome.stood
         past = replace(outcome.past, fitted=time) if learnt else outcome.past
-        carried = replace(self, motion=outcome.motion, past=past)
+        carry_over = replace(self, motion=outcome.motion, past=past)
         if not outcome.fresh:
-            return carried
+            return carry_over
         if views is not None and outcome.exposure == 1.0:  # what another light changes has not moved
             seen = [view for view in views if view.name not in outcome.updated.left_out]
-            carried = replace(carried, seen=seen)
-        return replace(carried, shown=shown)
+            carry_over = replace(carry_over, seen=seen)
+        return replace(carry_over, shown=shown)
 
 
 class Checkpoints:
@@ -83,7 +83,7 @@ class Checkpoints:
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
     ...     checkpoints = Checkpoints(Path(folder))
-    ...     checkpoints.save(4, Carried(labels=np.array([True, False])))
+    ...     checkpoints.save(4, CarryOver(labels=np.array([True, False])))
     ...     checkpoints.load(4, factory=None).labels  # without pictures no view is made
     ...     checkpoints.indices()
     array([ True, False])
@@ -93,29 +93,29 @@ class Checkpoints:
     def __init__(self, directory: Path) -> None:
         self.directory = directory
 
-    def save(self, index: int, carried: Carried) -> None:
+    def save(self, index: int, carry_over: CarryOver) -> None:
         """Writes what frame ``index`` leaves to the next; before the frame is committed.
 
         Without masks that includes the pictures of the frame, 3 bytes a pixel.
         """
-        arrays: dict[str, Any] = {"format": np.int64(FORMAT), "structure": np.int64(carried.structure)}
-        if carried.motion is not None:
-            arrays |= _packed(carried.motion)
-        arrays |= {f"past.{name}": array for name, array in carried.past.arrays().items()}
+        arrays: dict[str, Any] = {"format": np.int64(FORMAT), "structure": np.int64(carry_over.structure)}
+        if carry_over.motion is not None:
+            arrays |= _packed(carry_over.motion)
+        arrays |= {f"past.{name}": array for name, array in carry_over.past.arrays().items()}
         arrays |= {
-            "shown.names": np.array(list(carried.shown), np.str_),
-            "shown.prints": np.array(list(carried.shown.values()), np.int64),
+            "shown.names": np.array(list(carry_over.shown), np.str_),
+            "shown.prints": np.array(list(carry_over.shown.values()), np.int64),
         }
-        if carried.labels is not None:
-            arrays["labels"] = carried.labels
-        for view in carried.seen:
+        if carry_over.labels is not None:
+            arrays["labels"] = carry_over.labels
+        for view in carry_over.seen:
             levels = np.rint(255 * view.target[:3]).astype(np.uint8)  # they were 8 bit: exact
             arrays[f"seen.{view.name}"] = np.moveaxis(levels, 0, -1)
         # A name that went missing by damage must not read as something that was never there.
         arrays["names"] = np.array(sorted(arrays))
         write_npz(self._file(index), arrays)
 
-    def load(self, index: int, factory: ViewFactory) -> Carried:
+    def load(self, index: int, factory: ViewFactory) -> CarryOver:
         """What frame ``index`` left.
 
         Args:
@@ -138,7 +138,7 @@ class Checkpoints:
             motion = _unpacked(arrays) if "motion.seconds" in arrays else None
             past = Past.of_arrays({name[5:]: array for name, array in arrays.items() if name.startswith("past.")})
             shown = dict(zip(arrays["shown.names"].tolist(), arrays["shown.prints"].tolist(), strict=True))
-            return Carried(motion, arrays.get("labels"), seen, int(arrays["structure"]), past, shown)
+            return CarryOver(motion, arrays.get("labels"), seen, int(arrays["structure"]), past, shown)
         except FileNotFoundError:
             raise CheckpointError(f"{file.name} is missing") from None
         except (ValueError, KeyError, TypeError) as error:
@@ -194,7 +194,7 @@ class ResumeError(ValueError):
 
 
 @dataclass(frozen=True)
-class Resumed:
+class ResumePoint:
     """Where a scene was taken up again.
 
     Attributes:
@@ -213,7 +213,7 @@ class Resumed:
 
 def find_commit(
     history: History, checkpoints: Checkpoints, factory: ViewFactory, held: Callable[[int], bool]
-) -> tuple[int, Carried | None, list[str]]:
+) -> tuple[int, CarryOver | None, list[str]]:
     """The commit to go on from, what it left to the next update (None: a cold start), and what was found damaged.
 
     Args:
@@ -224,13 +224,13 @@ def find_commit(
     """
     faults = list(history.damaged.values())
     whole: list[int] = []
-    carried: Carried | None = None
+    carry_over: CarryOver | None = None
     for index in reversed(history.indices):
         try:
             history.gaussians(index)
             history.report(index)
             whole.append(index)
-            carried = checkpoints.load(index, factory)
+            carry_over = checkpoints.load(index, factory)
             break
         except (HistoryError, CheckpointError) as error:
             faults.append(str(error))
@@ -239,6 +239,6 @@ def find_commit(
     if not whole:
         raise ResumeError("no state can be read: " + "; ".join(faults))
     later = sorted({*history.indices, *history.damaged})
-    if carried is None or not all(held(index) for index in later if index > whole[-1]):
+    if carry_over is None or not all(held(index) for index in later if index > whole[-1]):
         return whole[0], None, faults
-    return whole[-1], carried, faults
+    return whole[-1], carry_over, faults

@@ -57,7 +57,7 @@ class FrameFiles:
         self._copied: tuple[Stamp, int] | None = None
 
     @property
-    def there(self) -> bool:
+    def exists(self) -> bool:
         """Whether the directory holds a history, maybe one that lost a file."""
         return self.fixed.exists() or self.fixed_copy.exists()
 

@@ -77,7 +77,7 @@ class History(HistoryReader):
         folder = Path(directory)
         folder.mkdir(parents=True, exist_ok=True)
         clear_parts(folder)
-        return cls.load(folder) if FrameFiles(folder).there else cls(folder)
+        return cls.load(folder) if FrameFiles(folder).exists else cls(folder)
 
     def save(self, directory: Path | str) -> None:
         """Writes a copy of this history into another directory, one frame at a time."""

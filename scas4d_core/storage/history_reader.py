@@ -59,7 +59,7 @@ class HistoryReader:
             HistoryError: no history there, or the file that all frames need is damaged.
         """
         files = FrameFiles(Path(directory))
-        if not files.there:
+        if not files.exists:
             raise HistoryError(f"{files.directory.name} holds no history: {files.fixed.name} is missing")
         history = cls()
         history._files = files
