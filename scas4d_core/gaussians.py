@@ -69,7 +69,7 @@ class Gaussians:
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """[N] which Gaussians the label lets move."""
+        """[N] bool: the Gaussians that move, by their label."""
         moving: NDArray[np.bool_] = self.foreground > 0.5
         return moving
 
@@ -98,8 +98,8 @@ def quaternions_to_matrices(quaternions: NDArray[Any]) -> NDArray[Any]:
 def moving_extent(gaussians: Gaussians) -> float:
     """Longest side, in metres, of the box that holds 98 % of the moving Gaussians on each axis (of all if none moves).
 
-    The unit of tolerances and features that should not depend on the size of the scene; the few Gaussians that
-    stray do not change it.
+    It is the unit of tolerances and features that should not depend on the size of the scene; a few stray Gaussians do
+    not change it.
 
     >>> points = np.linspace(0, 1, 101)[:, None] * [2, 1, 0]
     >>> round(moving_extent(Gaussians.of_points(points, 0.01)), 3)

@@ -62,7 +62,7 @@ def _refusal(name: str, given: Any, constant: Constant) -> InitErrorDetails | No
 
 
 class SceneSettings(Model):
-    """How the outside world enters.
+    """The world of the scene: unit, pictures, background, floor.
 
     >>> SceneSettings(metres_per_unit="auto").image_scale
     1.0

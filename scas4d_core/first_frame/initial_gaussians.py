@@ -19,14 +19,15 @@ MEAN, QUATERNION, SCALE, OPACITY, COLOUR, LABEL = (
 
 INITIAL_OPACITY = 0.1
 PER_PIXEL, PER_COVERED_PIXEL, LARGEST_BUDGET = 0.34, 0.27, 100_000
-"""The rule for the budget of Gaussians, see ``StaticSettings.max_gaussians``. Detail lies on objects: a picture that is
-mostly background asks for nearly as many Gaussians as a full one. Beyond the largest an update takes seconds."""
+"""The rule for the budget of Gaussians where ``StaticSettings.max_gaussians`` is not set. Detail lies on objects: a
+picture that is mostly background needs nearly as many Gaussians as a full one. Beyond the largest an update takes
+seconds."""
 PLAIN = 2 / 255
 """A pixel this near the background's colour is background."""
 
 
 def budget(views: list[TrainingView], scene: SceneSettings, settings: StaticSettings) -> int:
-    """How many Gaussians the scene may have."""
+    """Largest number of Gaussians of the scene, by the setting or by the size and content of the pictures."""
     if settings.max_gaussians is not None:
         return settings.max_gaussians
     background = np.array(scene.background, np.float32)[:, None, None]
@@ -49,7 +50,8 @@ def initial_parameters(
 
     Args:
         positions: [P, 3] metres inside. colours: [P, 3] in 0…1. foreground: [P] label or None.
-        limit: points beyond this many are left out at random.
+        limit: most Gaussians; of a larger cloud, points are left out at random.
+        rng: draws these.
     """
     if len(positions) > limit:
         keep = np.sort(rng.choice(len(positions), limit, replace=False))

@@ -1,4 +1,4 @@
-"""A first cloud from the pictures of frame 0 and calibrated cameras alone."""
+"""Initial points: a cloud from the pictures of frame 0 and calibrated cameras alone."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from scas4d_core.first_frame.surfaces import TOLERANCE, Support, fit_surfaces, s
 from scas4d_core.first_frame.triangulation import Triangulation, triangulate
 from scas4d_core.first_frame.visual_hull import MISSES, VisualHull, carve, contradicted, pixel_at
 
-Tell = Callable[[str, int, int], None]
-"""progress(stage, done, total)."""
+Report = Callable[[str, int, int], None]
+"""Called with a stage, the steps done and the steps in all."""
 
 MAX_POINTS = 60_000
 """Points kept at most; where there are more, the spacing grows."""
@@ -39,11 +39,12 @@ SPACING = 1.5
 """Distance of neighbouring points, pixels at the middle of the stage; twice that on the background."""
 
 COLOUR_SPREAD = 0.12
-"""Median deviation of the cameras' colours (0…1) above which a point no stereo has confirmed is in the wrong place."""
+"""Median deviation of the cameras' colours (0…1) above which a point that stereo has not confirmed is in the wrong
+place."""
 LOOKED_THROUGH = 2
-"""Cameras that look through an unconfirmed point to refute it: one depth may be wrong."""
+"""Cameras looking through an unconfirmed point that refute it: one depth may be wrong."""
 CONTRADICTED = 1
-"""Masks that speak against a point to refute it: one will do, for all masks agree on the hull behind the point."""
+"""Masks speaking against a point that refute it: one is enough, for all masks agree on the hull behind the point."""
 CROWD = 4
 """Stereo points that the 27 cells about one must hold: true surfaces are seen by many pixels, strays by few."""
 
@@ -52,19 +53,19 @@ def initial_points(
     rig: Rig,
     images: Mapping[str, NDArray[np.uint8]],
     masks: Mapping[str, NDArray[np.uint8]],
-    progress: Tell | None = None,
+    progress: Report | None = None,
     *,
     max_points: int = MAX_POINTS,
     stereo: bool = True,
     stereo_iterations: int = ITERATIONS,
     seed: int = 0,
 ) -> InitialPoints:
-    """Points on the surfaces that the pictures of one moment show.
+    """Finds points on the surfaces that the pictures of one moment show.
 
     Triangulation features bound the scene and support walls and floors; PatchMatch stereo, kept where at least
     ``MIN_VIEWS`` cameras agree and few look through, gives what has texture; the visual hull (of the masks, or of
-    silhouettes before a plain background) and the fitted surfaces give the rest. A point that one camera alone supports
-    is never made, except on a wall or floor that others have found.
+    silhouettes before a plain background) and the fitted surfaces give the rest. No point rests on one camera
+    alone, except on a wall or floor that others have found.
 
     Args:
         rig: calibrated cameras, in the user's world.
@@ -89,7 +90,7 @@ def initial_points(
     >>> cloud.positions.shape == cloud.colours.shape, bool((cloud.foreground <= 1).all())
     (True, True)
     """
-    tell: Tell = progress or (lambda stage, done, total: None)
+    tell: Report = progress or (lambda stage, done, total: None)
     labelled = collect_views(rig, images, masks)
     min_views = min(MIN_VIEWS, len(labelled))
     middle = look_at_point(labelled)
@@ -134,7 +135,7 @@ def initial_points(
 
 
 def _in_foreground(views: Sequence[PosedPicture], triangulated: Triangulation) -> Bool:
-    """[P] whether most of the cameras that saw a triangulated point have it in their mask."""
+    """[P] true where most of the cameras that saw a triangulated point have it in their mask."""
     points = triangulated.positions
     said, yes = np.zeros(len(points)), np.zeros(len(points))
     for view, seen in zip(views, triangulated.views.T, strict=True):
@@ -156,8 +157,9 @@ def _stereo(
     middle: Float,
     iterations: int,
     seed: int,
-    tell: Tell,
+    tell: Report,
 ) -> list[DepthMap]:
+    """Depth maps of all pictures, halved; the search starts from hull, surfaces and triangulated points."""
     small = [halved(view) for view in views]
     hull_surface = hull.centres[hull.surface()]
     known = hull_surface if plain else np.concatenate([triangulated.positions, hull_surface])
@@ -199,7 +201,7 @@ def _stereo(
 
 
 def _free_hull(hull: VisualHull, maps: Sequence[DepthMap], min_views: int) -> Float:
-    """[P, 3] surface of what remains of the hull after the space that cameras look through is taken away."""
+    """[P, 3] surface of the hull without the space that cameras look through."""
     if len(hull.cells) == 0:
         return np.zeros((0, 3))
     solid = looked_through(maps, hull.centres, min_views, margin=0.01) < LOOKED_THROUGH
@@ -216,10 +218,10 @@ def _merged(
     stereo: bool,
     max_points: int,
 ) -> InitialPoints:
-    """Thin, colour, label; drop what the pictures speak against.
+    """Thins, colours and labels the candidates, and drops those that the pictures contradict.
 
-    ``sources``: points that cameras agree on, points of the hull, points of fitted surfaces; where an earlier source
-    has a point, the later ones are not asked.
+    ``sources``: points that cameras agree on, points of the hull, points of fitted surfaces; a later source counts only
+    where no earlier one has a point.
     """
     fine = SPACING * pixel
     # Cameras that must see a point and agree on its colour: none once more, where stereo or features agree already;
@@ -229,7 +231,7 @@ def _merged(
     for source, (candidates, views_needed) in enumerate(zip(sources, needed_by, strict=True)):
         new, sizes = thinned(candidates, fine)
         if source == 0 and stereo and len(new):
-            # Features are few and checked; what is left of them near no stereo is kept by the hull and the walls.
+            # Features are few and checked; the hull and the walls cover those that lie near no point of stereo.
             crowd = np.asarray(cKDTree(candidates).query_ball_point(new, 1.5 * fine, return_length=True))
             new = new[(crowd >= CROWD) | (sizes >= CROWD)]
         elif len(points) and len(new):
@@ -244,12 +246,12 @@ def _merged(
     visible = visible_from(views, points, fine)
     foreground = _foreground(labelled, points, visible)
     if plain:
-        # What projects before the plain background there is an outline, and has none of its colour.
+        # A point that projects to the plain background there lies beside an outline, and has none of its colour.
         for row, view in zip(visible, views, strict=True):
             column, line, _, _ = pixels_inside(view.camera, points)
             row &= np.asarray(view.mask)[line, column]
     elif foreground is not None:
-        # A person before the wall is no sample of the wall's colour, nor the wall beside him of his.
+        # A person in front of a wall is no sample of the wall's colour, nor the wall of the person's.
         for row, view in zip(visible, views, strict=True):
             if view.mask is not None:
                 column, line, _, _ = pixels_inside(view.camera, points)
@@ -291,7 +293,7 @@ def _foreground(views: Sequence[PosedPicture], points: Float, visible: Bool) -> 
 
 
 def _spaced(points: Float, cell: float) -> NDArray[np.intp]:
-    """Of each cubic cell, the index of the point nearest to the mean of those in it: evener than any one of them."""
+    """Index of one point for each cubic cell, the nearest to the mean of the cell's points: that spreads evenly."""
     cells = np.floor(points / cell).astype(np.int64)
     _, where = np.unique(cells, axis=0, return_inverse=True)
     where = where.ravel()
@@ -303,7 +305,7 @@ def _spaced(points: Float, cell: float) -> NDArray[np.intp]:
 
 
 def thinned(points: Float, cell: float) -> tuple[Float, NDArray[np.intp]]:
-    """One point a cubic cell: the mean [Q, 3] of the points in it, and how many they were [Q]."""
+    """Means [Q, 3] of the points in each cubic cell of edge ``cell``, and the number of points in each [Q]."""
     if len(points) == 0:
         return points.reshape(-1, 3), np.zeros(0, dtype=np.intp)
     cells = np.floor(points / cell).astype(np.int64)

@@ -1,4 +1,4 @@
-"""What one camera saw in frame 0, and what several of them say about a point. Numpy only."""
+"""Pictures with camera poses, and queries over several of them: visibility, occlusion, colour of points. Numpy only."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class PosedPicture:
     Attributes:
         camera: calibrated, in the user's world.
         image: [H, W, 3] uint8.
-        mask: [H, W] bool, true where the foreground is; None where nobody said.
+        mask: [H, W] bool, true on the foreground; None where the capture has none.
     """
 
     camera: Camera
@@ -40,7 +40,7 @@ class PosedPicture:
 def collect_views(
     rig: Rig, images: Mapping[str, NDArray[np.uint8]], masks: Mapping[str, NDArray[np.uint8]]
 ) -> list[PosedPicture]:
-    """The views of every camera of the rig that has a picture, in the rig's order.
+    """Views of all cameras of the rig that have a picture, in the rig's order.
 
     Raises:
         InitialPointsError: fewer than two pictures, or a picture or mask whose size is not its camera's.
@@ -69,7 +69,7 @@ def collect_views(
 
 
 def look_at_point(views: Sequence[PosedPicture]) -> Float:
-    """[3] the point nearest to all optical axes (least squares); the middle of the stage of an inward-looking rig."""
+    """[3] point nearest to all optical axes (least squares): the middle of the stage of an inward-looking rig."""
     axes = np.array([view.camera.rotation[2] for view in views])
     centres = np.array([view.camera.centre for view in views])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -79,7 +79,7 @@ def look_at_point(views: Sequence[PosedPicture]) -> Float:
 
 
 def pixels_inside(camera: Camera, points: Float) -> tuple[NDArray[np.intp], NDArray[np.intp], Float, Bool]:
-    """Where world points [P, 3] fall in a picture.
+    """Projects world points [P, 3] to whole pixels of a picture.
 
     Returns:
         columns, rows [P] of the pixel that holds each (0 where outside), depths [P], and which are inside [P].
@@ -122,10 +122,10 @@ def front_depth(camera: Camera, occluders: Float, spacing: float, points: Float)
 
 
 def visible_from(views: Sequence[PosedPicture], points: Float, spacing: float) -> Bool:
-    """Which cameras may see which points, the points themselves being the occluders.
+    """Visibility of points [P, 3] in each camera; the points themselves are the occluders.
 
     A point is hidden if it lies more than four diameters of a disc behind the nearest one; see ``front_depth``.
-    Surfaces seen at more than about 60 degrees from their normal may count as hidden: poor witnesses of colour anyway.
+    Surfaces seen at more than about 60 degrees from their normal may count as hidden: their colour is vague anyway.
 
     Returns:
         [V, P] bool; false also where the point projects outside the picture.
@@ -140,12 +140,12 @@ def visible_from(views: Sequence[PosedPicture], points: Float, spacing: float) -
 
 @dataclass(frozen=True, eq=False)
 class PointColours:
-    """What the cameras that may see each point agree on.
+    """Colours of points over the cameras that may see them.
 
     Attributes:
         colours: [P, 3] float32 in 0…1, median over those cameras.
         spread: [P] median absolute deviation from it, largest channel, 0…1.
-        count: [P] cameras.
+        count: [P] cameras that see the point.
     """
 
     colours: NDArray[np.float32]

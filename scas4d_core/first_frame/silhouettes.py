@@ -12,7 +12,8 @@ from scipy.ndimage import label
 from scas4d_core.first_frame.posed_pictures import Bool, PosedPicture
 
 TOLERANCE = 8
-"""Values of 255, in any channel, that are still the background: above resampling and mild compression noise."""
+"""Difference from the background, of 255 in any channel, that still counts as background: above resampling and mild
+compression noise."""
 PLAIN_BORDER = 0.95
 """Share of the border of every picture in one colour from which the background counts as plain."""
 SMALL_HOLE = 12
@@ -24,7 +25,7 @@ def _border(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def plain_background(views: Sequence[PosedPicture]) -> NDArray[np.uint8] | None:
-    """The one colour [3] uint8 of the borders of all pictures; None where there is no such colour."""
+    """Colour [3] uint8 that the borders of all pictures share; None where they do not."""
     borders = [_border(view.image) for view in views]
     colour = np.median(np.concatenate(borders), axis=0)
     for border in borders:

@@ -55,20 +55,20 @@ gain and offset."""
 WEIGHT_MASK = 3.0
 """Weight of the mask loss where masks are given; in frame 0 it teaches the labels only."""
 EXPOSURE_TRIAL, EXPOSURE_SPREAD = 0.3, 0.015
-"""Share of the iterations after which exposure terms are judged, and the standard deviation of the gains over cameras
-below which they go. After 900 iterations it was 0.004 and 0.007 where there is no difference, 0.033 on a real rig."""
+"""Share of the iterations after which exposure terms are assessed, and the standard deviation of the gains over cameras
+below which they are given up. After 900 iterations it was 0.004 and 0.007 on equal cameras, 0.033 on a real rig."""
 SPLIT_SHRINK = 1.6
 """A split Gaussian's halves are smaller by this (3DGS)."""
 
 
 @dataclass(frozen=True, eq=False)
 class StaticResult:
-    """What frame 0 leaves.
+    """Result of fitting frame 0.
 
     Attributes:
-        gaussians: Θ_0. exposures: [3, 2] gain and offset of each training camera, empty without exposure terms.
+        gaussians: Θ_0. exposures: [3, 2] gain and offset of each training camera; empty without exposure terms.
         losses: the training loss of every iteration. psnr: dB of the view that each iteration rendered.
-        cameras: by name, how well each camera's picture was met when it was last rendered.
+        cameras: by name, the fit of each camera's picture in its last iteration.
     """
 
     gaussians: Gaussians
@@ -125,7 +125,7 @@ class StaticTrainer:
         self._gradients = np.empty_like(self.parameters)
 
     def train(self, progress: Callable[[int, float], None] | None = None) -> list[float]:
-        """Run all iterations, or as many as the stop rule lets; ``progress`` gets the iteration and the loss."""
+        """Runs all iterations, or fewer by the stop rule; ``progress`` is called with the iteration and its loss."""
         settings = self.settings
         losses: list[float] = []
         order = view_order(len(self.views), settings.iterations, self._rng)
@@ -144,7 +144,7 @@ class StaticTrainer:
                 self._last = min(settings.iterations, done + len(self.views))
                 self.remove_unseen()
             if settings.exposure == "auto" and done == round(EXPOSURE_TRIAL * settings.iterations):
-                self._judge_exposure()
+                self._assess_exposure()
             if progress is not None:
                 progress(done, losses[-1])
             if done == self._last:
@@ -152,7 +152,7 @@ class StaticTrainer:
         return losses
 
     def _settled(self, losses: list[float]) -> bool:
-        """The stop rule: rounds over all views no longer lower the loss. One more round of them follows the verdict."""
+        """True once rounds over all views no longer lower the loss; one more round of them follows."""
         window = STOP_ROUNDS * len(self.views)
         if self.settings.stop_gain == 0 or len(losses) % window or len(losses) < 2 * window:
             return False
@@ -160,7 +160,7 @@ class StaticTrainer:
         return bool(before - now < self.settings.stop_gain * before)
 
     def step(self, view: TrainingView, iteration: int) -> float:
-        """One iteration: render the view, compare, carry back, Adam. Returns the loss."""
+        """One iteration: renders the view, compares, carries the gradient back, steps Adam. Returns the loss."""
         activation.activate(self.parameters, self._means, self._factors, self._opacities, self._features)
         gradients = self._loss.evaluate(self._means, self._factors, self._opacities, self._features, view)
         self.psnr.append(self._loss.psnr)
@@ -205,8 +205,8 @@ class StaticTrainer:
         for other in self.views:
             other.exposure[:3] -= centre
 
-    def _judge_exposure(self) -> None:
-        """Give up the gains and offsets where they hardly differ from camera to camera."""
+    def _assess_exposure(self) -> None:
+        """Gives up gains and offsets that hardly differ from camera to camera."""
         gains = np.array([view.exposure[:3, 0] for view in self.views])
         if gains.std(axis=0).mean() < EXPOSURE_SPREAD:
             self.exposing = False
@@ -214,7 +214,11 @@ class StaticTrainer:
                 view.exposure[:] = (1, 0)
 
     def control_density(self, target: int) -> None:
-        """Remove what is all but transparent; clone or split those the pictures pull hardest, up to ``target``."""
+        """Removes Gaussians that are all but transparent; clones or splits those with the largest screen gradients.
+
+        Args:
+            target: number of Gaussians to reach.
+        """
         opacity = 1 / (1 + np.exp(-self.parameters[:, 10]))
         score = self._screen / np.maximum(self._seen, 1)
         keep = opacity >= min(PRUNE_OPACITY, float(np.median(opacity)))  # never more than half at once
@@ -230,10 +234,10 @@ class StaticTrainer:
         self._take(np.flatnonzero(keep), [self.parameters[clone], *halves])
 
     def remove_unseen(self) -> None:
-        """Remove what fewer than ``MIN_VIEWS`` cameras see.
+        """Removes Gaussians that fewer than ``MIN_VIEWS`` cameras see.
 
-        What no camera sees is free to be anything and shows once the scene moves; what one alone sees is a floater
-        that explains that camera's picture and spoils every other.
+        A Gaussian that no camera sees is free to be anything and shows once the scene moves; one that a single camera
+        sees is a floater that explains this camera's picture and spoils all others.
         """
         activation.activate(self.parameters, self._means, self._factors, self._opacities, self._features)
         counts = np.zeros(len(self.parameters), np.int64)
@@ -245,7 +249,7 @@ class StaticTrainer:
             self._take(np.flatnonzero(keep), [])
 
     def _take(self, rows: NDArray[np.int64], added: list[Array]) -> None:
-        """Keep some rows with their moments and append others with none."""
+        """Keeps some rows with their moments and appends others with none."""
         fresh = np.zeros((sum(map(len, added)), activation.COLUMNS), np.float32)
         first = np.concatenate([self._first[rows], fresh])
         second = np.concatenate([self._second[rows], fresh])
@@ -255,7 +259,7 @@ class StaticTrainer:
         self._allocate()
 
     def _half(self, rows: NDArray[np.int64]) -> Array:
-        """The rows, smaller, and displaced by a sample of themselves."""
+        """The rows with smaller scales, each displaced by a sample of its own Gaussian."""
         half = self.parameters[rows].copy()
         offset = self._rng.standard_normal((len(rows), 3)).astype(np.float32)
         half[:, MEAN] += np.einsum("nij,nj->ni", self._factors[rows], offset)
@@ -263,7 +267,7 @@ class StaticTrainer:
         return half
 
     def gaussians(self) -> Gaussians:
-        """Θ_0. Without masks everything may move."""
+        """The state Θ_0; without masks every Gaussian may move."""
         self._allocate()
         activation.activate(self.parameters, self._means, self._factors, self._opacities, self._features)
         count = len(self.parameters)
@@ -288,10 +292,13 @@ def fit_static_scene(
     settings: StaticSettings,
     progress: Callable[[int, float], None] | None = None,
 ) -> StaticResult:
-    """Θ_0 from the views of frame 0 and a first cloud.
+    """Fits Θ_0 to the views of frame 0, from a cloud of points.
 
     Args:
-        positions: [P, 3] metres inside. colours: [P, 3] in 0…1. foreground: [P] or None.
+        factory: of the scene's views. views: of frame 0; their exposures are learnt in place.
+        positions: [P, 3] metres in the inside world. colours: [P, 3] in 0…1. foreground: [P] in 0…1, or None.
+        scene, settings: of the scene, of frame 0.
+        progress: called with the iterations done and the last loss.
 
     Raises:
         ValueError: the cloud is empty.

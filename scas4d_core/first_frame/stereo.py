@@ -31,11 +31,11 @@ MIN_ANGLE_DEG, MAX_ANGLE_DEG = 4.0, 50.0
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """What stereo says about one picture.
+    """Depths of one picture by stereo.
 
     Attributes:
-        view: camera and picture, at the size stereo worked at.
-        depth: [H, W] along z, world units, 0 where nothing is known.
+        view: camera and picture, at the size that stereo worked at.
+        depth: [H, W] along z, world units, 0 where unknown.
         agreeing: [H, W] other cameras whose depth agrees.
     """
 
@@ -64,7 +64,7 @@ def halved(view: PosedPicture, width: int = WIDTH) -> PosedPicture:
 
 
 def neighbours_of(views: Sequence[PosedPicture], index: int, middle: Float, count: int) -> list[int]:
-    """The views to compare one with: nearest in angle about ``middle`` [3], but not too near."""
+    """Indices of the views to compare one with: nearest in angle about ``middle`` [3], but not too near."""
     rays = np.array([view.camera.centre - middle for view in views])
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
     angle = np.degrees(np.arccos(np.clip(rays @ rays[index], -1, 1)))
@@ -95,7 +95,7 @@ def depth_maps(
         iterations: rounds of PatchMatch.
         seed: of the random planes.
         hull: of the masks: depths of masked pixels that lie outside it are false.
-        progress: told (views done, views).
+        progress: called with (views done, views).
     """
     greys = [
         np.ascontiguousarray(v.image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32) / np.float32(255))
@@ -138,7 +138,7 @@ def depth_maps(
 
 
 def _confine(view: PosedPicture, depth: Float, hull: VisualHull) -> None:
-    """Forget, in place, the depths of masked pixels that lie off the hull: no foreground is there."""
+    """Clears, in place, the depths of masked pixels that lie off the hull: there is no foreground."""
     rows, columns = np.nonzero((depth > 0) & np.asarray(view.mask))
     if len(rows) == 0:
         return
@@ -148,7 +148,7 @@ def _confine(view: PosedPicture, depth: Float, hull: VisualHull) -> None:
 
 
 def _agreement(views: Sequence[PosedPicture], depths: Sequence[Float], index: int) -> NDArray[np.intp]:
-    """[H, W] how many other cameras' depths send a pixel's point back to it."""
+    """[H, W] number of other cameras whose depth sends a pixel's point back to it."""
     camera, depth = views[index].camera, depths[index]
     rows, columns = np.nonzero(depth > 0)
     uv = np.stack([columns + 0.5, rows + 0.5], axis=-1)
@@ -170,7 +170,7 @@ def _agreement(views: Sequence[PosedPicture], depths: Sequence[Float], index: in
 
 
 def fused_points(maps: Sequence[DepthMap], min_views: int, max_violations: float = 0.5) -> Float:
-    """[P, 3] the points of all depth maps on which ``min_views`` cameras agree and through which few look.
+    """[P, 3] points of all depth maps on which ``min_views`` cameras agree and through which few look.
 
     A camera whose trusted depth lies clearly behind a point looks through it. A point is a floater if the cameras that
     look through it are more than ``max_violations`` times those that agree on it (after Merrell et al. 2007).

@@ -1,6 +1,6 @@
-"""Points where the same SIFT feature is seen by several calibrated cameras (known-pose triangulation, pycolmap).
+"""Triangulates SIFT features that several calibrated cameras see (known poses, pycolmap).
 
-The poses are known, so a match is looked for along its epipolar line only: far fewer wrong candidates pass the ratio
+The poses are known, so matches are searched along their epipolar line only: far fewer wrong candidates pass the ratio
 test than in a search over the whole picture, and wide baselines keep their matches.
 """
 
@@ -33,7 +33,7 @@ MIN_ANGLE_DEG = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Triangulation:
-    """Points and who saw them.
+    """Triangulated points, and the views that saw them.
 
     Attributes:
         positions: [P, 3] float64 world.
@@ -57,7 +57,7 @@ def features(views: Sequence[PosedPicture]) -> list[tuple[Float, NDArray[np.floa
     # A quarter of COLMAP's contrast: smooth walls have little, and the known poses throw wrong matches out.
     options.sift.peak_threshold = 0.0017
     level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = max(level, 1)  # a line of news a picture is too much
+    pycolmap.logging.minloglevel = max(level, 1)  # COLMAP logs a line for each picture otherwise
     try:
         sift = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
         found = []
@@ -110,7 +110,7 @@ def guided_matches(
 
 
 def triangulate(views: Sequence[PosedPicture], *, min_views: int = 3, seed: int = 0) -> Triangulation:
-    """Match SIFT features over all pairs of views and triangulate each track robustly (LO-RANSAC), poses fixed.
+    """Matches SIFT features over all pairs of views and triangulates each track robustly (LO-RANSAC), poses fixed.
 
     Args:
         views: pictures of one moment.

@@ -1,7 +1,6 @@
 """The visual hull: the largest shape whose silhouettes are the masks (Laurentini 1994), by an octree of voxels.
 
-A camera in whose picture a voxel does not fall says nothing about it; a voxel counts only where ``min_views`` cameras
-see it.
+A camera has no say about voxels outside its picture; a voxel counts only where ``min_views`` cameras see it.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ MAX_VOXELS = 4_000_000
 
 @dataclass(frozen=True, eq=False)
 class VisualHull:
-    """Voxels inside every silhouette that may judge them.
+    """Voxels inside the silhouettes of all cameras that see them.
 
     Attributes:
         cells: [M, 3] integer indices on the grid.
@@ -54,7 +53,7 @@ class VisualHull:
         return len(self.cells) * self.voxel**3
 
     def about(self, points: Float) -> Bool:
-        """[P] points [P, 3] within the hull or nearer to it than two voxels (and some a little farther)."""
+        """[P] true for points [P, 3] within the hull or nearer to it than two voxels (and some a little farther)."""
         pairs = np.unique(self.cells // 2, axis=0)
         low = pairs.min(0) - 2
         size = pairs.max(0) + 3 - low
@@ -70,7 +69,7 @@ class VisualHull:
         return result
 
     def surface(self) -> Bool:
-        """[M] voxels with at least one of their six neighbours empty."""
+        """[M] true for voxels with at least one of their six neighbours empty."""
         if len(self.cells) == 0:
             return np.zeros(0, dtype=bool)
         low = self.cells.min(0) - 1
@@ -86,7 +85,7 @@ class VisualHull:
 
 
 def pixel_at(views: Sequence[PosedPicture], point: Float) -> float:
-    """World units across one pixel at ``point``, median over the cameras before which it lies (1 where none)."""
+    """World units across one pixel at ``point`` [3], median over the cameras that have it in front (1 without any)."""
     sizes = [
         float(view.camera.project(point)[1]) / view.camera.fx for view in views if view.camera.project(point)[1] > 0
     ]
@@ -96,7 +95,7 @@ def pixel_at(views: Sequence[PosedPicture], point: Float) -> float:
 def carve(
     views: Sequence[PosedPicture], *, voxel_pixels: float = VOXEL_PIXELS, misses: float = 0.0, min_views: int = 3
 ) -> VisualHull:
-    """Carve the hull of the masks.
+    """Carves the hull of the masks.
 
     Args:
         views: those without a mask are ignored.
@@ -128,11 +127,11 @@ def carve(
 
 
 def contradicted(views: Sequence[PosedPicture], hull: VisualHull, points: Float, misses: float) -> NDArray[np.intp]:
-    """[P] masks that speak against each point [P, 3].
+    """[P] number of masks that contradict each point [P, 3].
 
-    A point within the silhouettes is foreground, and nothing speaks against it. Any other is background: it must not
-    lie before the hull where a camera sees foreground. Stereo makes such points beside outlines, where a patch covers
-    both.
+    A point within the silhouettes is foreground, and no mask contradicts it. Any other is background: it must not lie
+    before the hull in a camera that sees foreground there. Stereo makes such points beside outlines, where a patch
+    covers both.
 
     Args:
         views: those without a mask are ignored.
@@ -171,7 +170,7 @@ def _kept(
     min_views: int,
     last: bool,
 ) -> Bool:
-    """[M] voxels that no more than a share ``misses`` of their cameras see off the silhouette."""
+    """[M] true for voxels that no more than a share ``misses`` of their cameras see off the silhouette."""
     missed = np.zeros(len(centres), dtype=np.int32)
     seen = np.zeros(len(centres), dtype=np.int32)
     may_see = np.zeros(len(centres), dtype=np.int32)

@@ -1,11 +1,11 @@
-"""Parts: Gaussians that move alike, by K-means on positions and material rotations over time.
+"""Segments parts: Gaussians that move alike, by K-means on positions and material rotations over time.
 
 The paper's section "Visualization of Part Segmentation": the feature of Gaussian i is
-``[λp·p_i(t), λR·R_i(t), λp0·p_i(0)]`` over the frames t. Here p is in units of the extent of what moves, so that one
-set of λ serves every scene.
+``[λp·p_i(t), λR·R_i(t), λp0·p_i(0)]`` over the frames t. Here p is in units of the extent of the moving
+Gaussians, so that one set of λ serves every scene.
 
-Parts found again, after more frames, keep their labels: the clustering also starts from the parts before and leaves
-them only for clearly better ones, and the new labels are matched to the old ones by what they cover in common.
+Parts found again, after more frames, keep their labels: the clustering also starts from the previous parts and gives
+them up only for clearly better ones, and new labels are matched to previous ones by their overlap.
 """
 
 from __future__ import annotations
@@ -57,17 +57,17 @@ def parts(
     count: int | None = None,
     previous: NDArray[Any] | None = None,
 ) -> NDArray[np.int64]:
-    """A part label for every Gaussian, [N]: 0…count−1, the largest part first; −1 for those that do not move.
+    """Part labels of all Gaussians, [N] int64: 0…count−1, the largest part first; −1 for those that do not move.
 
-    Which Gaussians move is read off the newest committed frame. A Gaussian weighs by its opacity times the area of its
-    two longest axes, about what it covers in a picture, so that swarms of small ones do not draw the borders.
+    The newest committed frame tells which Gaussians move. A Gaussian weighs by its opacity times the area of its two
+    longest axes, about its area in a picture, so that swarms of small ones do not decide the borders.
 
     Args:
         history: at least one committed frame; with a single frame only its positions tell parts apart.
-        count: how many parts; None: the count from 2 to ``MOST_PARTS`` with the largest mean silhouette
+        count: of parts; None: the count from 2 to ``MOST_PARTS`` with the largest mean silhouette
             (Rousseeuw 1987) on up to 1,000 Gaussians.
-        previous: [N] labels found before, with the same count (or None), from fewer frames. Parts that go on keep
-            their labels then, whatever their size; with a count found anew, a label may be left out.
+        previous: [N] labels found from fewer frames with the same ``count`` (or None). Parts that continue keep their
+            labels then, whatever their size; with a count chosen anew, a label may be left out.
 
     Raises:
         ValueError: nothing committed, nothing moves, count below 1 or above the number of moving Gaussians, or
@@ -124,14 +124,14 @@ def parts(
 
 
 def match_labels(labels: NDArray[Any], previous: NDArray[Any], weights: NDArray[Any]) -> NDArray[np.int64]:
-    """The same parts under the labels of those before that they overlap most, as a whole (Hungarian method).
+    """Renames parts to the previous labels that they overlap most, as a whole (Hungarian method).
 
-    A part that overlaps none of those before, or whose match went to another, takes the lowest label left.
+    A part that overlaps no previous part, or whose match went to another, takes the lowest free label.
 
     Args:
         labels: [N] new labels from 0; negative ones belong to no part and stay.
-        previous: [N] labels before.
-        weights: [N] what a Gaussian counts for.
+        previous: [N] labels found before.
+        weights: [N] of the Gaussians.
 
     Returns:
         [N] labels.
@@ -158,7 +158,7 @@ def match_labels(labels: NDArray[Any], previous: NDArray[Any], weights: NDArray[
 
 
 def motion(history: History, rows: NDArray[np.intp], frames: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Positions [T, M, 3] and material rotations [T, M, 4] of some Gaussians at no more than ``frames`` even times."""
+    """Positions [T, M, 3] and material rotations [T, M, 4] of some Gaussians at up to ``frames`` even frames."""
     indices = np.array(history.indices)
     even = np.unique(np.linspace(0, len(indices) - 1, min(frames, len(indices))).round().astype(np.intp))
     chosen = [int(index) for index in indices[even]]
@@ -192,7 +192,7 @@ def part_features(positions: NDArray[Any], rotations: NDArray[Any], extent: floa
 
 
 def coverage(gaussians: Gaussians) -> NDArray[np.float64]:
-    """[N] opacity times the product of the two longest axes, m²: about what a Gaussian covers in a picture."""
+    """[N] opacity times the product of the two longest axes, m²: about the area of a Gaussian in a picture."""
     axes = np.linalg.svd(gaussians.factors.astype(np.float64), compute_uv=False)
     return gaussians.opacities * axes[:, 0] * axes[:, 1]
 
@@ -206,7 +206,7 @@ def _cluster(
 ) -> Any:
     known = np.empty(0, np.int64) if previous is None else np.unique(previous[previous >= 0])
     if count is None:
-        # Drawn by weight, so that the silhouette sees what the pictures see.
+        # Drawn by weight, so that the silhouette weighs Gaussians as pictures do.
         drawn = rng.choice(len(features), size=SILHOUETTE_SAMPLE, p=weights / weights.sum())
         count = _best_count(features[np.unique(drawn)], len(known))
     fresh = _kmeans(count).fit(features, sample_weight=weights)
@@ -218,7 +218,7 @@ def _cluster(
 
 
 def _best_count(features: Features, known: int) -> int:
-    """The count of the largest mean silhouette; ``known``, that of the parts before, has an advantage (0: none)."""
+    """Count with the largest mean silhouette; ``known``, that of the previous parts, has an advantage (0: none)."""
     from sklearn.metrics import silhouette_score
 
     best, best_score = 1, 0.0
@@ -231,7 +231,7 @@ def _best_count(features: Features, known: int) -> int:
 
 
 def _kmeans(count: int, **given: Any) -> Any:
-    """scikit-learn's, whose import takes a second: whoever renders views does without."""
+    """K-means of scikit-learn, imported here: the import takes a second, and rendering views needs none."""
     from sklearn.cluster import KMeans
 
     return KMeans(n_clusters=count, **{"n_init": RESTARTS, "random_state": SEED, **given})

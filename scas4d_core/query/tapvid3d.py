@@ -1,4 +1,4 @@
-"""Tracks in the layout of TAPVid-3D's npz files, so that its tools read them as predictions.
+"""Lays out tracks as TAPVid-3D's npz files, so that its tools read them as predictions.
 
 The names and axes are those that the benchmark's own evaluation reads (google-deepmind/tapnet,
 ``tapvid3d/evaluation/evaluate_model.py``). Points are in the axes of one camera (OpenCV: x right, y down, z forward),
@@ -24,15 +24,15 @@ def tapvid3d(
     metres_per_unit: float = 1.0,
     pixels: NDArray[Any] | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """The arrays of one file; there are no pictures in it (``images_jpeg_bytes``), which predictions need not have.
+    """Makes the arrays of one file, without pictures (``images_jpeg_bytes``), which predictions need not have.
 
     Args:
-        positions: [T, Q, 3] user's world and units, NaN where there is none.
+        positions: [T, Q, 3] user's world and units, NaN where unknown.
         visibility: [T, Q] in the camera.
         camera: user's world.
-        queried: the row of T in which the points were asked for; −1 where that frame is not among them.
+        queried: row of T in which the points were queried; −1 where that frame is not among them.
         metres_per_unit: metres in a unit of the user's world.
-        pixels: [Q, 2] that were asked for; without them, where the camera has the points in that row.
+        pixels: [Q, 2] queried; None: the projections of the points in that row.
 
     Returns:
         ``tracks_XYZ`` [T, Q, 3] float32, metres in the camera's axes. ``visibility`` [T, Q] bool. ``queries_xyt``

@@ -1,9 +1,9 @@
-"""Trajectories of points: each is carried rigidly by the Gaussians that it lies in.
+"""Tracks points: each is carried rigidly by the Gaussians that it lies in (paper, Point-Tracking).
 
 A point p, given at frame q, is carried by Gaussian i to frame t as ``μ_i(t) + R_i(t) R_i(q)ᵀ (p − μ_i(q))``, R the
-material rotation. A few Gaussians carry every point and the geometric median of their answers is the track, so
-that one Gaussian that went astray does not take the point with it. A pixel becomes a point by ``ray_depth``.
-docs/tracks.md has the definitions and what they are worth.
+material rotation. Several Gaussians carry every point, and the geometric median of their answers is the track, so
+that a single stray Gaussian does not take the point with it. A pixel becomes a point by ``ray_depth``. docs/tracks.md
+has the definitions and their accuracy.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ RenderDepth = Callable[[Camera, int], tuple[NDArray[Any], NDArray[Any]]]
 ALPHA_OF_A_SURFACE = 0.5
 """A pixel shows a surface where at least half of it is covered."""
 WEISZFELD_ROUNDS = 12
-"""Rounds of the geometric median: it has settled to a small part of the carriers' spread by then."""
+"""Rounds of the geometric median: by then it moves by a small part of the carriers' spread."""
 BYTES_AT_ONCE = 64e6
 """Working memory of the search for carriers."""
 
@@ -63,7 +63,7 @@ class Tracks:
             query that met no surface.
         ids: [Q] int64: the Gaussian that carries the point most; −1 for a pixel query that met no surface.
         indices: [T] int64 frames.
-        visibility: by camera name, [T, Q] bool, for the cameras that were asked for; see ``seen``.
+        visibility: by camera name, [T, Q] bool, for the cameras queried; see ``seen``.
     """
 
     positions: Float
@@ -73,11 +73,11 @@ class Tracks:
     visibility: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     def pixels(self, camera: Camera) -> Float:
-        """[T, Q, 2] where a camera (user's world) has the points, in pixels; NaN behind the camera."""
+        """[T, Q, 2] projections into a camera (user's world), pixels; NaN behind the camera."""
         return camera.project(self.positions)[0]
 
     def with_visibility(self, camera: Camera, render_depth: RenderDepth, tolerance: float) -> Tracks:
-        """The same tracks with the visibility in one more camera; the arguments are those of ``seen``."""
+        """Adds the visibility in one more camera; the arguments are those of ``seen``."""
         visible = seen(self.positions, self.indices, camera, render_depth, tolerance)
         return replace(self, visibility={**self.visibility, camera.name: visible})
 
@@ -96,8 +96,8 @@ def tracks_of_points(
         history: the committed states.
         world: user's world to inside.
         points: [Q, 3] in the user's world at frame ``index``.
-        index: the committed frame the points are given in.
-        indices: the committed frames to answer for, any order.
+        index: the committed frame that the points are given in.
+        indices: the committed frames of the tracks, any order.
         count: Gaussians that carry a point.
 
     Raises:
@@ -150,17 +150,17 @@ def tracks_of_pixels(
     render_depth: RenderDepth,
     limits: Limits = DEFAULT,
 ) -> Tracks:
-    """Carries the surface points that a camera has at given pixels of one frame; answers with their visibility in it.
+    """Carries the surface points at given pixels of one frame of a camera; with their visibility in that camera.
 
     Args:
         history: the committed states.
         world: user's world to inside.
         camera: in the user's world.
-        uv: [Q, 2] pixels, continuous: (0.5, 0.5) is the centre of the first pixel. The depth is where half of
-            what the ray loses is lost (``ray_depth``). A ray that loses less than half of its light takes the
-            rendered depth of the nearest covered pixel within ``PIXEL_REACH``.
+        uv: [Q, 2] pixels, continuous: (0.5, 0.5) is the centre of the first pixel. The depth is that of ``ray_depth``;
+            a ray that loses less than half of its light takes the rendered depth of the nearest covered pixel within
+            ``PIXEL_REACH``.
         index: the committed frame that ``uv`` is given in.
-        indices: the committed frames to answer for.
+        indices: the committed frames of the tracks.
         render_depth: rendered depth and alpha.
         limits: the constants that ``render_depth`` renders with.
 
@@ -214,8 +214,7 @@ def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indice
     """The trajectories of Gaussians' means by id; their confidence is 1.
 
     Raises:
-        ValueError: an id that the history does not hold.
-        HistoryError: a frame that was not committed.
+        ValueError: an unknown id. HistoryError: a frame was not committed.
 
     >>> history = History()
     >>> history.append(7, 0.0, Gaussians.of_points([[0, 0, 0], [1, 0, 0]], radius=0.2))
@@ -237,21 +236,21 @@ def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indice
 
 
 def depth_tolerance(history: History, world: WorldFrame, index: int) -> float:
-    """The tolerance for ``seen`` in the user's units: ``DEPTH_TOLERANCE`` of the extent of what moves at one frame."""
+    """Tolerance of ``seen`` in the user's units: ``DEPTH_TOLERANCE`` of the moving Gaussians' extent at one frame."""
     return DEPTH_TOLERANCE * moving_extent(history.gaussians(index)) / world.metres_per_unit
 
 
 def seen(
     positions: Float, indices: Sequence[int] | NDArray[Any], camera: Camera, render_depth: RenderDepth, tolerance: float
 ) -> NDArray[np.bool_]:
-    """Which points a camera sees, [T, Q]: inside the picture, before the camera, and nothing rendered before them.
+    """Visibility of points in a camera, [T, Q] bool: inside the picture, in front of the camera, and not hidden.
 
-    "Before" is by more than ``tolerance`` against the rendered depth, the farthest of the 3×3 pixels around the one
-    that the point projects into (a track is off by a pixel easily, and at an edge that decides; on true positions this
-    is right more often too). A pixel that is less than half covered hides nothing.
+    A point is hidden where it lies more than ``tolerance`` behind the rendered depth, the farthest of the 3×3 pixels
+    around its own (tracks are easily off by a pixel, which decides at an edge; on true positions this is right more
+    often too). A pixel that is less than half covered hides nothing.
 
     Args:
-        positions: [T, Q, 3] user's world; NaN is never seen.
+        positions: [T, Q, 3] user's world; NaN is never visible.
         indices: [T] committed frames.
         camera: in the user's world.
         render_depth: rendered depth and alpha.
@@ -273,17 +272,17 @@ def seen(
 def carriers(
     gaussians: Gaussians, points: Float, count: int, softening: float
 ) -> tuple[NDArray[np.intp], Float, Float]:
-    """The Gaussians that a point lies in most: those of largest o·exp(−½ m²), m the Mahalanobis distance.
+    """Gaussians that points lie in most: those of largest o·exp(−½ m²), m the Mahalanobis distance.
 
     Args:
         gaussians: the state, N Gaussians.
         points: [Q, 3] metres, inside world.
-        count: how many carry a point, K (N where there are fewer).
+        count: K, Gaussians that carry a point (N where there are fewer).
         softening: metres; m is taken in Σ + softening²·I.
 
     Returns:
-        Rows [Q, K], heaviest first; weights [Q, K] that sum to 1, in proportion to o·exp(−½ m²) (so far from
-        everything the nearest alone carries); the opacity 1 − Π(1 − o·exp(−½ m²)) of the K at the point, [Q].
+        Rows [Q, K], heaviest first; weights [Q, K] that sum to 1, in proportion to o·exp(−½ m²) (far from all,
+        the nearest alone carries); the opacity 1 − Π(1 − o·exp(−½ m²)) of the K at the point, [Q].
 
     >>> state = Gaussians.of_points([[0, 0, 0], [1, 0, 0]], radius=0.2)
     >>> rows, weights, opacity = carriers(state, np.array([[0.1, 0, 0]]), count=1, softening=0.0)
@@ -316,7 +315,7 @@ def carriers(
 
 
 def geometric_median(points: Float, weights: Float) -> Float:
-    """The point of least weighted distance to K others, by Weiszfeld's iteration from their mean.
+    """Geometric median [Q, 3]: the point of least weighted distance to K others, by Weiszfeld's iteration.
 
     Args:
         points: [Q, K, 3].
@@ -339,7 +338,7 @@ def geometric_median(points: Float, weights: Float) -> Float:
 def _covered_near(
     depth: NDArray[Any], alpha: NDArray[Any], row: NDArray[np.intp], column: NDArray[np.intp], reach: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.intp], NDArray[np.intp]]:
-    """Which pixels have a covered one within reach, and the nearest such pixel's row and column."""
+    """Finds the covered pixel nearest to each pixel: true where it is within reach, its row, its column."""
     covered = (alpha >= ALPHA_OF_A_SURFACE) & np.isfinite(depth)
     if not covered.any():
         return np.zeros(len(row), dtype=np.bool_), row, column

@@ -4,9 +4,9 @@ A scene whose process died goes on as if nothing had happened.
 
 Beside the frames of a ``History`` lies one ``checkpoint_<index>.npz`` for each of its newest commits. It is written,
 synced and renamed *before* the frame's own rename, which is the commit: a committed frame has its checkpoint, and a
-checkpoint without its frame is as good as not there. The one before the newest is kept as well, for the case that the
-newest state or checkpoint is damaged. What never changes (exposures, whether there are masks) is in the report of the
-first frame; clusters and neighbours are built again from the first frame, and a digest says whether they are the same.
+checkpoint without its frame does not count. The checkpoint before the newest is kept as well, in case the newest state
+or checkpoint is damaged. Facts that never change (exposures, presence of masks) are in the report of the first frame;
+clusters and neighbours are built again from the first frame, and a digest tells their changes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from scas4d_core.update.views import TrainingView, ViewFactory
 from scas4d_core.update.warm_start import Motion
 
 FORMAT = 2
-"""Of a checkpoint's file; another one is refused."""
+"""Version of a checkpoint's file; others are refused."""
 
 
 class CheckpointError(ValueError):
@@ -39,15 +39,15 @@ class CheckpointError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class CarryOver:
-    """What one update leaves to the next beside Θ.
+    """The state that one update passes to the next beside Θ.
 
     Attributes:
-        motion: that was found, or None where the next update starts cold.
-        labels: [N] what has been seen to move, in scenes without masks; None until something has.
-        seen: views of the last frame that was believed, in scenes without masks: the next are compared with them.
+        motion: the motion found, or None where the next update starts cold.
+        labels: [N] the Gaussians that have been seen to move, in scenes without masks; None until some have.
+        seen: views of the last frame that was not held, in scenes without masks; the next are compared with them.
         structure: digest of the clusters and neighbours that the motion belongs to.
-        past: what is usual for the scene and its cameras.
-        shown: fingerprint of each picture of the last frame that was believed (``repeats``).
+        past: usual values of the scene and its cameras.
+        shown: fingerprint of each picture of the last frame that was not held (``repeats``).
     """
 
     motion: Motion | None = None
@@ -60,25 +60,25 @@ class CarryOver:
     def after(
         self, outcome: Outcome, time: float, views: Sequence[TrainingView] | None, shown: Mapping[str, int]
     ) -> CarryOver:
-        """What the next frame leaves in turn; of pictures that were not believed nothing is kept.
+        """The state that the next frame passes on in turn; of rejected pictures nothing is kept.
 
         Args:
-            outcome: of that frame. time: its, seconds.
-            views: that it was updated with, or None in scenes with masks. shown: fingerprints of its pictures.
+            outcome: of that frame. time: of that frame, seconds.
+            views: its training views, or None in scenes with masks. shown: fingerprints of its pictures.
         """
         learnt = outcome.fresh and not outcome.stood
         past = replace(outcome.past, fitted=time) if learnt else outcome.past
         carry_over = replace(self, motion=outcome.motion, past=past)
         if not outcome.fresh:
             return carry_over
-        if views is not None and outcome.exposure == 1.0:  # what another light changes has not moved
+        if views is not None and outcome.exposure == 1.0:  # a change of light is no motion
             seen = [view for view in views if view.name not in outcome.updated.left_out]
             carry_over = replace(carry_over, seen=seen)
         return replace(carry_over, shown=shown)
 
 
 class Checkpoints:
-    """The checkpoints in the directory of a history; for the process that appends to it.
+    """Writes and reads the checkpoints in the directory of a history; for the process that appends to it.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -94,7 +94,7 @@ class Checkpoints:
         self.directory = directory
 
     def save(self, index: int, carry_over: CarryOver) -> None:
-        """Writes what frame ``index`` leaves to the next; before the frame is committed.
+        """Writes the state that frame ``index`` passes to the next; before the frame is committed.
 
         Without masks that includes the pictures of the frame, 3 bytes a pixel.
         """
@@ -111,15 +111,15 @@ class Checkpoints:
         for view in carry_over.seen:
             levels = np.rint(255 * view.target[:3]).astype(np.uint8)  # they were 8 bit: exact
             arrays[f"seen.{view.name}"] = np.moveaxis(levels, 0, -1)
-        # A name that went missing by damage must not read as something that was never there.
+        # An array lost by damage must not read as one that was never written.
         arrays["names"] = np.array(sorted(arrays))
         write_npz(self._file(index), arrays)
 
     def load(self, index: int, factory: ViewFactory) -> CarryOver:
-        """What frame ``index`` left.
+        """Reads the state that frame ``index`` passed on.
 
         Args:
-            factory: of the scene; makes views of the pictures.
+            factory: of the scene's views; makes views of the pictures.
 
         Raises:
             CheckpointError: it is not there, damaged, or of another format.
@@ -190,19 +190,19 @@ def _unpacked(arrays: dict[str, NDArray[Any]]) -> Motion:
 
 
 class ResumeError(ValueError):
-    """A history that cannot be gone on from; the message says what is damaged."""
+    """A history from which no scene can be resumed; the message names the damage."""
 
 
 @dataclass(frozen=True)
 class ResumePoint:
-    """Where a scene was taken up again.
+    """The commit from which a scene was resumed.
 
     Attributes:
-        index: the commit that it goes on from.
+        index: of the commit.
         undone: committed frames after it that were taken back; each has to be given again, or is lost.
-        faults: why, a sentence for each file that could not be used; empty after an ordinary end.
-        cold: the state is whole, but what the next update needs beside it is not: that starts without a motion, and
-            the scene is no longer bit-identical to one that was not disturbed.
+        faults: a sentence for each file that could not be used; empty after an ordinary end.
+        cold: true where the state is whole and its checkpoint is not: the next update starts without a motion, and the
+            scene is no longer bit-identical to one that was not disturbed.
     """
 
     index: int
@@ -214,10 +214,11 @@ class ResumePoint:
 def find_commit(
     history: History, checkpoints: Checkpoints, factory: ViewFactory, held: Callable[[int], bool]
 ) -> tuple[int, CarryOver | None, list[str]]:
-    """The commit to go on from, what it left to the next update (None: a cold start), and what was found damaged.
+    """Finds the commit to resume from: its index, its checkpoint (None: a cold start), and the damage that was found.
 
     Args:
-        factory: of the scene's views. held: whether the pictures of a committed frame can be given again.
+        history, checkpoints: of the scene. factory: of its views.
+        held: true for a committed frame whose pictures can be given again.
 
     Raises:
         ResumeError: no state can be read.
@@ -235,7 +236,7 @@ def find_commit(
         except (HistoryError, CheckpointError) as error:
             faults.append(str(error))
             if index not in checkpoints.indices() and whole:
-                break  # so old that it has none any more: nothing before it has one either
+                break  # too old to have a checkpoint: no commit before it has one either
     if not whole:
         raise ResumeError("no state can be read: " + "; ".join(faults))
     later = sorted({*history.indices, *history.damaged})

@@ -115,7 +115,7 @@ class HistoryReader:
 
     @property
     def directory(self) -> Path | None:
-        """Where the frames are kept; None in memory."""
+        """Directory of the states; None in memory."""
         return None if self._files is None else self._files.directory
 
     def __len__(self) -> int:
@@ -224,7 +224,7 @@ class HistoryReader:
         try:
             return self._files.read(index, names)
         except FileNotFoundError:
-            self._forget(index)  # the process that appends has deleted it, or somebody else has
+            self._forget(index)  # deleted, by the process that appends or by somebody else
             self._files.faults[self._files.path(index).name] = f"{self._files.path(index).name} is gone"
             self._require(index)
             raise

@@ -1,4 +1,4 @@
-"""The deformation of one frame in plain torch: cluster map, its Jacobian, the cascade, what is left per Gaussian.
+"""The deformation of one frame in plain torch: cluster map, its Jacobian, cascade, deltas of single Gaussians.
 
 Equation numbers are those of the SCas4D paper: (5) transport of a Gaussian, (6) the cluster map, (7) the cascade.
 Everything is vectorized, differentiable, and of the dtype and on the device of its inputs; in float64 it is the twin
@@ -21,10 +21,10 @@ LARGEST = EXPONENT / log2(e)
 """Of an exponential's argument."""
 
 ClusterMap = Literal["centred", "published"]
-"""Which form of equation (6): scaling about the cluster's pivot, or about the world's origin as published."""
+"""Form of equation (6): scaling about the cluster's pivot, or about the world's origin as published."""
 
 Covariance = Literal["entangled", "separate"]
-"""What moves a Gaussian's covariance beside its own ΔR and Δs.
+"""The map that moves a Gaussian's covariance beside its own ΔR and Δs.
 
 "entangled", equation (5): the Jacobian of the map that moves its mean. "separate": nothing, as in the paper's ablation,
 which learns the covariance apart from the positions; a wheel's Gaussians then keep their orientation while they go
@@ -57,14 +57,14 @@ class ClusterParams(NamedTuple):
 
 
 class Layer(NamedTuple):
-    """One layer of the hierarchy: which cluster each of the M points belongs to ([M] int64), and the parameters."""
+    """One layer of the hierarchy: the cluster of each of the M points ([M] int64), and the parameters."""
 
     labels: Tensor
     params: ClusterParams
 
 
 class Deltas(NamedTuple):
-    """What each Gaussian does on its own after the cascade (Δp, ΔR, Δs of the paper); zeros are the identity.
+    """Deltas of single Gaussians after the cascade (Δp, ΔR, Δs of the paper); zeros are the identity.
 
     Attributes:
         dp: [M, 3] metres, added to the mean.
@@ -84,7 +84,7 @@ class Deltas(NamedTuple):
 
 
 class Transported(NamedTuple):
-    """Points after a map, and what the map does to their surroundings.
+    """Points after a map, with the Jacobian and rotation of the map at each.
 
     Attributes:
         points: [M, 3] metres.
@@ -221,7 +221,10 @@ def cluster_map(
         pivots: [K, 3] metres.
         labels: [M] int64 in 0…K−1.
         params: of the K clusters.
-        kind: which of the two forms.
+        kind: form of the map.
+
+    Raises:
+        ValueError: an unknown form.
 
     >>> points = torch.tensor([[1.0, 0, 0], [-1, 0, 0]])
     >>> params = ClusterParams.identity(1, torch.float32)
@@ -303,7 +306,10 @@ def deform(
         factors: [M, 3, 3] of the previous frame.
         layers: coarse to fine.
         deltas: per Gaussian.
-        kind: form of the cluster map. covariance: what moves the factors.
+        kind: form of the cluster map. covariance: "separate" leaves J out of the factors.
+
+    Raises:
+        ValueError: an unknown form.
 
     >>> means, factors = torch.zeros(1, 3), 0.1 * torch.eye(3)[None]
     >>> deltas = Deltas.identity(1, torch.float32)

@@ -1,4 +1,4 @@
-"""Whether the device that the settings name can be had."""
+"""Checks that the device of the settings is available."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import importlib.util
 
 
 class DeviceError(RuntimeError):
-    """A device that is not there; the message says what to do."""
+    """A device that is not available; the message names the remedy."""
 
 
 def require_device(device: str) -> None:
-    """Return where the update can run on ``device``.
+    """Raises unless an update can run on ``device``.
 
     Args:
         device: "cpu" or "cuda".

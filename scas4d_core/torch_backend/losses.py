@@ -1,4 +1,4 @@
-"""The losses of an update in plain torch; the twins of the fused CPU kernels, and the CUDA path.
+"""Losses of an update in plain torch: the twins of the fused CPU kernels, and the CUDA path.
 
 Weights and forms follow the SCas4D paper (equation (8): scale loss) and Dynamic3DGaussians, whose local rigidity,
 isometry and rotation terms it takes over. Every function returns a scalar of its inputs' dtype, unweighted.

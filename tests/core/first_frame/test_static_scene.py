@@ -162,7 +162,7 @@ def test_exposures_are_given_up_where_the_cameras_are_alike(spread: float, kept:
     trainer = StaticTrainer(ViewFactory(RIG), views, parameters, SceneSettings(), settings)
     for view, side in zip(views, (-1, 1, -1, 1, -1, 1), strict=True):
         view.exposure[:3] = (1 + side * spread, 0.02 * side)
-    trainer._judge_exposure()
+    trainer._assess_exposure()
     assert trainer.exposing == kept
     assert all((view.exposure == (1, 0)).all() for view in views) != kept
 
