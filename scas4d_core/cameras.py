@@ -1,4 +1,4 @@
-"""Cameras, rigs, and the frame of the inside world. Numpy only.
+"""Cameras, rigs, and the similarity to the inside world. Numpy only.
 
 Axes are OpenCV's: x right, y down, z forward; ``X_cam = R X_world + t``; ``u = fx x/z + cx``.
 Pixel (column i, row j) covers [i, i+1) x [j, j+1); its centre is (i + 0.5, j + 0.5).
@@ -19,7 +19,7 @@ ROTATION_TOLERANCE = 1e-3
 
 
 class CameraError(ValueError):
-    """A camera that cannot be: the message names the camera, the field, the value and the remedy."""
+    """An impossible camera; the message names the camera, the field, the value and the remedy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +34,16 @@ class Camera:
 
     Raises:
         CameraError: not finite, focal length not positive, skew, no rotation, or empty picture.
+
+    >>> lens = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
+    >>> camera = Camera("front", lens, np.eye(4), width=64, height=48)
+    >>> uv, depth = camera.project([0.1, 0, 2])
+    >>> uv, depth
+    (array([37., 24.]), array(2.))
+    >>> camera.unproject(uv, depth)
+    array([0.1, 0. , 2. ])
+    >>> camera.scaled(0.5).cx
+    16.0
     """
 
     name: str
@@ -114,7 +124,7 @@ class Camera:
         return centre
 
     def scaled(self, image_scale: float) -> Camera:
-        """The same camera seeing pictures resized by ``image_scale``; sizes round to whole pixels.
+        """The camera for pictures resized by ``image_scale``; sizes round to whole pixels.
 
         With pixel centres at +0.5 a resize multiplies u, v (and so fx, fy, cx, cy) by the exact ratio of the sizes.
         """
@@ -153,6 +163,12 @@ class WorldFrame:
     Attributes:
         origin: [3] float64, in the user's units.
         metres_per_unit: metres in one of the user's units.
+
+    >>> world = WorldFrame(origin=np.array([10.0, 0, 0]), metres_per_unit=0.01)  # of centimetres
+    >>> world.to_inside([110.0, 0, 0])
+    array([1., 0., 0.])
+    >>> world.to_user([1.0, 0, 0])
+    array([110.,   0.,   0.])
     """
 
     origin: Float
@@ -169,7 +185,7 @@ class WorldFrame:
         return result
 
     def camera_to_inside(self, camera: Camera) -> Camera:
-        """The camera as the inside world sees it; rotation and intrinsics stay."""
+        """The camera in the inside world; rotation and intrinsics stay."""
         pose = camera.world_to_camera.copy()
         pose[:3, 3] = (camera.rotation @ self.origin + camera.translation) * self.metres_per_unit
         return Camera(camera.name, camera.intrinsics, pose, camera.width, camera.height)
@@ -183,7 +199,17 @@ ONE_PLACE = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Cameras that look at one scene, names unique."""
+    """Cameras that look at one scene; names are unique.
+
+    >>> lens, pose = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
+    >>> beside = pose.copy()
+    >>> beside[0, 3] = -2  # the camera's centre is at x = 2
+    >>> rig = Rig((Camera("left", lens, pose, 64, 48), Camera("right", lens, beside, 64, 48)))
+    >>> rig.names, rig["right"].centre, rig.radius
+    (('left', 'right'), array([2., 0., 0.]), 1.1)
+    >>> rig.world_frame("auto").metres_per_unit  # the rig's radius is taken for 3 m
+    2.727272727272727
+    """
 
     cameras: tuple[Camera, ...]
 
@@ -221,14 +247,14 @@ class Rig:
     def radius(self) -> float:
         """1.1 x the largest distance of a camera centre from their mean: the scene radius of Dynamic3DGaussians.
 
-        One camera, or several at one place, say nothing of how large their scene is, and with 0 nothing would move:
-        then it is ``AUTO_RIG_RADIUS_M``, in the unit that the cameras are in.
+        One camera, or several at one place, do not tell the size of their scene, and with radius 0 nothing would move:
+        the radius is ``AUTO_RIG_RADIUS_M`` then, in the unit of the cameras.
         """
         return AUTO_RIG_RADIUS_M if self.at_one_place else self._spread
 
     @property
     def at_one_place(self) -> bool:
-        """Whether the cameras have no extent to measure the scene by."""
+        """True where the cameras have no extent by which the scene could be measured."""
         return self._spread < ONE_PLACE
 
     @property
@@ -236,7 +262,7 @@ class Rig:
         return float(1.1 * max(np.linalg.norm(camera.centre - self.centre) for camera in self.cameras))
 
     def world_frame(self, metres_per_unit: float | str = 1.0) -> WorldFrame:
-        """The frame recentred on the rig.
+        """The similarity to the inside world, which is recentred on the rig.
 
         Args:
             metres_per_unit: metres in one unit of the calibration, or "auto" to take the rig's radius for 3 m.
@@ -263,10 +289,15 @@ class Rig:
         return WorldFrame(self.centre, metres)
 
     def scaled(self, image_scale: float) -> Rig:
-        """Every camera under ``image_scale``."""
+        """The rig for pictures resized by ``image_scale``."""
         return Rig(tuple(camera.scaled(image_scale) for camera in self.cameras))
 
 
 def rig_inside(frame: WorldFrame, cameras: Sequence[Camera]) -> Rig:
-    """The cameras of a rig as the inside world sees them."""
+    """The rig of cameras moved to the inside world.
+
+    >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
+    >>> rig_inside(WorldFrame(np.array([0.0, 0, 2]), 0.1), [camera])["front"].centre
+    array([ 0. ,  0. , -0.2])
+    """
     return Rig(tuple(frame.camera_to_inside(camera) for camera in cameras))

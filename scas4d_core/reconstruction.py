@@ -19,21 +19,20 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import Rig, WorldFrame, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
-from scas4d_core.first_frame.start import Fixed, fit_first
+from scas4d_core.first_frame.start import FirstFrame, fit_first
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.frame_report import FrameReport, Progress, report_of_first, report_of_update
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.query.committed import Committed, View
+from scas4d_core.query.committed import CommittedScene, View
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.robust import outliers as judge
 from scas4d_core.robust.attempts import axis_lengths
 from scas4d_core.robust.repeats import fingerprints, same_again
 from scas4d_core.robust.solve_frame import Given, Trial
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.storage.checkpoint import Carried, Checkpoints
+from scas4d_core.storage.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, find_commit
 from scas4d_core.storage.history import History, HistoryError
-from scas4d_core.storage.resuming import Resumed, ResumeError, find_commit
-from scas4d_core.structure.motion_mask import labelled, labels_learnt, settled
+from scas4d_core.structure.motion_mask import labelled, labels_learnt, with_reliable_labels
 from scas4d_core.torch_backend.device import require_device
 from scas4d_core.update.budget import Budget
 from scas4d_core.update.frame_update import Updater
@@ -44,14 +43,14 @@ from scas4d_core.update.schedule import mask_weight
 from scas4d_core.update.views import TrainingView, ViewFactory, scaled_to
 from scas4d_core.warm_up import warm_up_elsewhere
 
-__all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "Resumed", "StepError", "View"]
+__all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "ResumePoint", "StepError", "View"]
 
 
 class StepError(ValueError):
     """A frame that cannot be stepped to; the state is as it was."""
 
 
-class Reconstruction(Committed):
+class Reconstruction(CommittedScene):
     """One scene, from frame 0 on. Made by ``start`` or, from what another process left on disk, by ``resume``.
 
     Attributes:
@@ -67,9 +66,9 @@ class Reconstruction(Committed):
         self._sizes: dict[str, tuple[int, int]] = {}
         self.static: StaticResult | None = None
         self.report: FrameReport | None = None
-        self.resumed: Resumed | None = None
-        self._fixed: Fixed
-        self._carried = Carried()
+        self.resumed: ResumePoint | None = None
+        self._fixed: FirstFrame
+        self._carried = CarryOver()
         self._checkpoints = None if history.directory is None else Checkpoints(history.directory)
         limits = scene_limits(settings.scene.near, rig.radius)
         self._picture = PictureLoss(self._factory, settings.scene.background, 1.0, 0.0, limits=limits)
@@ -126,10 +125,10 @@ class Reconstruction(Committed):
         result = static or fit_first(
             self._scaled(frame), points, self._factory, settings, self.world, progress or (lambda _: None)
         )
-        result = replace(result, gaussians=settled(result.gaussians))
+        result = replace(result, gaussians=with_reliable_labels(result.gaussians))
         fitted = perf_counter()
         self.static = result
-        self._fixed = Fixed(len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians))
+        self._fixed = FirstFrame(len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians))
         self._updater, structure = self._prepared(result.gaussians, None)
         seen = () if self._fixed.masked else self._factory.views(self._scaled(frame), {}, use_masks=False)
         load = {} if started is None else {"load": began - started}
@@ -137,7 +136,7 @@ class Reconstruction(Committed):
         report = report_of_first(frame, result, self.rig.names, len(self._updater.hierarchy.rows), seconds, dropped)
         psnr = {name: fit.psnr for name, fit in result.cameras.items()}
         past = replace(judge.Past.of_first(psnr, judge.brightness(frame.images)), fitted=frame.time)
-        carried = Carried(seen=seen, structure=structure, past=past, shown=fingerprints(frame.images))
+        carried = CarryOver(seen=seen, structure=structure, past=past, shown=fingerprints(frame.images))
         self._commit(report, result.gaussians, carried, {**self._fixed.record(), **(notes or {})})
         return self
 
@@ -164,14 +163,14 @@ class Reconstruction(Committed):
         self = cls._of(rig, settings, history)
         assert self._checkpoints is not None
         try:
-            self._fixed = Fixed.of(history)
+            self._fixed = FirstFrame.of(history)
         except (HistoryError, KeyError) as error:
             raise ResumeError(f"the first frame, which every update needs, cannot be read ({error})") from error
         index, left, faults = find_commit(history, self._checkpoints, self._factory, held)
-        same = self._go_on(Carried(labels=self._labels_of(index)) if left is None else left)
+        same = self._go_on(CarryOver(labels=self._labels_of(index)) if left is None else left)
         if left is not None and not same:
             faults.append("clusters came out otherwise than before: the next update starts without a motion")
-        self.resumed = Resumed(index, history.cut(index), faults, cold=left is None or not same)
+        self.resumed = ResumePoint(index, history.cut(index), faults, cold=left is None or not same)
         self._checkpoints.clean(history.indices)
         if self.resumed.cold:
             with suppress(OSError):  # for want of room: the next start is as cold as this one
@@ -202,11 +201,11 @@ class Reconstruction(Committed):
         for one in sorted({first, index}):
             copy.append(one, history.time(one), history.gaussians(one), history.report(one))
         self = cls._of(rig, settings, copy)
-        self._fixed = Fixed.of(copy)
-        self._go_on(Carried(labels=self._labels_of(index)))
+        self._fixed = FirstFrame.of(copy)
+        self._go_on(CarryOver(labels=self._labels_of(index)))
         return self
 
-    def _go_on(self, carried: Carried) -> bool:
+    def _go_on(self, carried: CarryOver) -> bool:
         """Prepare the updates after a committed one; whether the motion that it left fits the clusters of now."""
         first = self.history.gaussians(self.history.indices[0])
         self._updater, structure = self._prepared(first, carried.labels)
@@ -320,7 +319,7 @@ class Reconstruction(Committed):
         self._effort = UpdateSettings.model_validate({**self.settings.update.model_dump(), **changes})
         self._budget.milliseconds = self._effort.budget_ms
 
-    def _commit(self, report: FrameReport, gaussians: Gaussians, carried: Carried, more: Mapping[str, Any]) -> None:
+    def _commit(self, report: FrameReport, gaussians: Gaussians, carried: CarryOver, more: Mapping[str, Any]) -> None:
         """The checkpoint first, then state and report in one rename."""
         if self._checkpoints is not None:
             self._checkpoints.save(report.index, carried)
@@ -336,7 +335,7 @@ class Reconstruction(Committed):
         if self._checkpoints is not None:
             self._checkpoints.clean(self.history.indices)
 
-    def _learn_what_moves(self, views: list[TrainingView], look: judge.Look) -> tuple[Updater, Carried]:
+    def _learn_what_moves(self, views: list[TrainingView], look: judge.Look) -> tuple[Updater, CarryOver]:
         """Where frame 0 had no mask, the pictures tell what moves; what has moved once stays in the hierarchy.
 
         The labels become part of the state with the commit of this frame. A hierarchy of other Gaussians is a new one:

@@ -2,22 +2,74 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 
 
+class Constant(NamedTuple):
+    """A former setting: the value that it has for good, and the dotted name of the constant that holds it.
+
+    ``place`` is empty where the feature went and only ``value``, which switched it off or was its default, is accepted.
+    """
+
+    value: Any
+    place: str = ""
+
+
 class Model(BaseModel):
-    """Settings do not change once read, and an unknown name is an error."""
+    """Base of all settings: they do not change once read, and an unknown name is an error.
+
+    Attributes:
+        constants: former settings by name. Stored settings and requests may still name them: at the constant's value
+            they are dropped, at any other the error (type ``constant``) names the value given, the constant's value and
+            its place. ``studies/constants.py`` varies one.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    constants: ClassVar[Mapping[str, Constant]] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _drop_constants(cls, given: Any) -> Any:
+        if not isinstance(given, Mapping) or not (named := given.keys() & cls.constants.keys()):
+            return given
+        wrong = [_refusal(name, given[name], cls.constants[name]) for name in sorted(named)]
+        if errors := [error for error in wrong if error is not None]:
+            raise ValidationError.from_exception_data(cls.__name__, errors)
+        return {name: value for name, value in given.items() if name not in named}
+
+
+def _refusal(name: str, given: Any, constant: Constant) -> InitErrorDetails | None:
+    """The error of a former setting that is given another value than its constant has; None: it has the same."""
+    value = list(constant.value) if isinstance(constant.value, tuple) else constant.value
+    if (list(given) if isinstance(given, tuple) else given) == value and isinstance(given, bool) == isinstance(
+        value, bool
+    ):
+        return None
+    now = f"it is the constant {constant.place} = {value} now" if constant.place else f"only {value} is accepted still"
+    error = PydanticCustomError(
+        "constant",
+        "{name} cannot be {given}: it is no setting any more, {now}",
+        {"name": name, "given": repr(given), "now": now, "remedy": f"leave {name} out"},
+    )
+    return InitErrorDetails(type=error, loc=(name,), input=given)
 
 
 class SceneSettings(Model):
-    """How the outside world enters."""
+    """The world of the scene: unit, pictures, background, floor.
+
+    >>> SceneSettings(metres_per_unit="auto").image_scale
+    1.0
+    >>> SceneSettings(image_scale=2)
+    Traceback (most recent call last):
+    pydantic_core._pydantic_core.ValidationError: 1 validation error for SceneSettings...
+    """
 
     metres_per_unit: Positive | Literal["auto"] = Field(
         1.0,
@@ -48,8 +100,30 @@ class SceneSettings(Model):
 
 
 class StaticSettings(Model):
-    """Frame 0: 3D Gaussian Splatting with adaptive density control."""
+    """Frame 0: 3D Gaussian Splatting with adaptive density control.
 
+    >>> StaticSettings.model_validate({"seed": 3, "min_views": 2}).seed  # min_views is a constant now: dropped
+    3
+    """
+
+    constants: ClassVar[Mapping[str, Constant]] = {
+        "initial_share": Constant(0.6, "scas4d_core.first_frame.static_scene.INITIAL_SHARE"),
+        "densify_from": Constant(200, "scas4d_core.first_frame.static_scene.DENSIFY_FROM"),
+        "densify_every": Constant(100, "scas4d_core.first_frame.static_scene.DENSIFY_EVERY"),
+        "densify_until": Constant(0.6, "scas4d_core.first_frame.static_scene.DENSIFY_UNTIL"),
+        "densify_gradient": Constant(1e-6, "scas4d_core.first_frame.static_scene.DENSIFY_GRADIENT"),
+        "prune_opacity": Constant(0.01, "scas4d_core.first_frame.static_scene.PRUNE_OPACITY"),
+        "min_views": Constant(2, "scas4d_core.first_frame.static_scene.MIN_VIEWS"),
+        "seen_pixels": Constant(0.05, "scas4d_core.first_frame.static_scene.SEEN_PIXELS"),
+        "rate_position": Constant(1.6e-4, "scas4d_core.first_frame.static_scene.RATE_POSITION"),
+        "rate_position_end": Constant(1.6e-6, "scas4d_core.first_frame.static_scene.RATE_POSITION_END"),
+        "rate_colour": Constant(2.5e-3, "scas4d_core.first_frame.static_scene.RATE_COLOUR"),
+        "rate_opacity": Constant(5e-2, "scas4d_core.first_frame.static_scene.RATE_OPACITY"),
+        "rate_scale": Constant(5e-3, "scas4d_core.first_frame.static_scene.RATE_SCALE"),
+        "rate_rotation": Constant(2e-3, "scas4d_core.first_frame.static_scene.RATE_ROTATION"),
+        "rate_exposure": Constant(1e-3, "scas4d_core.first_frame.static_scene.RATE_EXPOSURE"),
+        "weight_mask": Constant(3.0, "scas4d_core.first_frame.static_scene.WEIGHT_MASK"),
+    }
     iterations: int = Field(3000, ge=1, description="Iterations of frame 0, one training view each.")
     stop_gain: float = Field(
         0.0,
@@ -66,36 +140,10 @@ class StaticSettings(Model):
         "and 0.27 more for each that is not background, at most 100,000: 25,000 for an object at 256x256, 40,000 for "
         "a room.",
     )
-    initial_share: float = Field(
-        0.6, gt=0, le=1, description="Share of the budget that the first cloud may take; of a larger one a random part."
-    )
-    densify_from: int = Field(200, ge=0, description="First iteration that densifies; before, gradients are noise.")
-    densify_every: int = Field(100, ge=1, description="Iterations between densifications.")
-    densify_until: float = Field(0.6, ge=0, le=1, description="Fraction of the iterations after which none is added.")
-    densify_gradient: Positive = Field(
-        1e-6,
-        description="Mean screen gradient (per half picture, as in 3DGS) above which a Gaussian may be refined; the "
-        "budget decides how many are, hardest pulled first.",
-    )
-    prune_opacity: NotNegative = Field(0.01, description="Less opaque Gaussians are removed while densifying.")
-    min_views: int = Field(2, ge=0, description="What fewer training cameras than this see is removed.")
-    seen_pixels: NotNegative = Field(
-        0.05, description="Pixels' worth of blending weight from which a camera counts as seeing a Gaussian."
-    )
     exposure: bool | Literal["auto"] = Field(
         default="auto",
         description="Learn a colour gain and offset per training camera (held-out cameras are scored raw). 'auto': "
         "give it up after 30 % of the iterations where the cameras turn out alike: then it only fits noise.",
-    )
-    rate_position: Positive = Field(1.6e-4, description="Adam rate of means at the start, per metre of scene radius.")
-    rate_position_end: Positive = Field(1.6e-6, description="The same at the end; the decay is exponential.")
-    rate_colour: Positive = Field(2.5e-3, description="Adam rate of colours.")
-    rate_opacity: Positive = Field(5e-2, description="Adam rate of opacity logits.")
-    rate_scale: Positive = Field(5e-3, description="Adam rate of log scales.")
-    rate_rotation: Positive = Field(2e-3, description="Adam rate of quaternions.")
-    rate_exposure: Positive = Field(1e-3, description="Adam rate of gain and offset.")
-    weight_mask: NotNegative = Field(
-        3.0, description="Weight of the mask loss where masks are given; in frame 0 it teaches the labels only."
     )
     seed: int = Field(0, ge=0, description="Seed of the order of views and of the split of Gaussians.")
 

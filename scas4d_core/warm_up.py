@@ -101,7 +101,7 @@ def warm_up(*, anew: bool = True) -> None:
 def _reconstruct_a_ball() -> None:
     from scas4d_core.reconstruction import Reconstruction
 
-    settings = Settings.model_validate({"static": {"iterations": 30, "densify_from": 5, "densify_every": 10}})
+    settings = Settings.model_validate({"static": {"iterations": 30}})
     rig = _rig()
     points = _points()
     for masked, covariance in ((True, "entangled"), (False, "separate")):

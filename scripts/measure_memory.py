@@ -20,6 +20,7 @@ from scas4d_core.presets import preset
 from scas4d_core.settings import Settings
 from server.health.estimate import estimate
 from server.settings import ServerSettings
+from studies.constants import varied
 from studies.quality.quality import peak_megabytes
 
 
@@ -58,8 +59,7 @@ def main() -> None:
     parser.add_argument("--masks", action="store_true")
     given = parser.parse_args()
     base = preset("scas4d").model_dump()
-    base["static"] |= {"iterations": 8, "max_gaussians": given.gaussians, "initial_share": 1.0, "densify_from": 1000}
-    base["static"] |= {"min_views": 0, "prune_opacity": 0.0}
+    base["static"] |= {"iterations": 8, "max_gaussians": given.gaussians}
     base["update"] |= {"iterations": 4}
     base["scene"] |= {"image_scale": given.scale}
     settings = Settings.model_validate(base)
@@ -68,7 +68,9 @@ def main() -> None:
     points = 0.4 * normals / np.linalg.norm(normals, axis=1, keepdims=True)
     cloud = InitialPoints(points, np.full((given.gaussians, 3), 0.5, np.float32), None)
     first = frame(rig, given.size, 0, given.masks)
-    reconstruction = Reconstruction.start(rig, first, settings, points=cloud)
+    static_scene = "scas4d_core.first_frame.static_scene"
+    with varied(f"{static_scene}.INITIAL_SHARE", 1.0), varied(f"{static_scene}.MIN_VIEWS", 0):
+        reconstruction = Reconstruction.start(rig, first, settings, points=cloud)  # every Gaussian asked for stays
     for index in (1, 2):
         reconstruction.step(frame(rig, given.size, index, given.masks))
     peak = peak_megabytes() or float("nan")

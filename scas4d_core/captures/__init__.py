@@ -1,4 +1,4 @@
-"""Captures on disk: `open_capture` is the door. Numpy and Pillow only."""
+"""Reads captures on disk, by `open_capture`. Numpy and Pillow only."""
 
 from __future__ import annotations
 
@@ -29,14 +29,20 @@ __all__ = [
 
 
 def open_capture(folder: Path | str, **options: Any) -> Capture:
-    """Open a capture of any known layout; the files in the folder tell which.
+    """Opens a capture of any known layout; the files in the folder tell the layout.
 
     Args:
         folder: of the capture.
-        options: those of the reader: `read_dynamic3dgs` (image_scale, fps, use_masks, use_points).
+        options: of the reader, `read_dynamic3dgs`: image_scale, fps, use_masks, use_points.
 
     Raises:
         CaptureError: no such folder, no known layout, or a fault in one of the files.
+
+    >>> capture = open_capture("samples/robot", image_scale=0.25)
+    >>> capture.rig.names[:3], capture.frame_count
+    (('0', '1', '2'), 14)
+    >>> capture.frame(0).images["0"].shape
+    (64, 64, 3)
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -1,4 +1,4 @@
-"""`Capture`: what a rig saw, on disk. Opening reads the cameras; pictures are decoded when they are looked at."""
+"""A capture: pictures of a rig over time, on disk. Pictures are decoded when they are read."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from scas4d_core.captures.images import decode_image, decode_mask
 Files = Mapping[str, Path]
 
 
-class Decoded(Mapping[str, NDArray[np.uint8]]):
-    """Pictures by camera name, decoded anew on every look and not kept: a long capture stays out of memory."""
+class LazyPictures(Mapping[str, NDArray[np.uint8]]):
+    """Pictures by camera name, decoded anew at every access and not kept: a long capture stays out of memory."""
 
     def __init__(self, files: Files, decode: Callable[[str, Path], NDArray[np.uint8]]) -> None:
         self._files = files
@@ -37,10 +37,10 @@ class Decoded(Mapping[str, NDArray[np.uint8]]):
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """A sequence of frames of one rig, and what is known beside it.
+    """A sequence of frames of one rig, with points and ground truth where there are any.
 
     Attributes:
-        name: of the folder.
+        name: of the capture's folder.
         full_rig: the training cameras at the size of the files.
         full_test_rig: the test cameras at the size of the files; None where there are none.
         image_scale: pictures, masks, labels and the cameras of ``rig`` are resized by this.
@@ -52,6 +52,16 @@ class Capture:
         points: a cloud of frame 0, or None.
         ground_truth: tracks and parts, or None.
         extent: longest side of the box of the foreground over the sequence, user's units, or None.
+
+    >>> from scas4d_core.captures import open_capture
+    >>> capture = open_capture("samples/robot")
+    >>> frame = capture.frame(2)
+    >>> round(frame.time, 4), sorted(frame.masks) == sorted(capture.rig.names)
+    (0.0667, True)
+    >>> capture.encoded(2, "0")[:4]  # the file as it is
+    b'\x89PNG'
+    >>> capture.test_rig.names
+    ('4', '11')
     """
 
     name: str
@@ -79,14 +89,14 @@ class Capture:
 
     @property
     def frame_count(self) -> int:
-        """T."""
+        """T, the number of frames."""
         return len(self.image_files)
 
     def frame(self, index: int) -> Frame:
         """The training pictures and masks of one moment.
 
         Raises:
-            IndexError: no such frame. Looking at a picture may raise ImageError.
+            IndexError: no such frame. Reading a picture may raise ImageError.
         """
         return self._frame(index, self.full_rig, self.image_files, self.mask_files)
 
@@ -95,14 +105,14 @@ class Capture:
 
         Raises:
             IndexError: no such frame.
-            CaptureError: the capture has no test cameras. Looking at a picture may raise ImageError.
+            CaptureError: the capture has no test cameras. Reading a picture may raise ImageError.
         """
         if self.full_test_rig is None:
             raise CaptureError(f"capture {self.name}: has no test cameras (no test_meta.json)")
         return self._frame(index, self.full_test_rig, self.test_image_files, self.test_mask_files)
 
     def encoded(self, index: int, camera: str) -> bytes:
-        """A picture's file as it is, at full size whatever ``image_scale``, of a training or test camera.
+        """Bytes of a picture's file, at full size whatever ``image_scale``, of a training or test camera.
 
         Raises:
             IndexError: no such frame.
@@ -112,7 +122,7 @@ class Capture:
         return _read(self._file(index, camera, self.image_files, self.test_image_files))
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
-        """A mask's file as it is, at full size whatever ``image_scale``; None where there is none.
+        """Bytes of a mask's file, at full size whatever ``image_scale``; None where there is none.
 
         Raises:
             IndexError: no such frame.
@@ -142,8 +152,10 @@ class Capture:
         return Frame(
             index=index,
             time=index / self.fps,
-            images=Decoded(images[index], lambda name, path: decode_image(path, size=sizes[name], image_scale=scale)),
-            masks=Decoded(masks[index], lambda name, path: decode_mask(path, size=sizes[name], image_scale=scale)),
+            images=LazyPictures(
+                images[index], lambda name, path: decode_image(path, size=sizes[name], image_scale=scale)
+            ),
+            masks=LazyPictures(masks[index], lambda name, path: decode_mask(path, size=sizes[name], image_scale=scale)),
         )
 
 

@@ -3,7 +3,7 @@
 ``train_meta.json`` and ``test_meta.json`` hold ``w``, ``h``, ``k[t][c]`` (3×3, pixels), ``w2c[t][c]`` (4×4, OpenCV
 axes), ``fn[t][c]`` (path under ``ims/``) and ``cam_id[t][c]``. Masks lie under ``seg/`` with the same path, ending in
 ``.png``. ``init_pt_cld.npz`` holds ``data`` [P, 7]: x y z, r g b (0…1), foreground (0…1). Beyond that layout,
-``train_meta.json`` may say ``fps``, and a cloud of which nobody knows the foreground has six columns.
+``train_meta.json`` may hold ``fps``, and a cloud without known foreground has six columns.
 (JonathonLuiten/Dynamic3DGaussians, ``train.py``.)
 """
 
@@ -36,7 +36,7 @@ def read_dynamic3dgs(
     use_masks: bool = True,
     use_points: bool = True,
 ) -> Capture:
-    """Open a capture. Cameras are named ``str(cam_id)``; test cameras are those of ``test_meta.json``.
+    """Opens a capture. Cameras are named ``str(cam_id)``; test cameras are those of ``test_meta.json``.
 
     Masks, cloud, test cameras and ground truth are optional, but masks must be there for all training cameras or none.
 

@@ -1,4 +1,4 @@
-"""The files of a capture that are not pictures: JSON and npz, with errors that say what is wrong. Numpy only."""
+"""Reads the JSON and npz files of a capture, with errors that name the fault. Numpy only."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 
 class CaptureError(ValueError):
-    """A capture that cannot be read: the message names the file, the fault and the remedy."""
+    """A capture that cannot be read; the message names the file, the fault and the remedy."""
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON file that holds an object.
+    """Reads a JSON file that holds an object.
 
     Raises:
         CaptureError: missing, not JSON, or not an object.
@@ -32,7 +32,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_npz(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    """Named arrays of an npz file, without pickle.
+    """Reads named arrays of an npz file, without pickle.
 
     Raises:
         CaptureError: missing, broken, or without one of the keys.

@@ -1,4 +1,4 @@
-"""What one moment of a capture holds: pictures and masks by camera; and the points it may start from. Numpy only."""
+"""A frame, pictures and masks of one moment by camera, and the initial points of a scene. Numpy only."""
 
 from __future__ import annotations
 
@@ -16,8 +16,13 @@ class Frame:
     Attributes:
         index: 0, 1, 2, … in order of time.
         time: seconds since the first frame.
-        images: by camera name, [H, W, 3] uint8, the sRGB values of the file. May decode when an entry is read.
-        masks: by camera name, [H, W] uint8, 1 where the foreground is; empty where the capture has no masks.
+        images: by camera name, [H, W, 3] uint8, the sRGB values of the file. An entry may be decoded when it is read.
+        masks: by camera name, [H, W] uint8, 1 on the foreground; empty where the capture has no masks.
+
+    >>> picture = np.zeros((48, 64, 3), np.uint8)
+    >>> frame = Frame(index=3, time=0.1, images={"front": picture, "left": picture}, masks={})
+    >>> sorted(frame.images)
+    ['front', 'left']
     """
 
     index: int
@@ -28,12 +33,16 @@ class Frame:
 
 @dataclass(eq=False)
 class InitialPoints:
-    """A cloud on the surfaces of frame 0, to start from.
+    """A cloud on the surfaces of frame 0, from which frame 0 is fitted.
 
     Attributes:
         positions: [P, 3] float64, user's units and axes.
         colours: [P, 3] float32 in 0…1, sRGB values as in the pictures.
-        foreground: [P] float32 in 0…1, or None where nobody said.
+        foreground: [P] float32 in 0…1, or None where unknown.
+
+    >>> cloud = InitialPoints(np.zeros((5, 3)), np.full((5, 3), 0.5, np.float32))
+    >>> len(cloud), cloud.foreground is None
+    (5, True)
     """
 
     positions: NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""What a synthetic capture knows for certain: point tracks, visibility, parts and their labels. Numpy only."""
+"""Ground truth of a synthetic capture: point tracks, visibility, parts and their labels. Numpy only."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class Part:
     """One part of the scene.
 
     Attributes:
-        id: its value in part labels.
-        name: in words.
-        rigid: whether all of it moves as one.
-        static: whether it stands still throughout.
-        foreground: whether masks cover it.
+        id: the part's value in part labels.
+        name: for people.
+        rigid: true where all of the part moves as one.
+        static: true where it stands still throughout.
+        foreground: true where masks cover it.
         pose: [T, 4, 4] part to world, where rigid; a point moves from frame s to t by ``pose[t] @ inv(pose[s])``.
     """
 
@@ -40,12 +40,19 @@ class GroundTruth:
 
     Attributes:
         points: [T, P, 3] float64 world positions, user's units.
-        part_id: [P] int64, the part that a point is on.
-        visible: [T, C, P] bool: inside the picture with nothing in front of it.
+        part_id: [P] int64, the part of each point.
+        visible: [T, C, P] bool: inside the picture and not hidden.
         cameras: names for the axis C, training and test cameras alike.
         parts: the table of parts; empty where the capture has none.
         label_files: by camera name, the label picture of every frame; empty where the capture has none.
         image_size: by camera name, (width, height) to which labels are resized.
+
+    >>> from scas4d_core.captures import open_capture
+    >>> truth = open_capture("samples/robot").ground_truth
+    >>> truth.points.shape, truth.visible_in("0").shape, int(truth.moving.sum())
+    ((14, 512, 3), (14, 512), 325)
+    >>> [part.name for part in truth.parts][:3]
+    ['base', 'turret', 'upper_arm']
     """
 
     points: NDArray[np.float64]
@@ -58,7 +65,7 @@ class GroundTruth:
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """[P] the points that leave their place of frame 0 by more than a millionth of the box of all points."""
+        """[P] bool: points that leave their place of frame 0 by more than a millionth of the box of all points."""
         moved: NDArray[np.float64] = np.linalg.norm(self.points - self.points[:1], axis=-1).max(axis=0)
         box = float(np.ptp(self.points.reshape(-1, 3), axis=0).max())
         moving: NDArray[np.bool_] = moved > 1e-6 * box

@@ -1,10 +1,10 @@
-"""Pictures and masks, from the bytes of a file to arrays. Numpy and Pillow only.
+"""Decodes pictures and masks from files, and resizes them. Numpy and Pillow only.
 
-What a picture file may hold, and what becomes of it:
+Content of a picture file, and its treatment:
 
 ======================  ====================================================================================
-EXIF orientation ≠ 1    refused: the intrinsics of a calibrated camera belong to one reading of the pixels,
-                        and whether the calibration turned the picture cannot be told from the file
+EXIF orientation ≠ 1    refused: the intrinsics of a calibrated camera belong to one orientation of the pixels,
+                        and the file does not tell which one the calibration used
 alpha (also palette)    composited over black, in the values of the file: the empty background of a capture
 grey                    replicated to three channels
 16 bit                  to 8 bit by value / 257: grey exactly, colour by its high byte (within one level of that)
@@ -36,7 +36,7 @@ Size = tuple[int, int]
 
 
 class ImageError(ValueError):
-    """A picture or mask that cannot be used: the message names the file and the fault."""
+    """A picture or mask that cannot be used; the message names the file and the fault."""
 
 
 def scaled_size(size: Size, image_scale: float) -> Size:
@@ -49,19 +49,27 @@ def scaled_size(size: Size, image_scale: float) -> Size:
 def decode_image(
     source: bytes | Path, *, size: Size | None = None, image_scale: float = 1.0, name: str | None = None
 ) -> NDArray[np.uint8]:
-    """A picture as sRGB values.
+    """Decodes a picture to sRGB values.
 
     Args:
         source: the bytes of a picture file, or its path.
         size: (width, height) in pixels that the file must have: those of the camera before ``image_scale``.
         image_scale: resizes by area averaging to the size that `Camera.scaled` gives, edges on edges.
-        name: what to call the picture in messages; the path, if None.
+        name: of the picture in messages; None: the path.
 
     Returns:
         [H, W, 3] uint8.
 
     Raises:
-        ImageError: no such file, not a picture, or one of the refusals in the head of this module.
+        ImageError: no such file, not a picture, or content that the head of this module refuses.
+
+    >>> file = io.BytesIO()
+    >>> Image.new("RGB", (4, 2), (255, 128, 0)).save(file, "PNG")
+    >>> decode_image(file.getvalue(), size=(4, 2)).shape
+    (2, 4, 3)
+    >>> decode_image(file.getvalue(), image_scale=0.5)
+    array([[[255, 128,   0],
+            [255, 128,   0]]], dtype=uint8)
     """
     name = name or _name(source)
     picture = _open(source, name, PICTURE_FORMATS, size)
@@ -72,12 +80,17 @@ def decode_image(
 def decode_mask(
     source: bytes | Path, *, size: Size | None = None, image_scale: float = 1.0, name: str | None = None
 ) -> NDArray[np.uint8]:
-    """A foreground mask, 1 where any stored value is not zero. Arguments and errors as for `decode_image`.
+    """Decodes a foreground mask, 1 where any stored value is not zero; arguments and errors as for `decode_image`.
 
     Under ``image_scale`` a pixel is foreground when at least half of its area is.
 
     Returns:
         [H, W] uint8, values 0 and 1.
+
+    >>> file = io.BytesIO()
+    >>> Image.fromarray(np.array([[0, 1, 255]], np.uint8)).save(file, "PNG")
+    >>> decode_mask(file.getvalue())
+    array([[0, 1, 1]], dtype=uint8)
     """
     name = name or _name(source)
     picture = _open(source, name, MASK_FORMATS, size)
@@ -96,19 +109,24 @@ def decode_mask(
 
 
 def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str | None = None) -> NDArray[np.uint8]:
-    """A picture of labels, one channel of 8 bit; a label is a name, so pixels are picked, never averaged.
+    """Decodes a picture of labels, one channel of 8 bit; labels are picked, never averaged.
 
     Args:
         source: the bytes of the file, or its path.
         size: (width, height) the file must have.
         target: (width, height) of the result; a pixel takes the label under its centre.
-        name: what to call the picture in messages; the path, if None.
+        name: of the picture in messages; None: the path.
 
     Returns:
         [H, W] uint8.
 
     Raises:
         ImageError: as for `decode_mask`, or more than one channel.
+
+    >>> file = io.BytesIO()
+    >>> Image.fromarray(np.array([[3, 3, 7, 7]], np.uint8)).save(file, "PNG")
+    >>> decode_labels(file.getvalue(), size=(4, 1), target=(2, 1))
+    array([[3, 7]], dtype=uint8)
     """
     name = name or _name(source)
     picture = _open(source, name, MASK_FORMATS, size)
@@ -123,7 +141,13 @@ def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str |
 
 
 def picture_size(source: bytes | Path, name: str | None = None) -> Size:
-    """Width and height in pixels from the head of the file, without decoding it."""
+    """Width and height in pixels from the head of the file, without decoding it.
+
+    >>> file = io.BytesIO()
+    >>> Image.new("RGB", (4, 2)).save(file, "JPEG")
+    >>> picture_size(file.getvalue())
+    (4, 2)
+    """
     name = name or _name(source)
     try:
         with Image.open(_stream(source), formats=PICTURE_FORMATS) as picture:
@@ -133,10 +157,13 @@ def picture_size(source: bytes | Path, name: str | None = None) -> Size:
 
 
 def resize_area(picture: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
-    """A picture [H, W, C] resized to (width, height), each new pixel the mean over its area of the old picture.
+    """Resizes a picture [H, W, C] to (width, height); each new pixel is the mean over its area of the old picture.
 
     Edges map to edges, so a pixel position (centres at +0.5) is multiplied by the ratio of the sizes, as in
     `Camera.scaled`. (Pillow's BOX filter takes whole source pixels only: half a pixel off at fractional ratios.)
+
+    >>> resize_area(np.array([[[0], [10], [20]]], np.uint8), size=(2, 1))[..., 0]
+    array([[ 3, 17]], dtype=uint8)
     """
     if size == (picture.shape[1], picture.shape[0]):
         return picture
@@ -144,7 +171,7 @@ def resize_area(picture: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
 
 
 def area_average(picture: NDArray[np.float64], size: Size) -> NDArray[np.float64]:
-    """``resize_area`` for float64 pictures, unrounded."""
+    """``resize_area`` of float64 pictures [H, W] or [H, W, C], without rounding."""
     for axis, target in ((0, size[1]), (1, size[0])):
         picture = np.moveaxis(picture, axis, 0)
         length = picture.shape[0]

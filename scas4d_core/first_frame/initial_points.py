@@ -1,4 +1,4 @@
-"""A first cloud from the pictures of frame 0 and calibrated cameras alone."""
+"""Initial points: a cloud from the pictures of frame 0 and calibrated cameras alone."""
 
 from __future__ import annotations
 
@@ -15,35 +15,36 @@ from scas4d_core.first_frame.posed_pictures import (
     Bool,
     Float,
     InitialPointsError,
-    View,
+    PosedPicture,
     collect_views,
     look_at_point,
     observe,
     pixels_inside,
     visible_from,
 )
-from scas4d_core.first_frame.settings import InitialPointsSettings
 from scas4d_core.first_frame.silhouettes import plain_background, with_silhouettes
-from scas4d_core.first_frame.stereo import DepthMap, depth_maps, fused_points, halved, looked_through
-from scas4d_core.first_frame.surfaces import (
-    Support,
-    fit_surfaces,
-    sample_surfaces,
-    settle,
-    surface_depth,
-)
-from scas4d_core.first_frame.triangulation import Triangulated, triangulate
-from scas4d_core.first_frame.visual_hull import VisualHull, carve, contradicted, pixel_at
+from scas4d_core.first_frame.stereo import ITERATIONS, DepthMap, depth_maps, fused_points, halved, looked_through
+from scas4d_core.first_frame.surfaces import TOLERANCE, Support, fit_surfaces, sample_surfaces, settle, surface_depth
+from scas4d_core.first_frame.triangulation import Triangulation, triangulate
+from scas4d_core.first_frame.visual_hull import MISSES, VisualHull, carve, contradicted, pixel_at
 
-Tell = Callable[[str, int, int], None]
-"""progress(stage, done, total)."""
+Report = Callable[[str, int, int], None]
+"""Called with a stage, the steps done and the steps in all."""
+
+MAX_POINTS = 60_000
+"""Points kept at most; where there are more, the spacing grows."""
+MIN_VIEWS = 3
+"""Cameras that must agree on a point: two always meet somewhere on an epipolar line."""
+SPACING = 1.5
+"""Distance of neighbouring points, pixels at the middle of the stage; twice that on the background."""
 
 COLOUR_SPREAD = 0.12
-"""Median deviation of the cameras' colours (0…1) above which a point no stereo has confirmed is in the wrong place."""
+"""Median deviation of the cameras' colours (0…1) above which a point that stereo has not confirmed is in the wrong
+place."""
 LOOKED_THROUGH = 2
-"""Cameras that look through an unconfirmed point to refute it: one depth may be wrong."""
+"""Cameras looking through an unconfirmed point that refute it: one depth may be wrong."""
 CONTRADICTED = 1
-"""Masks that speak against a point to refute it: one will do, for all masks agree on the hull behind the point."""
+"""Masks speaking against a point that refute it: one is enough, for all masks agree on the hull behind the point."""
 CROWD = 4
 """Stereo points that the 27 cells about one must hold: true surfaces are seen by many pixels, strays by few."""
 
@@ -52,73 +53,74 @@ def initial_points(
     rig: Rig,
     images: Mapping[str, NDArray[np.uint8]],
     masks: Mapping[str, NDArray[np.uint8]],
-    settings: InitialPointsSettings | None = None,
-    progress: Tell | None = None,
+    progress: Report | None = None,
+    *,
+    max_points: int = MAX_POINTS,
+    stereo: bool = True,
+    stereo_iterations: int = ITERATIONS,
+    seed: int = 0,
 ) -> InitialPoints:
-    """Points on the surfaces that the pictures of one moment show.
+    """Finds points on the surfaces that the pictures of one moment show.
 
-    Triangulated features bound the scene and support walls and floors; PatchMatch stereo, kept where at least
-    ``min_views`` cameras agree and few look through, gives what has texture; the visual hull (of the masks, or of
-    silhouettes before a plain background) and the fitted surfaces give the rest. A point that one camera alone supports
-    is never made, except on a wall or floor that others have found.
+    Triangulation features bound the scene and support walls and floors; PatchMatch stereo, kept where at least
+    ``MIN_VIEWS`` cameras agree and few look through, gives what has texture; the visual hull (of the masks, or of
+    silhouettes before a plain background) and the fitted surfaces give the rest. No point rests on one camera
+    alone, except on a wall or floor that others have found.
 
     Args:
         rig: calibrated cameras, in the user's world.
         images: [H, W, 3] uint8 by camera name; cameras without a picture are ignored.
         masks: [H, W] uint8 by camera name, 1 = foreground; may be empty.
-        settings: defaults if None.
-        progress: told (stage, done, total).
+        progress: called with (stage, done, total).
+        max_points: points kept at most.
+        stereo: dense stereo where the pictures have texture.
+        stereo_iterations: rounds of propagation and refinement.
+        seed: of every random choice; the same seed gives the same points.
 
     Returns:
         Points in the user's units; ``foreground`` is None where no masks were given.
 
     Raises:
         InitialPointsError: fewer than two pictures, a picture whose size is not its camera's, or nothing found.
+
+    >>> from scas4d_core.captures import open_capture
+    >>> capture = open_capture("samples/robot", image_scale=0.5)
+    >>> frame = capture.frame(0)
+    >>> cloud = initial_points(capture.rig, frame.images, frame.masks, stereo=False)
+    >>> cloud.positions.shape == cloud.colours.shape, bool((cloud.foreground <= 1).all())
+    (True, True)
     """
-    settings = settings or InitialPointsSettings()
-    tell: Tell = progress or (lambda stage, done, total: None)
+    tell: Report = progress or (lambda stage, done, total: None)
     labelled = collect_views(rig, images, masks)
-    min_views = min(settings.min_views, len(labelled))
+    min_views = min(MIN_VIEWS, len(labelled))
     middle = look_at_point(labelled)
     pixel = pixel_at(labelled, middle)
 
-    background = plain_background(labelled, settings.plain_border)
+    background = plain_background(labelled)
     plain = background is not None
     views = with_silhouettes(labelled, background) if background is not None else labelled
 
     tell("triangulation", 0, 1)
-    triangulated = triangulate(
-        views,
-        max_features=settings.max_features,
-        epipolar_error=settings.epipolar_error,
-        min_views=min_views,
-        seed=settings.seed,
-    )
+    triangulated = triangulate(views, min_views=min_views, seed=seed)
     tell("hull", 0, 1)
-    hull = carve(
-        views,
-        voxel_pixels=settings.hull_voxel,
-        misses=0.0 if plain else settings.hull_misses,
-        min_views=min_views,
-    )
+    hull = carve(views, misses=0.0 if plain else MISSES, min_views=min_views)
     supports: list[Support] = []
-    if not plain and settings.surfaces and len(triangulated.positions) >= 10:
+    if not plain and len(triangulated.positions) >= 10:
         standing = triangulated.positions[~_in_foreground(views, triangulated)]
         supports = fit_surfaces(
             standing,
             np.array([view.camera.centre for view in views]),
-            settings.surface_tolerance * rig.radius,
-            most=settings.surfaces,
-            seed=settings.seed,
+            TOLERANCE * rig.radius,
+            seed=seed,
         )
 
     maps: list[DepthMap] = []
-    if settings.stereo:
-        maps = _stereo(views, triangulated, hull, supports, plain, middle, settings, tell)
+    if stereo:
+        maps = _stereo(views, triangulated, hull, supports, plain, middle, stereo_iterations, seed, tell)
     tell("merging", 0, 1)
     confirmed = np.concatenate([fused_points(maps, min_views), triangulated.positions])
     if not plain and len(hull.cells):
-        confirmed = confirmed[contradicted(views, hull, confirmed, settings.hull_misses) < CONTRADICTED]
+        confirmed = confirmed[contradicted(views, hull, confirmed, MISSES) < CONTRADICTED]
 
     solid = _free_hull(hull, maps, min_views)
     walls = np.zeros((0, 3))
@@ -126,14 +128,14 @@ def initial_points(
         # One sample for about every four pixels of stereo's pictures is as dense as the thinning below needs.
         stride = max(2, max(view.camera.width for view in views) // 160)
         samples = sample_surfaces(views, supports, stride, rig.radius)
-        samples, _ = thinned(samples, 2.0 * settings.spacing * pixel)
-        samples = settle(samples, supports, confirmed, 4.0 * settings.surface_tolerance * rig.radius)
+        samples, _ = thinned(samples, 2.0 * SPACING * pixel)
+        samples = settle(samples, supports, confirmed, 4.0 * TOLERANCE * rig.radius)
         walls = samples[looked_through(maps, samples, min_views) < LOOKED_THROUGH]
-    return _merged(labelled, views, (confirmed, solid, walls), pixel, plain, settings)
+    return _merged(labelled, views, (confirmed, solid, walls), pixel, plain, stereo, max_points)
 
 
-def _in_foreground(views: Sequence[View], triangulated: Triangulated) -> Bool:
-    """[P] whether most of the cameras that saw a triangulated point have it in their mask."""
+def _in_foreground(views: Sequence[PosedPicture], triangulated: Triangulation) -> Bool:
+    """[P] true where most of the cameras that saw a triangulated point have it in their mask."""
     points = triangulated.positions
     said, yes = np.zeros(len(points)), np.zeros(len(points))
     for view, seen in zip(views, triangulated.views.T, strict=True):
@@ -147,16 +149,18 @@ def _in_foreground(views: Sequence[View], triangulated: Triangulated) -> Bool:
 
 
 def _stereo(
-    views: Sequence[View],
-    triangulated: Triangulated,
+    views: Sequence[PosedPicture],
+    triangulated: Triangulation,
     hull: VisualHull,
     supports: Sequence[Support],
     plain: bool,
     middle: Float,
-    settings: InitialPointsSettings,
-    tell: Tell,
+    iterations: int,
+    seed: int,
+    tell: Report,
 ) -> list[DepthMap]:
-    small = [halved(view, settings.stereo_width) for view in views]
+    """Depth maps of all pictures, halved; the search starts from hull, surfaces and triangulated points."""
+    small = [halved(view) for view in views]
     hull_surface = hull.centres[hull.surface()]
     known = hull_surface if plain else np.concatenate([triangulated.positions, hull_surface])
     ranges, priors, active = [], [], []
@@ -189,16 +193,15 @@ def _stereo(
         priors,
         active,
         middle,
-        neighbours=settings.stereo_neighbours,
-        iterations=settings.stereo_iterations,
-        seed=settings.seed,
+        iterations=iterations,
+        seed=seed,
         hull=hull,
         progress=lambda done, total: tell("stereo", done, total),
     )
 
 
 def _free_hull(hull: VisualHull, maps: Sequence[DepthMap], min_views: int) -> Float:
-    """[P, 3] surface of what remains of the hull after the space that cameras look through is taken away."""
+    """[P, 3] surface of the hull without the space that cameras look through."""
     if len(hull.cells) == 0:
         return np.zeros((0, 3))
     solid = looked_through(maps, hull.centres, min_views, margin=0.01) < LOOKED_THROUGH
@@ -207,27 +210,28 @@ def _free_hull(hull: VisualHull, maps: Sequence[DepthMap], min_views: int) -> Fl
 
 
 def _merged(
-    labelled: Sequence[View],
-    views: Sequence[View],
+    labelled: Sequence[PosedPicture],
+    views: Sequence[PosedPicture],
     sources: tuple[Float, Float, Float],
     pixel: float,
     plain: bool,
-    settings: InitialPointsSettings,
+    stereo: bool,
+    max_points: int,
 ) -> InitialPoints:
-    """Thin, colour, label; drop what the pictures speak against.
+    """Thins, colours and labels the candidates, and drops those that the pictures contradict.
 
-    ``sources``: points that cameras agree on, points of the hull, points of fitted surfaces; where an earlier source
-    has a point, the later ones are not asked.
+    ``sources``: points that cameras agree on, points of the hull, points of fitted surfaces; a later source counts only
+    where no earlier one has a point.
     """
-    fine = settings.spacing * pixel
+    fine = SPACING * pixel
     # Cameras that must see a point and agree on its colour: none once more, where stereo or features agree already;
     # two for the hull, which all masks support; one for a wall that is known from elsewhere.
     needed_by = (0, 2, 1)
     points, needed = np.zeros((0, 3)), np.zeros(0, dtype=np.intp)
     for source, (candidates, views_needed) in enumerate(zip(sources, needed_by, strict=True)):
         new, sizes = thinned(candidates, fine)
-        if source == 0 and settings.stereo and len(new):
-            # Features are few and checked; what is left of them near no stereo is kept by the hull and the walls.
+        if source == 0 and stereo and len(new):
+            # Features are few and checked; the hull and the walls cover those that lie near no point of stereo.
             crowd = np.asarray(cKDTree(candidates).query_ball_point(new, 1.5 * fine, return_length=True))
             new = new[(crowd >= CROWD) | (sizes >= CROWD)]
         elif len(points) and len(new):
@@ -242,12 +246,12 @@ def _merged(
     visible = visible_from(views, points, fine)
     foreground = _foreground(labelled, points, visible)
     if plain:
-        # What projects before the plain background there is an outline, and has none of its colour.
+        # A point that projects to the plain background there lies beside an outline, and has none of its colour.
         for row, view in zip(visible, views, strict=True):
             column, line, _, _ = pixels_inside(view.camera, points)
             row &= np.asarray(view.mask)[line, column]
     elif foreground is not None:
-        # A person before the wall is no sample of the wall's colour, nor the wall beside him of his.
+        # A person in front of a wall is no sample of the wall's colour, nor the wall of the person's.
         for row, view in zip(visible, views, strict=True):
             if view.mask is not None:
                 column, line, _, _ = pixels_inside(view.camera, points)
@@ -263,7 +267,7 @@ def _merged(
             if len(members) and spacing > fine:
                 chosen[members] = False
                 chosen[members[_spaced(points[members], spacing)]] = True
-        if chosen.sum() <= settings.max_points:
+        if chosen.sum() <= max_points:
             break
         scale *= 1.15
     if not chosen.any():
@@ -274,7 +278,7 @@ def _merged(
     return InitialPoints(points[chosen], seen.colours[chosen], None if foreground is None else foreground[chosen])
 
 
-def _foreground(views: Sequence[View], points: Float, visible: Bool) -> NDArray[np.float32] | None:
+def _foreground(views: Sequence[PosedPicture], points: Float, visible: Bool) -> NDArray[np.float32] | None:
     """[P] share of the cameras that may see each point whose mask holds it; None without masks."""
     said, yes = np.zeros(len(points)), np.zeros(len(points))
     for row, view in zip(visible, views, strict=True):
@@ -289,7 +293,7 @@ def _foreground(views: Sequence[View], points: Float, visible: Bool) -> NDArray[
 
 
 def _spaced(points: Float, cell: float) -> NDArray[np.intp]:
-    """Of each cubic cell, the index of the point nearest to the mean of those in it: evener than any one of them."""
+    """Index of one point for each cubic cell, the nearest to the mean of the cell's points: that spreads evenly."""
     cells = np.floor(points / cell).astype(np.int64)
     _, where = np.unique(cells, axis=0, return_inverse=True)
     where = where.ravel()
@@ -301,7 +305,7 @@ def _spaced(points: Float, cell: float) -> NDArray[np.intp]:
 
 
 def thinned(points: Float, cell: float) -> tuple[Float, NDArray[np.intp]]:
-    """One point a cubic cell: the mean [Q, 3] of the points in it, and how many they were [Q]."""
+    """Means [Q, 3] of the points in each cubic cell of edge ``cell``, and the number of points in each [Q]."""
     if len(points) == 0:
         return points.reshape(-1, 3), np.zeros(0, dtype=np.intp)
     cells = np.floor(points / cell).astype(np.int64)

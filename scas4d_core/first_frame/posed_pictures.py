@@ -1,4 +1,4 @@
-"""What one camera saw in frame 0, and what several of them say about a point. Numpy only."""
+"""Pictures with camera poses, and queries over several of them: visibility, occlusion, colour of points. Numpy only."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class InitialPointsError(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class PosedPicture:
     """A camera and its picture.
 
     Attributes:
         camera: calibrated, in the user's world.
         image: [H, W, 3] uint8.
-        mask: [H, W] bool, true where the foreground is; None where nobody said.
+        mask: [H, W] bool, true on the foreground; None where the capture has none.
     """
 
     camera: Camera
@@ -39,8 +39,8 @@ class View:
 
 def collect_views(
     rig: Rig, images: Mapping[str, NDArray[np.uint8]], masks: Mapping[str, NDArray[np.uint8]]
-) -> list[View]:
-    """The views of every camera of the rig that has a picture, in the rig's order.
+) -> list[PosedPicture]:
+    """Views of all cameras of the rig that have a picture, in the rig's order.
 
     Raises:
         InitialPointsError: fewer than two pictures, or a picture or mask whose size is not its camera's.
@@ -60,7 +60,7 @@ def collect_views(
             raise InitialPointsError(
                 f"masks[{camera.name!r}]: shape {mask.shape}; give {image.shape[:2]}, the size of its picture"
             )
-        views.append(View(camera, image, None if mask is None else np.asarray(mask) > 0))
+        views.append(PosedPicture(camera, image, None if mask is None else np.asarray(mask) > 0))
     if len(views) < 2:
         raise InitialPointsError(
             f"images: {len(views)} of the rig's {len(rig)} cameras have a picture; points from pictures need at least 2"
@@ -68,8 +68,8 @@ def collect_views(
     return views
 
 
-def look_at_point(views: Sequence[View]) -> Float:
-    """[3] the point nearest to all optical axes (least squares); the middle of the stage of an inward-looking rig."""
+def look_at_point(views: Sequence[PosedPicture]) -> Float:
+    """[3] point nearest to all optical axes (least squares): the middle of the stage of an inward-looking rig."""
     axes = np.array([view.camera.rotation[2] for view in views])
     centres = np.array([view.camera.centre for view in views])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -79,7 +79,7 @@ def look_at_point(views: Sequence[View]) -> Float:
 
 
 def pixels_inside(camera: Camera, points: Float) -> tuple[NDArray[np.intp], NDArray[np.intp], Float, Bool]:
-    """Where world points [P, 3] fall in a picture.
+    """Projects world points [P, 3] to whole pixels of a picture.
 
     Returns:
         columns, rows [P] of the pixel that holds each (0 where outside), depths [P], and which are inside [P].
@@ -121,11 +121,11 @@ def front_depth(camera: Camera, occluders: Float, spacing: float, points: Float)
     return front
 
 
-def visible_from(views: Sequence[View], points: Float, spacing: float) -> Bool:
-    """Which cameras may see which points, the points themselves being the occluders.
+def visible_from(views: Sequence[PosedPicture], points: Float, spacing: float) -> Bool:
+    """Visibility of points [P, 3] in each camera; the points themselves are the occluders.
 
     A point is hidden if it lies more than four diameters of a disc behind the nearest one; see ``front_depth``.
-    Surfaces seen at more than about 60 degrees from their normal may count as hidden: poor witnesses of colour anyway.
+    Surfaces seen at more than about 60 degrees from their normal may count as hidden: their colour is vague anyway.
 
     Returns:
         [V, P] bool; false also where the point projects outside the picture.
@@ -139,13 +139,13 @@ def visible_from(views: Sequence[View], points: Float, spacing: float) -> Bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Observed:
-    """What the cameras that may see each point agree on.
+class PointColours:
+    """Colours of points over the cameras that may see them.
 
     Attributes:
         colours: [P, 3] float32 in 0…1, median over those cameras.
         spread: [P] median absolute deviation from it, largest channel, 0…1.
-        count: [P] cameras.
+        count: [P] cameras that see the point.
     """
 
     colours: NDArray[np.float32]
@@ -153,12 +153,12 @@ class Observed:
     count: NDArray[np.intp]
 
 
-def observe(views: Sequence[View], points: Float, visible: Bool) -> Observed:
+def observe(views: Sequence[PosedPicture], points: Float, visible: Bool) -> PointColours:
     """Median colour of points [P, 3] over the cameras in ``visible`` [V, P]; NaN where no camera sees the point."""
     if len(points) > BLOCK:  # bounds the memory of the samples
         blocks = [slice(start, start + BLOCK) for start in range(0, len(points), BLOCK)]
         parts = [observe(views, points[block], visible[:, block]) for block in blocks]
-        return Observed(
+        return PointColours(
             np.concatenate([part.colours for part in parts]),
             np.concatenate([part.spread for part in parts]),
             np.concatenate([part.count for part in parts]),
@@ -175,4 +175,4 @@ def observe(views: Sequence[View], points: Float, visible: Bool) -> Observed:
     if some.any():
         colours[some] = np.nanmedian(samples[:, some], axis=0)
         spread[some] = np.nanmedian(np.abs(samples[:, some] - colours[some]), axis=0).max(-1)
-    return Observed(colours, spread, count)
+    return PointColours(colours, spread, count)

@@ -9,10 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from scas4d_core.first_frame.posed_pictures import Bool, View
+from scas4d_core.first_frame.posed_pictures import Bool, PosedPicture
 
 TOLERANCE = 8
-"""Values of 255, in any channel, that are still the background: above resampling and mild compression noise."""
+"""Difference from the background, of 255 in any channel, that still counts as background: above resampling and mild
+compression noise."""
+PLAIN_BORDER = 0.95
+"""Share of the border of every picture in one colour from which the background counts as plain."""
 SMALL_HOLE = 12
 """Pixels: background islands up to this size inside the object are dark texture, not holes."""
 
@@ -21,18 +24,13 @@ def _border(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.concatenate([image[0], image[-1], image[1:-1, 0], image[1:-1, -1]])
 
 
-def plain_background(views: Sequence[View], share: float = 0.95) -> NDArray[np.uint8] | None:
-    """The one colour [3] uint8 of the borders of all pictures; None where there is no such colour.
-
-    Args:
-        views: the pictures.
-        share: of the border pixels of every single picture that must have the colour.
-    """
+def plain_background(views: Sequence[PosedPicture]) -> NDArray[np.uint8] | None:
+    """Colour [3] uint8 that the borders of all pictures share; None where they do not."""
     borders = [_border(view.image) for view in views]
     colour = np.median(np.concatenate(borders), axis=0)
     for border in borders:
         same = np.abs(border - colour).max(axis=1) <= TOLERANCE
-        if same.mean() < share:
+        if same.mean() < PLAIN_BORDER:
             return None
     result: NDArray[np.uint8] = colour.astype(np.uint8)
     return result
@@ -49,6 +47,6 @@ def silhouette(image: NDArray[np.uint8], background: NDArray[np.uint8]) -> Bool:
     return result
 
 
-def with_silhouettes(views: Sequence[View], background: NDArray[np.uint8]) -> list[View]:
+def with_silhouettes(views: Sequence[PosedPicture], background: NDArray[np.uint8]) -> list[PosedPicture]:
     """The views with the silhouette as their mask."""
     return [replace(view, mask=silhouette(view.image, background)) for view in views]

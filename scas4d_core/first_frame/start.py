@@ -1,4 +1,4 @@
-"""Frame 0: fitted, and what it leaves to every update."""
+"""Fits frame 0, and keeps the facts of it that every update needs."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from scas4d_core.update.views import ViewFactory
 
 
 @dataclass(frozen=True, eq=False)
-class Fixed:
-    """What frame 0 leaves to every update.
+class FirstFrame:
+    """The facts of frame 0 that every update needs.
 
     Attributes:
-        masked: whether it had masks. exposures: [3, 2] gain and offset by camera.
+        masked: true where it had masks. exposures: [3, 2] gain and offset of each channel, by camera name.
         lengths: [N, 3] metres, of the axes of the Gaussians.
     """
 
@@ -34,15 +34,15 @@ class Fixed:
     lengths: NDArray[np.float32]
 
     def record(self) -> dict[str, Any]:
-        """What the state of frame 0 does not tell of it, as JSON; committed with the report."""
+        """The facts that the state of frame 0 does not hold, as JSON values; they are committed with its report."""
         return {
             "masked": self.masked,
             "exposures": {name: exposure.tolist() for name, exposure in self.exposures.items()},
         }
 
     @classmethod
-    def of(cls, history: History) -> Fixed:
-        """What the first frame of a history left.
+    def of(cls, history: History) -> FirstFrame:
+        """Reads the facts from the first frame of a history.
 
         Raises:
             HistoryError: it cannot be read. KeyError: its report lacks something.
@@ -62,18 +62,18 @@ def fit_first(
     world: WorldFrame,
     tell: Callable[[Progress], None],
 ) -> StaticResult:
-    """Frame 0 from a first cloud, which is made from the pictures where none is given.
+    """Fits frame 0 to its pictures, from a cloud that is given or made from the pictures.
 
-    It is made inside: the same wherever the user's origin is and whatever the unit.
+    The cloud is made in the inside world: the user's origin and unit do not change it.
 
     Args:
         frame: with pictures of the size of the factory's rig. points: in the user's world. world: user's to inside.
-        tell: is told of each stage.
+        tell: called with the progress of each stage.
     """
     static = settings.static
     if points is None:
         points = initial_points(
-            factory.rig, frame.images, frame.masks, None,
+            factory.rig, frame.images, frame.masks,
             lambda stage, done, total: tell(Progress(stage, done, total)),
         )  # fmt: skip
         positions = points.positions

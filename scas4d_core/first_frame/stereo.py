@@ -10,9 +10,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
 from scas4d_core.first_frame.patch_match import patch_match
-from scas4d_core.first_frame.posed_pictures import Bool, Float, View, pixels_inside
+from scas4d_core.first_frame.posed_pictures import Bool, Float, PosedPicture, pixels_inside
 from scas4d_core.first_frame.visual_hull import VisualHull
 
+WIDTH = 320
+"""Pixels: wider pictures are halved until they are not."""
+NEIGHBOURS = 4
+"""Other cameras that each picture is compared with."""
+ITERATIONS = 4
+"""Rounds of propagation and refinement."""
 MAX_COST = 0.35
 """1 − NCC of a match that is believed (before the cameras are compared)."""
 REPROJECTION = 1.0
@@ -25,15 +31,15 @@ MIN_ANGLE_DEG, MAX_ANGLE_DEG = 4.0, 50.0
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """What stereo says about one picture.
+    """Depths of one picture by stereo.
 
     Attributes:
-        view: camera and picture, at the size stereo worked at.
-        depth: [H, W] along z, world units, 0 where nothing is known.
+        view: camera and picture, at the size that stereo worked at.
+        depth: [H, W] along z, world units, 0 where unknown.
         agreeing: [H, W] other cameras whose depth agrees.
     """
 
-    view: View
+    view: PosedPicture
     depth: Float
     agreeing: NDArray[np.intp]
 
@@ -43,7 +49,7 @@ class DepthMap:
         return result
 
 
-def halved(view: View, width: int) -> View:
+def halved(view: PosedPicture, width: int = WIDTH) -> PosedPicture:
     """The view at half, a quarter … of its size, until it is no wider than ``width`` pixels."""
     image, mask, camera = view.image.astype(np.float32), view.mask, view.camera
     while camera.width > width and camera.width >= 2 and camera.height >= 2:
@@ -54,11 +60,11 @@ def halved(view: View, width: int) -> View:
         # Blocks of 2 × 2 with pixel centres at +0.5: every pixel coordinate is halved exactly, odd sizes or not.
         matrix = camera.intrinsics * np.array([[0.5], [0.5], [1.0]])
         camera = type(camera)(camera.name, matrix, camera.world_to_camera, w // 2, h // 2)
-    return View(camera, np.rint(image).astype(np.uint8), mask)
+    return PosedPicture(camera, np.rint(image).astype(np.uint8), mask)
 
 
-def neighbours_of(views: Sequence[View], index: int, middle: Float, count: int) -> list[int]:
-    """The views to compare one with: nearest in angle about ``middle`` [3], but not too near."""
+def neighbours_of(views: Sequence[PosedPicture], index: int, middle: Float, count: int) -> list[int]:
+    """Indices of the views to compare one with: nearest in angle about ``middle`` [3], but not too near."""
     rays = np.array([view.camera.centre - middle for view in views])
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
     angle = np.degrees(np.arccos(np.clip(rays @ rays[index], -1, 1)))
@@ -67,14 +73,13 @@ def neighbours_of(views: Sequence[View], index: int, middle: Float, count: int) 
 
 
 def depth_maps(
-    views: Sequence[View],
+    views: Sequence[PosedPicture],
     ranges: Sequence[tuple[float, float]],
     priors: Sequence[Float],
     active: Sequence[Bool],
     middle: Float,
     *,
-    neighbours: int = 4,
-    iterations: int = 4,
+    iterations: int = ITERATIONS,
     seed: int = 0,
     hull: VisualHull | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -87,11 +92,10 @@ def depth_maps(
         priors: [H, W] depth of each view to try first, 0 where unknown.
         active: [H, W] pixels wanted of each view.
         middle: [3] about which angles between cameras are measured.
-        neighbours: views each is compared with.
         iterations: rounds of PatchMatch.
         seed: of the random planes.
         hull: of the masks: depths of masked pixels that lie outside it are false.
-        progress: told (views done, views).
+        progress: called with (views done, views).
     """
     greys = [
         np.ascontiguousarray(v.image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32) / np.float32(255))
@@ -100,7 +104,7 @@ def depth_maps(
     tall, wide = max(g.shape[0] for g in greys), max(g.shape[1] for g in greys)
     depths = []
     for i, view in enumerate(views):
-        chosen = [j for j in neighbours_of(views, i, middle, neighbours) if greys[j].shape == (tall, wide)]
+        chosen = [j for j in neighbours_of(views, i, middle, NEIGHBOURS) if greys[j].shape == (tall, wide)]
         camera = view.camera
         if len(chosen) < 2:
             depths.append(np.zeros(greys[i].shape))
@@ -133,8 +137,8 @@ def depth_maps(
     return [DepthMap(view, depths[i], _agreement(views, depths, i)) for i, view in enumerate(views)]
 
 
-def _confine(view: View, depth: Float, hull: VisualHull) -> None:
-    """Forget, in place, the depths of masked pixels that lie off the hull: no foreground is there."""
+def _confine(view: PosedPicture, depth: Float, hull: VisualHull) -> None:
+    """Clears, in place, the depths of masked pixels that lie off the hull: there is no foreground."""
     rows, columns = np.nonzero((depth > 0) & np.asarray(view.mask))
     if len(rows) == 0:
         return
@@ -143,8 +147,8 @@ def _confine(view: View, depth: Float, hull: VisualHull) -> None:
     depth[rows[off], columns[off]] = 0.0
 
 
-def _agreement(views: Sequence[View], depths: Sequence[Float], index: int) -> NDArray[np.intp]:
-    """[H, W] how many other cameras' depths send a pixel's point back to it."""
+def _agreement(views: Sequence[PosedPicture], depths: Sequence[Float], index: int) -> NDArray[np.intp]:
+    """[H, W] number of other cameras whose depth sends a pixel's point back to it."""
     camera, depth = views[index].camera, depths[index]
     rows, columns = np.nonzero(depth > 0)
     uv = np.stack([columns + 0.5, rows + 0.5], axis=-1)
@@ -166,7 +170,7 @@ def _agreement(views: Sequence[View], depths: Sequence[Float], index: int) -> ND
 
 
 def fused_points(maps: Sequence[DepthMap], min_views: int, max_violations: float = 0.5) -> Float:
-    """[P, 3] the points of all depth maps on which ``min_views`` cameras agree and through which few look.
+    """[P, 3] points of all depth maps on which ``min_views`` cameras agree and through which few look.
 
     A camera whose trusted depth lies clearly behind a point looks through it. A point is a floater if the cameras that
     look through it are more than ``max_violations`` times those that agree on it (after Merrell et al. 2007).

@@ -1,7 +1,7 @@
 """Large smooth surfaces (walls, floors, domes) as planes and spheres, where the triangulated points support them.
 
-Smooth walls give few features, and stereo on them finds floaters. A plane or sphere that many triangulated points lie
-on says where the wall is between them. Fitted by RANSAC (Fischler & Bolles 1981), refined by least squares.
+Smooth walls give few features, and stereo on them finds floaters. A plane or sphere through many triangulated points
+gives the wall between them. Fitted by RANSAC (Fischler & Bolles 1981), refined by least squares.
 """
 
 from __future__ import annotations
@@ -14,16 +14,20 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
-from scas4d_core.first_frame.posed_pictures import Bool, Float, View
+from scas4d_core.first_frame.posed_pictures import Bool, Float, PosedPicture
 
+MOST = 3
+"""Planes and spheres fitted to the triangulated points: walls, floor and a dome are rarely more."""
+TOLERANCE = 0.012
+"""Distance of an inlier from a fitted surface, in radii of the rig."""
 TRIALS = 1500
 MIN_SHARE = 0.1
-"""Of the triangulated points, that a surface must explain."""
+"""Share of the triangulated points that a surface must explain."""
 MIN_INLIERS = 30
 CAMERA_SLACK = 1.25
 """A dome holds all cameras within this many radii: they are often mounted in it."""
 MAX_BEHIND = 0.15
-"""Share of the triangulated points that may lie behind a surface: what bounds a room has next to nothing behind it."""
+"""Share of the triangulated points that may lie behind a surface: a wall of a room has next to nothing behind it."""
 MAX_RADIUS = 2.0
 """Radius of a dome in radii of the rig; a larger one is a wall, and a plane says that with less freedom."""
 GAP_PLANE = 0.5
@@ -128,7 +132,7 @@ def fit_sphere(points: Float) -> Sphere | None:
     return Sphere(answer[:3] + middle, float(np.sqrt(square)))
 
 
-def fit_surfaces(points: Float, centres: Float, tolerance: float, *, most: int, seed: int) -> list[Support]:
+def fit_surfaces(points: Float, centres: Float, tolerance: float, *, most: int = MOST, seed: int = 0) -> list[Support]:
     """Planes and spheres that bound the room of the cameras, the best supported first.
 
     Args:
@@ -166,13 +170,13 @@ def fit_surfaces(points: Float, centres: Float, tolerance: float, *, most: int, 
         if on.sum() < needed:
             break
         found.append(Support(best, rest[on]))
-        # What lies close to a surface already found supports no second one beside it.
+        # Points close to a surface that was found support no second one beside it.
         rest = rest[np.abs(best.offsets(rest)) > 2.0 * tolerance]
     return found
 
 
 def _bounds(surface: Surface, points: Float, centres: Float, tolerance: float) -> bool:
-    """Whether the cameras are on one side of the surface and nearly all the points on the same."""
+    """True where the cameras are on one side of the surface and nearly all the points on the same."""
     cameras, behind = surface.offsets(centres), surface.offsets(points)
     if isinstance(surface, Sphere):
         reach = np.linalg.norm(centres - surface.centre, axis=1).max()
@@ -208,8 +212,8 @@ def _refined(surface: Surface, near: Float, tolerance: float) -> Surface | None:
     return Sphere(np.asarray(answer.x[:3]), float(answer.x[3]))
 
 
-def surface_depth(view: View, supports: Sequence[Support], uv: Float) -> tuple[Float, Float]:
-    """Where the rays through pixels [R, 2] first meet the surfaces.
+def surface_depth(view: PosedPicture, supports: Sequence[Support], uv: Float) -> tuple[Float, Float]:
+    """First intersections of the rays through pixels [R, 2] with the surfaces.
 
     Returns:
         points [R, 3] (NaN where no surface is met) and depths along z [R] (infinity there).
@@ -226,11 +230,11 @@ def surface_depth(view: View, supports: Sequence[Support], uv: Float) -> tuple[F
     return points, depth
 
 
-def sample_surfaces(views: Sequence[View], supports: Sequence[Support], stride: int, scale: float) -> Float:
-    """[P, 3] points of the surfaces where the cameras look, one for each ``stride``-th pixel outside the masks.
+def sample_surfaces(views: Sequence[PosedPicture], supports: Sequence[Support], stride: int, scale: float) -> Float:
+    """[P, 3] points of the surfaces that the cameras see, one for each ``stride``-th pixel outside the masks.
 
     Args:
-        views: the cameras; masked pixels show something else.
+        views: of the cameras; masked pixels show something else.
         supports: fitted surfaces.
         stride: pixels.
         scale: radius of the rig: samples far from every triangulated point of the surface (``GAP_…``) are left out,
@@ -267,7 +271,7 @@ def sample_surfaces(views: Sequence[View], supports: Sequence[Support], stride: 
 
 
 def settle(points: Float, supports: Sequence[Support], seen: Float, reach: float) -> Float:
-    """Samples moved along the normal of their surface to where measured points about them lie.
+    """Moves samples along the normal of their surface to the measured points about them.
 
     A dome is made of panels and a floor is not quite flat: the measured offsets are averaged over the neighbours of
     each sample, with the fitted surface itself as one more measurement.
@@ -276,7 +280,7 @@ def settle(points: Float, supports: Sequence[Support], seen: Float, reach: float
         points: [P, 3] on the surfaces.
         supports: fitted surfaces.
         seen: [M, 3] measured points.
-        reach: world units; measured points farther from the sample count little, farther from the surface not at all.
+        reach: world units; measured points farther from the sample count little; farther from the surface, not at all.
     """
     if len(points) == 0 or len(seen) == 0:
         return points

@@ -1,6 +1,6 @@
-"""Points where the same SIFT feature is seen by several calibrated cameras (known-pose triangulation, pycolmap).
+"""Triangulates SIFT features that several calibrated cameras see (known poses, pycolmap).
 
-The poses are known, so a match is looked for along its epipolar line only: far fewer wrong candidates pass the ratio
+The poses are known, so matches are searched along their epipolar line only: far fewer wrong candidates pass the ratio
 test than in a search over the whole picture, and wide baselines keep their matches.
 """
 
@@ -16,19 +16,24 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from scas4d_core.cameras import Camera
-from scas4d_core.first_frame.posed_pictures import Float, View
+from scas4d_core.first_frame.posed_pictures import Float, PosedPicture
 
 RATIO = 0.8
 """Best over second-best descriptor distance among the candidates on the epipolar line (Lowe 2004, section 7.1)."""
 MAX_DESCRIPTOR_DISTANCE = 0.7
 """COLMAP's bound on the distance of two unit descriptors."""
+MAX_FEATURES = 4096
+"""SIFT features a picture; matching costs their product for each pair."""
+EPIPOLAR_ERROR = 2.0
+"""Pixels that a match may lie off its epipolar line, and the bound of the reprojection error; residuals of a
+calibration are near 0.5."""
 MIN_ANGLE_DEG = 2.0
 """Rays that meet under less say little about depth."""
 
 
 @dataclass(frozen=True, eq=False)
-class Triangulated:
-    """Points and who saw them.
+class Triangulation:
+    """Triangulated points, and the views that saw them.
 
     Attributes:
         positions: [P, 3] float64 world.
@@ -41,18 +46,18 @@ class Triangulated:
     error: Float
 
 
-def features(views: Sequence[View], max_features: int) -> list[tuple[Float, NDArray[np.float32]]]:
+def features(views: Sequence[PosedPicture]) -> list[tuple[Float, NDArray[np.float32]]]:
     """SIFT of every view: keypoints [K, 2] (pixel centres at +0.5, as in COLMAP) and unit descriptors [K, 128]."""
     import pycolmap
 
     options: Any = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.num_threads = 1
-    options.sift.max_num_features = max_features
+    options.sift.max_num_features = MAX_FEATURES
     # A quarter of COLMAP's contrast: smooth walls have little, and the known poses throw wrong matches out.
     options.sift.peak_threshold = 0.0017
     level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = max(level, 1)  # a line of news a picture is too much
+    pycolmap.logging.minloglevel = max(level, 1)  # COLMAP logs a line for each picture otherwise
     try:
         sift = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
         found = []
@@ -79,9 +84,8 @@ def fundamental_matrix(first: Camera, second: Camera) -> Float:
 def guided_matches(
     first: tuple[Camera, Float, NDArray[np.float32]],
     second: tuple[Camera, Float, NDArray[np.float32]],
-    epipolar_error: float,
 ) -> NDArray[np.intp]:
-    """[M, 2] mutually best pairs of features within ``epipolar_error`` pixels of each other's epipolar lines."""
+    """[M, 2] mutually best pairs of features within ``EPIPOLAR_ERROR`` pixels of each other's epipolar lines."""
     (camera_a, uv_a, descriptors_a), (camera_b, uv_b, descriptors_b) = first, second
     if len(uv_a) == 0 or len(uv_b) == 0:
         return np.zeros((0, 2), dtype=np.intp)
@@ -92,7 +96,7 @@ def guided_matches(
     residual = np.abs(lines_b @ np.hstack([uv_b, ones_b]).T).astype(np.float32)
     slope = np.minimum(np.linalg.norm(lines_b[:, :2], axis=1)[:, None], np.linalg.norm(lines_a[:, :2], axis=1)[None, :])
     distance = np.sqrt(np.maximum(2.0 - 2.0 * (descriptors_a @ descriptors_b.T), 0.0))
-    distance[residual > epipolar_error * slope] = 2.0
+    distance[residual > EPIPOLAR_ERROR * slope] = 2.0
     best_b, best_a = distance.argmin(1), distance.argmin(0)
     rows = np.arange(len(uv_a))
     value = distance[rows, best_b]
@@ -105,29 +109,22 @@ def guided_matches(
     return np.stack([rows[good], best_b[good]], axis=1)
 
 
-def triangulate(
-    views: Sequence[View], *, max_features: int = 4096, epipolar_error: float = 2.0, min_views: int = 3, seed: int = 0
-) -> Triangulated:
-    """Match SIFT features over all pairs of views and triangulate each track robustly (LO-RANSAC), poses fixed.
+def triangulate(views: Sequence[PosedPicture], *, min_views: int = 3, seed: int = 0) -> Triangulation:
+    """Matches SIFT features over all pairs of views and triangulates each track robustly (LO-RANSAC), poses fixed.
 
     Args:
         views: pictures of one moment.
-        max_features: SIFT features a picture.
-        epipolar_error: pixels a match may lie off its line; the same bound holds for the reprojection error.
         min_views: inlier views a point needs.
         seed: of RANSAC.
     """
     import pycolmap
 
-    found = [
-        (view.camera, uv, descriptors)
-        for view, (uv, descriptors) in zip(views, features(views, max_features), strict=True)
-    ]
+    found = [(view.camera, uv, descriptors) for view, (uv, descriptors) in zip(views, features(views), strict=True)]
     offsets = np.concatenate([[0], np.cumsum([len(uv) for _, uv, _ in found])])
     owner = np.repeat(np.arange(len(views)), np.diff(offsets))
     pixels = np.concatenate([uv for _, uv, _ in found]) if len(owner) else np.zeros((0, 2))
     pairs = [
-        guided_matches(found[a], found[b], epipolar_error) + offsets[[a, b]]
+        guided_matches(found[a], found[b]) + offsets[[a, b]]
         for a in range(len(views))
         for b in range(a + 1, len(views))
     ]
@@ -152,7 +149,7 @@ def triangulate(
     options: Any = pycolmap.EstimateTriangulationOptions()
     options.min_tri_angle = np.deg2rad(MIN_ANGLE_DEG)
     options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
-    options.ransac.max_error = epipolar_error
+    options.ransac.max_error = EPIPOLAR_ERROR
     options.ransac.random_seed = seed
     options.ransac.max_num_trials = 500
 
@@ -177,11 +174,11 @@ def triangulate(
             for w, uv in zip(who[inlier], pixels[group][inlier], strict=True)
         ]
         error = float(np.mean(residuals))
-        if not error <= epipolar_error:  # NaN: behind a camera
+        if not error <= EPIPOLAR_ERROR:  # NaN: behind a camera
             continue
         positions.append(point)
         seen.append(row)
         errors.append(error)
-    return Triangulated(
+    return Triangulation(
         np.array(positions).reshape(-1, 3), np.array(seen, dtype=bool).reshape(-1, len(views)), np.array(errors)
     )

@@ -1,7 +1,6 @@
 """The visual hull: the largest shape whose silhouettes are the masks (Laurentini 1994), by an octree of voxels.
 
-A camera in whose picture a voxel does not fall says nothing about it; a voxel counts only where ``min_views`` cameras
-see it.
+A camera has no say about voxels outside its picture; a voxel counts only where ``min_views`` cameras see it.
 """
 
 from __future__ import annotations
@@ -13,10 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt
 
-from scas4d_core.first_frame.posed_pictures import Bool, Float, View, front_depth, look_at_point, pixels_inside
+from scas4d_core.first_frame.posed_pictures import Bool, Float, PosedPicture, front_depth, look_at_point, pixels_inside
 
 SEEN_SHARE = 0.35
 """Share of the masked cameras that must see a voxel: at the edges of the stage few do, and ghosts stay uncarved."""
+VOXEL_PIXELS = 1.5
+"""Edge of the smallest voxel, at most, in pixels at the middle of the stage."""
+MISSES = 0.05
+"""Share of the cameras whose given mask may miss a voxel: automatic masks are ragged. Silhouettes read off a plain
+background are exact and get none."""
 COARSE = 32
 """Voxels along an edge of the first, coarsest grid."""
 MAX_VOXELS = 4_000_000
@@ -25,7 +29,7 @@ MAX_VOXELS = 4_000_000
 
 @dataclass(frozen=True, eq=False)
 class VisualHull:
-    """Voxels inside every silhouette that may judge them.
+    """Voxels inside the silhouettes of all cameras that see them.
 
     Attributes:
         cells: [M, 3] integer indices on the grid.
@@ -49,7 +53,7 @@ class VisualHull:
         return len(self.cells) * self.voxel**3
 
     def about(self, points: Float) -> Bool:
-        """[P] points [P, 3] within the hull or nearer to it than two voxels (and some a little farther)."""
+        """[P] true for points [P, 3] within the hull or nearer to it than two voxels (and some a little farther)."""
         pairs = np.unique(self.cells // 2, axis=0)
         low = pairs.min(0) - 2
         size = pairs.max(0) + 3 - low
@@ -65,7 +69,7 @@ class VisualHull:
         return result
 
     def surface(self) -> Bool:
-        """[M] voxels with at least one of their six neighbours empty."""
+        """[M] true for voxels with at least one of their six neighbours empty."""
         if len(self.cells) == 0:
             return np.zeros(0, dtype=bool)
         low = self.cells.min(0) - 1
@@ -80,16 +84,18 @@ class VisualHull:
         return bare
 
 
-def pixel_at(views: Sequence[View], point: Float) -> float:
-    """World units across one pixel at ``point``, median over the cameras before which it lies (1 where none)."""
+def pixel_at(views: Sequence[PosedPicture], point: Float) -> float:
+    """World units across one pixel at ``point`` [3], median over the cameras that have it in front (1 without any)."""
     sizes = [
         float(view.camera.project(point)[1]) / view.camera.fx for view in views if view.camera.project(point)[1] > 0
     ]
     return float(np.median(sizes)) if sizes else 1.0
 
 
-def carve(views: Sequence[View], *, voxel_pixels: float = 1.0, misses: float = 0.0, min_views: int = 3) -> VisualHull:
-    """Carve the hull of the masks.
+def carve(
+    views: Sequence[PosedPicture], *, voxel_pixels: float = VOXEL_PIXELS, misses: float = 0.0, min_views: int = 3
+) -> VisualHull:
+    """Carves the hull of the masks.
 
     Args:
         views: those without a mask are ignored.
@@ -120,12 +126,12 @@ def carve(views: Sequence[View], *, voxel_pixels: float = 1.0, misses: float = 0
         voxel /= 2
 
 
-def contradicted(views: Sequence[View], hull: VisualHull, points: Float, misses: float) -> NDArray[np.intp]:
-    """[P] masks that speak against each point [P, 3].
+def contradicted(views: Sequence[PosedPicture], hull: VisualHull, points: Float, misses: float) -> NDArray[np.intp]:
+    """[P] number of masks that contradict each point [P, 3].
 
-    A point within the silhouettes is foreground, and nothing speaks against it. Any other is background: it must not
-    lie before the hull where a camera sees foreground. Stereo makes such points beside outlines, where a patch covers
-    both.
+    A point within the silhouettes is foreground, and no mask contradicts it. Any other is background: it must not lie
+    before the hull in a camera that sees foreground there. Stereo makes such points beside outlines, where a patch
+    covers both.
 
     Args:
         views: those without a mask are ignored.
@@ -156,7 +162,7 @@ def _distance(mask: Bool) -> Float:
 
 
 def _kept(
-    views: Sequence[View],
+    views: Sequence[PosedPicture],
     distances: Sequence[Float],
     centres: Float,
     voxel: float,
@@ -164,7 +170,7 @@ def _kept(
     min_views: int,
     last: bool,
 ) -> Bool:
-    """[M] voxels that no more than a share ``misses`` of their cameras see off the silhouette."""
+    """[M] true for voxels that no more than a share ``misses`` of their cameras see off the silhouette."""
     missed = np.zeros(len(centres), dtype=np.int32)
     seen = np.zeros(len(centres), dtype=np.int32)
     may_see = np.zeros(len(centres), dtype=np.int32)

@@ -1,4 +1,4 @@
-"""Pictures against the truth: PSNR, SSIM, FLIP, LPIPS.
+"""Compares pictures with the truth: PSNR, SSIM, FLIP, LPIPS.
 
 Pictures are [H, W, 3]: floats in 0…1, or uint8 in 0…255. Rendered values outside 0…1 are clamped first, as a display
 does.
@@ -32,7 +32,7 @@ class Score:
 
     Attributes:
         value: None where the metric could not be computed.
-        reason: why not, and what to do about it; empty where there is a value.
+        reason: fault and remedy; empty where there is a value.
     """
 
     value: float | None
@@ -45,13 +45,17 @@ def psnr(image: NDArray[Any], truth: NDArray[Any], mask: NDArray[Any] | None = N
     Args:
         image: [H, W, 3] rendered.
         truth: [H, W, 3].
-        mask: [H, W]; only pixels where it is not zero count: with the foreground's mask, PSNR on the foreground alone.
+        mask: [H, W]; only pixels where it is not zero count, for example the foreground's.
 
     Returns:
-        dB; infinity where the pictures are the same; NaN where the mask is empty.
+        dB; infinity for equal pictures; NaN for an empty mask.
 
     Raises:
         ValueError: shapes differ, or values are not finite.
+
+    >>> truth = np.zeros((8, 8, 3))
+    >>> round(psnr(truth + 0.1, truth), 6), psnr(truth, truth)
+    (20.0, inf)
     """
     first, second = _pair(image, truth)
     squared = (first - second) ** 2
@@ -75,10 +79,14 @@ def ssim(image: NDArray[Any], truth: NDArray[Any]) -> float:
         truth: [H, W, 3].
 
     Returns:
-        At most 1, which means the same.
+        At most 1, for equal pictures.
 
     Raises:
         ValueError: shapes differ, or values are not finite.
+
+    >>> picture = np.random.default_rng(0).random((32, 32, 3))
+    >>> ssim(picture, picture), round(ssim(1 - picture, picture), 2)
+    (1.0, -0.73)
     """
     x, y = _pair(image, truth)
     mean_x, mean_y = _window_mean(x), _window_mean(y)
@@ -92,7 +100,7 @@ def ssim(image: NDArray[Any], truth: NDArray[Any]) -> float:
 
 
 def flip(image: NDArray[Any], truth: NDArray[Any]) -> Score:
-    """Mean LDR-ꟻLIP error (Andersson et al. 2020) at the 67 pixels per degree its authors recommend; 0 is the same.
+    """Mean LDR-ꟻLIP error (Andersson et al. 2020) at the 67 pixels per degree its authors recommend; 0 means equal.
 
     Args:
         image: [H, W, 3] rendered, sRGB.
@@ -100,6 +108,10 @@ def flip(image: NDArray[Any], truth: NDArray[Any]) -> Score:
 
     Raises:
         ValueError: shapes differ, or values are not finite.
+
+    >>> picture = np.full((16, 16, 3), 0.5)
+    >>> flip(picture, picture)
+    Score(value=0.0, reason='')
     """
     first, second = _pair(image, truth)
     try:
@@ -118,7 +130,7 @@ def flip(image: NDArray[Any], truth: NDArray[Any]) -> Score:
 
 
 def lpips(image: NDArray[Any], truth: NDArray[Any], backbone: str = "vgg") -> Score:
-    """Learnt perceptual distance (Zhang et al. 2018); 0 is the same. Never downloads anything.
+    """Learnt perceptual distance LPIPS (Zhang et al. 2018); 0 means equal. Nothing is downloaded.
 
     Args:
         image: [H, W, 3] rendered.
@@ -130,6 +142,11 @@ def lpips(image: NDArray[Any], truth: NDArray[Any], backbone: str = "vgg") -> Sc
 
     Raises:
         ValueError: shapes differ, values are not finite, or no such backbone.
+
+    >>> picture = np.full((64, 64, 3), 0.5)
+    >>> score = lpips(picture, picture)
+    >>> score.value == 0 or score.reason != ""  # not where the network's weights are missing
+    True
     """
     first, second = _pair(image, truth)
     if backbone not in LPIPS_BACKBONES:

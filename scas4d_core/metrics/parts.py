@@ -1,4 +1,4 @@
-"""Part labels against the truth."""
+"""Compares part labels with the truth."""
 
 from __future__ import annotations
 
@@ -14,20 +14,24 @@ def adjusted_rand_index(
 ) -> float:
     """Agreement of two partitions of the foreground's pixels, corrected for chance (Hubert and Arabie 1985).
 
-    Pixels of several frames and cameras are pooled when stacked, so a part must keep its label over them; which number
-    it has does not matter. A foreground pixel where nothing was rendered carries whatever label ``labels`` has there:
-    to the index it is one more part.
+    Pixels of several frames and cameras are pooled when stacked, so a part must keep its label over them; the
+    numbers themselves do not matter. A foreground pixel without any rendered part counts with the label that ``labels``
+    has there, as one more part.
 
     Args:
         labels: [...] integers, rendered.
         truth: [...] integers, the same shape.
-        foreground: [...] the pixels that count; those where truth is not 0, if None.
+        foreground: [...] bool, the pixels that count; None: those where truth is not 0.
 
     Returns:
         1 for the same partition, about 0 for chance.
 
     Raises:
         ValueError: shapes differ, or no pixel is foreground.
+
+    >>> truth = np.array([0, 1, 1, 2, 2])  # the first pixel is background
+    >>> adjusted_rand_index(np.array([5, 7, 7, 4, 4]), truth)
+    1.0
     """
     if labels.shape != truth.shape:
         raise ValueError(f"labels have shape {labels.shape}, the truth {truth.shape}; render at the size of the truth")

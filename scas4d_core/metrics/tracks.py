@@ -1,7 +1,7 @@
-"""Point tracks against the truth.
+"""Compares point tracks with the truth.
 
-A track that has no finite position in a frame (behind the camera, lost) has missed the point: in two dimensions by one
-whole diagonal, in three by infinity. The query's own frame does not count: there the answer was given.
+A track without a finite position in a frame (behind the camera, lost) misses the point: in two dimensions by one whole
+diagonal, in three by infinity. The query's own frame does not count, for its answer is given.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class TrackError:
     Attributes:
         median: %; infinity where at least half of the positions are lost.
         percentile_90: %; the smallest observed distance that 90 % do not exceed.
-        count: how many positions went in.
+        count: of positions.
     """
 
     median: float
@@ -44,12 +44,13 @@ def median_trajectory_error(
     """2D MTE without oracle: median over frames of each track's pixel error, mean over tracks, in % of the diagonal.
 
     The definition is that of PointOdyssey (Zheng et al. 2023, ``median_l2``), which Dynamic 3D Gaussians follows,
-    without the query's frame; the paper normalizes by the diagonal of the picture.
+    without the query's frame; the paper (Point-Tracking) normalizes by the diagonal of the picture.
 
     Args:
         tracks: [T, Q, 2] predicted pixels, NaN where lost.
         truth: [T, Q, 2] pixels.
-        counted: [T, Q] where the truth counts: visible in that camera. A track never counted is left out.
+        counted: [T, Q] bool: frames in which the truth counts, visible in that camera. A track never counted is left
+            out.
         diagonal: of the picture, pixels.
         query: the frame in which the points were given; it does not count.
 
@@ -58,6 +59,11 @@ def median_trajectory_error(
 
     Raises:
         ValueError: shapes differ.
+
+    >>> truth = np.zeros((3, 1, 2))
+    >>> tracks = truth + [[[0, 0]], [[3, 4]], [[3, 4]]]
+    >>> median_trajectory_error(tracks, truth, np.ones((3, 1), bool), diagonal=100)
+    5.0
     """
     errors = _percent_of_diagonal(tracks, truth, diagonal)
     medians = _medians(errors, _without_query(counted, errors.shape, query))
@@ -72,15 +78,15 @@ def oracle_tracks(
     radius: float = ORACLE_RADIUS_PX,
     query: int = 0,
 ) -> NDArray[np.float64]:
-    """The paper's oracle: of all candidates near a point in the query frame, the one whose track fits the truth best.
+    """The paper's oracle: of the candidates near a point in the query frame, the one whose track fits the truth best.
 
-    It looks at the answer, so its error (`median_trajectory_error` of what it returns) is a bound of what the centroids
-    could reach, no measure of tracking; report it beside the error without oracle.
+    The oracle uses the answer, so its error (`median_trajectory_error` of these tracks) bounds what the centroids can
+    reach and does not measure tracking; report it beside the error without oracle.
 
     Args:
         candidates: [T, N, 2] pixels of all Gaussian centroids, NaN behind the camera.
         truth: [T, Q, 2] pixels.
-        counted: [T, Q] where the truth counts.
+        counted: [T, Q] bool: frames in which the truth counts.
         radius: pixels about the true point in the query frame. Where no candidate lies within it, the nearest is taken
             (the paper does not say).
         query: the frame in which candidates are chosen.
@@ -90,6 +96,12 @@ def oracle_tracks(
 
     Raises:
         ValueError: shapes do not fit, or no candidate is in front of the camera.
+
+    >>> truth = np.zeros((2, 1, 2))
+    >>> candidates = np.array([[[1, 0], [2, 0]], [[9, 0], [0, 0]]], float)  # [T, N, 2]
+    >>> oracle_tracks(candidates, truth, np.ones((2, 1), bool))[:, 0]  # the second stays nearer
+    array([[2., 0.],
+           [0., 0.]])
     """
     if candidates.ndim != 3 or candidates.shape[0] != truth.shape[0] or candidates.shape[2] != 2:
         raise ValueError(f"candidates have shape {candidates.shape}; give [T={truth.shape[0]}, N, 2]")
@@ -119,12 +131,16 @@ def track_error_3d(
     Args:
         tracks: [T, P, 3] predicted, user's units; not finite where lost.
         truth: [T, P, 3], user's units.
-        moving: [P] the points that count: those that move at all (standing ones would flatter the median).
+        moving: [P] bool, the points that count: those that move at all (standing ones would flatter the median).
         extent: longest side of the box of the foreground, user's units.
         query: the frame in which the points were given; it does not count.
 
     Raises:
         ValueError: shapes differ, extent not positive, or no point moves.
+
+    >>> truth = np.zeros((3, 4, 3))
+    >>> track_error_3d(truth + [0, 0, 0.25], truth, moving=np.ones(4, bool), extent=2.0)
+    TrackError(median=12.5, percentile_90=12.5, count=8)
     """
     if tracks.shape != truth.shape or truth.ndim != 3 or truth.shape[2] != 3 or moving.shape != truth.shape[1:2]:
         raise ValueError(f"tracks {tracks.shape}, truth {truth.shape} must be [T, P, 3], moving {moving.shape} [P]")
@@ -153,18 +169,24 @@ def error_by_confidence(
 ) -> list[float]:
     """Median 3D error in % of the extent of equally large groups of positions, the most confident first.
 
-    A confidence that says something gives rising numbers. Positions count as in ``track_error_3d``.
+    A meaningful confidence gives rising numbers. Positions count as in ``track_error_3d``.
 
     Args:
         tracks: [T, P, 3] predicted. truth: [T, P, 3]. Both in the user's units.
         confidence: [T, P].
-        moving: [P] the points that count.
+        moving: [P] bool, the points that count.
         extent: user's units.
         query: the frame in which the points were given; it does not count.
-        groups: how many; those beyond a multiple of it, the least confident, are left out.
+        groups: number of groups; the least confident positions beyond a multiple of it are left out.
 
     Raises:
         ValueError: as ``track_error_3d``, or confidence of another shape.
+
+    >>> truth = np.zeros((2, 4, 3))
+    >>> tracks = truth + np.array([1, 2, 3, 4])[:, None] * [1, 0, 0]
+    >>> confidence = np.broadcast_to([0.9, 0.7, 0.5, 0.1], (2, 4))
+    >>> error_by_confidence(tracks, truth, confidence, np.ones(4, bool), extent=100, groups=2)
+    [1.5, 3.5]
     """
     if confidence.shape != tracks.shape[:2]:
         raise ValueError(f"confidence has shape {confidence.shape}; give [T, P] = {tracks.shape[:2]}")
@@ -178,15 +200,19 @@ def error_by_confidence(
 
 
 def visibility_accuracy(predicted: NDArray[np.bool_], truth: NDArray[np.bool_], *, query: int = 0) -> float:
-    """Share of points and frames, 0…1, whose visibility was told rightly: the occlusion accuracy of TAP-Vid.
+    """Share of points and frames, 0…1, whose visibility was predicted rightly: the occlusion accuracy of TAP-Vid.
 
     Args:
-        predicted: [T, Q].
-        truth: [T, Q].
+        predicted: [T, Q] bool.
+        truth: [T, Q] bool.
         query: the frame in which the points were given; it does not count.
 
     Raises:
         ValueError: shapes differ.
+
+    >>> truth = np.array([[True, True], [True, False]])
+    >>> visibility_accuracy(np.ones((2, 2), bool), truth)  # the query's frame does not count
+    0.5
     """
     if predicted.shape != truth.shape or truth.ndim != 2:
         raise ValueError(f"predicted {predicted.shape} and truth {truth.shape} must both be [T, Q]")

@@ -1,1 +1,1 @@
-"""Reads what was committed: views, tracks, parts, exports."""
+"""Reads committed states: views, tracks, parts, exports."""

@@ -1,4 +1,4 @@
-"""Reading what was committed: novel views, tracks, parts and exports of any frame of a history."""
+"""Queries about the committed states of a scene: novel views, tracks, parts and exports of any frame."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from scas4d_core.storage.history import History
 Array = NDArray[np.float32]
 
 MOST_LABEL = 254
-"""Parts are painted into 8 bits, 0 being nothing."""
+"""Parts are painted into 8 bits; 0 means no part."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,13 @@ class View:
         colour: [H, W, 3] float32, nominally 0…1, over the background. alpha: [H, W] float32.
         depth: [H, W] float32, alpha-weighted mean z along the camera's axis in the user's units; NaN where less than
             half of the pixel is covered.
-        parts: [H, W] uint8 or None: 0 nothing or standing, else 1 + the label that covers the pixel most.
+        parts: [H, W] uint8, or None where no labels were given: 0 for no part, else 1 + the label that covers the pixel
+            most.
+
+    >>> black = np.zeros((2, 2), np.float32)
+    >>> view = View(np.zeros((2, 2, 3), np.float32), alpha=black, depth=np.full_like(black, np.nan))
+    >>> view.colour.shape, view.parts is None  # labels were not asked for
+    ((2, 2, 3), True)
     """
 
     colour: Array
@@ -44,8 +50,19 @@ class View:
     parts: NDArray[np.uint8] | None = None
 
 
-class Committed:
-    """Reads a history. Cameras and points are in the user's world; ``index`` None is the newest frame."""
+class CommittedScene:
+    """Answers queries about a history. Cameras and points are in the user's world; ``index`` None is the newest frame.
+
+    >>> history = History()
+    >>> history.append(0, 0.0, Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0]))
+    >>> committed = CommittedScene(history, WorldFrame(np.zeros(3)))
+    >>> camera = Camera("front", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], np.eye(4), 16, 16)
+    >>> view = committed.render(camera, background=(0, 0, 1))
+    >>> view.colour[8, 8].round(1), view.depth[8, 8]
+    (array([0.9, 0. , 0.1], dtype=float32), np.float32(2.0))
+    >>> committed.tracks_of_points(np.array([[0, 0, 2]]), 0, [0]).confidence.round(2)
+    array([[0.9]])
+    """
 
     def __init__(self, history: History, world: WorldFrame, limits: Limits = DEFAULT) -> None:
         self.history = history
@@ -61,15 +78,15 @@ class Committed:
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         labels: NDArray[Any] | None = None,
     ) -> View:
-        """A novel view.
+        """Renders a novel view.
 
         Args:
             camera: user's world. index: a committed frame.
             background: RGB in 0…1 behind everything.
-            labels: [N] part of each Gaussian, −1 for none; asks for ``View.parts``.
+            labels: [N] part of each Gaussian, −1 for none; given where ``View.parts`` is wanted.
 
         Raises:
-            HistoryError: the frame was not committed.
+            HistoryError: the frame was not committed. ValueError: labels of another shape or range.
         """
         gaussians = self._state(index)
         inside = self.world.camera_to_inside(camera)
@@ -87,7 +104,7 @@ class Committed:
         return View(colour, alpha, depth, parts)
 
     def _parts_picture(self, gaussians: Gaussians, labels: NDArray[Any], inside: Camera) -> NDArray[np.uint8]:
-        """[H, W] the label whose Gaussians weigh most in the pixel, plus 1; as many labels a pass as colours have."""
+        """[H, W] uint8: the label whose Gaussians weigh most in the pixel, plus 1. A pass renders ``GROUP`` labels."""
         if labels.shape != (len(gaussians),) or not ((labels >= -1) & (labels <= MOST_LABEL)).all():
             raise ValueError(
                 f"labels {labels.shape} must be [{len(gaussians)}], one a Gaussian, each in -1...{MOST_LABEL}"
@@ -115,31 +132,33 @@ class Committed:
         return view.depth, view.alpha
 
     def tracks_of_points(self, points: NDArray[Any], index: int, indices: Sequence[int]) -> Tracks:
-        """Trajectories of points [Q, 3] of frame ``index`` over ``indices``."""
+        """Trajectories of points [Q, 3] of frame ``index`` over ``indices``; see ``tracks.tracks_of_points``."""
         return tracks_of_history.tracks_of_points(self.history, self.world, points, index, indices)
 
     def tracks_of_pixels(self, camera: Camera, uv: NDArray[Any], index: int, indices: Sequence[int]) -> Tracks:
-        """Trajectories of the surface points at pixels [Q, 2] of frame ``index``."""
+        """Trajectories of the surface points at pixels [Q, 2] of frame ``index``; see ``tracks.tracks_of_pixels``."""
         return tracks_of_history.tracks_of_pixels(
             self.history, self.world, camera, uv, index, indices, self._depth, limits=self._limits
         )
 
     def tracks_of_ids(self, ids: NDArray[Any], indices: Sequence[int]) -> Tracks:
-        """Trajectories of Gaussians by id."""
+        """Trajectories of Gaussians by id [Q]."""
         return tracks_of_history.tracks_of_ids(self.history, self.world, ids, indices)
 
     def with_visibility(self, tracks: Tracks, camera: Camera, index: int) -> Tracks:
-        """The same tracks, asked for at frame ``index``, with their visibility in one more camera."""
+        """Adds the visibility in one more camera to tracks that were queried at frame ``index``."""
         tolerance = tracks_of_history.depth_tolerance(self.history, self.world, index)
         return tracks.with_visibility(camera, self._depth, tolerance)
 
     def parts(self, count: int | None = None, previous: NDArray[Any] | None = None) -> NDArray[np.int64]:
-        """[N] part labels, the largest part 0; −1 for what does not move. ``count`` None: chosen by silhouette.
+        """Part labels [N], the largest part 0, and −1 for Gaussians that do not move; see ``parts.parts``.
 
-        With ``previous``, labels found from fewer frames, parts that go on keep their labels.
+        Args:
+            count: of parts; None: chosen by silhouette.
+            previous: [N] labels found from fewer frames; parts that continue keep their labels.
         """
         return parts_of_history.parts(self.history, count, previous=previous)
 
     def write_ply(self, path: Path, index: int | None = None) -> None:
-        """A committed frame as a standard 3DGS .ply."""
+        """Writes a committed frame as a standard 3DGS .ply."""
         ply.write_ply(path, self._state(index), self.world)

@@ -1,11 +1,11 @@
-"""Parts: Gaussians that move alike, by K-means on positions and material rotations over time.
+"""Segments parts: Gaussians that move alike, by K-means on positions and material rotations over time.
 
 The paper's section "Visualization of Part Segmentation": the feature of Gaussian i is
-``[λp·p_i(t), λR·R_i(t), λp0·p_i(0)]`` over the frames t. Here p is in units of the extent of what moves, so that one
-set of λ serves every scene.
+``[λp·p_i(t), λR·R_i(t), λp0·p_i(0)]`` over the frames t. Here p is in units of the extent of the moving
+Gaussians, so that one set of λ serves every scene.
 
-Parts found again, after more frames, keep their labels: the clustering also starts from the parts before and leaves
-them only for clearly better ones, and the new labels are matched to the old ones by what they cover in common.
+Parts found again, after more frames, keep their labels: the clustering also starts from the previous parts and gives
+them up only for clearly better ones, and new labels are matched to previous ones by their overlap.
 """
 
 from __future__ import annotations
@@ -14,12 +14,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.optimize import linear_sum_assignment
 from threadpoolctl import threadpool_limits
 
 from scas4d_core.gaussians import Gaussians, moving_extent, quaternions_to_matrices
-from scas4d_core.settings import Model
 from scas4d_core.storage.history import History
 
 Features = NDArray[np.float32]
@@ -31,63 +29,62 @@ SILHOUETTE_SAMPLE = 1000
 ROWS_AT_ONCE = 8192
 """Rows whose features are held at once while every Gaussian is labelled."""
 
-
-class PartsSettings(Model):
-    """The features and the clustering; one set for all scenes."""
-
-    lambda_position: float = Field(default=0.25, ge=0, description="Of p over time, p in units of the extent.")
-    lambda_rotation: float = Field(
-        default=1.0,
-        ge=0,
-        description="Of the entries of R over time; a turn of angle a moves them by 2.8 sin(a/2). Rotation tells parts "
-        "apart, position only those that turn alike: with more of it long parts are cut across.",
-    )
-    lambda_initial: float = Field(default=0.25, ge=0, description="Of p at the first frame, repeated as in the paper.")
-    frames: int = Field(
-        default=32, ge=2, description="At most this many frames, evenly over the history: memory stays bounded."
-    )
-    sample: int = Field(
-        default=20_000, ge=100, description="At most this many Gaussians are clustered; all are labelled."
-    )
-    most_parts: int = Field(default=12, ge=2, description="Largest count that is tried when none is given.")
-    stay: float = Field(
-        default=0.05,
-        ge=0,
-        description="Share of the inertia that a fresh clustering has to gain for the parts before to be given up.",
-    )
-    stay_count: float = Field(
-        default=0.02,
-        ge=0,
-        description="Mean silhouette that another count has to gain for that of the parts before to be given up.",
-    )
-    restarts: int = Field(default=10, ge=1, description="Starts of K-means (n_init); the best is kept.")
-    seed: int = Field(default=0, ge=0, description="Seed of the starts and of the sample.")
+LAMBDA_POSITION = 0.25
+"""λp, of p over time; p in units of the extent."""
+LAMBDA_ROTATION = 1.0
+"""λR, of the entries of R over time; a turn of angle a moves them by 2.8 sin(a/2). Rotation tells parts apart,
+position only those that turn alike: with more of it long parts are cut across."""
+LAMBDA_INITIAL = 0.25
+"""λp0, of p at the first frame, repeated as in the paper."""
+MOST_FRAMES = 32
+"""Frames that the features take, evenly over the history: memory stays bounded."""
+SAMPLE = 20_000
+"""Gaussians that are clustered, at most; all are labelled."""
+MOST_PARTS = 12
+"""Largest count that is tried when none is given."""
+STAY = 0.05
+"""Share of the inertia that a fresh clustering has to gain for the previous parts to be given up."""
+STAY_COUNT = 0.02
+"""Mean silhouette that another count has to gain for that of the previous parts to be given up."""
+RESTARTS = 10
+"""Starts of K-means (n_init); the best is kept."""
+SEED = 0
+"""Of the starts and of the sample."""
 
 
 def parts(
     history: History,
     count: int | None = None,
-    settings: PartsSettings | None = None,
     previous: NDArray[Any] | None = None,
 ) -> NDArray[np.int64]:
-    """A part label for every Gaussian, [N]: 0…count−1, the largest part first; −1 for those that do not move.
+    """Part labels of all Gaussians, [N] int64: 0…count−1, the largest part first; −1 for those that do not move.
 
-    Which Gaussians move is read off the newest committed frame. A Gaussian weighs by its opacity times the area of its
-    two longest axes, about what it covers in a picture, so that swarms of small ones do not draw the borders.
+    The newest committed frame tells which Gaussians move. A Gaussian weighs by its opacity times the area of its two
+    longest axes, about its area in a picture, so that swarms of small ones do not decide the borders.
 
     Args:
         history: at least one committed frame; with a single frame only its positions tell parts apart.
-        count: how many parts; None: the count from 2 to ``most_parts`` with the largest mean silhouette
+        count: of parts; None: the count from 2 to ``MOST_PARTS`` with the largest mean silhouette
             (Rousseeuw 1987) on up to 1,000 Gaussians.
-        settings: λ and the clustering.
-        previous: [N] labels found before, with the same count (or None), from fewer frames. Parts that go on keep
-            their labels then, whatever their size; with a count found anew, a label may be left out.
+        previous: [N] labels found from fewer frames with the same ``count`` (or None). Parts that continue keep their
+            labels then, whatever their size; with a count chosen anew, a label may be left out.
 
     Raises:
         ValueError: nothing committed, nothing moves, count below 1 or above the number of moving Gaussians, or
             ``previous`` of another number of Gaussians.
+
+    >>> from scas4d_core.storage.history import History
+    >>> boxes = np.random.default_rng(0).random((40, 3))
+    >>> boxes[20:] += [3, 0, 0]
+    >>> state = Gaussians.of_points(boxes, radius=0.1)
+    >>> apart = np.repeat([[0, 0, 0], [2, 0, 0]], 20, axis=0)
+    >>> history = History()
+    >>> for index in range(3):  # the second box moves away
+    ...     history.append(index, index / 30, state.replace(means=state.means + np.float32(index * apart)))
+    >>> labels = parts(history, count=2)
+    >>> len(set(labels[:20])), len(set(labels[20:])), bool(labels[0] != labels[20])
+    (1, 1, True)
     """
-    settings = settings or PartsSettings()
     if not len(history):
         raise ValueError("the history is empty; commit a frame before asking for parts")
     newest = history.gaussians(history.indices[-1])
@@ -104,20 +101,20 @@ def parts(
     if previous is not None and previous.shape != (len(newest),):
         raise ValueError(f"previous labels {previous.shape} must be [{len(newest)}], one a Gaussian")
 
-    rng = np.random.default_rng(settings.seed)
-    chosen = rows if rows.size <= settings.sample else np.sort(rng.choice(rows, settings.sample, replace=False))
+    rng = np.random.default_rng(SEED)
+    chosen = rows if rows.size <= SAMPLE else np.sort(rng.choice(rows, SAMPLE, replace=False))
     extent = moving_extent(newest)
-    positions, rotations = motion(history, rows, settings.frames)
+    positions, rotations = motion(history, rows, MOST_FRAMES)
     weights = coverage(newest)
     inside = np.searchsorted(rows, chosen)
-    features = part_features(positions[:, inside], rotations[:, inside], extent, settings)
+    features = part_features(positions[:, inside], rotations[:, inside], extent)
     before = None if previous is None else previous[chosen]
     labels = np.empty(rows.size, dtype=np.int64)
     with threadpool_limits(limits=1):  # threads would sum in another order and tip what lies between two parts
-        model = _cluster(features, weights[chosen], count, settings, rng, before)
+        model = _cluster(features, weights[chosen], count, rng, before)
         for start in range(0, rows.size, ROWS_AT_ONCE):
             block = slice(start, start + ROWS_AT_ONCE)
-            labels[block] = model.predict(part_features(positions[:, block], rotations[:, block], extent, settings))
+            labels[block] = model.predict(part_features(positions[:, block], rotations[:, block], extent))
     size = np.bincount(labels, weights[rows], minlength=model.n_clusters)
     rank = np.empty(model.n_clusters, dtype=np.int64)
     rank[np.argsort(-size, kind="stable")] = np.arange(model.n_clusters)
@@ -127,17 +124,21 @@ def parts(
 
 
 def match_labels(labels: NDArray[Any], previous: NDArray[Any], weights: NDArray[Any]) -> NDArray[np.int64]:
-    """The same parts under the labels of those before that they overlap most, as a whole (Hungarian method).
+    """Renames parts to the previous labels that they overlap most, as a whole (Hungarian method).
 
-    A part that overlaps none of those before, or whose match went to another, takes the lowest label left.
+    A part that overlaps no previous part, or whose match went to another, takes the lowest free label.
 
     Args:
         labels: [N] new labels from 0; negative ones belong to no part and stay.
-        previous: [N] labels before.
-        weights: [N] what a Gaussian counts for.
+        previous: [N] labels found before.
+        weights: [N] of the Gaussians.
 
     Returns:
         [N] labels.
+
+    >>> previous = np.array([0, 0, 1, 1])
+    >>> match_labels(np.array([1, 1, 0, 0]), previous, weights=np.ones(4))  # the same parts, numbered otherwise
+    array([0, 0, 1, 1])
     """
     result = labels.astype(np.int64)
     inside = labels >= 0
@@ -157,14 +158,14 @@ def match_labels(labels: NDArray[Any], previous: NDArray[Any], weights: NDArray[
 
 
 def motion(history: History, rows: NDArray[np.intp], frames: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Positions [T, M, 3] and material rotations [T, M, 4] of some Gaussians at no more than ``frames`` even times."""
+    """Positions [T, M, 3] and material rotations [T, M, 4] of some Gaussians at up to ``frames`` even frames."""
     indices = np.array(history.indices)
     even = np.unique(np.linspace(0, len(indices) - 1, min(frames, len(indices))).round().astype(np.intp))
     chosen = [int(index) for index in indices[even]]
     return history.stacked("means", chosen, rows), history.stacked("rotations", chosen, rows)
 
 
-def part_features(positions: NDArray[Any], rotations: NDArray[Any], extent: float, settings: PartsSettings) -> Features:
+def part_features(positions: NDArray[Any], rotations: NDArray[Any], extent: float) -> Features:
     """The features of M Gaussians over T frames, [M, 12 T + 3] float32.
 
     The paper repeats p(0) at every frame; here it stands once, times √T, which leaves every distance as it was.
@@ -174,7 +175,6 @@ def part_features(positions: NDArray[Any], rotations: NDArray[Any], extent: floa
         positions: [T, M, 3] metres.
         rotations: [T, M, 4] unit quaternions.
         extent: metres.
-        settings: λ.
     """
     frames, count = positions.shape[:2]
     p = positions.transpose(1, 0, 2) / extent
@@ -182,9 +182,9 @@ def part_features(positions: NDArray[Any], rotations: NDArray[Any], extent: floa
     scale = 1 / np.sqrt(frames)
     return np.concatenate(
         [
-            (settings.lambda_position * scale) * p.reshape(count, -1),
-            (settings.lambda_rotation * scale) * turned.reshape(count, -1),
-            settings.lambda_initial * p[:, 0],
+            (LAMBDA_POSITION * scale) * p.reshape(count, -1),
+            (LAMBDA_ROTATION * scale) * turned.reshape(count, -1),
+            LAMBDA_INITIAL * p[:, 0],
         ],
         axis=1,
         dtype=np.float32,
@@ -192,7 +192,7 @@ def part_features(positions: NDArray[Any], rotations: NDArray[Any], extent: floa
 
 
 def coverage(gaussians: Gaussians) -> NDArray[np.float64]:
-    """[N] opacity times the product of the two longest axes, m²: about what a Gaussian covers in a picture."""
+    """[N] opacity times the product of the two longest axes, m²: about the area of a Gaussian in a picture."""
     axes = np.linalg.svd(gaussians.factors.astype(np.float64), compute_uv=False)
     return gaussians.opacities * axes[:, 0] * axes[:, 1]
 
@@ -201,38 +201,37 @@ def _cluster(
     features: Features,
     weights: NDArray[Any],
     count: int | None,
-    settings: PartsSettings,
     rng: np.random.Generator,
     previous: NDArray[Any] | None,
 ) -> Any:
     known = np.empty(0, np.int64) if previous is None else np.unique(previous[previous >= 0])
     if count is None:
-        # Drawn by weight, so that the silhouette sees what the pictures see.
+        # Drawn by weight, so that the silhouette weighs Gaussians as pictures do.
         drawn = rng.choice(len(features), size=SILHOUETTE_SAMPLE, p=weights / weights.sum())
-        count = _best_count(features[np.unique(drawn)], settings, len(known))
-    fresh = _kmeans(count, settings).fit(features, sample_weight=weights)
+        count = _best_count(features[np.unique(drawn)], len(known))
+    fresh = _kmeans(count).fit(features, sample_weight=weights)
     if previous is None or len(known) != count:
         return fresh
     centres = np.stack([np.average(features[previous == k], axis=0, weights=weights[previous == k]) for k in known])
-    kept = _kmeans(count, settings, init=centres, n_init=1).fit(features, sample_weight=weights)
-    return kept if kept.inertia_ <= (1 + settings.stay) * fresh.inertia_ else fresh
+    kept = _kmeans(count, init=centres, n_init=1).fit(features, sample_weight=weights)
+    return kept if kept.inertia_ <= (1 + STAY) * fresh.inertia_ else fresh
 
 
-def _best_count(features: Features, settings: PartsSettings, known: int) -> int:
-    """The count of the largest mean silhouette; ``known``, that of the parts before, has an advantage (0: none)."""
+def _best_count(features: Features, known: int) -> int:
+    """Count with the largest mean silhouette; ``known``, that of the previous parts, has an advantage (0: none)."""
     from sklearn.metrics import silhouette_score
 
     best, best_score = 1, 0.0
-    for count in range(2, min(settings.most_parts, len(features) - 1) + 1):
-        labels = _kmeans(count, settings).fit_predict(features)
-        score = float(silhouette_score(features, labels)) + settings.stay_count * (count == known)
+    for count in range(2, min(MOST_PARTS, len(features) - 1) + 1):
+        labels = _kmeans(count).fit_predict(features)
+        score = float(silhouette_score(features, labels)) + STAY_COUNT * (count == known)
         if score > best_score:
             best, best_score = count, score
     return best
 
 
-def _kmeans(count: int, settings: PartsSettings, **given: Any) -> Any:
-    """scikit-learn's, whose import takes a second: whoever renders views does without."""
+def _kmeans(count: int, **given: Any) -> Any:
+    """K-means of scikit-learn, imported here: the import takes a second, and rendering views needs none."""
     from sklearn.cluster import KMeans
 
-    return KMeans(n_clusters=count, **{"n_init": settings.restarts, "random_state": settings.seed, **given})
+    return KMeans(n_clusters=count, **{"n_init": RESTARTS, "random_state": SEED, **given})

@@ -1,4 +1,4 @@
-"""A frame as a standard 3D Gaussian Splatting ``.ply`` (Kerbl et al. 2023), for any splat viewer.
+"""Writes and reads a frame as a standard 3D Gaussian Splatting ``.ply`` (Kerbl et al. 2023), for any splat viewer.
 
 Binary little-endian, one float32 row a Gaussian: x y z, nx ny nz (zero), f_dc_0…2 (degree 0 of the spherical
 harmonics), opacity (logit), scale_0…2 (log), rot_0…3 (w, x, y, z). World and lengths are the user's.
@@ -29,7 +29,7 @@ OPACITY_MARGIN = 1e-6
 JACOBI_SWEEPS = 12
 """Sweeps of one-sided Jacobi; it converges quadratically, and 3×3 takes about five."""
 ORTHOGONAL = 1e-6
-"""Cosine below which two axes count as orthogonal: float32 factors do not say it better."""
+"""Cosine below which two axes count as orthogonal: the precision of float32 factors."""
 
 _FIELDS = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
@@ -38,12 +38,12 @@ _FIELDS = (
 
 
 class PlyError(ValueError):
-    """Gaussians that no file should carry, or a file that holds none: the message names rows or path and the fault."""
+    """Gaussians that cannot be exported, or a file without any; the message names rows or path, and the fault."""
 
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """What a splat file says, in the user's world.
+    """The Gaussians of a splat file, in the user's world.
 
     Attributes:
         means: [N, 3] float64.
@@ -70,10 +70,20 @@ class Splats:
 
 
 def write_ply(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None:
-    """Writes one frame; the file appears whole or not at all.
+    """Writes one frame atomically.
+
+    Args:
+        path: of the file. gaussians: in the inside world. world: user's world to inside.
 
     Raises:
-        PlyError: rows that are not finite or have no volume, named by row and id. None is left out silently.
+        PlyError: rows that are not finite or have no volume, named by row and id; none is left out silently.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
+    >>> with TemporaryDirectory() as folder:
+    ...     write_ply(f"{folder}/a.ply", state, WorldFrame(np.zeros(3), metres_per_unit=0.5))
+    ...     read_ply(f"{folder}/a.ply").means
+    array([[0., 0., 4.]])
     """
     data = np.zeros(len(gaussians), dtype=[(name, "<f4") for name in _FIELDS])
     for name, column in _columns(splats(gaussians, world)).items():
@@ -92,6 +102,10 @@ def read_ply(path: Path | str) -> Splats:
 
     Raises:
         PlyError: no splat file, or a property is missing.
+
+    >>> read_ply("README.md")
+    Traceback (most recent call last):
+    scas4d_core.query.ply.PlyError: README.md: no 3D Gaussian Splatting .ply (...)
     """
     try:
         vertex = PlyData.read(str(path))["vertex"]
@@ -113,7 +127,7 @@ def read_ply(path: Path | str) -> Splats:
 
 
 def splats(gaussians: Gaussians, world: WorldFrame) -> Splats:
-    """The state as centre, axes and lengths in the user's world.
+    """Converts a state to centres, axes and lengths in the user's world.
 
     Raises:
         PlyError: rows that are not finite or have no volume.
@@ -130,7 +144,7 @@ def splats(gaussians: Gaussians, world: WorldFrame) -> Splats:
 
 
 def split_factors(factors: NDArray[Any]) -> tuple[Float, Float]:
-    """Rotations Q [N, 3, 3] and lengths s [N, 3] with Q diag(s²) Qᵀ = F Fᵀ, Q nearest to the transported axes.
+    """Splits factors into rotations Q [N, 3, 3] and lengths s [N, 3]: Q diag(s²) Qᵀ = F Fᵀ, Q nearest to F's columns.
 
     One-sided Jacobi: columns of F are turned pairwise, by at most 45°, until they are orthogonal. Columns that are
     orthogonal already stay as they are, also where lengths are equal and eigenvectors would be arbitrary. Of the 24
@@ -138,6 +152,10 @@ def split_factors(factors: NDArray[Any]) -> tuple[Float, Float]:
 
     Args:
         factors: [N, 3, 3], full rank.
+
+    >>> axes, lengths = split_factors(np.diag([3.0, 1.0, 2.0])[None])
+    >>> lengths, bool(np.allclose(axes, np.eye(3)))
+    (array([[3., 1., 2.]]), True)
     """
     start = np.asarray(factors, dtype=np.float64)
     columns = start.copy()
@@ -208,5 +226,5 @@ def _name_rows(gaussians: Gaussians, bad: NDArray[np.bool_], fault: str) -> None
     if rows.size:
         raise PlyError(
             f"{rows.size} Gaussians have {fault}: rows {rows[:5].tolist()}, ids {gaussians.ids[rows[:5]].tolist()}"
-            f"{' …' if rows.size > 5 else ''}; export a frame before they went bad, or mend them"
+            f"{' …' if rows.size > 5 else ''}; export an earlier frame, or mend them"
         )

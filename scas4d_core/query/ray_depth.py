@@ -1,8 +1,9 @@
-"""How deep the surface lies along single rays: for pixel queries, where the rendered depth is not sharp enough.
+"""Depth of the surface along single rays: for pixel queries, for which rendered depth is not sharp enough.
 
-The rendered depth is the weighted mean of the *centres* of what a pixel shows. Here each Gaussian absorbs along the
-very ray that is asked for, around the place where the ray passes it nearest (in its own metric), and the surface is
-where half of what the ray loses is lost. A mean lies between two surfaces at an edge; a median lies on one of them.
+The rendered depth is the weighted mean of the *centres* of a pixel's Gaussians. Here each Gaussian absorbs light along
+the queried ray itself, around the point where the ray passes it nearest (in its own metric), and the surface is at the
+depth by which the ray has lost half of the light that it loses. At an edge a mean lies between two surfaces; this
+median lies on one of them.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ from scas4d_core.rasterize.limits import DEFAULT, Limits
 Float = NDArray[np.float64]
 
 TILE_PX = 16
-"""Rays of one square of this size look for their Gaussians together."""
+"""Pixels: rays of one square of this size search their Gaussians together."""
 RAYS_AT_ONCE = 64
 """Rays whose Gaussians are held at once: working memory stays at some megabytes."""
 DEEPEST = 96
-"""A ray's depth is found from this many Gaussians, those that absorb most: the others together change nothing seen."""
+"""Gaussians that a ray's depth is computed from, those that absorb most: the others change nothing visible."""
 BISECTIONS = 26
 """Halvings of the bracket: 10 m to less than a micrometre."""
 REACH = 3.0
@@ -46,11 +47,17 @@ def ray_depths(
         camera: inside world.
         uv: [Q, 2] pixels; (0.5, 0.5) is the centre of the first pixel.
         limits: the rasterizer's constants, so that a ray meets what a pixel shows.
-        softening: metres, added to every axis (root of the sum of squares): no Gaussian is thinner than the surface is
-            known.
+        softening: metres, added to every axis (root of the sum of squares): the precision of the surface.
 
     Returns:
-        z [Q] metres along the camera's axis, NaN where nothing is met; covered [Q] in 0…1, the light that is lost.
+        z [Q] metres along the camera's axis, NaN where the ray meets nothing; covered [Q] in 0…1, the share of light
+        lost.
+
+    >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
+    >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
+    >>> depth, covered = ray_depths(state, camera, np.array([[32, 24], [0.5, 0.5]]))
+    >>> depth.round(3), covered.round(3)
+    (array([1.936,   nan]), array([0.9, 0. ]))
     """
     uv = np.asarray(uv, dtype=np.float64)
     depth, covered = np.full(len(uv), np.nan), np.zeros(len(uv))
@@ -73,7 +80,7 @@ def ray_depths(
 
 
 class _Splats:
-    """The Gaussians before a camera, front to back, as rays need them."""
+    """The Gaussians in front of a camera, front to back, prepared for rays."""
 
     def __init__(self, gaussians: Gaussians, camera: Camera, limits: Limits, softening: float) -> None:
         turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
@@ -118,7 +125,7 @@ class _Splats:
         alpha[after <= limits.transmittance_stop] = 0  # the rasterizer stops before it blends this one
         covered = 1 - np.prod(1 - alpha, axis=1)
 
-        # What absorbs along each ray, and where: the place of the least distance in the Gaussian's own metric.
+        # Each Gaussian absorbs around the place of least distance to the ray in its own metric.
         most = min(DEEPEST, alpha.shape[1])
         chosen = np.argpartition(-alpha * before, most - 1, axis=1)[:, :most]
         absorbs = -np.log1p(-np.take_along_axis(alpha, chosen, axis=1))

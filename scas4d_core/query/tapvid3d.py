@@ -1,4 +1,4 @@
-"""Tracks in the layout of TAPVid-3D's npz files, so that its tools read them as predictions.
+"""Lays out tracks as TAPVid-3D's npz files, so that its tools read them as predictions.
 
 The names and axes are those that the benchmark's own evaluation reads (google-deepmind/tapnet,
 ``tapvid3d/evaluation/evaluate_model.py``). Points are in the axes of one camera (OpenCV: x right, y down, z forward),
@@ -24,15 +24,15 @@ def tapvid3d(
     metres_per_unit: float = 1.0,
     pixels: NDArray[Any] | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """The arrays of one file; there are no pictures in it (``images_jpeg_bytes``), which predictions need not have.
+    """Makes the arrays of one file, without pictures (``images_jpeg_bytes``), which predictions need not have.
 
     Args:
-        positions: [T, Q, 3] user's world and units, NaN where there is none.
+        positions: [T, Q, 3] user's world and units, NaN where unknown.
         visibility: [T, Q] in the camera.
         camera: user's world.
-        queried: the row of T in which the points were asked for; −1 where that frame is not among them.
+        queried: row of T in which the points were queried; −1 where that frame is not among them.
         metres_per_unit: metres in a unit of the user's world.
-        pixels: [Q, 2] that were asked for; without them, where the camera has the points in that row.
+        pixels: [Q, 2] queried; None: the projections of the points in that row.
 
     Returns:
         ``tracks_XYZ`` [T, Q, 3] float32, metres in the camera's axes. ``visibility`` [T, Q] bool. ``queries_xyt``
@@ -41,6 +41,11 @@ def tapvid3d(
 
     Raises:
         ValueError: shapes do not fit.
+
+    >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
+    >>> arrays = tapvid3d(np.array([[[0, 0, 2.0]]]), np.array([[True]]), camera, queried=0)
+    >>> arrays["tracks_XYZ"].shape, arrays["queries_xyt"]
+    ((1, 1, 3), array([[32., 24.,  0.]], dtype=float32))
     """
     if positions.ndim != 3 or visibility.shape != positions.shape[:2]:
         raise ValueError(f"positions {positions.shape} must be [T, Q, 3] and visibility {visibility.shape} [T, Q]")

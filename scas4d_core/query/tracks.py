@@ -1,9 +1,9 @@
-"""Trajectories of points: each is carried rigidly by the Gaussians that it lies in.
+"""Tracks points: each is carried rigidly by the Gaussians that it lies in (paper, Point-Tracking).
 
 A point p, given at frame q, is carried by Gaussian i to frame t as ``μ_i(t) + R_i(t) R_i(q)ᵀ (p − μ_i(q))``, R the
-material rotation. A few Gaussians carry every point and the geometric median of their answers is the track, so
-that one Gaussian that went astray does not take the point with it. A pixel becomes a point by ``ray_depth``.
-docs/tracks.md has the definitions and what they are worth.
+material rotation. Several Gaussians carry every point, and the geometric median of their answers is the track, so
+that a single stray Gaussian does not take the point with it. A pixel becomes a point by ``ray_depth``. docs/tracks.md
+has the definitions and their accuracy.
 """
 
 from __future__ import annotations
@@ -14,14 +14,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.ndimage import distance_transform_edt, maximum_filter
 
 from scas4d_core.cameras import Camera, WorldFrame
 from scas4d_core.gaussians import Gaussians, moving_extent, quaternions_to_matrices
 from scas4d_core.query.ray_depth import ray_depths
 from scas4d_core.rasterize.limits import DEFAULT, Limits
-from scas4d_core.settings import Model
 from scas4d_core.storage.history import History
 
 Float = NDArray[np.float64]
@@ -31,49 +29,26 @@ RenderDepth = Callable[[Camera, int], tuple[NDArray[Any], NDArray[Any]]]
 ALPHA_OF_A_SURFACE = 0.5
 """A pixel shows a surface where at least half of it is covered."""
 WEISZFELD_ROUNDS = 12
-"""Rounds of the geometric median: it has settled to a small part of the carriers' spread by then."""
+"""Rounds of the geometric median: by then it moves by a small part of the carriers' spread."""
 BYTES_AT_ONCE = 64e6
 """Working memory of the search for carriers."""
 
-
-class TracksSettings(Model):
-    """How points are carried and seen."""
-
-    carriers: int = Field(
-        default=32,
-        ge=1,
-        description="Gaussians that carry a point; 1 is the single nearest. Against 1, the median 3D error falls by "
-        "6 % (cloth) to 25 % (stage).",
-    )
-    softening: float = Field(
-        default=0.01,
-        ge=0,
-        description="Of the extent; added to the axes of a Gaussian (root of the sum of squares) when asked how near a "
-        "point is: surface Gaussians are flatter than the surface is known, and a wider circle of carriers averages "
-        "more of their noise. Against 0.001, the median 3D error falls by 2 % (cloth) to 18 % (stage).",
-    )
-    ray_softening: float = Field(
-        default=0.003,
-        ge=0,
-        description="Of the extent; the same for where a Gaussian lies along the ray of a pixel query.",
-    )
-    agreement: float = Field(
-        default=0.01,
-        gt=0,
-        description="Of the extent; carriers whose answers lie this far from the track, on average, halve the "
-        "confidence.",
-    )
-    depth_tolerance: float = Field(
-        default=0.0075,
-        gt=0,
-        description="Of the extent; a point counts as seen up to this far behind the rendered depth, which lies about "
-        "that far from the surface.",
-    )
-    pixel_reach: float = Field(
-        default=2.0,
-        ge=0,
-        description="Pixels; a pixel query that misses a silhouette by less takes the nearest covered pixel's depth.",
-    )
+CARRIERS = 32
+"""Gaussians that carry a point; 1 is the single nearest. Against 1, the median 3D error falls by 6 % (cloth) to 25 %
+(stage)."""
+SOFTENING = 0.01
+"""Of the extent; added to the axes of a Gaussian (root of the sum of squares) for its distance to a point: surface
+Gaussians are flatter than the surface is known, and a wider circle of carriers averages more of their noise. Against
+0.001, the median 3D error falls by 2 % (cloth) to 18 % (stage)."""
+RAY_SOFTENING = 0.003
+"""Of the extent; the same for the place of a Gaussian along the ray of a pixel query."""
+AGREEMENT = 0.01
+"""Of the extent; carriers whose answers lie this far from the track, on average, halve the confidence."""
+DEPTH_TOLERANCE = 0.0075
+"""Of the extent; a point counts as seen up to this far behind the rendered depth, which lies about that far from the
+surface."""
+PIXEL_REACH = 2.0
+"""Pixels; a pixel query that misses a silhouette by less takes the nearest covered pixel's depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,11 +59,11 @@ class Tracks:
         positions: [T, Q, 3] float64, user's world and units; NaN for a pixel query that met no surface.
         confidence: [T, Q] float64 in 0…1: (1 − Π(1 − oᵢ exp(−½ mᵢ²))) / (1 + (s/a)²), the opacity of the carriers at
             the query point (m the Mahalanobis distance) over what their disagreement s in that frame takes away: the
-            weighted mean distance of their answers from the track (a = ``TracksSettings.agreement``). 0 for a pixel
+            weighted mean distance of their answers from the track (a = ``AGREEMENT``). 0 for a pixel
             query that met no surface.
         ids: [Q] int64: the Gaussian that carries the point most; −1 for a pixel query that met no surface.
         indices: [T] int64 frames.
-        visibility: by camera name, [T, Q] bool, for the cameras that were asked for; see ``seen``.
+        visibility: by camera name, [T, Q] bool, for the cameras queried; see ``seen``.
     """
 
     positions: Float
@@ -98,11 +73,11 @@ class Tracks:
     visibility: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     def pixels(self, camera: Camera) -> Float:
-        """[T, Q, 2] where a camera (user's world) has the points, in pixels; NaN behind the camera."""
+        """[T, Q, 2] projections into a camera (user's world), pixels; NaN behind the camera."""
         return camera.project(self.positions)[0]
 
     def with_visibility(self, camera: Camera, render_depth: RenderDepth, tolerance: float) -> Tracks:
-        """The same tracks with the visibility in one more camera; the arguments are those of ``seen``."""
+        """Adds the visibility in one more camera; the arguments are those of ``seen``."""
         visible = seen(self.positions, self.indices, camera, render_depth, tolerance)
         return replace(self, visibility={**self.visibility, camera.name: visible})
 
@@ -113,7 +88,7 @@ def tracks_of_points(
     points: NDArray[Any],
     index: int,
     indices: Sequence[int],
-    settings: TracksSettings | None = None,
+    count: int = CARRIERS,
 ) -> Tracks:
     """Carries 3D points through the frames.
 
@@ -121,15 +96,26 @@ def tracks_of_points(
         history: the committed states.
         world: user's world to inside.
         points: [Q, 3] in the user's world at frame ``index``.
-        index: the committed frame the points are given in.
-        indices: the committed frames to answer for, any order.
-        settings: how many Gaussians carry a point, and tolerances.
+        index: the committed frame that the points are given in.
+        indices: the committed frames of the tracks, any order.
+        count: Gaussians that carry a point.
 
     Raises:
         ValueError: points not [Q, 3] or not finite.
         HistoryError: a frame was not committed.
+
+    >>> history = History()
+    >>> state = Gaussians.of_points([[0, 0, 0], [1, 0, 0]], radius=0.2)
+    >>> for index in range(2):
+    ...     history.append(index, index / 30, state.replace(means=state.means + np.float32([0, index, 0])))
+    >>> world = WorldFrame(np.zeros(3))
+    >>> tracks = tracks_of_points(history, world, np.array([[0.1, 0, 0]]), index=0, indices=[0, 1])
+    >>> tracks.positions[:, 0]
+    array([[0.1, 0. , 0. ],
+           [0.1, 1. , 0. ]])
+    >>> tracks.ids
+    array([0])
     """
-    settings = settings or TracksSettings()
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points have shape {points.shape}; give [Q, 3]")
@@ -139,7 +125,7 @@ def tracks_of_points(
     theta = history.gaussians(index)
     extent = moving_extent(theta)
     inside = world.to_inside(points)
-    rows, weights, covered = carriers(theta, inside, settings.carriers, settings.softening * extent)
+    rows, weights, covered = carriers(theta, inside, count, SOFTENING * extent)
 
     offsets = np.einsum("qkji,qkj->qki", _matrices(theta.rotations[rows]), inside[:, None] - theta.means[rows])
     result = np.empty((len(indices), len(points), 3))
@@ -150,7 +136,7 @@ def tracks_of_points(
         answers = means + turned
         result[t] = geometric_median(answers, weights)
         apart = np.einsum("qk,qk->q", weights, np.linalg.norm(answers - result[t][:, None], axis=-1))
-        confidence[t] = covered / (1 + np.square(apart / max(settings.agreement * extent, 1e-12)))
+        confidence[t] = covered / (1 + np.square(apart / max(AGREEMENT * extent, 1e-12)))
     return Tracks(world.to_user(result), confidence, theta.ids[rows[:, 0]], np.asarray(indices, dtype=np.int64))
 
 
@@ -162,28 +148,35 @@ def tracks_of_pixels(
     index: int,
     indices: Sequence[int],
     render_depth: RenderDepth,
-    settings: TracksSettings | None = None,
     limits: Limits = DEFAULT,
 ) -> Tracks:
-    """Carries the surface points that a camera has at given pixels of one frame; answers with their visibility in it.
+    """Carries the surface points at given pixels of one frame of a camera; with their visibility in that camera.
 
     Args:
         history: the committed states.
         world: user's world to inside.
         camera: in the user's world.
-        uv: [Q, 2] pixels, continuous: (0.5, 0.5) is the centre of the first pixel. The depth is where half of
-            what the ray loses is lost (``ray_depth``). A ray that loses less than half of its light takes the
-            rendered depth of the nearest covered pixel within ``TracksSettings.pixel_reach``.
+        uv: [Q, 2] pixels, continuous: (0.5, 0.5) is the centre of the first pixel. The depth is that of ``ray_depth``;
+            a ray that loses less than half of its light takes the rendered depth of the nearest covered pixel within
+            ``PIXEL_REACH``.
         index: the committed frame that ``uv`` is given in.
-        indices: the committed frames to answer for.
+        indices: the committed frames of the tracks.
         render_depth: rendered depth and alpha.
-        settings: how many Gaussians carry a point, and tolerances.
         limits: the constants that ``render_depth`` renders with.
 
     Raises:
         ValueError: uv not [Q, 2], not finite or outside the picture.
+
+    >>> history = History()
+    >>> history.append(0, 0.0, Gaussians.of_points([[0, 0, 2]], radius=0.1))
+    >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
+    >>> def render_depth(camera, index):  # ``CommittedScene`` renders it
+    ...     return np.full((48, 64), 2.0), np.ones((48, 64))
+    >>> world = WorldFrame(np.zeros(3))
+    >>> tracks = tracks_of_pixels(history, world, camera, np.array([[32, 24]]), 0, [0], render_depth)
+    >>> tracks.positions[0, 0].round(3), tracks.visibility["front"]
+    (array([0.   , 0.   , 1.936]), array([[ True]]))
     """
-    settings = settings or TracksSettings()
     uv = np.asarray(uv, dtype=np.float64)
     if uv.ndim != 2 or uv.shape[1] != 2:
         raise ValueError(f"uv has shape {uv.shape}; give [Q, 2] pixels")
@@ -194,18 +187,18 @@ def tracks_of_pixels(
             f"give 0 <= u < {camera.width}, 0 <= v < {camera.height}"
         )
     theta = history.gaussians(index)
-    softening = settings.ray_softening * moving_extent(theta)
+    softening = RAY_SOFTENING * moving_extent(theta)
     depth, covered = ray_depths(theta, world.camera_to_inside(camera), uv, limits, softening)
     depth /= world.metres_per_unit
     met = covered >= ALPHA_OF_A_SURFACE
     if not met.all():
         rendered, alpha = render_depth(camera, index)
         column, row = uv[~met].astype(np.intp).T
-        near, row, column = _covered_near(rendered, alpha, row, column, settings.pixel_reach)
+        near, row, column = _covered_near(rendered, alpha, row, column, PIXEL_REACH)
         beside = np.flatnonzero(~met)[near]
         depth[beside], met[beside] = rendered[row[near], column[near]], True
     points = camera.unproject(uv[met], depth[met])
-    found = tracks_of_points(history, world, points, index, indices, settings)
+    found = tracks_of_points(history, world, points, index, indices)
     tracks = Tracks(
         positions=np.full((len(indices), len(uv), 3), np.nan),
         confidence=np.zeros((len(indices), len(uv))),
@@ -214,15 +207,19 @@ def tracks_of_pixels(
     )
     tracks.positions[:, met], tracks.confidence[:, met] = found.positions, found.confidence
     tracks.ids[met] = found.ids
-    return tracks.with_visibility(camera, render_depth, depth_tolerance(history, world, index, settings))
+    return tracks.with_visibility(camera, render_depth, depth_tolerance(history, world, index))
 
 
 def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indices: Sequence[int]) -> Tracks:
     """The trajectories of Gaussians' means by id; their confidence is 1.
 
     Raises:
-        ValueError: an id that the history does not hold.
-        HistoryError: a frame that was not committed.
+        ValueError: an unknown id. HistoryError: a frame was not committed.
+
+    >>> history = History()
+    >>> history.append(7, 0.0, Gaussians.of_points([[0, 0, 0], [1, 0, 0]], radius=0.2))
+    >>> tracks_of_ids(history, WorldFrame(np.zeros(3)), np.array([1]), indices=[7]).positions
+    array([[[1., 0., 0.]]])
     """
     wanted = np.asarray(ids, dtype=np.int64).reshape(-1)
     held = history.gaussians(history.indices[0]).ids if len(history) else np.empty(0, dtype=np.int64)
@@ -238,23 +235,22 @@ def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indice
     return Tracks(positions, np.ones(positions.shape[:2]), wanted, np.asarray(indices, dtype=np.int64))
 
 
-def depth_tolerance(history: History, world: WorldFrame, index: int, settings: TracksSettings | None = None) -> float:
-    """The tolerance for ``seen`` in the user's units: the setting times the extent of what moves at one frame."""
-    share = (settings or TracksSettings()).depth_tolerance
-    return share * moving_extent(history.gaussians(index)) / world.metres_per_unit
+def depth_tolerance(history: History, world: WorldFrame, index: int) -> float:
+    """Tolerance of ``seen`` in the user's units: ``DEPTH_TOLERANCE`` of the moving Gaussians' extent at one frame."""
+    return DEPTH_TOLERANCE * moving_extent(history.gaussians(index)) / world.metres_per_unit
 
 
 def seen(
     positions: Float, indices: Sequence[int] | NDArray[Any], camera: Camera, render_depth: RenderDepth, tolerance: float
 ) -> NDArray[np.bool_]:
-    """Which points a camera sees, [T, Q]: inside the picture, before the camera, and nothing rendered before them.
+    """Visibility of points in a camera, [T, Q] bool: inside the picture, in front of the camera, and not hidden.
 
-    "Before" is by more than ``tolerance`` against the rendered depth, the farthest of the 3×3 pixels around the one
-    that the point projects into (a track is off by a pixel easily, and at an edge that decides; on true positions this
-    is right more often too). A pixel that is less than half covered hides nothing.
+    A point is hidden where it lies more than ``tolerance`` behind the rendered depth, the farthest of the 3×3 pixels
+    around its own (tracks are easily off by a pixel, which decides at an edge; on true positions this is right more
+    often too). A pixel that is less than half covered hides nothing.
 
     Args:
-        positions: [T, Q, 3] user's world; NaN is never seen.
+        positions: [T, Q, 3] user's world; NaN is never visible.
         indices: [T] committed frames.
         camera: in the user's world.
         render_depth: rendered depth and alpha.
@@ -276,17 +272,22 @@ def seen(
 def carriers(
     gaussians: Gaussians, points: Float, count: int, softening: float
 ) -> tuple[NDArray[np.intp], Float, Float]:
-    """The Gaussians that a point lies in most: those of largest o·exp(−½ m²), m the Mahalanobis distance.
+    """Gaussians that points lie in most: those of largest o·exp(−½ m²), m the Mahalanobis distance.
 
     Args:
         gaussians: the state, N Gaussians.
         points: [Q, 3] metres, inside world.
-        count: how many carry a point, K (N where there are fewer).
+        count: K, Gaussians that carry a point (N where there are fewer).
         softening: metres; m is taken in Σ + softening²·I.
 
     Returns:
-        Rows [Q, K], heaviest first; weights [Q, K] that sum to 1, in proportion to o·exp(−½ m²) (so far from
-        everything the nearest alone carries); the opacity 1 − Π(1 − o·exp(−½ m²)) of the K at the point, [Q].
+        Rows [Q, K], heaviest first; weights [Q, K] that sum to 1, in proportion to o·exp(−½ m²) (far from all,
+        the nearest alone carries); the opacity 1 − Π(1 − o·exp(−½ m²)) of the K at the point, [Q].
+
+    >>> state = Gaussians.of_points([[0, 0, 0], [1, 0, 0]], radius=0.2)
+    >>> rows, weights, opacity = carriers(state, np.array([[0.1, 0, 0]]), count=1, softening=0.0)
+    >>> rows, opacity.round(2)
+    (array([[0]]), array([0.79]))
     """
     count = min(count, len(gaussians))
     factors = gaussians.factors.astype(np.float64)
@@ -314,11 +315,15 @@ def carriers(
 
 
 def geometric_median(points: Float, weights: Float) -> Float:
-    """The point of least weighted distance to K others, by Weiszfeld's iteration from their mean.
+    """Geometric median [Q, 3]: the point of least weighted distance to K others, by Weiszfeld's iteration.
 
     Args:
         points: [Q, K, 3].
         weights: [Q, K], sum 1.
+
+    >>> points = np.array([[[0, 0, 0], [0.1, 0, 0], [9, 9, 9]]])
+    >>> bool(np.linalg.norm(geometric_median(points, np.full((1, 3), 1 / 3))) < 0.2)  # the stray does not count
+    True
     """
     centre: Float = np.einsum("qk,qki->qi", weights, points)
     if points.shape[1] < 3:
@@ -333,7 +338,7 @@ def geometric_median(points: Float, weights: Float) -> Float:
 def _covered_near(
     depth: NDArray[Any], alpha: NDArray[Any], row: NDArray[np.intp], column: NDArray[np.intp], reach: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.intp], NDArray[np.intp]]:
-    """Which pixels have a covered one within reach, and the nearest such pixel's row and column."""
+    """Finds the covered pixel nearest to each pixel: true where it is within reach, its row, its column."""
     covered = (alpha >= ALPHA_OF_A_SURFACE) & np.isfinite(depth)
     if not covered.any():
         return np.zeros(len(row), dtype=np.bool_), row, column

@@ -4,7 +4,7 @@ Buffers are allocated once and grow only; forward and backward of the same view 
 on the number of threads. Twin: ``rasterize.twin``.
 
 A Gaussian that is not finite, or so large that its footprint overflows, is left out of the picture and its gradients
-are 0; so are gradients that overflow. ``CpuRasterizer.guards`` says how often.
+are 0; so are gradients that overflow. ``CpuRasterizer.guards`` counts them.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class CameraArrays(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """What a forward pass leaves: views into the rasterizer's buffers, valid until the next forward.
+    """Result of a forward pass: views into the rasterizer's buffers, valid until the next forward pass.
 
     Attributes:
         features: [C, H, W] float32. rest: [H, W] float32, transmittance left (alpha = 1 − rest).
@@ -54,7 +54,11 @@ class Picture(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """Views into the rasterizer's buffers, valid until the next backward; rows of culled Gaussians are 0."""
+    """Result of a backward pass: views into the rasterizer's buffers, valid until the next; culled Gaussians have 0.
+
+    Attributes:
+        means: [N, 3]. factors: [N, 3, 3]. opacities: [N]. features: [N, C]. screen: [N, 2] of the projected means.
+    """
 
     means: Array
     factors: Array
@@ -64,7 +68,7 @@ class Gradients(NamedTuple):
 
 
 class ForwardPass(NamedTuple):
-    """What ``backward`` needs of the forward pass before it: its inputs, and buffers that are its until the next."""
+    """Inputs and buffers of a forward pass that ``backward`` reads; valid until the next forward pass."""
 
     means: Array
     factors: Array
@@ -88,7 +92,22 @@ class CpuRasterizer:
     """Renders any number of feature channels in one pass, and carries gradients back.
 
     Attributes:
-        guards: how often each guard acted in all passes since the last ``reset`` of the counts.
+        guards: number of times that each guard acted since the last ``reset`` of the counts.
+
+    >>> from scas4d_core.gaussians import Gaussians
+    >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
+    >>> camera = Camera("front", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], np.eye(4), 16, 16)
+    >>> features = np.concatenate([state.colours, np.zeros((1, 1), np.float32)], axis=1)  # in groups of four
+    >>> rasterizer = CpuRasterizer()
+    >>> picture = rasterizer.forward(
+    ...     state.means, state.factors, state.opacities, features, CameraArrays.of(camera), np.zeros(4, np.float32)
+    ... )
+    >>> picture.features[:, 8, 8].round(2), round(float(picture.rest[8, 8]), 2)
+    (array([0.89, 0.  , 0.  , 0.  ], dtype=float32), 0.11)
+    >>> g_image, g_alpha = rasterizer.gradient_buffers()
+    >>> g_image[0, :16, :16] = 1  # of the sum of red over the pixels
+    >>> rasterizer.backward(g_image, g_alpha).features.round(0)
+    array([[113.,   0.,   0.,   0.]], dtype=float32)
     """
 
     def __init__(self, limits: Limits = DEFAULT) -> None:
@@ -123,10 +142,12 @@ class CpuRasterizer:
         background: Array,
         depth_channel: int = -1,
     ) -> Picture:
-        """Render.
+        """Renders features and transmittance of one view.
 
         Args:
-            means: [N, 3]; factors: [N, 3, 3]; opacities: [N]; features: [N, C]; all float32, C-contiguous.
+            means: [N, 3] metres; factors: [N, 3, 3]; opacities: [N]; features: [N, C], C a multiple of 4; all float32,
+                C-contiguous.
+            camera: of the inside world.
             background: [C] float32.
             depth_channel: a channel of ``features`` that this call fills with the depth of the centres (metres
                 along z), or −1.
@@ -241,7 +262,7 @@ class CpuRasterizer:
         return g_image, g_alpha
 
     def backward(self, g_image: Array, g_alpha: Array, detached: int = -1) -> Gradients:
-        """Gradients of the last forward pass.
+        """Carries gradients of a loss back through the last forward pass.
 
         Args:
             g_image, g_alpha: from ``gradient_buffers``, filled.

@@ -1,6 +1,6 @@
 """The rasterizer on a CUDA device, through gsplat 1.5.3 (``pip install -e '.[cuda]'``).
 
-Not yet run on a GPU: written against gsplat's sources. There, as here, the centre of pixel (column i, row j) is
+Not yet run on a GPU: written against gsplat's sources. There too the centre of pixel (column i, row j) is
 (i + 0.5, j + 0.5); order is by depth, ties by row; the cap (0.999), the floor (1/255), the transmittance stop (1e-4)
 and the tangent margin (0.3) are compiled in. gsplat finishes a pixel at T ≤ stop where ours do at T < stop.
 gsplat compiles its kernels at first use (minutes); set ``TORCH_CUDA_ARCH_LIST`` to the device's architecture.

@@ -1,4 +1,4 @@
-"""The named constants of a rasterizer: where a Gaussian's support ends and a pixel is finished."""
+"""Constants of a rasterizer: the end of a Gaussian's support, and the transmittance at which a pixel is finished."""
 
 from __future__ import annotations
 
@@ -30,18 +30,23 @@ class Limits(NamedTuple):
 
 
 NEAR_SHARE = 0.1
-"""Of the rig's radius: how near to a camera something may be drawn, where the scene leaves it open."""
+"""Near plane as a share of the rig's radius, where the scene gives none."""
 
 
 def scene_limits(near: float | str, rig_radius: float) -> Limits:
-    """The constants of a scene.
+    """The rasterizer's constants for one scene.
 
     Args:
         near: metres, or "auto" for ``NEAR_SHARE`` of the rig's radius.
         rig_radius: metres.
+
+    >>> scene_limits("auto", rig_radius=3.0).near  # metres
+    0.30000000000000004
+    >>> scene_limits(0.05, rig_radius=3.0).near
+    0.05
     """
     if isinstance(near, str):
-        # A single camera has no radius; a rig of millimetres still sees what is nearer than 1 cm.
+        # A single camera has no radius.
         near = NEAR_SHARE * rig_radius if rig_radius > 0 else Limits().near
     return Limits(near=near)
 

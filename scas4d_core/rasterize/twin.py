@@ -54,7 +54,7 @@ class CameraParams(NamedTuple):
 
 
 class Projected(NamedTuple):
-    """Gaussians as a camera sees them; rows nearer than the near plane hold no meaning.
+    """Projected Gaussians; rows nearer than the near plane are meaningless.
 
     Attributes:
         means: [N, 2] pixels.
@@ -68,7 +68,7 @@ class Projected(NamedTuple):
 
 
 class Rendered(NamedTuple):
-    """A picture.
+    """A rendered picture.
 
     Attributes:
         features: [H, W, C], background included.
@@ -136,7 +136,7 @@ def _composite(
 
 
 def sound(means: Tensor, factors: Tensor, opacities: Tensor, features: Tensor) -> Tensor:
-    """[N] whether a Gaussian can be drawn: finite, within ``guards.NOT_FINITE`` metres, features not too large."""
+    """[N] bool: Gaussians that can be drawn, finite, within ``guards.NOT_FINITE`` metres, features not too large."""
     size = means.detach().abs().sum(-1) + factors.detach().abs().sum((-2, -1)) + opacities.detach().abs()
     return (size <= NOT_FINITE) & (features.detach().abs() <= FEATURE_CEILING).all(-1)
 
@@ -150,7 +150,7 @@ def render(
     background: Tensor,
     limits: Limits = DEFAULT,
 ) -> Rendered:
-    """Σ_i w_i·feature_i + T_final·background at every pixel, front to back by depth, ties by row.
+    """Renders Σ_i w_i·feature_i + T_final·background at every pixel, front to back by depth, ties by row.
 
     alpha = min(cap, o·exp(−½ dᵀ cov2d⁻¹ d)) with d from the projected mean to the pixel's centre; a Gaussian
     contributes exactly where alpha ≥ floor; a pixel is finished, that Gaussian not drawn, once T·(1 − alpha) < stop.
@@ -164,6 +164,17 @@ def render(
         camera: of the inside world.
         background: [C].
         limits: of the backend to agree with.
+
+    >>> from scas4d_core.gaussians import Gaussians
+    >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
+    >>> means, factors, opacities, colours = (
+    ...     torch.tensor(array, dtype=torch.float64)
+    ...     for array in (state.means, state.factors, state.opacities, state.colours)
+    ... )
+    >>> camera = Camera("front", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], torch.eye(4).numpy(), 16, 16)
+    >>> picture = render(means, factors, opacities, colours, CameraParams.of(camera), torch.zeros(3))
+    >>> picture.features[8, 8].round(decimals=2), picture.alpha.shape
+    (tensor([0.8900, 0.0000, 0.0000], dtype=torch.float64), torch.Size([16, 16]))
     """
     finite = sound(means, factors, opacities, features)
     if not bool(finite.all()):

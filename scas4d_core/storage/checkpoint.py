@@ -1,15 +1,17 @@
-"""What an update needs beside Θ_{t−1}, on disk: a scene whose process died goes on as if nothing had happened.
+"""Checkpoints: the state of an update beside Θ_{t−1}, on disk, and the commit from which a scene is resumed.
+
+A scene whose process died goes on as if nothing had happened.
 
 Beside the frames of a ``History`` lies one ``checkpoint_<index>.npz`` for each of its newest commits. It is written,
 synced and renamed *before* the frame's own rename, which is the commit: a committed frame has its checkpoint, and a
-checkpoint without its frame is as good as not there. The one before the newest is kept as well, for the case that the
-newest state or checkpoint is damaged. What never changes (exposures, whether there are masks) is in the report of the
-first frame; clusters and neighbours are built again from the first frame, and a digest says whether they are the same.
+checkpoint without its frame does not count. The checkpoint before the newest is kept as well, in case the newest state
+or checkpoint is damaged. Facts that never change (exposures, presence of masks) are in the report of the first frame;
+clusters and neighbours are built again from the first frame, and a digest tells their changes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -18,17 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.captures.frame import Frame
+from scas4d_core.error_text import message_of
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import Outcome
-from scas4d_core.storage.error_text import told
 from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
-from scas4d_core.storage.history import NEWEST_KEPT
+from scas4d_core.storage.history import NEWEST_KEPT, History, HistoryError
 from scas4d_core.storage.npz import read_npz, write_npz
 from scas4d_core.update.views import TrainingView, ViewFactory
 from scas4d_core.update.warm_start import Motion
 
 FORMAT = 2
-"""Of a checkpoint's file; another one is refused."""
+"""Version of a checkpoint's file; others are refused."""
 
 
 class CheckpointError(ValueError):
@@ -36,16 +38,16 @@ class CheckpointError(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
-    """What one update leaves to the next beside Θ.
+class CarryOver:
+    """The state that one update passes to the next beside Θ.
 
     Attributes:
-        motion: that was found, or None where the next update starts cold.
-        labels: [N] what has been seen to move, in scenes without masks; None until something has.
-        seen: views of the last frame that was believed, in scenes without masks: the next are compared with them.
+        motion: the motion found, or None where the next update starts cold.
+        labels: [N] the Gaussians that have been seen to move, in scenes without masks; None until some have.
+        seen: views of the last frame that was not held, in scenes without masks; the next are compared with them.
         structure: digest of the clusters and neighbours that the motion belongs to.
-        past: what is usual for the scene and its cameras.
-        shown: fingerprint of each picture of the last frame that was believed (``repeats``).
+        past: usual values of the scene and its cameras.
+        shown: fingerprint of each picture of the last frame that was not held (``repeats``).
     """
 
     motion: Motion | None = None
@@ -57,57 +59,67 @@ class Carried:
 
     def after(
         self, outcome: Outcome, time: float, views: Sequence[TrainingView] | None, shown: Mapping[str, int]
-    ) -> Carried:
-        """What the next frame leaves in turn; of pictures that were not believed nothing is kept.
+    ) -> CarryOver:
+        """The state that the next frame passes on in turn; of rejected pictures nothing is kept.
 
         Args:
-            outcome: of that frame. time: its, seconds.
-            views: that it was updated with, or None in scenes with masks. shown: fingerprints of its pictures.
+            outcome: of that frame. time: of that frame, seconds.
+            views: its training views, or None in scenes with masks. shown: fingerprints of its pictures.
         """
         learnt = outcome.fresh and not outcome.stood
         past = replace(outcome.past, fitted=time) if learnt else outcome.past
-        carried = replace(self, motion=outcome.motion, past=past)
+        carry_over = replace(self, motion=outcome.motion, past=past)
         if not outcome.fresh:
-            return carried
-        if views is not None and outcome.exposure == 1.0:  # what another light changes has not moved
+            return carry_over
+        if views is not None and outcome.exposure == 1.0:  # a change of light is no motion
             seen = [view for view in views if view.name not in outcome.updated.left_out]
-            carried = replace(carried, seen=seen)
-        return replace(carried, shown=shown)
+            carry_over = replace(carry_over, seen=seen)
+        return replace(carry_over, shown=shown)
 
 
 class Checkpoints:
-    """The checkpoints in the directory of a history; for the process that appends to it."""
+    """Writes and reads the checkpoints in the directory of a history; for the process that appends to it.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     checkpoints = Checkpoints(Path(folder))
+    ...     checkpoints.save(4, CarryOver(labels=np.array([True, False])))
+    ...     checkpoints.load(4, factory=None).labels  # without pictures no view is made
+    ...     checkpoints.indices()
+    array([ True, False])
+    [4]
+    """
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
 
-    def save(self, index: int, carried: Carried) -> None:
-        """Writes what frame ``index`` leaves to the next; before the frame is committed.
+    def save(self, index: int, carry_over: CarryOver) -> None:
+        """Writes the state that frame ``index`` passes to the next; before the frame is committed.
 
         Without masks that includes the pictures of the frame, 3 bytes a pixel.
         """
-        arrays: dict[str, Any] = {"format": np.int64(FORMAT), "structure": np.int64(carried.structure)}
-        if carried.motion is not None:
-            arrays |= _packed(carried.motion)
-        arrays |= {f"past.{name}": array for name, array in carried.past.arrays().items()}
+        arrays: dict[str, Any] = {"format": np.int64(FORMAT), "structure": np.int64(carry_over.structure)}
+        if carry_over.motion is not None:
+            arrays |= _packed(carry_over.motion)
+        arrays |= {f"past.{name}": array for name, array in carry_over.past.arrays().items()}
         arrays |= {
-            "shown.names": np.array(list(carried.shown), np.str_),
-            "shown.prints": np.array(list(carried.shown.values()), np.int64),
+            "shown.names": np.array(list(carry_over.shown), np.str_),
+            "shown.prints": np.array(list(carry_over.shown.values()), np.int64),
         }
-        if carried.labels is not None:
-            arrays["labels"] = carried.labels
-        for view in carried.seen:
+        if carry_over.labels is not None:
+            arrays["labels"] = carry_over.labels
+        for view in carry_over.seen:
             levels = np.rint(255 * view.target[:3]).astype(np.uint8)  # they were 8 bit: exact
             arrays[f"seen.{view.name}"] = np.moveaxis(levels, 0, -1)
-        # A name that went missing by damage must not read as something that was never there.
+        # An array lost by damage must not read as one that was never written.
         arrays["names"] = np.array(sorted(arrays))
         write_npz(self._file(index), arrays)
 
-    def load(self, index: int, factory: ViewFactory) -> Carried:
-        """What frame ``index`` left.
+    def load(self, index: int, factory: ViewFactory) -> CarryOver:
+        """Reads the state that frame ``index`` passed on.
 
         Args:
-            factory: of the scene; makes views of the pictures.
+            factory: of the scene's views; makes views of the pictures.
 
         Raises:
             CheckpointError: it is not there, damaged, or of another format.
@@ -126,11 +138,11 @@ class Checkpoints:
             motion = _unpacked(arrays) if "motion.seconds" in arrays else None
             past = Past.of_arrays({name[5:]: array for name, array in arrays.items() if name.startswith("past.")})
             shown = dict(zip(arrays["shown.names"].tolist(), arrays["shown.prints"].tolist(), strict=True))
-            return Carried(motion, arrays.get("labels"), seen, int(arrays["structure"]), past, shown)
+            return CarryOver(motion, arrays.get("labels"), seen, int(arrays["structure"]), past, shown)
         except FileNotFoundError:
             raise CheckpointError(f"{file.name} is missing") from None
         except (ValueError, KeyError, TypeError) as error:
-            raise CheckpointError(told(error)) from error
+            raise CheckpointError(message_of(error)) from error
 
     def clean(self, committed: Sequence[int]) -> None:
         """Removes the checkpoints of all but the newest commits; after a commit.
@@ -175,3 +187,59 @@ def _unpacked(arrays: dict[str, NDArray[Any]]) -> Motion:
             array = arrays[name]
             values[item.name] = array if array.ndim else array.item()
     return Motion(**values)
+
+
+class ResumeError(ValueError):
+    """A history from which no scene can be resumed; the message names the damage."""
+
+
+@dataclass(frozen=True)
+class ResumePoint:
+    """The commit from which a scene was resumed.
+
+    Attributes:
+        index: of the commit.
+        undone: committed frames after it that were taken back; each has to be given again, or is lost.
+        faults: a sentence for each file that could not be used; empty after an ordinary end.
+        cold: true where the state is whole and its checkpoint is not: the next update starts without a motion, and the
+            scene is no longer bit-identical to one that was not disturbed.
+    """
+
+    index: int
+    undone: list[int]
+    faults: list[str]
+    cold: bool
+
+
+def find_commit(
+    history: History, checkpoints: Checkpoints, factory: ViewFactory, held: Callable[[int], bool]
+) -> tuple[int, CarryOver | None, list[str]]:
+    """Finds the commit to resume from: its index, its checkpoint (None: a cold start), and the damage that was found.
+
+    Args:
+        history, checkpoints: of the scene. factory: of its views.
+        held: true for a committed frame whose pictures can be given again.
+
+    Raises:
+        ResumeError: no state can be read.
+    """
+    faults = list(history.damaged.values())
+    whole: list[int] = []
+    carry_over: CarryOver | None = None
+    for index in reversed(history.indices):
+        try:
+            history.gaussians(index)
+            history.report(index)
+            whole.append(index)
+            carry_over = checkpoints.load(index, factory)
+            break
+        except (HistoryError, CheckpointError) as error:
+            faults.append(str(error))
+            if index not in checkpoints.indices() and whole:
+                break  # too old to have a checkpoint: no commit before it has one either
+    if not whole:
+        raise ResumeError("no state can be read: " + "; ".join(faults))
+    later = sorted({*history.indices, *history.damaged})
+    if carry_over is None or not all(held(index) for index in later if index > whole[-1]):
+        return whole[0], None, faults
+    return whole[-1], carry_over, faults

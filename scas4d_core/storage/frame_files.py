@@ -1,8 +1,9 @@
-"""The files of a history: ``fixed.npz``, written once, and one ``frame_<index>.npz`` a committed frame. Numpy only.
+"""The folder of a history: names of its files, and reading, writing and mending them. Numpy only.
 
-Every file is written beside its place, synced and renamed: a file with its final name is whole, and the listing of the
-directory is the only index there is. Of ``fixed.npz`` and of the first frame, which everything needs, there is a copy:
-a reader that finds the one damaged or gone reads the other.
+``fixed.npz``, written once, holds what all frames share; ``frame_<index>.npz`` a committed frame. Every file is written
+beside its place, synced and renamed: a file with its final name is whole, and the listing of the directory is the only
+index. ``fixed.npz`` and the first frame, which everything needs, have a copy: a reader that finds the original damaged
+or gone reads the copy.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from scas4d_core.storage.npz import read_npz, sync_folder, verify, write_npz
 
 Arrays = dict[str, NDArray[Any]]
 Stamp = tuple[int, int]
-"""Bytes and time of change of a file, in ns: whether it is the one that was read."""
+"""Bytes and time of change of a file, in ns: they tell a file that was written anew."""
 INDEX = "index"
-"""In the copy of the first frame: which one that is."""
+"""Array in the copy of the first frame: its index."""
 
 FIXED_FILE, FIXED_COPY, FIRST_COPY = "fixed.npz", "fixed.copy.npz", "first.copy.npz"
 _CHECKPOINT_FILE = re.compile(r"checkpoint_(\d{6,})\.npz")
@@ -30,7 +31,7 @@ _FRAME_FILE = re.compile(r"frame_(\d{6,})\.npz")
 
 
 class HistoryError(ValueError):
-    """A history that cannot be extended or read: the message names the frame or file, the fault and the remedy."""
+    """A history that cannot be extended or read; the message names the frame or file, the fault and the remedy."""
 
 
 class UnreadableFrameError(HistoryError):
@@ -38,14 +39,14 @@ class UnreadableFrameError(HistoryError):
 
 
 class DamagedFrameError(UnreadableFrameError):
-    """A frame whose file is damaged: it is not gone because it was deleted."""
+    """A frame whose file is damaged, in contrast to one that was deleted."""
 
 
 class FrameFiles:
-    """The files in one directory.
+    """Reads and writes the files of a history in one directory.
 
     Attributes:
-        faults: files that could not be read, by name with the reason; whoever tells of them empties it.
+        faults: files that could not be read, by name with the reason; emptied when they are reported.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -57,16 +58,16 @@ class FrameFiles:
         self._copied: tuple[Stamp, int] | None = None
 
     @property
-    def there(self) -> bool:
-        """Whether the directory holds a history, maybe one that lost a file."""
+    def exists(self) -> bool:
+        """True where the directory holds a history, perhaps one that lost a file."""
         return self.fixed.exists() or self.fixed_copy.exists()
 
     def path(self, index: int) -> Path:
-        """The file of a frame."""
+        """Path of the file of a frame."""
         return self.directory / frame_file(index)
 
     def listed(self) -> dict[int, Stamp]:
-        """The frames in the directory, rising; the first one too where only its copy is there and later ones are."""
+        """Stamps of the frames in the directory, rising; the first one is listed also where only its copy exists."""
         found: dict[int, Stamp] = {}
         with os.scandir(self.directory) as entries:
             for entry in entries:
@@ -81,7 +82,7 @@ class FrameFiles:
         return dict(sorted(found.items()))
 
     def stamped(self, indices: Iterable[int]) -> dict[int, Stamp]:
-        """The same of some frames, without looking at the others."""
+        """Stamps of the given frames that exist, without listing the directory."""
         found: dict[int, Stamp] = {}
         for index in sorted(indices):
             try:
@@ -103,19 +104,19 @@ class FrameFiles:
         return self._copied
 
     def write(self, index: int, arrays: Mapping[str, Any]) -> Stamp:
-        """Commits a frame, or writes it anew."""
+        """Writes the file of a frame, which commits it; returns its stamp."""
         file = self.path(index)
         write_npz(file, arrays)
         return _stamp(file.stat())
 
     def write_fixed(self, arrays: Arrays, index: int, first: Mapping[str, Any]) -> None:
-        """Writes what all frames need, and both copies; before the first of them, frame ``index``, is committed."""
+        """Writes the arrays that all frames share, and both copies; before the first frame, ``index``, is committed."""
         write_npz(self.fixed, arrays)
         write_npz(self.fixed_copy, arrays)
         write_npz(self.first_copy, {**first, INDEX: np.int64(index)})
 
     def time(self, index: int) -> float:
-        """Seconds of a frame.
+        """Time of a frame, seconds.
 
         Raises:
             FileNotFoundError: it is not there. UnreadableFrameError: it is damaged.
@@ -123,7 +124,7 @@ class FrameFiles:
         return float(self.read(index, ("time",))["time"])
 
     def read(self, index: int, names: Sequence[str]) -> Arrays:
-        """Named arrays of a frame; of the first one from its copy, where that alone can be read.
+        """Named arrays of a frame; of the first frame from its copy, where only that can be read.
 
         Raises:
             FileNotFoundError: it is not there. UnreadableFrameError: it is damaged.
@@ -141,7 +142,7 @@ class FrameFiles:
             return found
 
     def read_fixed(self, names: Sequence[str]) -> Arrays:
-        """Named arrays of what all frames need.
+        """Named arrays of those that all frames share.
 
         Raises:
             UnreadableFrameError: it is damaged or gone, and its copy too.
@@ -160,10 +161,10 @@ class FrameFiles:
         """Writes ``fixed.npz``, the first frame and their copies anew where they are damaged or gone.
 
         Args:
-            first: the first committed frame. fixed: what all frames need, as it was read.
+            first: index of the first committed frame. fixed: the arrays that all frames share, as they were read.
 
         Returns:
-            What was wrong with each file that was written, by name. Where nothing can be taken from, nothing is.
+            The fault of each file that was written, by name. A file without a whole copy is left.
         """
         mended: dict[str, str] = {}
         for file in (self.fixed, self.fixed_copy):
@@ -187,34 +188,34 @@ class FrameFiles:
         self.path(index).unlink(missing_ok=True)
 
     def sync(self) -> None:
-        """What was deleted stays so after a power cut."""
+        """Syncs the directory: deleted files stay deleted after a power cut."""
         sync_folder(self.directory)
 
 
 def frame_file(index: int) -> str:
-    """The name of a frame's file."""
+    """Name of the file of a frame."""
     return f"frame_{index:06d}.npz"
 
 
 def frame_of(name: str) -> int | None:
-    """The frame that a file is of, by its name."""
+    """Index of the frame in a file of this name; None for other files."""
     match = _FRAME_FILE.fullmatch(name)
     return int(match[1]) if match else None
 
 
 def checkpoint_file(index: int) -> str:
-    """The name of the file of a frame's checkpoint (``checkpoint``)."""
+    """Name of the file of a frame's checkpoint."""
     return f"checkpoint_{index:06d}.npz"
 
 
 def checkpoint_of(name: str) -> int | None:
-    """The frame that a file is the checkpoint of, by its name."""
+    """Index of the frame whose checkpoint has this name; None for other files."""
     match = _CHECKPOINT_FILE.fullmatch(name)
     return int(match[1]) if match else None
 
 
 def fault_of(file: Path) -> str | None:
-    """Reads all of a file; what is wrong with it, None: nothing."""
+    """Reads all of a file; returns its fault, None where it is whole."""
     try:
         verify(file)
     except (FileNotFoundError, ValueError) as error:

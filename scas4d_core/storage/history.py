@@ -1,31 +1,23 @@
-"""Θ_0 … Θ_t: the committed states of a scene, in memory or in a directory. Numpy only.
+"""Keeps the committed states of a scene, Θ_0 … Θ_t, in memory or in a directory. Numpy only.
 
-On disk (``frame_files``) a history is one file with opacities and ids, written once, and one a committed frame, which
-holds its state, its time and its report; its rename to its final name is the commit. One process appends and deletes;
-others read, and see what it did with ``refresh``.
+On disk (``frame_files``) a history is one file with opacities and ids, written once, and one file for each committed
+frame, which holds its state, its time and its report; the rename of that file to its final name is the commit. One
+process appends and deletes, through a ``History``; others read, and pick up its changes with ``refresh``.
 """
 
 from __future__ import annotations
 
 import json
-from collections import OrderedDict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.storage.frame_files import (
-    Arrays,
-    DamagedFrameError,
-    FrameFiles,
-    HistoryError,
-    Stamp,
-    UnreadableFrameError,
-)
+from scas4d_core.storage.frame_files import Arrays, DamagedFrameError, FrameFiles, HistoryError, UnreadableFrameError
+from scas4d_core.storage.history_reader import FIXED, FRAMES_KEPT, PER_FRAME, HistoryReader
 from scas4d_core.storage.npz import clear_parts
 
 __all__ = [
@@ -33,42 +25,41 @@ __all__ = [
     "UnreadableFrameError",
 ]  # fmt: skip
 
-PER_FRAME = ("means", "rotations", "factors", "colours", "foreground")
-"""Arrays of ``Gaussians`` that may differ from frame to frame."""
-FIXED = ("opacities", "ids")
-"""Arrays of ``Gaussians`` that a scene keeps after frame 0."""
-FRAMES_KEPT = 4
-"""Frames of a history on disk that stay in memory: the newest, and the last ones asked for."""
 NEWEST_KEPT = 2
-"""Newest states that retention never deletes: should the last be damaged, the one before it is gone on from."""
+"""Newest states that retention never deletes: should the last be damaged, the scene is resumed from the one before."""
 
 
-class History:
-    """The committed states of one scene, in the order of their indices.
+class History(HistoryReader):
+    """The committed states of one scene, in the order of their indices; for the process that appends.
 
     Args:
-        directory: where the frames are kept, made when missing; without it they stay in memory. A directory that
-            already holds frames is opened with ``History.load`` or ``History.open``.
+        directory: made when missing; without it the states stay in memory. A directory that already holds states is
+            opened with ``History.load`` or ``History.open``.
 
     Attributes:
-        damaged: frames whose file cannot be read, with the reason; they are not among ``indices``.
-        record_seconds: that the last ``append`` spent on the report: encoding it, and its share of writing, by bytes.
+        record_seconds: seconds that the last ``append`` spent on the report: encoding it, and its share of writing, by
+            bytes.
 
     Raises:
-        HistoryError: ``directory`` already holds frames.
+        HistoryError: ``directory`` already holds states.
+
+    >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
+    >>> history = History()  # in memory; History("states") keeps them in a folder
+    >>> history.append(0, 0.0, state, report={"loss": [0.5]})
+    >>> history.append(1, 0.1, state.replace(means=state.means + np.float32([0, 0, 1])))
+    >>> history.indices, history.times
+    ([0, 1], array([0. , 0.1]))
+    >>> history.stacked("means")[:, 0]  # of every frame
+    array([[0., 0., 2.],
+           [0., 0., 3.]], dtype=float32)
+    >>> history.append(1, 0.2, state)
+    Traceback (most recent call last):
+    scas4d_core.storage.frame_files.HistoryError: frame 1 comes after frame 1; append frames in rising order
     """
 
     def __init__(self, directory: Path | str | None = None) -> None:
-        self._files = None if directory is None else FrameFiles(Path(directory))
-        self.damaged: dict[int, str] = {}
+        super().__init__(None if directory is None else Path(directory))
         self.record_seconds = 0.0
-        self._fixed: Arrays = {}
-        self._times: dict[int, float] = {}
-        self._reports: dict[int, dict[str, Any]] = {}
-        self._stamps: dict[int, Stamp] = {}
-        self._texts: dict[int, bytes] = {}
-        """Reports on disk of the frames that are in memory."""
-        self._frames: OrderedDict[int, Arrays] = OrderedDict()
         if self._files is not None:
             self._files.directory.mkdir(parents=True, exist_ok=True)
             if self._files.listed():
@@ -77,31 +68,8 @@ class History:
                 )
 
     @classmethod
-    def load(cls, directory: Path | str, only: Iterable[int] | None = None) -> History:
-        """Opens the history in a directory; ``append`` goes on behind its last frame.
-
-        A frame that cannot be read is left out and named in ``damaged``.
-
-        Args:
-            directory: of the history.
-            only: frames to know of, for who reads those alone; every file of the directory is looked at without.
-
-        Raises:
-            HistoryError: no history there, or the file that all frames need is damaged.
-        """
-        files = FrameFiles(Path(directory))
-        if not files.there:
-            raise HistoryError(f"{files.directory.name} holds no history: {files.fixed.name} is missing")
-        history = cls()
-        history._files = files
-        history.refresh(only)
-        if history._stamps:
-            history._fixed = files.read_fixed(FIXED)
-        return history
-
-    @classmethod
     def open(cls, directory: Path | str) -> History:
-        """The history in a directory, or a new one where there is none; for the process that appends.
+        """Opens the history in a directory, or begins one where there is none.
 
         Raises:
             HistoryError: as ``load``.
@@ -109,7 +77,7 @@ class History:
         folder = Path(directory)
         folder.mkdir(parents=True, exist_ok=True)
         clear_parts(folder)
-        return cls.load(folder) if FrameFiles(folder).there else cls(folder)
+        return cls.load(folder) if FrameFiles(folder).exists else cls(folder)
 
     def save(self, directory: Path | str) -> None:
         """Writes a copy of this history into another directory, one frame at a time."""
@@ -124,7 +92,7 @@ class History:
             index: frame number, above every index before it.
             time: seconds.
             gaussians: the state; same ids and opacities as in the first frame. The arrays are copied.
-            report: how the state came about, as JSON (finite numbers, strings, lists, mappings); see ``report``.
+            report: made of JSON values (finite numbers, strings, lists, mappings).
 
         Raises:
             HistoryError: index not above the last, another number of Gaussians, other ids or opacities, or a report
@@ -134,7 +102,7 @@ class History:
             raise HistoryError(f"frame {index} comes after frame {self._newest()}; append frames in rising order")
         began = perf_counter()
         try:
-            said = json.dumps(dict(report or {}), allow_nan=False)
+            text = json.dumps(dict(report or {}), allow_nan=False)
         except (TypeError, ValueError) as error:
             raise HistoryError(
                 f"frame {index}: the report is no JSON ({error}); give finite numbers, strings, lists, mappings"
@@ -153,66 +121,28 @@ class History:
                 raise HistoryError(f"frame {index}: {name} has {len(arrays[name])} rows; give {count}, one a Gaussian")
         frame = {name: np.array(arrays[name]) for name in PER_FRAME}
         if self._files is not None:
-            text = said.encode()
-            written = _as_written(frame, time, text)
+            encoded = text.encode()
+            written = _as_written(frame, time, encoded)
             if not self._fixed:
                 self._files.write_fixed(fixed, index, written)
             began = perf_counter()
             self._stamps[index] = self._files.write(index, written)
-            self.record_seconds += (perf_counter() - began) * len(said) / self._stamps[index][0]
-            self._texts[index] = text
+            self.record_seconds += (perf_counter() - began) * len(text) / self._stamps[index][0]
+            self._texts[index] = encoded
         else:
             self._stamps[index] = (sum(array.nbytes for array in frame.values()), 0)
         self._fixed = fixed
         self._times[index] = float(time)
         if self._files is None:
-            self._reports[index] = json.loads(said)
+            self._reports[index] = json.loads(text)
         self.damaged.pop(index, None)
         self._keep(index, frame)
 
-    def refresh(self, only: Iterable[int] | None = None) -> tuple[list[int], list[int]]:
-        """Picks up what the process that writes this directory has done since; frames that are known stay unopened.
-
-        Args:
-            only: frames that may have changed, where that is known: a directory of a day takes a while to look through.
-
-        Returns:
-            The indices that are new (or written anew), and those that are gone.
-        """
-        if self._files is None:
-            return [], []
-        looked_at = {*self._times, *self.damaged} if only is None else set(only)
-        listed = self._files.listed() if only is None else self._files.stamped(looked_at)
-        gone = sorted(index for index in looked_at if index in self._times and index not in listed)
-        changed = [index for index, stamp in listed.items() if self._stamps.get(index) != stamp]
-        for index in [*gone, *changed]:
-            self._forget(index)
-        for index in looked_at - listed.keys():
-            self.damaged.pop(index, None)
-        newest = self._newest()
-        added = []
-        for index in changed:
-            try:
-                self._times[index] = self._files.time(index)
-            except FileNotFoundError:  # deleted since it was listed
-                continue
-            except ValueError as error:
-                self.damaged[index] = str(error)
-            else:
-                self.damaged.pop(index, None)
-                added.append(index)
-            self._stamps[index] = listed[index]
-        if added and added[0] < newest:
-            self._times = dict(sorted(self._times.items()))
-        if added and not self._fixed:
-            self._fixed = self._files.read_fixed(FIXED)
-        return added, gone
-
     def retain(self, *, last: int | None = None, size_bytes: int | None = None) -> list[int]:
-        """Deletes the oldest states until the rules hold; for the process that appends. No rule keeps all.
+        """Deletes the oldest states until the rules hold. Without a rule all stay.
 
         The first frame stays, because every update needs it, and so do the newest ``NEWEST_KEPT``, from which an
-        interrupted scene goes on, whatever the rule.
+        interrupted scene is resumed, whatever the rule.
 
         Args:
             last: states to keep besides the first.
@@ -242,7 +172,7 @@ class History:
         return deleted
 
     def cut(self, after: int) -> list[int]:
-        """Takes back every commit after frame ``after``; for the process that appends.
+        """Takes back every commit after frame ``after``.
 
         Returns:
             The indices taken back, damaged ones among them, rising.
@@ -259,21 +189,14 @@ class History:
 
     @property
     def files(self) -> FrameFiles | None:
-        """The files on disk, for who mends them (``scas4d_core.remake``); None in memory."""
+        """The files on disk, to mend them (``scas4d_core.remake``); None in memory."""
         return self._files
 
-    def take_faults(self) -> dict[str, str]:
-        """Files that were found damaged or gone since this was asked last, by name with the reason."""
-        if self._files is None:
-            return {}
-        faults, self._files.faults = self._files.faults, {}
-        return faults
-
     def mend_fixed(self) -> dict[str, str]:
-        """Writes anew what every frame needs, and its copy, where they are damaged; for the process that appends.
+        """Writes the files that every frame needs, and their copies, anew where they are damaged.
 
         Returns:
-            What was wrong with each file that was written, by name.
+            The fault of each file that was written, by name.
         """
         if self._files is None or not self._times or not self._fixed:
             return {}
@@ -284,7 +207,7 @@ class History:
         return mended
 
     def write_again(self, index: int) -> bool:
-        """Writes the file of a committed frame anew, the same bits; for the process that appends.
+        """Writes the file of a committed frame anew, the same bits.
 
         Returns:
             False where the frame is not in memory.
@@ -296,7 +219,7 @@ class History:
         return True
 
     def replace(self, index: int, time: float, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:
-        """Writes the state of a frame whose file is damaged or gone anew; for the process that appends.
+        """Writes the state of a frame anew whose file is damaged or gone.
 
         Args:
             index: of a frame before the newest. time: seconds. arrays: ``PER_FRAME``. report: as for ``append``.
@@ -314,144 +237,7 @@ class History:
         self.damaged.pop(index, None)
         self._times = dict(sorted([*self._times.items(), (index, float(time))]))
 
-    @property
-    def directory(self) -> Path | None:
-        """Where the frames are kept; None in memory."""
-        return None if self._files is None else self._files.directory
-
-    def __len__(self) -> int:
-        return len(self._times)
-
-    def __contains__(self, index: object) -> bool:
-        return index in self._times
-
-    @property
-    def indices(self) -> list[int]:
-        """The committed frame numbers, rising."""
-        return list(self._times)
-
-    @property
-    def times(self) -> NDArray[np.float64]:
-        """[T] float64 seconds, in the order of ``indices``."""
-        return np.array(list(self._times.values()), dtype=np.float64)
-
-    def time(self, index: int) -> float:
-        """Seconds of one committed frame."""
-        self._require(index)
-        return self._times[index]
-
-    def report(self, index: int) -> dict[str, Any]:
-        """What was committed with the state of a frame about how it came about; empty where nothing was.
-
-        Raises:
-            HistoryError: the frame was not committed, or its file is damaged.
-        """
-        self._require(index)
-        if self._files is None:
-            return dict(self._reports[index])
-        text = self._texts.get(index)
-        if text is None:
-            text = self._from_file(index, ("report",))["report"].tobytes()
-        try:
-            report: dict[str, Any] = json.loads(text)
-        except ValueError as error:
-            raise HistoryError(f"{self._files.path(index).name}: its report is no JSON ({error})") from error
-        if index in self._frames:
-            self._texts[index] = text
-        return report
-
-    def gaussians(self, index: int) -> Gaussians:
-        """The state of one committed frame; the arrays are the history's own and must not be written to.
-
-        Raises:
-            HistoryError: the frame was not committed, or its file is damaged.
-        """
-        self._require(index)
-        frame = self._frames.get(index)
-        if frame is None:
-            frame = self._from_file(index, PER_FRAME)
-            self._keep(index, frame)
-        else:
-            self._frames.move_to_end(index)
-        return Gaussians(**frame, **self._fixed)
-
-    def stacked(
-        self, name: str, indices: Sequence[int] | None = None, rows: NDArray[np.intp] | None = None
-    ) -> NDArray[Any]:
-        """One array of several frames, [T, N, ...], in the order of ``indices`` (default: every frame).
-
-        Reads only that array of the files, so that a long history needs no more memory than the answer.
-
-        Args:
-            name: one of ``PER_FRAME``.
-            indices: committed frames; may repeat.
-            rows: Gaussians by row, any shape; the answer is then [T, *rows.shape, ...].
-
-        Raises:
-            HistoryError: ``name`` is not in ``PER_FRAME``, or a frame was not committed.
-        """
-        if name not in PER_FRAME:
-            raise HistoryError(f"{name!r} is not kept per frame; ask for one of {', '.join(PER_FRAME)}")
-        chosen = self.indices if indices is None else list(indices)
-        if not chosen:
-            raise HistoryError("indices is empty; name at least one committed frame")
-        result: NDArray[Any] | None = None
-        for row, index in enumerate(chosen):
-            self._require(index)
-            frame = self._frames.get(index)
-            array = frame[name] if frame is not None else self._from_file(index, (name,))[name]
-            if rows is not None:
-                array = array[rows]
-            if result is None:
-                result = np.empty((len(chosen), *array.shape), dtype=array.dtype)
-            result[row] = array
-        assert result is not None
-        return result
-
-    def _require(self, index: int) -> None:
-        if index in self._times:
-            return
-        if index in self.damaged:
-            raise DamagedFrameError(f"frame {index} cannot be read: {self.damaged[index]}")
-        held = f"{next(iter(self._times))} to {self._newest()}" if self._times else "none yet"
-        raise UnreadableFrameError(f"frame {index} is not in the history; committed frames: {held}")
-
-    def _newest(self) -> int:
-        """Index of the last frame, -1 without one; ``indices`` copies all of them."""
-        return next(reversed(self._times), -1)
-
-    def _from_file(self, index: int, names: Sequence[str]) -> Arrays:
-        assert self._files is not None
-        try:
-            return self._files.read(index, names)
-        except FileNotFoundError:
-            self._forget(index)  # the process that appends has deleted it, or somebody else has
-            self._files.faults[self._files.path(index).name] = f"{self._files.path(index).name} is gone"
-            self._require(index)
-            raise
-        except UnreadableFrameError as error:
-            stamp = self._stamps.get(index)
-            self._forget(index)
-            self.damaged[index] = str(error)
-            if stamp is not None:  # until another file is there
-                self._stamps[index] = stamp
-            raise DamagedFrameError(str(error)) from error
-
-    def _forget(self, index: int) -> None:
-        self._times.pop(index, None)
-        self._reports.pop(index, None)
-        self._stamps.pop(index, None)
-        self._texts.pop(index, None)
-        self._frames.pop(index, None)
-
-    def _keep(self, index: int, frame: Arrays) -> None:
-        self._frames[index] = frame
-        if self._files is not None:
-            newest = self._newest()
-            for old in [i for i in self._frames if i != newest][: max(0, len(self._frames) - FRAMES_KEPT)]:
-                del self._frames[old]
-                self._texts.pop(old, None)
-
 
 def _as_written(frame: Arrays, time: float, report: bytes) -> dict[str, Any]:
+    """The arrays of a frame's file."""
     return {**frame, "time": np.float64(time), "report": np.frombuffer(report, np.uint8)}

@@ -1,7 +1,7 @@
-"""npz files that are whole or not there, and read without trusting them. Numpy only.
+"""Writes npz files atomically, with a checksum for each array, and reads them without trusting them. Numpy only.
 
-Each carries a BLAKE2b of 128 bits of every array, over its type, shape and values, in the comment of the zip. The zip's
-own CRC-32 does not do: a flipped bit in the header of an array can make numpy read fewer bytes than there are, and then
+The comment of the zip holds a BLAKE2b of 128 bits for every array, over its type, shape and values. The zip's own
+CRC-32 is not enough: a flipped bit in the header of an array can make numpy read fewer bytes than there are, and then
 the CRC is never compared. Files of earlier versions have no comment and are read with the CRC alone.
 """
 
@@ -22,14 +22,14 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.storage.error_text import told
+from scas4d_core.error_text import message_of
 
 DAMAGE = (
     OSError, ValueError, KeyError, EOFError, IndexError, TypeError, SyntaxError, TokenError, RuntimeError, MemoryError,
     OverflowError, AttributeError, Warning, struct.error, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
-"""What reading a cut or overwritten zip of arrays can raise. zip's checksums cover the arrays; a header that was
-overwritten is read before its checksum is, and may ask for an impossible array."""
+"""Exceptions that reading a cut or overwritten zip of arrays can raise. An overwritten header is read before the
+checksum of its array, and may ask for an impossible array."""
 DIGEST = 16
 """Bytes of a checksum."""
 PIECE = 1 << 20
@@ -37,14 +37,21 @@ PIECE = 1 << 20
 
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Writes an npz that is either whole at ``path`` or not there: temporary file, sync, rename, sync of the folder."""
+    """Writes an npz atomically, whole at ``path`` or not at all: temporary file, sync, rename, sync of the folder.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     write_npz(Path(folder) / "a.npz", {"means": np.zeros((2, 3))})
+    ...     read_npz(Path(folder) / "a.npz")["means"].shape
+    (2, 3)
+    """
     with written_whole(path, path.with_name(f".{path.name}.{os.getpid()}.part")) as file:
         _save(file, arrays)
 
 
 @contextmanager
 def written_whole(path: Path, beside: Path) -> Iterator[BinaryIO]:
-    """A file to write to that is whole and on disk at ``path`` in the end, or not there; until then at ``beside``."""
+    """Opens a file ``beside`` to write to; in the end it is whole and on disk at ``path``, or not there at all."""
     try:
         with beside.open("wb") as file:
             yield file
@@ -58,7 +65,7 @@ def written_whole(path: Path, beside: Path) -> Iterator[BinaryIO]:
 
 
 def _save(file: BinaryIO, arrays: Mapping[str, Any]) -> None:
-    """What ``np.savez`` writes, and the checksums."""
+    """Writes the zip as ``np.savez`` does, and the checksums as its comment."""
     checksums = {}
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, given in arrays.items():
@@ -76,7 +83,7 @@ def _comment(checksums: Mapping[str, str]) -> bytes:
         comment = json.dumps({"blake2b": short}, separators=(",", ":")).encode()
         if len(comment) <= zipfile.ZIP_MAX_COMMENT:
             return comment
-    return b""  # the CRC is left
+    return b""  # the CRC alone is left
 
 
 def _digest(array: NDArray[Any]) -> str:
@@ -86,7 +93,7 @@ def _digest(array: NDArray[Any]) -> str:
 
 
 def _agrees(kept: str, found: str) -> bool:
-    """Whether a checksum, whole or shortened, is that of what was read."""
+    """True where a stored checksum, whole or shortened, matches the one of the array that was read."""
     return len(kept) >= 4 and found.startswith(kept)
 
 
@@ -95,7 +102,7 @@ def _begun(dtype: np.dtype[Any], shape: tuple[int, ...]) -> hashlib.blake2b:
 
 
 def _checksums(archive: zipfile.ZipFile) -> dict[str, str] | None:
-    """By array; None in a file of an earlier version."""
+    """Checksums by array; None in a file of an earlier version."""
     if not archive.comment:
         return None
     found: dict[str, str] = json.loads(archive.comment)["blake2b"]
@@ -106,7 +113,7 @@ def _checksums(archive: zipfile.ZipFile) -> dict[str, str] | None:
 
 
 def sync_folder(folder: Path) -> None:
-    """What was renamed or deleted in the folder survives a power cut."""
+    """Syncs a folder: renames and deletions in it survive a power cut."""
     if os.name != "posix":  # elsewhere a directory cannot be opened to be synced
         return
     handle = os.open(folder, os.O_RDONLY)
@@ -117,11 +124,20 @@ def sync_folder(folder: Path) -> None:
 
 
 def read_npz(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
-    """Named arrays of an npz, or all of them, each compared with its checksum; nothing is unpickled.
+    """Reads named arrays of an npz, or all, and compares each with its checksum; nothing is unpickled.
 
     Raises:
         FileNotFoundError: it is not there.
         ValueError: it is damaged, or lacks a name; says which file, without its folder, and why.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "a.npz"
+    ...     write_npz(file, {"a": np.arange(3)})
+    ...     shortened = file.write_bytes(file.read_bytes()[:-40])
+    ...     read_npz(file)
+    Traceback (most recent call last):
+    ValueError: a.npz is damaged, or no npz file (...)
     """
     try:
         # Opened here, because numpy leaves a damaged file open.
@@ -140,7 +156,7 @@ def read_npz(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArra
 
 
 def verified(path: Path) -> Iterator[int]:
-    """Reads all of an npz piece by piece, and yields the bytes of each piece; a whole one is read to the end.
+    """Reads all of an npz piece by piece and yields the bytes of each; a damaged file raises on the way.
 
     Raises:
         FileNotFoundError: it is not there.
@@ -184,10 +200,10 @@ def _streamed(file: IO[bytes]) -> Generator[int, None, str]:
 
 
 def _damage(path: Path, error: BaseException) -> ValueError:
-    return ValueError(f"{path.name} is damaged, or no npz file ({type(error).__name__}: {told(error)})")
+    return ValueError(f"{path.name} is damaged, or no npz file ({type(error).__name__}: {message_of(error)})")
 
 
 def clear_parts(folder: Path) -> None:
-    """Removes what interrupted writes of ``write_npz`` left; only for the folder's one writer."""
+    """Removes temporary files of interrupted ``write_npz`` calls; only for the one process that writes the folder."""
     for part in folder.glob(".*.npz.*.part"):
         part.unlink(missing_ok=True)

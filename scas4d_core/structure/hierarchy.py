@@ -22,7 +22,7 @@ KMEANS_ROUNDS = 30
 """Lloyd iterations: the update needs compact clusters, not an optimum."""
 
 KMEANS_SAMPLE_PER_CLUSTER = 256
-"""Points per cluster that K-means looks at; beyond, a sample bounds time and memory (1 M points: 330,000 x 3)."""
+"""Points per cluster that K-means uses; beyond, a sample bounds time and memory (1 M points: 330,000 x 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,16 +50,24 @@ class Hierarchy:
 def build_hierarchy(
     means: NDArray[Any], moving: NDArray[np.bool_], clusters: tuple[int, ...], smallest: int, seed: int = 0
 ) -> Hierarchy:
-    """Cluster the moving Gaussians.
+    """Clusters the moving Gaussians (paper, Training Strategy).
 
     Args:
         means: [N, 3] metres; not finite ones belong to no cluster. moving: [N]; nor do the others.
-        clusters: wished clusters per layer, coarse to fine, ascending; capped so that ``smallest`` Gaussians fall into
-            each on average. Empty: no layer.
+        clusters: clusters per layer, coarse to fine, ascending; capped so that ``smallest`` Gaussians fall into each
+            on average. Empty: no layer.
         seed: of K-means.
 
     Raises:
-        ValueError: the wished numbers do not ascend.
+        ValueError: the numbers do not ascend.
+
+    >>> points = np.array([[0, 0, 0], [5, 0, 0], [0.1, 0, 0], [5.1, 0, 0], [9, 9, 9]])
+    >>> moving = np.array([True, True, True, True, False])
+    >>> found = build_hierarchy(points, moving, clusters=(1, 2), smallest=1)
+    >>> found.sizes
+    (1, 2)
+    >>> [found.rows[a:b].tolist() for a, b in pairwise(found.starts[-1])]  # the finest layer's clusters
+    [[0, 2], [1, 3]]
     """
     if any(a >= b for a, b in pairwise(clusters)):
         raise ValueError(f"clusters {clusters} must ascend from the coarsest layer to the finest")
@@ -111,8 +119,8 @@ def _merge(points: NDArray[np.float64], labels: Int, count: int) -> Int:
     """[M] labels after merging the clusters' mean positions to ``count`` clusters.
 
     Agglomerative (the paper), then evened out: K-means among the merged clusters, started from what was merged, gives
-    a cluster at the border of two parents to the nearer one. Still nested, and rounder: what was merged first stays
-    merged otherwise, however badly the rest then fits.
+    a cluster at the border of two parents to the nearer one. Still nested, and rounder: without this, clusters merged
+    first stay merged however badly the rest then fits.
     """
     from sklearn.cluster import AgglomerativeClustering, KMeans
 

@@ -1,7 +1,7 @@
-"""Which Gaussians move: read from the pictures where no mask says it, and settled where the masks leave a few standing.
+"""The motion mask: learns from the pictures of two frames which Gaussians move, in scenes without masks.
 
-A pixel has changed where it differs from the frame before. A Gaussian moves when most of the cameras that see it see it
-in changed pixels: the background behind the new place of an object has changed for some cameras, but not for most.
+A pixel has changed where it differs from the frame before. A Gaussian moves when most of the cameras that see it have
+it in changed pixels: the background behind the new place of an object has changed for some cameras, but not for most.
 """
 
 from __future__ import annotations
@@ -23,24 +23,29 @@ CHANGE = 0.04
 REACH_PIXELS = 5
 """Side of the square that a changed pixel marks: the inside of a plain surface moves without changing."""
 SEEN_PIXELS = 0.02
-"""Pixels' worth of blending weight from which a camera has a say."""
+"""Pixels' worth of blending weight from which a camera has a vote."""
 IN_CHANGE = 0.5
-"""Share of a Gaussian's weight in changed pixels from which a camera says that it moves."""
+"""Share of a Gaussian's weight in changed pixels from which a camera votes that it moves."""
 MAJORITY = 0.5
-"""Share of the cameras with a say that have to say so; and at least two."""
+"""Share of the voting cameras that have to agree that a Gaussian moves; and at least two."""
 
 STANDING_SHARE = 0.1
-"""Share of standing Gaussians from which a scene has something that stands; below, their labels are noise."""
+"""Share of standing Gaussians from which a scene has a standing part; below, their labels are noise."""
 
 NEW_LABELS = 0.01
 """Share of all Gaussians that must be found moving anew before the hierarchy is built again."""
 
 
-def settled(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians of frame 0 with labels that can be relied on.
+def with_reliable_labels(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians of frame 0, all of them moving where only a few stand.
 
-    The few Gaussians of an object that no mask taught would stay behind when it moves, and hide it. In a cluster that
-    does not move they stand just as well.
+    These few belong to an object, but no mask taught their label: they would stay behind when the object moves, and
+    hide it. In a cluster that does not move they stand just as well.
+
+    >>> state = Gaussians.of_points([[x, 0, 0] for x in range(100)], radius=0.1)
+    >>> few_stand = state.replace(foreground=np.float32([0] * 5 + [1] * 95))
+    >>> int(with_reliable_labels(few_stand).moving.sum())  # 5 of 100 are noise
+    100
     """
     standing = int((~gaussians.moving).sum())
     if not 0 < standing < STANDING_SHARE * len(gaussians):
@@ -49,7 +54,14 @@ def settled(gaussians: Gaussians) -> Gaussians:
 
 
 def changed_pixels(before: Array, now: Array) -> Array:
-    """[H, W] 1 where the planes [3, H, W] of two frames differ, and around; else 0."""
+    """[H, W] 1 where the planes [3, H, W] of two frames differ, and around; else 0.
+
+    >>> before = np.zeros((3, 7, 7), np.float32)
+    >>> now = before.copy()
+    >>> now[0, 3, 3] = 0.5
+    >>> int(changed_pixels(before, now).sum())  # the pixel, and five by five about it
+    25
+    """
     changed = (np.abs(now - before).max(axis=0) > CHANGE).astype(np.float32)
     marked: Array = maximum_filter(changed, size=REACH_PIXELS)
     return marked
@@ -58,10 +70,11 @@ def changed_pixels(before: Array, now: Array) -> Array:
 def moving_between(
     gaussians: Gaussians, before: Sequence[TrainingView], now: Sequence[TrainingView], picture: PictureLoss
 ) -> NDArray[np.bool_]:
-    """[N] whether each Gaussian, as it stood in the frame before, is seen to move.
+    """[N] bool: Gaussians that the pictures of two frames show to move.
 
     Args:
-        gaussians: Θ_{t−1}. before, now: the views of both frames; cameras that only one has are left out.
+        gaussians: Θ_{t−1}. before, now: the views of both frames; cameras of only one are left out.
+        picture: renders.
     """
     features = np.concatenate([gaussians.colours, gaussians.foreground[:, None]], axis=1)
     earlier = {view.name: view for view in before}
@@ -88,10 +101,10 @@ def labels_learnt(
     now: Sequence[TrainingView],
     picture: PictureLoss,
 ) -> NDArray[np.bool_] | None:
-    """[N] what has been seen to move by now, or None where that is no more than before, or hardly.
+    """[N] bool: Gaussians that have been seen to move by now; None where hardly any are new.
 
     Args:
-        gaussians: Θ_{t−1}. known: [N] what had been seen to move before, or None.
+        gaussians: Θ_{t−1}. known: [N] those that had been seen to move before, or None.
         before, now: see ``moving_between``.
     """
     found = moving_between(gaussians, before, now, picture)
@@ -100,5 +113,5 @@ def labels_learnt(
 
 
 def labelled(gaussians: Gaussians, labels: NDArray[np.bool_] | None) -> Gaussians:
-    """The Gaussians with the labels [N] learnt from motion, where there are any."""
+    """The Gaussians with the labels [N] learnt from motion; unchanged where ``labels`` is None."""
     return gaussians if labels is None else gaussians.replace(foreground=labels.astype(np.float32))

@@ -28,7 +28,13 @@ def build_neighbours(means: NDArray[Any], count: int, falloff: float) -> Neighbo
     """The ``count`` nearest neighbours of each of ``means`` [M, 3] (metres); fewer where there are fewer Gaussians.
 
     Args:
-        falloff: 1/m².
+        means: [M, 3] metres. count: k. falloff: 1/m²; the weight of a neighbour at distance d is exp(−falloff d²).
+
+    >>> graph = build_neighbours(np.array([[0, 0, 0], [1, 0, 0], [3, 0, 0]]), count=1, falloff=1.0)
+    >>> graph.index[:, 0], graph.distances[:, 0]
+    (array([1, 0, 1], dtype=int32), array([1., 1., 2.], dtype=float32))
+    >>> graph.weights[:, 0].round(3)
+    array([0.368, 0.368, 0.018], dtype=float32)
     """
     points = np.asarray(means, dtype=np.float64)
     total = len(points)

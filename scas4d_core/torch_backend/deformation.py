@@ -1,4 +1,4 @@
-"""The deformation of one frame in plain torch: cluster map, its Jacobian, the cascade, what is left per Gaussian.
+"""The deformation of one frame in plain torch: cluster map, its Jacobian, cascade, deltas of single Gaussians.
 
 Equation numbers are those of the SCas4D paper: (5) transport of a Gaussian, (6) the cluster map, (7) the cascade.
 Everything is vectorized, differentiable, and of the dtype and on the device of its inputs; in float64 it is the twin
@@ -21,10 +21,10 @@ LARGEST = EXPONENT / log2(e)
 """Of an exponential's argument."""
 
 ClusterMap = Literal["centred", "published"]
-"""Which form of equation (6): scaling about the cluster's pivot, or about the world's origin as published."""
+"""Form of equation (6): scaling about the cluster's pivot, or about the world's origin as published."""
 
 Covariance = Literal["entangled", "separate"]
-"""What moves a Gaussian's covariance beside its own ΔR and Δs.
+"""The map that moves a Gaussian's covariance beside its own ΔR and Δs.
 
 "entangled", equation (5): the Jacobian of the map that moves its mean. "separate": nothing, as in the paper's ablation,
 which learns the covariance apart from the positions; a wheel's Gaussians then keep their orientation while they go
@@ -57,14 +57,14 @@ class ClusterParams(NamedTuple):
 
 
 class Layer(NamedTuple):
-    """One layer of the hierarchy: which cluster each of the M points belongs to ([M] int64), and the parameters."""
+    """One layer of the hierarchy: the cluster of each of the M points ([M] int64), and the parameters."""
 
     labels: Tensor
     params: ClusterParams
 
 
 class Deltas(NamedTuple):
-    """What each Gaussian does on its own after the cascade (Δp, ΔR, Δs of the paper); zeros are the identity.
+    """Deltas of single Gaussians after the cascade (Δp, ΔR, Δs of the paper); zeros are the identity.
 
     Attributes:
         dp: [M, 3] metres, added to the mean.
@@ -84,7 +84,7 @@ class Deltas(NamedTuple):
 
 
 class Transported(NamedTuple):
-    """Points after a map, and what the map does to their surroundings.
+    """Points after a map, with the Jacobian and rotation of the map at each.
 
     Attributes:
         points: [M, 3] metres.
@@ -117,13 +117,23 @@ def _normalized(q: Tensor) -> Tensor:
 
 
 def rotation_quaternions(r: Tensor) -> Tensor:
-    """[..., 3] rotation parameters to unit quaternions [..., 4]: (1, r)/|(1, r)|, the half-angle's tangent and axis."""
+    """[..., 3] rotation parameters to unit quaternions [..., 4]: (1, r)/|(1, r)|, the half-angle's tangent and axis.
+
+    >>> rotation_quaternions(torch.tensor([[0.0, 0, 1]]))  # tan(angle/2) = 1: a quarter turn about z
+    tensor([[0.7071, 0.0000, 0.0000, 0.7071]])
+    """
     q = torch.cat([torch.ones_like(r[..., :1]), r], dim=-1)
     return _normalized(q)
 
 
 def quaternion_matrices(q: Tensor) -> Tensor:
-    """Unit quaternions [..., 4] to rotation matrices [..., 3, 3]."""
+    """Unit quaternions [..., 4] to rotation matrices [..., 3, 3].
+
+    >>> quaternion_matrices(torch.tensor([0.0, 0, 0, 1]))  # a half turn about z
+    tensor([[-1.,  0.,  0.],
+            [ 0., -1.,  0.],
+            [ 0.,  0.,  1.]])
+    """
     w, x, y, z = q.unbind(-1)
     entries = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -134,7 +144,12 @@ def quaternion_matrices(q: Tensor) -> Tensor:
 
 
 def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product [..., 4] of quaternions: the rotation b first, then a."""
+    """Hamilton product [..., 4] of quaternions: the rotation b first, then a.
+
+    >>> about_x, about_z = torch.tensor([0.0, 1, 0, 0]), torch.tensor([0.0, 0, 0, 1])  # half turns
+    >>> quaternion_product(about_z, about_x)  # a half turn about y
+    tensor([0., 0., 1., 0.])
+    """
     aw, av = a[..., :1], a[..., 1:]
     bw, bv = b[..., :1], b[..., 1:]
     w = aw * bw - (av * bv).sum(-1, keepdim=True)
@@ -146,6 +161,9 @@ def scaling_factor(z: Tensor) -> tuple[Tensor, Tensor]:
     """The factor f of equation (6) and its derivative df/dz, any shape.
 
     f = 2σ(2z) is the paper's tanh(z) + 1 without its cancellation: in float32 the latter is exactly 0 from about −9.
+
+    >>> scaling_factor(torch.zeros(1))
+    (tensor([1.]), tensor([1.]))
     """
     f = 2 * torch.sigmoid(2 * z)
     return f, f * (2 - f)
@@ -162,6 +180,10 @@ def polar_rotation(f: Tensor, y: Tensor, c: Tensor) -> Tensor:
         f: [M] scaling factors in (0, 2).
         y: [M, 3] metres.
         c: [M, 3] per metre.
+
+    >>> one = torch.ones(1)
+    >>> polar_rotation(one, torch.tensor([[1.0, 0, 0]]), torch.tensor([[2.0, 0, 0]]))  # a stretch turns nothing
+    tensor([[1., 0., 0., 0.]])
     """
     g = (2 - f)[:, None]
     cosine = 2 + g * (c * y).sum(-1, keepdim=True)
@@ -172,7 +194,12 @@ def polar_rotation(f: Tensor, y: Tensor, c: Tensor) -> Tensor:
 
 
 def cluster_pivots(points: Tensor, labels: Tensor, count: int) -> Tensor:
-    """[count, 3] means of the clusters' points, detached: no gradient flows through a pivot. Empty clusters get 0."""
+    """[count, 3] means of the clusters' points, detached: no gradient flows through a pivot. Empty clusters get 0.
+
+    >>> cluster_pivots(torch.tensor([[0.0, 0, 0], [2, 0, 0], [5, 5, 5]]), torch.tensor([0, 0, 1]), 2)
+    tensor([[1., 0., 0.],
+            [5., 5., 5.]])
+    """
     points = points.detach()
     sums = torch.zeros(count, 3, dtype=points.dtype, device=points.device).index_add_(0, labels, points)
     sizes = torch.bincount(labels, minlength=count).clamp_min(int(EMPTY_CLUSTER))
@@ -194,7 +221,17 @@ def cluster_map(
         pivots: [K, 3] metres.
         labels: [M] int64 in 0…K−1.
         params: of the K clusters.
-        kind: which of the two forms.
+        kind: form of the map.
+
+    Raises:
+        ValueError: an unknown form.
+
+    >>> points = torch.tensor([[1.0, 0, 0], [-1, 0, 0]])
+    >>> params = ClusterParams.identity(1, torch.float32)
+    >>> params.t[0, 2] = 3  # 3 m along z
+    >>> cluster_map(points, torch.zeros(1, 3), torch.tensor([0, 0]), params).points
+    tensor([[ 1.,  0.,  3.],
+            [-1.,  0.,  3.]])
     """
     pivot, t, c = pivots[labels], params.t[labels], params.c[labels]
     q = rotation_quaternions(params.r)
@@ -230,6 +267,15 @@ def cascade(points: Tensor, layers: Sequence[Layer], kind: ClusterMap = "centred
 
     Returns:
         Points, J_K … J_2 J_1, and Q_K ∘ … ∘ Q_1.
+
+    >>> points = torch.tensor([[1.0, 0, 0], [-1, 0, 0]])
+    >>> coarse, fine = ClusterParams.identity(1, torch.float32), ClusterParams.identity(2, torch.float32)
+    >>> coarse.t[0, 2] = 3
+    >>> fine.t[1, 2] = -1
+    >>> moved = cascade(points, [Layer(torch.tensor([0, 0]), coarse), Layer(torch.tensor([0, 1]), fine)])
+    >>> moved.points
+    tensor([[ 1.,  0.,  3.],
+            [-1.,  0.,  2.]])
     """
     jacobians = torch.eye(3, dtype=points.dtype, device=points.device).expand(len(points), 3, 3)
     rotations = torch.zeros(len(points), 4, dtype=points.dtype, device=points.device)
@@ -260,7 +306,17 @@ def deform(
         factors: [M, 3, 3] of the previous frame.
         layers: coarse to fine.
         deltas: per Gaussian.
-        kind: form of the cluster map. covariance: what moves the factors.
+        kind: form of the cluster map. covariance: "separate" leaves J out of the factors.
+
+    Raises:
+        ValueError: an unknown form.
+
+    >>> means, factors = torch.zeros(1, 3), 0.1 * torch.eye(3)[None]
+    >>> deltas = Deltas.identity(1, torch.float32)
+    >>> deltas.dp[0, 0] = 0.5
+    >>> deformed = deform(means, factors, [], deltas)
+    >>> deformed.means, deformed.turns
+    (tensor([[0.5000, 0.0000, 0.0000]]), tensor([[1., 0., 0., 0.]]))
     """
     points, jacobians, rotations = cascade(means, layers, kind)
     if covariance not in ("entangled", "separate"):
@@ -276,6 +332,11 @@ def deform(
 
 
 def material_rotations(turns: Tensor, previous: Tensor) -> Tensor:
-    """[M, 4] unit quaternions since frame 0: this frame's turns after the previous material rotations."""
+    """[M, 4] unit quaternions since frame 0: this frame's turns after the previous material rotations.
+
+    >>> quarter = torch.tensor([[0.5, 0, 0, 0.5]]) * 2**0.5
+    >>> material_rotations(quarter, previous=quarter)
+    tensor([[0., 0., 0., 1.]])
+    """
     q = quaternion_product(turns, previous)
     return _normalized(q)

@@ -1,4 +1,4 @@
-"""Whether the device that the settings name can be had."""
+"""Checks that the device of the settings is available."""
 
 from __future__ import annotations
 
@@ -6,17 +6,22 @@ import importlib.util
 
 
 class DeviceError(RuntimeError):
-    """A device that is not there; the message says what to do."""
+    """A device that is not available; the message names the remedy."""
 
 
 def require_device(device: str) -> None:
-    """Return where the update can run on ``device``.
+    """Raises unless an update can run on ``device``.
 
     Args:
         device: "cpu" or "cuda".
 
     Raises:
         DeviceError: "cuda" without torch, gsplat, a torch built for CUDA, a GPU, or the compiler that gsplat needs.
+
+    >>> require_device("cpu")
+    >>> require_device("cuda")  # doctest: +SKIP
+    Traceback (most recent call last):
+    scas4d_core.torch_backend.device.DeviceError: device 'cuda': ...; or choose device 'cpu'
     """
     if device == "cpu":
         return

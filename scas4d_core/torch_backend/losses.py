@@ -1,4 +1,4 @@
-"""The losses of an update in plain torch; the twins of the fused CPU kernels, and the CUDA path.
+"""Losses of an update in plain torch: the twins of the fused CPU kernels, and the CUDA path.
 
 Weights and forms follow the SCas4D paper (equation (8): scale loss) and Dynamic3DGaussians, whose local rigidity,
 isometry and rotation terms it takes over. Every function returns a scalar of its inputs' dtype, unweighted.
@@ -41,7 +41,13 @@ def _blurred(pictures: Tensor) -> Tensor:
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """SSIM of every pixel and channel, [H, W, C], of two pictures [H, W, C] in 0…1; zero padding at the border."""
+    """SSIM of every pixel and channel, [H, W, C], of two pictures [H, W, C] in 0…1; zero padding at the border.
+
+    >>> picture = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    >>> similarity = ssim_map(picture, picture)
+    >>> similarity.shape, bool(torch.allclose(similarity, torch.ones_like(similarity)))
+    (torch.Size([16, 16, 3]), True)
+    """
     channels = image.shape[-1]
     x, y = (picture.permute(2, 0, 1)[:, None] for picture in (image, target))
     blurred = _blurred(torch.cat([x, y, x * x, y * y, x * y]))
@@ -59,13 +65,22 @@ def image_loss(image: Tensor, target: Tensor) -> Tensor:
     Args:
         image: [H, W, C] rendered; a mask is a picture of one channel.
         target: [H, W, C] observed, 0…1.
+
+    >>> picture = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    >>> abs(float(image_loss(picture, picture))) < 1e-12
+    True
     """
     l1 = (image - target).abs().mean()
     return (1 - SSIM_SHARE) * l1 + SSIM_SHARE * (1 - ssim_map(image, target).mean())
 
 
 def psnr(image: Tensor, target: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio, dB, of two pictures [H, W, C] in 0…1."""
+    """Peak signal-to-noise ratio, dB, of two pictures [H, W, C] in 0…1.
+
+    >>> truth = torch.zeros(8, 8, 3, dtype=torch.float64)
+    >>> round(float(psnr(truth + 0.1, truth)), 6)
+    20.0
+    """
     squares = ((image - target) ** 2).sum().clamp_min(SMALLEST_SQUARE)
     return 10 * torch.log10(image.numel() / squares)
 
@@ -89,6 +104,14 @@ def rigidity_loss(
         neighbours: [M, k] int64 rows.
         weights: [M, k].
         rows: [m] int64, the i to sum over; None for all.
+
+    >>> previous = torch.tensor([[0.0, 0, 0], [1, 0, 0]])
+    >>> still = torch.tensor([[1.0, 0, 0, 0]] * 2)
+    >>> neighbours, weights = torch.tensor([[1], [0]]), torch.ones(2, 1)
+    >>> rigidity_loss(previous + 5, still, previous, neighbours, weights)  # both moved alike
+    tensor(1.0000e-10)
+    >>> rigidity_loss(2 * previous, still, previous, neighbours, weights)  # apart by 1 m
+    tensor(1.)
     """
     i, j, w = _pairs(neighbours, weights, rows)
     now = means[j] - means[i][:, None]
@@ -108,6 +131,11 @@ def isometry_loss(
         neighbours: [M, k] int64 rows.
         weights: [M, k].
         rows: [m] int64, the i to sum over; None for all.
+
+    >>> neighbours, weights = torch.tensor([[1], [0]]), torch.ones(2, 1)
+    >>> means = torch.tensor([[0.0, 0, 0], [0, 1.5, 0]])
+    >>> isometry_loss(means, torch.ones(2, 1), neighbours, weights)  # 1 m apart at the start, 1.5 m now
+    tensor(0.5000)
     """
     i, j, w = _pairs(neighbours, weights, rows)
     d0 = distances if rows is None else distances[rows]
@@ -123,6 +151,10 @@ def rotation_loss(turns: Tensor, neighbours: Tensor, weights: Tensor, rows: Tens
         neighbours: [M, k] int64 rows.
         weights: [M, k].
         rows: [m] int64, the i to sum over; None for all.
+
+    >>> turns = torch.tensor([[1.0, 0, 0, 0], [0.6, 0.8, 0, 0]])
+    >>> rotation_loss(turns, torch.tensor([[1], [0]]), torch.ones(2, 1))
+    tensor(0.8944)
     """
     i, j, w = _pairs(neighbours, weights, rows)
     return torch.sqrt(w * ((turns[j] - turns[i][:, None]) ** 2).sum(-1) + ROOT_FLOOR).mean()
@@ -143,15 +175,27 @@ def scale_loss(factors: Tensor, first_lengths: Tensor, max_scale: float) -> Tens
         factors: [M, 3, 3] of this frame.
         first_lengths: [M, 3] metres, ``axis_lengths`` at frame 0.
         max_scale: metres.
+
+    >>> factors = 0.5 * torch.eye(3)[None]
+    >>> scale_loss(factors, first_lengths=torch.full((1, 3), 0.1), max_scale=0.02)
+    tensor(0.4000)
     """
     return (axis_lengths(factors) - first_lengths.clamp_min(max_scale)).clamp_min(0).mean()
 
 
 def floor_loss(means: Tensor, plane: Sequence[float]) -> Tensor:
-    """Mean metres of ``means`` [M, 3] below the plane (a, b, c, d): where a·x + b·y + c·z + d is positive."""
+    """Mean metres of ``means`` [M, 3] below the plane (a, b, c, d): where a·x + b·y + c·z + d is positive.
+
+    >>> floor_loss(torch.tensor([[0.0, 1.5, 0], [0, 0, 0]]), plane=(0, 1, 0, -1))  # y points down, the floor is at 1
+    tensor(0.2500)
+    """
     return (means @ means.new_tensor(plane[:3]) + plane[3]).clamp(min=0).mean()
 
 
 def soft_colour_loss(colours: Tensor, previous: Tensor) -> Tensor:
-    """Mean |colour − colour of the previous frame| over Gaussians and channels; both [N, 3]."""
+    """Mean |colour − colour of the previous frame| over Gaussians and channels; both [N, 3].
+
+    >>> soft_colour_loss(torch.full((4, 3), 0.5), torch.full((4, 3), 0.25))
+    tensor(0.2500)
+    """
     return (colours - previous).abs().mean()

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
-from scas4d_core.storage.error_text import told
+from scas4d_core.error_text import message_of
 from server.problems import Problem
 from server.processes.engine import load_engine
 from server.processes.messages import Stop
@@ -41,7 +41,7 @@ def main(engine: str, connection: Connection[Any, Any]) -> None:
         connection.send(WarmedUp())
     except Exception as error:
         log.exception("the kernels could not be warmed up")
-        connection.send(WarmedUp(f"{type(error).__name__}: {told(error)}"))
+        connection.send(WarmedUp(f"{type(error).__name__}: {message_of(error)}"))
     with contextlib.suppress(EOFError, OSError):
         connection.recv()  # until told to end, or until the service is gone: what was sent is read by then
     os._exit(0)

@@ -17,7 +17,7 @@ from scas4d_core.storage.history import History
 if TYPE_CHECKING:
     from scas4d_core.query.committed import View
     from scas4d_core.query.tracks import Tracks
-    from scas4d_core.reconstruction import FrameReport, Progress, Resumed
+    from scas4d_core.reconstruction import FrameReport, Progress, ResumePoint
     from scas4d_core.replay import Decode, Replayed
 
 
@@ -25,7 +25,7 @@ class Reconstruction(Protocol):
     """What the worker process owns: see `scas4d_core.reconstruction.Reconstruction`."""
 
     history: History
-    resumed: Resumed | None
+    resumed: ResumePoint | None
 
     def step(
         self,
@@ -215,15 +215,15 @@ class CoreEngine:
         return remake(rig, settings, history, base, frame, budget, dropped=dropped, notes=notes)
 
     def reader(self, rig: Rig, settings: Any, history: History) -> Reader:
-        """`Committed`, on one thread: the others belong to the update."""
+        """`CommittedScene`, on one thread: the others belong to the update."""
         from scas4d_core.cameras import rig_inside
-        from scas4d_core.query.committed import Committed
+        from scas4d_core.query.committed import CommittedScene
         from scas4d_core.rasterize.limits import scene_limits
 
         _one_thread()
         world = rig.world_frame(settings.scene.metres_per_unit)
         limits = scene_limits(settings.scene.near, rig_inside(world, rig.cameras).radius)
-        return Committed(history, world, limits)
+        return CommittedScene(history, world, limits)
 
 
 def _one_thread() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.wire import parts_model
-from scas4d_core.storage.error_text import told
+from scas4d_core.error_text import message_of
 from scas4d_core.storage.frame_files import frame_file
 from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFrameError
 from server.processes import encode, track_answers
@@ -139,17 +139,17 @@ class Renderer:
                 log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
                 if more and isinstance(ask.query, PartsQuery | LabelsQuery):  # found from all others
                     continue
-                return Refused(ask.number, f"{told(error)}; it is mended if it can be", status=503)
+                return Refused(ask.number, f"{message_of(error)}; it is mended if it can be", status=503)
             except UnreadableFrameError as error:  # deleted since the door looked
                 log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
                 self._note_missing(ask.query)
-                return Refused(ask.number, told(error), status=404)
+                return Refused(ask.number, message_of(error), status=404)
             except ValueError as error:
                 log.warning("scene %s refused %s: %s", self.spec.folder.name, asked, error)
-                return Refused(ask.number, told(error))
+                return Refused(ask.number, message_of(error))
             except Exception as error:
                 log.exception("scene %s, %s", self.spec.folder.name, asked)
-                return Refused(ask.number, f"{type(error).__name__}: {told(error)}", status=500)
+                return Refused(ask.number, f"{type(error).__name__}: {message_of(error)}", status=500)
         raise AssertionError("the last turn returns")
 
     def _answer(self, number: int, query: Query) -> Answer:

@@ -10,7 +10,7 @@ from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
-from scas4d_core.storage.error_text import told
+from scas4d_core.error_text import message_of
 from scas4d_core.storage.history import History
 from server.processes.decoding import decode, read
 from server.processes.engine import load_engine
@@ -35,7 +35,7 @@ def main(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
         _replay(spec, connection)
     except Exception as error:  # whatever the engine raises, the service goes on and says so
         log.exception("scene %s: the replay failed", spec.scene.folder.name)
-        fault = f"{type(error).__name__}: {told(error)}"
+        fault = f"{type(error).__name__}: {message_of(error)}"
     with contextlib.suppress(EOFError, OSError):  # the service is gone
         connection.send(ReplayEnded(fault))
         logging.shutdown()

@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 
 from client.wire import FrameState
-from scas4d_core.storage.error_text import told
+from scas4d_core.error_text import message_of
 from scas4d_core.storage.frame_files import (
     FIRST_COPY,
     FIXED_COPY,
@@ -104,7 +104,7 @@ class Scrub:
                 rate = self._bytes_per_second * (AT_WORK if self._scene.at_work() else 1.0)
                 await asyncio.sleep(weight * size / rate)
         except (OSError, ValueError) as error:
-            return "gone" if isinstance(error, FileNotFoundError) else told(error)
+            return "gone" if isinstance(error, FileNotFoundError) else message_of(error)
         return None
 
     async def _definition(self) -> None:

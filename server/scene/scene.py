@@ -12,7 +12,7 @@ from typing import Any
 
 from client.wire import FrameReportModel, FrameState, ProgressModel, SceneState, SceneStatus
 from scas4d_core.cameras import Camera
-from scas4d_core.storage.error_text import told
+from scas4d_core.error_text import message_of
 from server.health import metrics
 from server.ingest.acknowledge import Ingest
 from server.processes import worker
@@ -336,7 +336,7 @@ class Scene:
             except OSError as error:
                 if not no_room(error):
                     raise
-                self.trouble = f"the journal waits for room on the disk: {told(error)}"
+                self.trouble = f"the journal waits for room on the disk: {message_of(error)}"
                 self._tell(SceneChanged())
                 await asyncio.sleep(AGAIN_S)
 
@@ -421,7 +421,7 @@ class Scene:
         self._background.run(coroutine)
 
     def _failed(self, error: BaseException) -> None:
-        self.ledger.fatal = f"the service failed: {type(error).__name__}: {told(error)}"
+        self.ledger.fatal = f"the service failed: {type(error).__name__}: {message_of(error)}"
         log.error("scene %s", self.id, exc_info=error)
         self._tell(SceneChanged())
 

@@ -10,8 +10,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from client.wire import SceneCreate
+from scas4d_core.error_text import message_of
 from scas4d_core.settings import Settings
-from scas4d_core.storage.error_text import told
 from scas4d_core.storage.npz import read_npz, sync_folder
 from server.problems import Problem, counted
 from server.processes.placement import Placement
@@ -103,7 +103,7 @@ class Scenes:
             try:
                 await self._restore(self._folder / name)
             except Exception as error:  # a fault of one scene is none of the others
-                self.unreadable[name] = f"the service failed: {type(error).__name__}: {told(error)}"
+                self.unreadable[name] = f"the service failed: {type(error).__name__}: {message_of(error)}"
                 log.exception("scene %s cannot be taken up", name)
         for path in graves:
             await asyncio.to_thread(shutil.rmtree, path, ignore_errors=True)
@@ -139,7 +139,7 @@ class Scenes:
             scene = Scene(definition, folder, found, self.server, self.placement, self.hub)
             scene.points_sha256 = await asyncio.to_thread(points_sha256, scene.spec.points)
         except (DefinitionError, OSError) as error:
-            self.unreadable[folder.name] = told(error)
+            self.unreadable[folder.name] = message_of(error)
             log.error("folder %s holds no scene that can be read; it is left as it is: %s", folder, error)
             return
         for said in found.damage:

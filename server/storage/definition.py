@@ -11,8 +11,8 @@ from typing import Any
 from blake3 import blake3
 
 from client.wire import SceneCreate
+from scas4d_core.error_text import message_of
 from scas4d_core.settings import Settings
-from scas4d_core.storage.error_text import told
 from scas4d_core.storage.npz import written_whole
 from server.storage.events import Created, Fact
 from server.storage.journal import replay
@@ -62,7 +62,7 @@ class Definition:
                 Settings.model_validate(data["settings"]),
             )
         except (KeyError, TypeError, ValueError) as error:  # pydantic's error is a ValueError
-            raise DefinitionError(f"the definition cannot be read: {told(error)}") from None
+            raise DefinitionError(f"the definition cannot be read: {message_of(error)}") from None
 
 
 def write_definition(folder: Path, definition: Definition) -> None:
@@ -104,7 +104,7 @@ def _checked(folder: Path) -> tuple[Definition | None, str | None]:
     except FileNotFoundError:
         return None, f"{SCENE_FILE} is gone"
     except (OSError, KeyError, TypeError, ValueError) as error:
-        return None, f"{SCENE_FILE} is damaged ({told(error)})"
+        return None, f"{SCENE_FILE} is damaged ({message_of(error)})"
 
 
 def is_nothing(folder: Path) -> bool:

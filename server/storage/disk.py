@@ -7,7 +7,7 @@ import fcntl
 import os
 from pathlib import Path
 
-from scas4d_core.storage.error_text import told
+from scas4d_core.error_text import message_of
 from server.problems import Problem
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
@@ -27,7 +27,7 @@ def full_disk(error: Exception) -> Problem:
     """The answer where there is no room."""
     return Problem(
         507,
-        f"the disk has no room: {told(error)}",
+        f"the disk has no room: {message_of(error)}",
         remedy="free room in the service's data folder, or shorten the scene's retention, and send the same again",
         headers={"Retry-After": "5"},
     )

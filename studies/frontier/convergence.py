@@ -130,12 +130,12 @@ def _watched(capture: Capture, variant: Variant, out: Path, updates: int) -> lis
 
 def _psnr(reconstruction: Any, capture: Capture, state: Gaussians, true: Any) -> float:
     """Mean over the test cameras, of a state that need not be committed."""
-    from scas4d_core.query.committed import Committed
+    from scas4d_core.query.committed import CommittedScene
     from scas4d_core.storage.history import History
 
     held = History()
     held.append(0, 0.0, state, {})
-    shown = Committed(held, reconstruction.world, reconstruction._limits)
+    shown = CommittedScene(held, reconstruction.world, reconstruction._limits)
     assert capture.test_rig is not None
     cameras = capture.test_rig.cameras
     return float(np.mean([metrics.psnr(shown.render(camera).colour, true[camera.name]) for camera in cameras]))

@@ -24,7 +24,7 @@ from scas4d_core.captures.frame import Frame
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import psnr
-from scas4d_core.query.committed import Committed
+from scas4d_core.query.committed import CommittedScene
 from scas4d_core.storage.history import History
 from studies.hard_frames.footage import Filmed, MadeUp
 from studies.hard_frames.frames import FrameCase, Pictures, Sent, Step, good, named, teleported, violations
@@ -138,7 +138,7 @@ def study(
 class Pushed:
     """A scene of the service, read from its folder."""
 
-    committed: Committed
+    committed: CommittedScene
     count: int
 
     def state(self, index: int) -> Gaussians:
@@ -198,7 +198,7 @@ def _push(service: Service, footage: MadeUp | Filmed, sent: Sequence[Sent], told
     told(f"scene {scene}: {status.next_frame} frames, {len(faults)} faults")
     history = History.load(service.data / "scenes" / scene / "states")
     return Pushed(
-        Committed(history, footage.rig.world_frame(footage.settings.scene.metres_per_unit)), len(sent)
+        CommittedScene(history, footage.rig.world_frame(footage.settings.scene.metres_per_unit)), len(sent)
     ), faults
 
 

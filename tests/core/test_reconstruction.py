@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from scas4d_core.query.ply import read_ply
 from scas4d_core.reconstruction import FrameReport, Progress, Reconstruction, StepError
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings, Weights
 from scas4d_core.storage.history import History
+from studies.constants import varied
 
 BOX = make_box()
 TURN = Rotation.from_rotvec([0, 0.05, 0])
@@ -28,9 +29,17 @@ METRES = 0.25
 WORLD = WorldFrame(np.array([4.0, -7.0, 11.0]), METRES)
 SETTINGS = Settings(
     scene=SceneSettings(metres_per_unit=METRES),
-    static=StaticSettings(iterations=300, max_gaussians=600, rate_colour=1e-2, rate_position=8e-4),
+    static=StaticSettings(iterations=300, max_gaussians=600),
     update=UpdateSettings(iterations=40, clusters=(2, 12, 48), neighbour_falloff=200.0, rate_end=0.1),
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_iterations_do() -> Iterator[None]:
+    """Frame 0 at higher rates."""
+    static_scene = "scas4d_core.first_frame.static_scene"
+    with varied(f"{static_scene}.RATE_COLOUR", 1e-2), varied(f"{static_scene}.RATE_POSITION", 8e-4):
+        yield
 
 
 def user_rig(world: WorldFrame = WORLD) -> Rig:

@@ -16,15 +16,17 @@ from pathlib import Path
 import numpy as np
 
 from scas4d_core.captures import open_capture
+from scas4d_core.first_frame import static_scene
 from scas4d_core.kernels.jit import threads
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings, StaticSettings, UpdateSettings
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "robot"
 SETTINGS = Settings(
-    static=StaticSettings(iterations=40, densify_from=10, densify_every=10, max_gaussians=2500),
+    static=StaticSettings(iterations=40, max_gaussians=2500),
     update=UpdateSettings(iterations=8),
 )
+static_scene.DENSIFY_FROM = static_scene.DENSIFY_EVERY = 10  # densified, as short as it is
 
 
 def digest(arrays: Iterable[np.ndarray]) -> str:

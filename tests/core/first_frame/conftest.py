@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scas4d_core.cameras import Camera, Rig
-from scas4d_core.first_frame.posed_pictures import View
+from scas4d_core.first_frame.posed_pictures import PosedPicture
 
 RADIUS = 0.45
 HALF = np.array([0.5, 0.35, 0.4])
@@ -84,7 +84,7 @@ def points_on_box(count: int) -> np.ndarray:
     return points * HALF
 
 
-def ball_views(count: int = 24) -> list[View]:
+def ball_views(count: int = 24) -> list[PosedPicture]:
     """Silhouettes of a ball about the origin, exact at the pixel centres."""
     views = []
     for camera in ring(count).cameras:
@@ -92,7 +92,7 @@ def ball_views(count: int = 24) -> list[View]:
         rays = camera.unproject(uv, np.ones((128, 128))) - camera.centre
         along = -(rays @ camera.centre) / (rays**2).sum(-1)
         nearest = np.linalg.norm(camera.centre + rays * along[..., None], axis=-1)
-        views.append(View(camera, np.zeros((128, 128, 3), np.uint8), nearest <= RADIUS))
+        views.append(PosedPicture(camera, np.zeros((128, 128, 3), np.uint8), nearest <= RADIUS))
     return views
 
 

@@ -8,13 +8,12 @@ from scas4d_core.cameras import Camera, Rig
 from scas4d_core.first_frame.initial_points import initial_points
 from scas4d_core.first_frame.posed_pictures import (
     InitialPointsError,
-    View,
+    PosedPicture,
     collect_views,
     look_at_point,
     observe,
     visible_from,
 )
-from scas4d_core.first_frame.settings import InitialPointsSettings
 from scas4d_core.first_frame.stereo import DepthMap, fused_points, halved, looked_through
 from scas4d_core.first_frame.triangulation import fundamental_matrix, triangulate
 
@@ -55,22 +54,21 @@ def test_without_masks_nobody_said_what_is_foreground(cloud):
 
 def test_masks_label_the_points(box):
     rig, images, masks = box
-    labelled = initial_points(rig, images, masks, InitialPointsSettings(stereo_iterations=2))
+    labelled = initial_points(rig, images, masks, stereo_iterations=2)
     assert labelled.foreground is not None
     assert (labelled.foreground > 0.5).mean() > 0.95
 
 
 def test_same_seed_same_points(box):
     rig, images, _ = box
-    settings = InitialPointsSettings(stereo_iterations=1, seed=4)
-    one, two = (initial_points(rig, images, {}, settings) for _ in range(2))
+    one, two = (initial_points(rig, images, {}, stereo_iterations=1, seed=4) for _ in range(2))
     assert np.array_equal(one.positions, two.positions)
     assert np.array_equal(one.colours, two.colours)
 
 
 def test_budget_of_points_is_kept(box):
     rig, images, _ = box
-    few = initial_points(rig, images, {}, InitialPointsSettings(stereo=False, max_points=300))
+    few = initial_points(rig, images, {}, stereo=False, max_points=300)
     assert 100 < len(few) <= 300
 
 
@@ -100,7 +98,7 @@ def _flat_maps(depths: list[float]) -> list[DepthMap]:
         pose = np.eye(4)
         pose[0, 3] = -0.2 * i
         camera = Camera(f"c{i}", np.array([[60.0, 0, 20], [0, 60.0, 20], [0, 0, 1]]), pose, 40, 40)
-        view = View(camera, np.zeros((40, 40, 3), np.uint8))
+        view = PosedPicture(camera, np.zeros((40, 40, 3), np.uint8))
         others = agree if abs(depth - 3) < 0.01 else 0
         maps.append(DepthMap(view, np.full((40, 40), depth), np.full((40, 40), others)))
     return maps
@@ -123,7 +121,7 @@ def test_what_cameras_look_through_is_found():
 
 def test_halved_pictures_keep_their_geometry(scene):
     camera = scene.ring(2, size=65).cameras[0]
-    view = halved(View(camera, np.zeros((65, 65, 3), np.uint8), np.ones((65, 65), bool)), 40)
+    view = halved(PosedPicture(camera, np.zeros((65, 65, 3), np.uint8), np.ones((65, 65), bool)), 40)
     assert (view.camera.width, view.image.shape) == (32, (32, 32, 3))
     point = np.array([0.1, -0.2, 0.05])
     assert view.camera.project(point)[0] == pytest.approx(camera.project(point)[0] / 2)
@@ -131,7 +129,7 @@ def test_halved_pictures_keep_their_geometry(scene):
 
 def test_hidden_points_are_not_seen_and_colours_are_medians(scene):
     rig = scene.ring(6)
-    views = [View(c, np.full((128, 128, 3), 40 * i, np.uint8)) for i, c in enumerate(rig.cameras)]
+    views = [PosedPicture(c, np.full((128, 128, 3), 40 * i, np.uint8)) for i, c in enumerate(rig.cameras)]
     points = scene.points_on_box(20_000)
     visible = visible_from(views, points, 0.02)
     for row, camera in zip(visible, rig.cameras, strict=True):
@@ -155,7 +153,7 @@ def test_look_at_point_is_where_the_axes_meet(scene):
     offset = np.array([10.0, -3.0, 4.0])
     rig = scene.ring(6, offset=offset)
     centred = [
-        View(Camera(c.name, np.array([[190.0, 0, 64], [0, 190.0, 64], [0, 0, 1]]), c.world_to_camera, 128, 128),
+        PosedPicture(Camera(c.name, np.array([[190.0, 0, 64], [0, 190.0, 64], [0, 0, 1]]), c.world_to_camera, 128, 128),
              np.zeros((128, 128, 3), np.uint8))
         for c in rig.cameras
     ]  # fmt: skip
@@ -167,7 +165,7 @@ def test_pictures_that_show_nothing_in_common_are_an_error(box):
     rng = np.random.default_rng(0)
     noise = {c.name: rng.integers(0, 255, (128, 128, 3)).astype(np.uint8) for c in rig.cameras[:4]}
     with pytest.raises(InitialPointsError, match="calibration"):
-        initial_points(rig, noise, {}, InitialPointsSettings(stereo_iterations=1))
+        initial_points(rig, noise, {}, stereo_iterations=1)
 
 
 def test_wrong_size_and_too_few_pictures_are_named(box):

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 from box_scene import held_out_camera, make_box, make_rig, photograph, take_frame
 
 from scas4d_core.captures.frame import Frame
+from scas4d_core.first_frame import static_scene
+from scas4d_core.first_frame.initial_gaussians import initial_parameters, logit
 from scas4d_core.first_frame.static_scene import (
     EXPOSURE_SPREAD,
     STOP_ROUNDS,
     StaticResult,
     StaticTrainer,
     fit_static_scene,
-    initial_parameters,
-    logit,
 )
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.settings import SceneSettings, StaticSettings
@@ -22,10 +24,21 @@ from scas4d_core.update.views import ViewFactory
 
 RIG = make_rig()
 BOX = make_box()
-SETTINGS = StaticSettings(
-    iterations=1000, max_gaussians=900, densify_from=50, densify_every=50, rate_colour=1e-2, rate_position=8e-4,
-    exposure=False,
-)  # fmt: skip
+SETTINGS = StaticSettings(iterations=1000, max_gaussians=900, exposure=False)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_iterations_do() -> Iterator[None]:
+    """Densified early and often, at higher rates."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (
+            ("DENSIFY_FROM", 50),
+            ("DENSIFY_EVERY", 50),
+            ("RATE_COLOUR", 1e-2),
+            ("RATE_POSITION", 8e-4),
+        ):
+            patch.setattr(static_scene, name, value)
+        yield
 
 
 def cloud() -> tuple[np.ndarray, np.ndarray]:
@@ -116,21 +129,22 @@ def test_faint_gaussians_are_removed_but_never_all() -> None:
     trainer._allocate()
     trainer.step(views[0], 0)
     count = len(trainer.parameters)
-    trainer.parameters[5:25, 10] = logit(np.array(0.5 * SETTINGS.prune_opacity))
+    trainer.parameters[5:25, 10] = logit(np.array(0.5 * static_scene.PRUNE_OPACITY))
     trainer.control_density(0)  # no room: nothing is added
     assert len(trainer.parameters) == count - 20
-    assert trainer.gaussians().opacities.min() >= SETTINGS.prune_opacity
+    assert trainer.gaussians().opacities.min() >= static_scene.PRUNE_OPACITY
     trainer.parameters[:, 10] = -9
     trainer.control_density(0)
     assert len(trainer.parameters) > 0
 
 
-def test_exposures_of_the_cameras_are_recovered() -> None:
+def test_exposures_of_the_cameras_are_recovered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(static_scene, "RATE_EXPOSURE", 5e-3)
     frame = take_frame(0, 0.0, BOX, RIG)
     gains = dict(zip(RIG.names, (1.2, 0.85, 1.0, 1.1, 0.9, 0.95), strict=True))
     dimmed = {name: image * (0.75 * gains[name]) for name, image in frame.images.items()}
     images = {name: image.round().astype(np.uint8) for name, image in dimmed.items()}
-    settings = SETTINGS.model_copy(update={"exposure": True, "rate_exposure": 5e-3})
+    settings = SETTINGS.model_copy(update={"exposure": True})
     result = fit(settings, Frame(0, 0.0, images, frame.masks))
     assert set(result.exposures) == set(RIG.names)
     found = np.array([result.exposures[name][:, 0].mean() for name in RIG.names])
@@ -148,7 +162,7 @@ def test_exposures_are_given_up_where_the_cameras_are_alike(spread: float, kept:
     trainer = StaticTrainer(ViewFactory(RIG), views, parameters, SceneSettings(), settings)
     for view, side in zip(views, (-1, 1, -1, 1, -1, 1), strict=True):
         view.exposure[:3] = (1 + side * spread, 0.02 * side)
-    trainer._judge_exposure()
+    trainer._assess_exposure()
     assert trainer.exposing == kept
     assert all((view.exposure == (1, 0)).all() for view in views) != kept
 
@@ -186,9 +200,10 @@ def test_progress_counts_every_iteration() -> None:
     assert seen == list(enumerate(result.losses, start=1))
 
 
-def test_frame_0_ends_early_once_nothing_is_gained() -> None:
+def test_frame_0_ends_early_once_nothing_is_gained(monkeypatch: pytest.MonkeyPatch) -> None:
     """The verdict comes after densification, at the end of some rounds, and one more round follows it."""
-    settings = SETTINGS.model_copy(update={"iterations": 120, "densify_until": 0.3, "exposure": False})
+    monkeypatch.setattr(static_scene, "DENSIFY_UNTIL", 0.3)
+    settings = SETTINGS.model_copy(update={"iterations": 120})
     whole = fit(settings)
     assert len(whole.losses) == 120
     never = fit(settings.model_copy(update={"stop_gain": 0.0}))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from numpy._core import _multiarray_umath as numpy_core
 
-PROGRAM = Path(__file__).parent / "committed_bits.py"
+PROGRAM = Path(__file__).parents[2] / "helpers" / "committed_bits.py"
 LIBRARIES = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 

@@ -10,7 +10,7 @@ from box_scene import SIZE, held_out_camera, make_box, moved, photograph
 
 from scas4d_core.cameras import Camera, WorldFrame, rig_inside
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.query.committed import Committed
+from scas4d_core.query.committed import CommittedScene
 from scas4d_core.query.ply import read_ply
 from scas4d_core.storage.history import History, HistoryError
 
@@ -46,11 +46,11 @@ def plane(normal: np.ndarray, through: np.ndarray, half: float = 0.5, count: int
     )
 
 
-def committed(*states: Gaussians) -> Committed:
+def committed(*states: Gaussians) -> CommittedScene:
     history = History()
     for index, state in enumerate(states):
         history.append(index, index / 30, state)
-    return Committed(history, WORLD)
+    return CommittedScene(history, WORLD)
 
 
 @pytest.mark.parametrize(("normal", "bias"), [([0.0, 0, -1], 1e-4), ([0.3, 0.1, -1], 0.008), ([-0.5, 0.4, -1], 0.016)])

@@ -4,7 +4,8 @@ from scipy.spatial.transform import Rotation
 from sklearn.metrics import adjusted_rand_score
 
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.query.parts import STANDING, PartsSettings, match_labels, part_features, parts
+from scas4d_core.query import parts as module
+from scas4d_core.query.parts import STANDING, match_labels, part_features, parts
 from scas4d_core.storage.history import History
 
 
@@ -59,31 +60,42 @@ def test_standing_gaussians_belong_to_no_part():
     assert np.array_equal(labels[: len(which)], which)
 
 
-def test_count_is_found_and_a_sample_labels_everyone():
+@pytest.fixture
+def quick(monkeypatch):
+    """Fewer starts of K-means, and fewer counts tried."""
+    monkeypatch.setattr(module, "RESTARTS", 3)
+    monkeypatch.setattr(module, "MOST_PARTS", 6)
+
+
+@pytest.mark.usefixtures("quick")
+def test_count_is_found_and_a_sample_labels_everyone(monkeypatch):
     history, which = bodies()
-    labels = parts(history, None, PartsSettings(sample=200, restarts=3, most_parts=6))
+    monkeypatch.setattr(module, "SAMPLE", 200)
+    labels = parts(history)
     assert len(labels) == len(which)
     assert labels.max() + 1 == 3
     assert adjusted_rand_score(which, labels) > 0.99
 
 
-def test_long_histories_are_thinned_evenly():
+def test_long_histories_are_thinned_evenly(monkeypatch):
     history, which = bodies(frames=40)
+    monkeypatch.setattr(module, "MOST_FRAMES", 5)
     asked: list[list[int]] = []
     stacked = history.stacked
     history.stacked = lambda name, indices=None, rows=None: (asked.append(list(indices)), stacked(name, indices, rows))[
         1
     ]
-    assert np.array_equal(parts(history, 3, PartsSettings(frames=5)), which)
+    assert np.array_equal(parts(history, 3), which)
     assert asked == [[0, 10, 20, 29, 39]] * 2
 
 
-def test_features_have_the_papers_distances():
+def test_features_have_the_papers_distances(monkeypatch):
     rng = np.random.default_rng(1)
     positions = rng.normal(size=(6, 2, 3))
     rotations = np.roll(Rotation.random(12, random_state=1).as_quat().reshape(6, 2, 4), 1, axis=-1)
-    settings = PartsSettings(lambda_position=0.7, lambda_rotation=0.4, lambda_initial=1.3)
-    features = part_features(positions, rotations, 2.0, settings)
+    for name, value in (("POSITION", 0.7), ("ROTATION", 0.4), ("INITIAL", 1.3)):
+        monkeypatch.setattr(module, f"LAMBDA_{name}", value)
+    features = part_features(positions, rotations, 2.0)
     matrices = Rotation.from_quat(np.roll(rotations, -1, axis=-1).reshape(-1, 4)).as_matrix().reshape(6, 2, 9)
     paper = np.concatenate(
         [0.7 * positions / 2, 0.4 * matrices, np.repeat(1.3 * positions[:1] / 2, 6, axis=0)], axis=-1
@@ -122,16 +134,17 @@ def test_without_the_parts_before_labels_would_not_be_stable():
     assert np.mean(match_labels(swapped, labels, np.ones(998)) == labels) > 0.97
 
 
-def test_another_count_is_taken_only_where_it_is_clearly_better():
+@pytest.mark.usefixtures("quick")
+def test_another_count_is_taken_only_where_it_is_clearly_better(monkeypatch):
     history, which = bodies()
-    settings = PartsSettings(restarts=3, most_parts=6)
     four = np.where((which == 0) & (np.arange(len(which)) % 2 == 0), 3, which)
-    assert np.array_equal(parts(history, None, settings, previous=four) == 1, which == 1)
-    assert len(np.unique(parts(history, None, settings, previous=four))) == 3
+    assert np.array_equal(parts(history, previous=four) == 1, which == 1)
+    assert len(np.unique(parts(history, previous=four))) == 3
     # Two parts are hardly worse than three here: they stay where they were found before.
     two = np.where(which == 2, 1, which)
-    assert len(np.unique(parts(history, None, settings, previous=two))) == 2
-    fresh = parts(history, None, settings.model_copy(update={"stay_count": 0}), previous=two)
+    assert len(np.unique(parts(history, previous=two))) == 2
+    monkeypatch.setattr(module, "STAY_COUNT", 0)
+    fresh = parts(history, previous=two)
     assert len(np.unique(fresh)) == 3
 
 

@@ -5,7 +5,6 @@ from scipy.spatial.transform import Rotation
 from scas4d_core.cameras import Camera, WorldFrame
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.tracks import (
-    TracksSettings,
     carriers,
     geometric_median,
     seen,
@@ -60,12 +59,12 @@ def test_points_of_a_rigid_body_are_carried_exactly_from_any_frame(count):
     points = rest[:50] + 0.02
     expected = truth(points)
     for index in (0, 3):
-        tracks = tracks_of_points(history, WORLD, expected[index], index, FRAMES, TracksSettings(carriers=count))
+        tracks = tracks_of_points(history, WORLD, expected[index], index, FRAMES, count)
         np.testing.assert_allclose(tracks.positions, expected, atol=2e-4)  # centimetres: float32 states
         assert tracks.indices.tolist() == FRAMES
     np.testing.assert_array_equal(
         tracks.positions[3],
-        tracks_of_points(history, WORLD, expected[3], 3, [3], TracksSettings(carriers=count)).positions[0],
+        tracks_of_points(history, WORLD, expected[3], 3, [3], count).positions[0],
     )
 
 
@@ -74,7 +73,7 @@ def test_a_stray_carrier_does_not_take_the_point_with_it():
     history, _ = rigid_history(stray=stray, size=4)  # they overlap, as those of a trained scene do
     points = np.random.default_rng(3).uniform(-0.5, 0.5, size=(300, 3))
     expected = truth(points)
-    single = tracks_of_points(history, WORLD, expected[0], 0, FRAMES, TracksSettings(carriers=1))
+    single = tracks_of_points(history, WORLD, expected[0], 0, FRAMES, 1)
     several = tracks_of_points(history, WORLD, expected[0], 0, FRAMES)
     lost = [np.mean(np.abs(t.positions[-1] - expected[-1]).max(axis=-1) > 10) for t in (single, several)]
     assert lost[0] > 0.08
@@ -179,7 +178,7 @@ def stacked(*parts: Gaussians) -> Gaussians:
     return Gaussians(**{name: np.concatenate([p.arrays()[name] for p in parts]) for name in parts[0].arrays()})
 
 
-def test_pixels_go_along_their_rays_and_report_what_met_no_surface():
+def test_pixels_go_along_their_rays_and_report_what_met_no_surface(monkeypatch):
     history = History()
     for t in FRAMES:  # a small sheet 2 m away that sinks, in centimetres 200
         state = sheet(2.0, 0.05, 0.9, 7)
@@ -211,8 +210,8 @@ def test_pixels_go_along_their_rays_and_report_what_met_no_surface():
     np.testing.assert_allclose(np.diff(tracks.positions[:, 0], axis=0), [[0, 1, 0]] * 5, atol=1e-3)
     assert tracks.visibility["c"].shape == (6, 3)
     assert tracks.visibility["c"][0, 1] == np.False_
-    strict = TracksSettings(pixel_reach=1)
-    assert tracks_of_pixels(history, WORLD, user_camera, uv, 0, FRAMES, depth, strict).ids[2] == -1
+    monkeypatch.setattr("scas4d_core.query.tracks.PIXEL_REACH", 1)
+    assert tracks_of_pixels(history, WORLD, user_camera, uv, 0, FRAMES, depth).ids[2] == -1
     with pytest.raises(ValueError, match=r"pixel \[64\.0, 3\.0\] \(query 1\) lies outside"):
         tracks_of_pixels(history, WORLD, user_camera, np.array([[1, 1], [64, 3]]), 0, FRAMES, depth)
 

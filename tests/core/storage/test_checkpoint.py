@@ -34,7 +34,7 @@ UPDATE = UpdateSettings(iterations=4, clusters=(2, 12), momentum=0.5)
 def settings(**scene: object) -> Settings:
     return Settings(
         scene=SceneSettings(metres_per_unit=1.0, **scene),  # type: ignore[arg-type]
-        static=StaticSettings(iterations=12, max_gaussians=400, exposure=True, rate_exposure=0.01),
+        static=StaticSettings(iterations=12, max_gaussians=400, exposure=True),
         update=UPDATE,
     )
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from test_history import filled, same, state
 
+from scas4d_core.error_text import message_of, without_paths
 from scas4d_core.storage.checkpoint import Checkpoints
-from scas4d_core.storage.error_text import told, without_paths
 from scas4d_core.storage.frame_files import FIRST_COPY, FIXED_COPY, FIXED_FILE, DamagedFrameError
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.storage.npz import read_npz, verify, write_npz
@@ -203,18 +203,18 @@ def test_no_message_has_a_path(tmp_path):
     ):
         with pytest.raises(ValueError, match=r"\w") as caught:
             call()
-        said.append(told(caught.value))
+        said.append(message_of(caught.value))
     assert not [text for text in said if str(tmp_path) in text]
     shutil.rmtree(folder)
 
 
 def test_paths_are_taken_out_of_foreign_messages(tmp_path):
-    assert told(OSError(28, "No space left on device", f"{tmp_path}/a.npz")) == "No space left on device"
+    assert message_of(OSError(28, "No space left on device", f"{tmp_path}/a.npz")) == "No space left on device"
     assert without_paths(f"cannot open '{tmp_path}/a b.npz': {tmp_path}/x/y.npz").count(str(tmp_path)) == 0
     assert without_paths("GET /v1/scenes/abc, http://host/tmp/x, 3/4, a/b") == (
         "GET /v1/scenes/abc, http://host/tmp/x, 3/4, a/b"
     )
-    assert told(ValueError(f"<_io.BufferedReader name='{tmp_path}/f'>")) == "<_io.BufferedReader name='f'>"
+    assert message_of(ValueError(f"<_io.BufferedReader name='{tmp_path}/f'>")) == "<_io.BufferedReader name='f'>"
 
 
 def test_as_many_cameras_as_a_rig_may_have_are_checked_too(tmp_path):

@@ -10,7 +10,7 @@ from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.structure.motion_mask import changed_pixels, settled
+from scas4d_core.structure.motion_mask import changed_pixels, with_reliable_labels
 
 RIG = make_rig()
 BOX = make_box()
@@ -75,7 +75,7 @@ def test_the_few_that_stand_in_an_object_move_with_it(standing: int, all_move: b
     labels = np.full(100, 0.9, np.float32)
     labels[:standing] = 0.2
     hundred = Gaussians(**{name: array[rows] for name, array in BOX.arrays().items()}).replace(foreground=labels)
-    after = settled(hundred)
+    after = with_reliable_labels(hundred)
     assert after.moving.all() == all_move
     np.testing.assert_array_equal(after.foreground[standing:], labels[standing:])
     if not all_move:

@@ -1,4 +1,4 @@
-"""Errors as text for others than the one who runs the service: without paths of this machine. Standard library only."""
+"""Messages of errors for users: without paths of this machine. Standard library only."""
 
 from __future__ import annotations
 
@@ -10,12 +10,22 @@ _PATH = re.compile(r"(?<![\w.:/])/(?:[^\s'\"<>|:;,()\[\]]+/)*[^\s'\"<>|:;,()\[\]
 
 
 def without_paths(text: str) -> str:
-    """The text with the last part alone of every path that can be one of this machine; ``/v1/scenes`` cannot."""
+    """Shortens every absolute path that may be one of this machine to its last part; ``/v1/scenes`` stays.
+
+    >>> without_paths("cannot read /usr/share/scenes/a.npz of /v1/scenes/a")
+    'cannot read a.npz of /v1/scenes/a'
+    """
     return _PATH.sub(_last_part, text)
 
 
-def told(error: BaseException) -> str:
-    """What an error says; of an ``OSError`` what the system says, because its own text names the file with its path."""
+def message_of(error: BaseException) -> str:
+    """The message of an error without paths; of an ``OSError`` the system's text, because its own names the file.
+
+    >>> message_of(OSError(28, "No space left on device", "/usr/share/a.npz"))
+    'No space left on device'
+    >>> message_of(KeyError())
+    'KeyError'
+    """
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return without_paths(str(error)) or type(error).__name__
