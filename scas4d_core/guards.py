@@ -1,11 +1,11 @@
 """Every clamp, floor and epsilon of the core's arithmetic: its name, its value, its unit and its reason, once.
 
 Two tables. A *guard* acts where the arithmetic would leave the finite numbers, and is counted each time it does, so
-that it cannot hide a fault. A *convention* is part of what is computed: it acts all the time, its count would say
-nothing, and its row says so. Kernels import the values; ``kernels.cache`` compiles anew when they change.
+that it cannot hide a fault. A *convention* is part of the method: it acts all the time and is not
+counted. Kernels import the values; ``kernels.cache`` compiles anew when they change.
 
-``scripts/bench stability`` prints both tables with what they did in the catalogue of hard cases, and takes each one
-away to see which case then fails.
+``scripts/bench stability`` prints both tables with their counts in the catalogue of hard cases, and takes each one away
+to find the cases that fail then.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ class Guard:
     """A number that the arithmetic needs beside the equations.
 
     Attributes:
-        name: what it is counted under.
+        name: of its count.
         value: in ``unit``.
-        without: the value that takes its effect away; NaN where another than the value has to change for that.
+        without: the value that takes its effect away; NaN where something else has to change for that.
         where: the file under ``scas4d_core``.
-        reason: why it is there, and what happens where it acts.
-        counted: what one count is; of a convention, why there is none.
+        reason: of the guard, and its effect.
+        counted: the unit of its count; of a convention, the reason for having none.
     """
 
     name: str
@@ -228,12 +228,18 @@ SMALLEST_SQUARE = _convention(
     "smallest_square", 1e-9, 0.0,
     unit="1", where="torch_backend/losses.py, update/picture_loss.py",
     reason="Sum of squared differences below which two pictures count as equal: PSNR stays finite.",
-    counted="acts on a figure that is told, not on the state",
+    counted="acts on a reported figure, not on the state",
 )  # fmt: skip
 
 
 class GuardCounts(Mapping[str, int]):
-    """How often guards acted since the last ``reset``, by name."""
+    """Number of times that guards acted since the last ``reset``, by name.
+
+    >>> counts = GuardCounts("gradient_ceiling", "moment_floor")
+    >>> counts.add(("gradient_ceiling", "moment_floor"), np.array([[2, 0], [1, 5]]))  # of two tasks
+    >>> dict(counts)
+    {'gradient_ceiling': 3, 'moment_floor': 5}
+    """
 
     def __init__(self, *names: str) -> None:
         unknown = set(names) - set(GUARDS) - set(OBSERVED)
@@ -242,13 +248,13 @@ class GuardCounts(Mapping[str, int]):
         self._counts = dict.fromkeys(names, 0)
 
     def add(self, names: Sequence[str], acted: NDArray[np.int64]) -> None:
-        """Count what a kernel's tasks counted under these names, [tasks, names] or [names]."""
+        """Adds the counts of a kernel's tasks, [tasks, names] or [names], under these names."""
         counts = acted.reshape(-1, len(names)).sum(axis=0)
         for name, count in zip(names, counts.tolist(), strict=True):
             self._counts[name] += count
 
     def reset(self) -> None:
-        """Begin again at 0."""
+        """Sets all counts to 0."""
         self._counts = dict.fromkeys(self._counts, 0)
 
     def __getitem__(self, name: str) -> int:
@@ -268,11 +274,11 @@ OBSERVED = {
     "folded": "Gaussians in a layer, forward, where the cluster map turns space inside out: det J ≤ 0. Nothing is "
     "clamped; the state stays finite, and a fold can be undone by the next steps.",
 }
-"""What is counted beside the guards, and changes nothing."""
+"""Events that are counted beside the guards and change nothing."""
 
 
 def summed(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """Counts of several holders, added up by name."""
+    """Adds up several counts by name."""
     total: dict[str, int] = {}
     for each in counts:
         for name, count in each.items():

@@ -24,6 +24,7 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "scas4d_core.first_frame.initial_points": ("initial_points",),
     "scas4d_core.first_frame.static_scene": ("fit_static_scene",),
     "scas4d_core.gaussians": ("Gaussians", "moving_extent", "quaternions_to_matrices"),
+    "scas4d_core.guards": ("GuardCounts",),
     "scas4d_core.metrics.image": ("flip", "lpips", "psnr", "ssim"),
     "scas4d_core.metrics.parts": ("adjusted_rand_index",),
     "scas4d_core.metrics.tracks": (

@@ -28,7 +28,7 @@ from scas4d_core.first_frame.surfaces import TOLERANCE, Support, fit_surfaces, s
 from scas4d_core.first_frame.triangulation import Triangulation, triangulate
 from scas4d_core.first_frame.visual_hull import MISSES, VisualHull, carve, contradicted, pixel_at
 
-Report = Callable[[str, int, int], None]
+OnProgress = Callable[[str, int, int], None]
 """Called with a stage, the steps done and the steps in all."""
 
 MAX_POINTS = 60_000
@@ -53,7 +53,7 @@ def initial_points(
     rig: Rig,
     images: Mapping[str, NDArray[np.uint8]],
     masks: Mapping[str, NDArray[np.uint8]],
-    progress: Report | None = None,
+    progress: OnProgress | None = None,
     *,
     max_points: int = MAX_POINTS,
     stereo: bool = True,
@@ -90,7 +90,7 @@ def initial_points(
     >>> cloud.positions.shape == cloud.colours.shape, bool((cloud.foreground <= 1).all())
     (True, True)
     """
-    tell: Report = progress or (lambda stage, done, total: None)
+    on_progress: OnProgress = progress or (lambda stage, done, total: None)
     labelled = collect_views(rig, images, masks)
     min_views = min(MIN_VIEWS, len(labelled))
     middle = look_at_point(labelled)
@@ -100,9 +100,9 @@ def initial_points(
     plain = background is not None
     views = with_silhouettes(labelled, background) if background is not None else labelled
 
-    tell("triangulation", 0, 1)
+    on_progress("triangulation", 0, 1)
     triangulated = triangulate(views, min_views=min_views, seed=seed)
-    tell("hull", 0, 1)
+    on_progress("hull", 0, 1)
     hull = carve(views, misses=0.0 if plain else MISSES, min_views=min_views)
     supports: list[Support] = []
     if not plain and len(triangulated.positions) >= 10:
@@ -116,8 +116,8 @@ def initial_points(
 
     maps: list[DepthMap] = []
     if stereo:
-        maps = _stereo(views, triangulated, hull, supports, plain, middle, stereo_iterations, seed, tell)
-    tell("merging", 0, 1)
+        maps = _stereo(views, triangulated, hull, supports, plain, middle, stereo_iterations, seed, on_progress)
+    on_progress("merging", 0, 1)
     confirmed = np.concatenate([fused_points(maps, min_views), triangulated.positions])
     if not plain and len(hull.cells):
         confirmed = confirmed[contradicted(views, hull, confirmed, MISSES) < CONTRADICTED]
@@ -157,7 +157,7 @@ def _stereo(
     middle: Float,
     iterations: int,
     seed: int,
-    tell: Report,
+    on_progress: OnProgress,
 ) -> list[DepthMap]:
     """Depth maps of all pictures, halved; the search starts from hull, surfaces and triangulated points."""
     small = [halved(view) for view in views]
@@ -196,7 +196,7 @@ def _stereo(
         iterations=iterations,
         seed=seed,
         hull=hull,
-        progress=lambda done, total: tell("stereo", done, total),
+        progress=lambda done, total: on_progress("stereo", done, total),
     )
 
 

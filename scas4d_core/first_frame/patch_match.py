@@ -203,7 +203,7 @@ def patch_match(
     Args:
         image: [H, W] float32 grey in 0…1.
         active: [H, W] bool, pixels that are wanted.
-        prior: [H, W] float64 depth to try first, 0 where nobody knows one.
+        prior: [H, W] float64 depth to try first, 0 where unknown.
         inverse: [4] float64, (1/fx, −cx/fx, 1/fy, −cy/fy).
         others: [V, H', W'] float32 neighbours' pictures.
         matrices: [V, 3, 3] float64, K' R of each neighbour, R from the reference's axes.

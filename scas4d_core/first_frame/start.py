@@ -60,7 +60,7 @@ def fit_first(
     factory: ViewFactory,
     settings: Settings,
     world: WorldFrame,
-    tell: Callable[[Progress], None],
+    on_progress: Callable[[Progress], None],
 ) -> StaticResult:
     """Fits frame 0 to its pictures, from a cloud that is given or made from the pictures.
 
@@ -68,13 +68,13 @@ def fit_first(
 
     Args:
         frame: with pictures of the size of the factory's rig. points: in the user's world. world: user's to inside.
-        tell: called with the progress of each stage.
+        on_progress: called with the progress of each stage.
     """
     static = settings.static
     if points is None:
         points = initial_points(
             factory.rig, frame.images, frame.masks,
-            lambda stage, done, total: tell(Progress(stage, done, total)),
+            lambda stage, done, total: on_progress(Progress(stage, done, total)),
         )  # fmt: skip
         positions = points.positions
     else:
@@ -87,5 +87,5 @@ def fit_first(
         points.foreground,
         settings.scene,
         static,
-        lambda done, loss: tell(Progress("fitting frame 0", done, static.iterations, {"loss": loss})),
+        lambda done, loss: on_progress(Progress("fitting frame 0", done, static.iterations, {"loss": loss})),
     )

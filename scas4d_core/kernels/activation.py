@@ -1,4 +1,5 @@
-"""Frame 0's free parameters to what the rasterizer reads, and back. Twin: the same formulas in torch, in the tests.
+"""Free parameters of frame 0 to the rasterizer's inputs, and gradients back. Twin: the same formulas in torch, in the
+tests.
 
 F = R(q/|q|) diag(exp s); opacity = sigmoid(o); label = sigmoid(m). A quaternion without a direction is no rotation:
 ``guards.QUATERNION_FLOOR``.
@@ -24,7 +25,7 @@ SHORTEST = np.float32(QUATERNION_FLOOR)
 LARGEST = np.float32(EXPONENT) / LOG2_E
 
 ACTED = ("quaternion_floor", "exponent")
-"""What ``activate`` counts."""
+"""Guards that ``activate`` counts."""
 
 
 def activate(
@@ -34,10 +35,10 @@ def activate(
     opacities: NDArray[np.float32],
     features: NDArray[np.float32],
 ) -> NDArray[np.int64]:
-    """Fill means [N, 3], factors [N, 3, 3], opacities [N], features [N, 4] (RGB, label) from parameters [N, 15].
+    """Fills means [N, 3], factors [N, 3, 3], opacities [N], features [N, 4] (RGB, label) from parameters [N, 15].
 
     Returns:
-        [2] for how many Gaussians the guards in ``ACTED`` acted.
+        [2] Gaussians for which each guard in ``ACTED`` acted.
     """
     acted = np.zeros((-(-len(parameters) // CHUNK), len(ACTED)), np.int64)
     activate_rows(parameters, means, factors, opacities, features, acted)
@@ -47,7 +48,7 @@ def activate(
 
 @inline
 def direction(p):
-    """The unit quaternion of a row of parameters, and 1 over its length; no rotation and 0 where it has none."""
+    """The unit quaternion of a row of parameters, and 1 over its length; no rotation and 0 without a direction."""
     square = p[3] * p[3] + p[4] * p[4] + p[5] * p[5] + p[6] * p[6]
     directed = square > SHORTEST
     norm = ONE / np.float32(np.sqrt(square)) if directed else ZERO
@@ -60,7 +61,7 @@ def direction(p):
 
 @parallel_kernel
 def activate_rows(parameters, means, factors, opacities, features, acted):
-    """As ``activate``. ``acted``: out [tasks, 2]."""
+    """Runs ``activate`` in tasks; ``acted`` [tasks, 2] is filled."""
     count = parameters.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):
         aimless = clamped = 0
@@ -86,7 +87,7 @@ def activate_rows(parameters, means, factors, opacities, features, acted):
 
 @parallel_kernel
 def activate_backward(parameters, factors, opacities, features, g_means, g_factors, g_opacities, g_features, gradients):
-    """dL/dparameters [N, 15] from the rasterizer's gradients."""
+    """Fills dL/dparameters [N, 15] from the rasterizer's gradients."""
     count = parameters.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):
         for i in range(task * CHUNK, min(count, (task + 1) * CHUNK)):

@@ -1,6 +1,7 @@
 """A step of Adam (Kingma and Ba 2015) over a table of parameters, a rate per column. Twin: ``torch.optim.Adam``.
 
-What is not finite or would not stay so is held, and counted: ``guards.GRADIENT_CEILING``, ``guards.MOMENT_FLOOR``.
+Numbers that are not finite, or would not stay so, are clamped and counted: ``guards.GRADIENT_CEILING``,
+``guards.MOMENT_FLOOR``.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ SMALLEST = np.float32(MOMENT_FLOOR)
 LARGEST = np.float32(GRADIENT_CEILING)
 
 ACTED = ("gradient_ceiling", "moment_floor")
-"""What ``adam`` counts."""
+"""Guards that ``adam`` counts."""
 
 EVERY_ROW = np.ones(1, np.float32)
-"""All rows alike."""
+"""``by_row`` where all rows have the same rates."""
 
 ROWS = 1024
 
@@ -39,16 +40,16 @@ def adam(
     beta2: Any,
     step: int,
 ) -> NDArray[np.int64]:
-    """Update ``parameters`` [n, columns] in place.
+    """Updates ``parameters`` [n, columns] in place.
 
     Args:
-        gradients: [n, columns], C-contiguous; numbers that a guard holds are overwritten with what is taken for them.
+        gradients: [n, columns], C-contiguous; guarded numbers are overwritten with their bounds.
         first, second: [n, columns], moments, updated in place. rates: [columns].
-        by_row: [n], what the rates of each row are multiplied with, or ``EVERY_ROW``.
+        by_row: [n], factor on the rates of each row, or ``EVERY_ROW``.
         beta1, beta2: decays (float32). step: 1 for the first update.
 
     Returns:
-        [2] how many numbers of the gradient the guards in ``ACTED`` held.
+        [2] numbers of the gradient on which each guard in ``ACTED`` acted.
     """
     acted = np.zeros((-(-len(parameters) // ROWS), len(ACTED)), np.int64)
     adam_rows(parameters, gradients, first, second, rates, by_row, beta1, beta2, step, acted)
@@ -57,9 +58,9 @@ def adam(
 
 
 @kernel
-def hold(gradients, first, last, acted):
-    """Bring the numbers from flat index ``first`` to before ``last`` within the guards; add to ``acted`` [2]."""
-    # First whether there is anything to do: NaN and infinity stay in a sum.
+def guard_gradients(gradients, first, last, acted):
+    """Clamps the numbers from flat index ``first`` to before ``last``; adds to ``acted`` [2]."""
+    # A sum shows at once whether any number needs a guard: NaN and infinity stay in it.
     total, least = lanes.fill(ZERO), lanes.fill(ONE)
     for place in range(first, last, lanes.COUNT):
         size = lanes.magnitude(lanes.load_first(gradients, place, last - place))
@@ -86,12 +87,12 @@ def hold(gradients, first, last, acted):
 
 @parallel_kernel
 def adam_rows(parameters, gradients, first, second, rates, by_row, beta1, beta2, step, acted):
-    """As ``adam``. ``acted``: [tasks, 2], added to."""
+    """Runs ``adam`` in tasks; ``acted`` [tasks, 2] is added to."""
     rows, columns = parameters.shape
     correction1 = ONE - np.float32(beta1**step)
     correction2 = ONE - np.float32(beta2**step)
     for task in prange((rows + ROWS - 1) // ROWS):
-        hold(gradients, task * ROWS * columns, min(rows, (task + 1) * ROWS) * columns, acted[task])
+        guard_gradients(gradients, task * ROWS * columns, min(rows, (task + 1) * ROWS) * columns, acted[task])
     for task in prange((rows + ROWS - 1) // ROWS):
         for i in range(task * ROWS, min(rows, (task + 1) * ROWS)):
             row = by_row[i] if by_row.shape[0] > 1 else by_row[0]

@@ -1,7 +1,7 @@
 """Front-to-back blending of tiles, forward and backward. Twin: ``rasterize.twin.render``.
 
-A tile is 8×8 blocks of 4×4 pixels, and a block is one ``Lanes``. Of a Gaussian, the blocks that its support meets are
-visited (``tiles.cover``), in the order of their bits.
+A tile is 8×8 blocks of 4×4 pixels, and a block is one ``Lanes``. For each Gaussian, the blocks that its support meets
+are visited (``tiles.cover``), in the order of their bits.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ BLOCKS = (TILE // BLOCK) ** 2
 BLOCK_X = np.array([BLOCK * (block >> 3) for block in range(BLOCKS)], np.float32)
 BLOCK_Y = np.array([BLOCK * (block & 7) for block in range(BLOCKS)], np.float32)
 AHEAD = 4
-"""Entries that a Gaussian's numbers are asked for before they are used: they lie anywhere in memory."""
+"""Entries by which a Gaussian's numbers are prefetched: they lie anywhere in memory."""
 
 HALF_LOG2_E = np.float32(0.5 * 1.4426950408889634)
 """Powers are of 2 inside: alpha = 2^(log2(opacity) − HALF_LOG2_E · quadratic form)."""
@@ -46,7 +46,7 @@ def opened(cover):
 
 @inline
 def fetch_ahead(entry, end, items, splats, features):
-    """Ask for the numbers of an entry further on."""
+    """Prefetches the numbers of an entry further on."""
     i = items[min(entry + AHEAD, end - 1)]
     lanes.fetch(splats, i)
     lanes.fetch(features, i)
@@ -54,7 +54,7 @@ def fetch_ahead(entry, end, items, splats, features):
 
 @kernel
 def copy_blocks(plane, y_first, x_first, state, start, step, inward):
-    """Between a plane's tile and one plane of the blocks' state, which begins at ``start``, a block each ``step``."""
+    """Copies between a plane's tile and one plane of the blocks' state, from ``start``, a block each ``step``."""
     for column in range(TILE // BLOCK):
         for row in range(TILE // BLOCK):
             place = start + step * (column * (TILE // BLOCK) + row)
@@ -70,7 +70,7 @@ def copy_blocks(plane, y_first, x_first, state, start, step, inward):
 def blend_task(
     task, splats, features, groups, starts, items, covers, tile_order, tasks, size, background, limits, image, rest
 ):
-    """The tiles of one task of ``blend``."""
+    """Blends the tiles of one task of ``blend``."""
     cap, stop = limits[1], limits[2]
     faintest = np.float32(log2(limits[0]))
     channels = GROUP * len(groups)
@@ -110,7 +110,7 @@ def blend_task(
                 after = before - weight
                 drawn = (power >= faintest) & (after >= stop)
                 if not lanes.any_of(drawn):
-                    # Nothing to see, though pixels may end here. A visit that changes nothing is none for the backward;
+                    # Nothing visible, though pixels may end here. The backward skips a visit that changes nothing;
                     # a block that is finished is not visited again.
                     bit = np.uint64(1) << np.uint64(block)
                     ended = (power >= faintest) & (before > ZERO)
@@ -156,7 +156,7 @@ def blend_task(
 
 @parallel_kernel
 def blend(splats, features, groups, starts, items, covers, tile_order, tasks, size, background, limits, image, rest):
-    """Blend every tile front to back.
+    """Blends every tile front to back.
 
     Args:
         splats: [N, 16]; features: [N, C] float32, C a multiple of 4; starts [tiles + 1], items: tile lists.
@@ -206,7 +206,7 @@ def blend_backward_task(
     g_alpha,
     records,
 ):
-    """The tiles of one task of ``blend_backward``."""
+    """Carries gradients back through the tiles of one task of ``blend_backward``."""
     cap, stop = limits[1], limits[2]
     faintest = np.float32(log2(limits[0]))
     channels = GROUP * len(groups)
@@ -329,7 +329,7 @@ def blend_backward(
     g_alpha,
     records,
 ):
-    """Gradients of every entry, a pair of Gaussian and tile.
+    """Computes the gradients of every entry, a pair of Gaussian and tile.
 
     Front to back, as forward: what lies behind entry i enters only through its product with the incoming gradient,
     one number a pixel, which is what remains of the total after the entries so far.

@@ -1,7 +1,7 @@
-"""Where compiled kernels are kept: a folder for each version of the kernels' sources.
+"""The cache of compiled kernels: a folder for each version of the kernels' sources.
 
-Numba keeps a compiled function as long as the file that holds it does not change. A kernel also contains what it calls
-from other files, which Numba does not look at: after an edit there it would go on with the old code. So the folder is
+Numba keeps a compiled function as long as its own file does not change. A kernel also contains functions that it calls
+from other files, which Numba does not watch: after an edit there it would continue with the old code. So the folder is
 named by a digest of all files here and of the guards, whose values they contain; folders of earlier versions are
 removed.
 """
@@ -18,14 +18,14 @@ import numba
 
 PREFIX = "kernels-"
 KEPT = 3
-"""Versions: several checkouts may share a cache."""
+"""Versions kept: several checkouts may share a cache."""
 
 
 GUARDS = Path(__file__).parent.parent / "guards.py"
 
 
 def digest(folder: Path = Path(__file__).parent) -> str:
-    """Of the names and contents of a folder's Python files, and of the guards."""
+    """Digest of the names and contents of a folder's Python files, and of the guards."""
     found = hashlib.sha256()
     for path in [*sorted(folder.glob("*.py")), GUARDS]:
         found.update(f"{path.name}\0".encode() + hashlib.sha256(path.read_bytes()).digest())
@@ -33,7 +33,7 @@ def digest(folder: Path = Path(__file__).parent) -> str:
 
 
 def base() -> Path:
-    """NUMBA_CACHE_DIR, else scas4d/numba in the user's folder of caches."""
+    """Folder of all versions: NUMBA_CACHE_DIR, else scas4d/numba in the user's folder of caches."""
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given:
         path = Path(given)
@@ -42,7 +42,7 @@ def base() -> Path:
 
 
 def use(folder: Path) -> None:
-    """Numba keeps what it compiles in this version's folder; where none can be made, Numba's own choice stands."""
+    """Has Numba cache in this version's folder; where none can be made, Numba's own choice stands."""
     mine = folder / (PREFIX + digest())
     try:
         mine.mkdir(parents=True, exist_ok=True)
@@ -56,7 +56,7 @@ def use(folder: Path) -> None:
 
 
 def remove_old(folder: Path, kept: int = KEPT) -> None:
-    """Removes all but the versions that were used last."""
+    """Removes all versions but the ``kept`` that were used last."""
     with contextlib.suppress(OSError):  # another process may remove the same ones
         versions = sorted(folder.glob(PREFIX + "*"), key=lambda path: path.stat().st_mtime, reverse=True)
         for path in versions[kept:]:

@@ -1,7 +1,7 @@
 """The cascade of cluster maps and its backward (paper, single-layer deformation function and nesting).
 
-Twin: ``deformation.cascade``. Everything here is about sixteen Gaussians of one cluster at a time (``Lanes``), so that
-what a cluster says is a number and what a Gaussian has is a vector; ``deform`` puts the steps together. A layer carries
+Twin: ``deformation.cascade``. Every step handles sixteen Gaussians of one cluster (``Lanes``), so that values
+of a cluster are numbers and values of Gaussians are vectors; ``deform`` combines the steps. A layer carries
 a point x, the Gaussian's factor F (nine entries, row by row; the map's Jacobian is applied to it at once) and its turn
 Q to the next.
 
@@ -34,7 +34,7 @@ FEWEST = int(EMPTY_CLUSTER)
 LARGEST = np.float32(EXPONENT) / LOG2_E
 
 ACTED = ("exponent", "half_turn", "folded")
-"""What ``carry`` counts."""
+"""Guards that ``carry`` counts."""
 
 
 @inline
@@ -70,7 +70,7 @@ def product(aw, ax, ay, az, bw, bx, by, bz):
 
 @kernel
 def cluster_table(parameters, sums, first, last, count, table):
-    """What a cluster says to its points.
+    """Fills the table of a cluster: rotation, pivot and the parameters that its points read.
 
     Args:
         parameters: [10]. sums: [blocks, 3] of the points of each block as moved by the layers above; the cluster has
@@ -98,7 +98,7 @@ def cluster_table(parameters, sums, first, last, count, table):
 
 @inline
 def scaled(table, about_origin, x, y, z):
-    """f, y and u of points: u is what the factor multiplies, R y or R y + p + t; and −2z."""
+    """f, y and u of points, u being the vector that f scales, R y or R y + p + t; and −2z."""
     r0, r1, r2, r3, r4, r5, r6, r7, r8 = (
         table[0], table[1], table[2], table[3], table[4], table[5], table[6], table[7], table[8]
     )  # fmt: skip
@@ -128,7 +128,7 @@ def polar(table, about_origin, f, yx, yy, yz):
     """The polar rotation of f I + f' e cᵀ, which acts in the plane of e and c; the common factor f is left out.
 
     Returns:
-        The quaternion a (4); what the backward needs: e (3), e·c, c × e (3), cosine, sine (3), their length rho, the
+        The quaternion a (4); and for the backward e (3), e·c, c × e (3), cosine, sine (3), their length rho, the
         quaternion's scale, and rho + cosine.
     """
     cx, cy, cz = table[19], table[20], table[21]
@@ -160,7 +160,7 @@ def carry(table, about_origin, separate, points, place, v, present, lane, acted)
         points: x, y, z of the block from flat index ``place`` on, as they enter.
         v: [13, 16] factors 0–8 and turns 9–12.
         present: flat; from ``lane`` on, 0 for a Gaussian that is not counted, else 1.
-        acted: [3 or more] int64, added to: for how many of them the guards in ``ACTED`` acted; None: not counted.
+        acted: [3 or more] int64, added to: Gaussians for which each guard in ``ACTED`` acted; None: not counted.
     """
     x, y, z = (
         lanes.load(points, place), lanes.load(points, place + lanes.COUNT), lanes.load(points, place + 2 * lanes.COUNT)
@@ -207,7 +207,7 @@ def carry_backward(table, about_origin, separate, points, place, v, entering, g,
     Args:
         table, about_origin, separate, points, place: as for ``carry``.
         v: factors and turns as they enter, from flat index ``entering`` on.
-        g: [16, 16] gradients in place: point 0–2, factor 3–11, turn 12–15; of what leaves, then of what enters.
+        g: [16, 16] gradients, in place: point 0–2, factor 3–11, turn 12–15; of the layer's outputs, then of its inputs.
         records: out from flat index ``record`` on, the block's share of its cluster's gradient.
     """
     n = lanes.COUNT
@@ -234,7 +234,7 @@ def carry_backward(table, about_origin, separate, points, place, v, entering, g,
             g1 = lanes.load(g, n * (6 + column))
             g2 = lanes.load(g, n * (9 + column))
             along = j0 * cx + j1 * cy + j2 * cz
-            # Gradient of f and of the factor's columns: what R turns.
+            # Gradient of f and of the factor's columns, turned back by R.
             h0, h1, h2 = g0 * r0 + g1 * r3 + g2 * r6, g0 * r1 + g1 * r4 + g2 * r7, g0 * r2 + g1 * r5 + g2 * r8
             g_f += h0 * j0 + h1 * j1 + h2 * j2
             outer = ux * g0 + uy * g1 + uz * g2
@@ -322,7 +322,7 @@ def carry_backward(table, about_origin, separate, points, place, v, entering, g,
 
 @kernel
 def cluster_gradient(records, layer, first, last, table, gradient):
-    """Sum the records of a cluster's blocks, in order, into dL/dparameters [10].
+    """Sums the records of a cluster's blocks, in order, into dL/dparameters [10].
 
     Args:
         records: [blocks, layers, 32]; those of blocks from ``first`` to before ``last`` in ``layer``.

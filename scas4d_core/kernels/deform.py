@@ -1,7 +1,7 @@
-"""D_t over all Gaussians that move, and its backward: ``cascade`` and ``deltas`` put together. Twin: ``deformation``.
+"""D_t over all moving Gaussians, and its backward: ``cascade`` and ``deltas`` combined. Twin: ``deformation``.
 
-Gaussians are taken in blocks of sixteen of one finest cluster, hence of one cluster in every layer; where a cluster's
-number is no multiple of sixteen, its last block repeats its last Gaussian. Nothing but points is kept between layers
+Gaussians are taken in blocks of sixteen of one finest cluster, hence of one cluster in every layer; where the size of a
+cluster is no multiple of sixteen, its last block repeats its last Gaussian. Only points are kept between layers
 (pivots are their means): the backward carries factors and turns through the layers again, which costs less than
 reading them from memory.
 """
@@ -24,8 +24,8 @@ CARRIED = 13 * lanes.COUNT
 
 
 @kernel
-def ask_for(block, rows, one, two):
-    """Have what two arrays hold of the Gaussians of a block brought near: they lie anywhere in memory."""
+def prefetch(block, rows, one, two):
+    """Prefetches the rows of a block's Gaussians in two arrays: they lie anywhere in memory."""
     block = min(block, rows.shape[0] - 1)
     for lane in range(lanes.COUNT):
         lanes.fetch(one, rows[block, lane])
@@ -34,7 +34,7 @@ def ask_for(block, rows, one, two):
 
 @kernel
 def start_block(block, before, v):
-    """Factors of frame t−1 and no turn into v [13, 16]."""
+    """Fills v [13, 16] with the factors of frame t−1 and no turn."""
     for k in range(9):
         lanes.store(v, lanes.COUNT * k, lanes.load(before, (9 * block + k) * lanes.COUNT))
     lanes.store(v, lanes.COUNT * 9, lanes.fill(ONE))
@@ -44,7 +44,7 @@ def start_block(block, before, v):
 
 @kernel
 def move_points(block, table, about_origin, points, layer, out, place):
-    """Points of a block through a layer, from ``points[layer]`` to flat index ``place`` of ``out`` on."""
+    """Moves the points of a block through a layer, from ``points[layer]`` to flat index ``place`` of ``out`` on."""
     first = (layer * points.shape[1] + block) * 3 * lanes.COUNT
     x, y, z = moved(
         table, about_origin, lanes.load(points, first), lanes.load(points, first + lanes.COUNT),
@@ -76,7 +76,7 @@ def deform(
     parameters, offsets, ranges, clusters, entries, rows, present, before, deltas, about_origin, separate,
     points, sums, tables, means, factors, state, acted,
 ):  # fmt: skip
-    """The moved Gaussians: M that move, of N, in B blocks, under L layers of K clusters together.
+    """Moves M of N Gaussians, in B blocks, through L layers of K clusters together.
 
     Args:
         parameters: [K, 10], layer after layer, coarse to fine. offsets: [L + 1] int64, the first cluster of each layer.
@@ -108,7 +108,7 @@ def deform(
         v = np.empty(CARRIED, np.float32)
         moved_points = np.empty(3 * lanes.COUNT, np.float32)
         for block in range(task * BLOCKS, min(blocks, (task + 1) * BLOCKS)):
-            ask_for(block + 1, rows, means, factors)
+            prefetch(block + 1, rows, means, factors)
             start_block(block, before, v)
             for layer in range(layers):
                 place = (layer * blocks + block) * 3 * lanes.COUNT
@@ -148,7 +148,7 @@ def deform_backward(
         v = np.empty((layers + 1) * CARRIED, np.float32)
         g = np.empty(16 * lanes.COUNT, np.float32)
         for block in range(task * BLOCKS, min(blocks, (task + 1) * BLOCKS)):
-            ask_for(block + 1, rows, g_means, g_factors)
+            prefetch(block + 1, rows, g_means, g_factors)
             start_block(block, before, v)
             for layer in range(layers):
                 leaving = v[(layer + 1) * CARRIED : (layer + 2) * CARRIED]

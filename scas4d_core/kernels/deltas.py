@@ -1,4 +1,4 @@
-"""What each Gaussian does on its own after the cascade (Δp, ΔR, Δs), and the scale loss. Twin: ``deformation.deform``.
+"""Deltas of single Gaussians after the cascade (Δp, ΔR, Δs), and the scale loss. Twin: ``deformation.deform``.
 
 F_t = R(Δr) J F_{t−1} diag(exp Δs); x_t = x + Δp; turn = q(Δr) ∘ Q, taken with w ≥ 0. Sixteen Gaussians at a time, as in
 ``cascade``.
@@ -18,12 +18,12 @@ LARGEST = np.float32(EXPONENT) / LOG2_E
 COLUMNS = 9
 """Columns of ``deltas``: Δp 0–2, Δr 3–5, Δs 6–8."""
 
-# Columns of a Gaussian's state, what the terms between neighbours read: mean now 0–2, turn since frame t−1 3–6, mean at
-# frame t−1 7–9. A row is a cache line.
+# Columns of a Gaussian's state for the neighbour terms: mean now 0–2, turn since frame t−1 3–6, mean at frame t−1 7–9.
+# A row is a cache line.
 STATE = 16
 MEAN, TURN, PREVIOUS = 0, 3, 7
 TIED = 8
-"""Columns of what they answer: gradient of the mean 0–2, of the turn 3–6, none."""
+"""Columns of their gradients: of the mean 0–2, of the turn 3–6, none."""
 
 
 @inline
@@ -38,7 +38,7 @@ def own_quaternion(deltas, entries, place):
 
 @kernel
 def apply_own(deltas, entries, rows, place, present, v, points, means, factors, state, acted):
-    """Write sixteen moved Gaussians.
+    """Writes sixteen moved Gaussians.
 
     Args:
         deltas: [M, 9]. entries, rows: flat int64; from ``place`` on, the Gaussians' rows among the M that move and
@@ -124,7 +124,7 @@ def apply_own_backward(
         g6 += h2 * e0
         g7 += h2 * e1
         g8 += h2 * e2
-        # Scale loss on the length of the axis, which ΔR leaves as it is.
+        # Scale loss on the length of the axis, which ΔR does not change.
         length = lanes.square_root(e0 * e0 + e1 * e1 + e2 * e2)
         bound = lanes.pick(bounds, entries, place, 3, column)
         over = length - bound

@@ -1,10 +1,10 @@
 """The image loss 0.8 L1 + 0.2 (1 − SSIM) and its gradient, over planes [C, H, W]. Twin: ``losses.image_loss``.
 
-SSIM is that of the 3DGS world: 11×11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01², C2 = 0.03². The window is
-separable; passes go along a row, sixteen pixels at a time, and read across rows.
+SSIM is that of 3D Gaussian Splatting: 11×11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01², C2 = 0.03². The
+window is separable; passes go along a row, sixteen pixels at a time, and read across rows.
 
-Most of many pictures is black, in the target and in the render. A window that is 0 in both has an SSIM of 1 and pulls
-at no pixel: of each row only the columns are computed that are near enough to something else.
+Most of many pictures is black, in the target and in the render. A window that is 0 in both has an SSIM of 1 and no
+gradient: only the columns of each row near other pixels are computed.
 """
 
 from __future__ import annotations
@@ -70,13 +70,13 @@ def across(scratch, place, pitch):
 
 @inline
 def exposed(value, gain, offset):
-    """What the camera records of a rendered value."""
+    """The value that a camera records: gain times the rendered value, plus offset."""
     return gain * value + offset
 
 
 @kernel
 def filter_rows(rows, quantities, scratch, kind, channel, y, span, cleared):
-    """Filter padded rows along themselves, into a row of scratch.
+    """Filters padded rows along themselves, into a row of scratch.
 
     Args:
         rows: [quantities or more, pitch + 2 PAD]. kind, channel, y: of the first quantity in ``scratch``.
@@ -101,7 +101,7 @@ def start_of(planes, channel, y):
 
 @kernel
 def span_of(image, gain, offset, target, channel, y, pitch, spans):
-    """Where a row is not black in both pictures, in whole ``Lanes``.
+    """Finds the columns of a row that are not black in both pictures, in whole ``Lanes``.
 
     Args:
         spans: out [4]: first column and last but one of the windows that hold such a pixel, then the same of the pixels
@@ -128,7 +128,7 @@ def span_of(image, gain, offset, target, channel, y, pitch, spans):
 
 @inline
 def hull(spans, which, y, reach):
-    """The columns of the rows around row y."""
+    """Smallest range of columns that holds the spans of the rows around row y."""
     first, last = spans[y, which], spans[y, which + 1]
     for other in range(max(0, y - reach), min(spans.shape[0], y + reach + 1)):
         first = min(first, spans[other, which])
@@ -138,7 +138,7 @@ def hull(spans, which, y, reach):
 
 @parallel_kernel
 def target_moments(target, scratch, means, squares):
-    """The window's mean of a target and of its square, once per frame and view.
+    """Fills the window's means of a target and of its square, once per frame and view.
 
     Args:
         target: [C, H, W]. scratch: [2 or more, C, H + 10, stride(W)], its upper and lower 5 rows 0.
@@ -168,7 +168,7 @@ def target_moments(target, scratch, means, squares):
 
 @kernel
 def windows_of_row(image, exposure, target, scratch, spans, rows, channel, y):
-    """First pass of ``image_loss`` over a row: what is windowed, filtered along the row."""
+    """First pass of ``image_loss`` over a row: the windowed quantities, filtered along the row."""
     width, pitch = target.shape[2], scratch.shape[3]
     gain, offset = exposure[channel, 0], exposure[channel, 1]
     here, there = start_of(image, channel, y), start_of(target, channel, y)
@@ -184,7 +184,7 @@ def windows_of_row(image, exposure, target, scratch, spans, rows, channel, y):
 
 @kernel
 def clear(rows):
-    """Set padded rows to 0."""
+    """Sets padded rows to 0."""
     for x in range(0, rows.size, lanes.COUNT):
         lanes.store(rows, x, lanes.fill(ZERO))
 
@@ -193,7 +193,7 @@ def clear(rows):
 def loss_of_row(
     image, exposure, target, target_means, target_squares, weights, scratch, spans, rows, losses, channel, y
 ):
-    """Second pass: the loss of a row, and its gradients by what is windowed, filtered along the row."""
+    """Second pass: the loss of a row, and its gradients by the windowed quantities, filtered along the row."""
     channels, height, width = target.shape
     pitch = scratch.shape[3]
     gain, offset = exposure[channel, 0], exposure[channel, 1]

@@ -1,4 +1,4 @@
-"""How kernels are compiled, in one place."""
+"""Compilers of kernels: the one set of options that all of them share, and the float32 exponential."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ llvm.set_option("scas4d", "-unroll-full-max-count=8")
 llvm.set_option("scas4d", "-hoist-runtime-checks=false")
 
 # No fast math: every operation rounds as IEEE 754 says, in the order written, so that kernels compute the same bits on
-# every processor. An estimated reciprocal (`arcp`, `afn`) rounds as its maker likes, a product fused with a sum
-# (`contract`) where there is such an instruction, a reordered sum (`reassoc`) by the width of the registers. Sums over
-# many numbers are written in lanes instead. What it costs an update is within what can be measured (docs/kernels.md).
+# every processor. An estimated reciprocal (`arcp`, `afn`) rounds differently by manufacturer, a product fused with a
+# sum (`contract`) only where there is such an instruction, a reordered sum (`reassoc`) by the width of the registers.
+# Sums over many numbers are written in lanes instead. The cost is below what can be measured (docs/kernels.md).
 STRICT: dict[str, Any] = {"fastmath": False, "error_model": "numpy"}
 
 kernel: Any = njit(cache=True, **STRICT)
@@ -52,7 +52,7 @@ def threads() -> int:
 
 @intrinsic
 def _float_of_bits(typing_context: Any, bits: Any) -> Any:
-    """Reinterpret an int32 as a float32."""
+    """Reinterprets an int32 as a float32."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.bitcast(arguments[0], ir.FloatType())

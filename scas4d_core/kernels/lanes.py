@@ -1,8 +1,8 @@
-"""Sixteen float32 in one value: what a kernel does to sixteen pixels at once, written out.
+"""Sixteen float32 in one value: vector instructions for kernels, written out.
 
 ``Lanes`` is LLVM's ``<16 x float>``: one AVX-512 register, two of AVX2, four of NEON. Kernels add, subtract, multiply,
 divide and compare it like a number (a float32 beside it is spread over the lanes), and read and write it at a flat
-index of a contiguous array. Nothing depends on what the compiler's loop vectorizer makes of a loop.
+index of a contiguous array. No result depends on the compiler's loop vectorizer.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def _spread(context: Any, builder: Any, source: Any, target: Any, value: Any) ->
 
 
 def _operator(function: Any, result: Any, method: str, *how: str) -> None:
-    """Let ``function`` take two ``Lanes``, or one and a float32; ``method`` of the builder writes the instruction."""
+    """Lets ``function`` take two ``Lanes``, or one and a float32; ``method`` of the builder writes the instruction."""
 
     class Template(AbstractTemplate):
         key = function
@@ -158,7 +158,7 @@ def choose(typing_context: Any, mask: Any, yes: Any, no: Any) -> Any:
 
 @emitted
 def any_of(typing_context: Any, mask: Any) -> Any:
-    """Whether the mask holds anywhere."""
+    """True where the mask holds in any lane."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         bits = builder.bitcast(arguments[0], ir.IntType(COUNT))
@@ -252,7 +252,7 @@ def _places(context: Any, builder: Any, array_type: Any, array: Any, index: Any,
 
 @emitted
 def load(typing_context: Any, array: Any, index: Any) -> Any:
-    """The sixteen numbers from a flat index of a float32 array on; need not be aligned, must be inside."""
+    """The sixteen numbers from a flat index of a float32 array on; unaligned is fine, out of bounds is not."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = _place(context, builder, signature.args[0], *arguments)
@@ -263,7 +263,7 @@ def load(typing_context: Any, array: Any, index: Any) -> Any:
 
 @emitted
 def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
-    """Write the lanes from a flat index on."""
+    """Writes the lanes from a flat index on."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = _place(context, builder, signature.args[0], *arguments[:2])
@@ -284,7 +284,7 @@ def _first(builder: Any, count: Any) -> Any:
 
 @emitted
 def load_first(typing_context: Any, array: Any, index: Any, count: Any) -> Any:
-    """As ``load``, of the first ``count`` numbers only (16 or more: all); 0 beyond, which is not read."""
+    """Loads the first ``count`` numbers only (16 or more: all); 0 beyond, which is not read."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = _place(context, builder, signature.args[0], *arguments[:2])
@@ -296,7 +296,7 @@ def load_first(typing_context: Any, array: Any, index: Any, count: Any) -> Any:
 
 @emitted
 def store_first(typing_context: Any, array: Any, index: Any, count: Any, value: Any) -> Any:
-    """As ``store``, of the first ``count`` lanes only (16 or more: all)."""
+    """Stores the first ``count`` lanes only (16 or more: all)."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = _place(context, builder, signature.args[0], *arguments[:2])
@@ -319,7 +319,7 @@ def only_first(typing_context: Any, value: Any, count: Any) -> Any:
 
 @inline
 def count_of(mask):
-    """How many lanes a mask holds for."""
+    """Number of lanes for which a mask holds."""
     return np.int64(sum_of(choose(mask, fill(np.float32(1.0)), fill(np.float32(0.0)))))
 
 
@@ -344,7 +344,7 @@ def gather(typing_context: Any, array: Any, index: Any, stride: Any) -> Any:
 
 @emitted
 def scatter(typing_context: Any, array: Any, index: Any, stride: Any, value: Any) -> Any:
-    """Write the lanes to a flat index and to every ``stride`` after it."""
+    """Writes the lanes to a flat index and to every ``stride`` after it."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         for lane, place in enumerate(_places(context, builder, signature.args[0], *arguments[:3])):
@@ -380,7 +380,7 @@ def pick(typing_context: Any, array: Any, rows: Any, place: Any, columns: Any, c
 
 @emitted
 def put(typing_context: Any, array: Any, rows: Any, place: Any, columns: Any, column: Any, value: Any) -> Any:
-    """Write the lanes to a column of the rows that ``pick`` would read; of rows named twice, the last lane stays."""
+    """Writes the lanes to a column of the rows that ``pick`` would read; of rows named twice, the last lane stays."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         for lane, place in enumerate(_places_of_rows(context, builder, signature.args[:2], arguments[:5])):
@@ -405,7 +405,7 @@ def rows_at(typing_context: Any, array: Any, rows: Any, place: Any) -> Any:
 
 @emitted
 def add_halves(typing_context: Any, array: Any, rows: Any, place: Any, columns: Any) -> Any:
-    """Add eight ``Lanes``, the columns of sixteen rows, to a float32 array [n, 8] at the rows named, one by one."""
+    """Adds eight ``Lanes``, the columns of sixteen rows, to a float32 array [n, 8] at the rows named, one by one."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         given = [arguments[0], arguments[1], arguments[2], _LONG(COUNT // 2), _LONG(0)]
@@ -443,7 +443,7 @@ def add_halves(typing_context: Any, array: Any, rows: Any, place: Any, columns: 
 
 @emitted
 def fetch(typing_context: Any, array: Any, row: Any) -> Any:
-    """Have a row of a two-dimensional float32 array brought into the first-level cache; any row, inside or not."""
+    """Prefetches a row of a two-dimensional float32 array into the first-level cache; any row, inside or not."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         struct = cgutils.create_struct_proxy(signature.args[0])(context, builder, value=arguments[0])
@@ -496,7 +496,7 @@ def exp(x):
 
 @emitted
 def _exponent_and_mantissa(typing_context: Any, x: Any) -> Any:
-    """Of positive numbers: x = m 2^e with m in [1/√2, √2)."""
+    """Splits positive numbers: x = m 2^e with m in [1/√2, √2)."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         def all_of(value: int) -> Any:

@@ -22,7 +22,7 @@ UNDER_ROOT = np.float32(ROOT_FLOOR)
 """Added under each root."""
 
 CHUNK = 4096
-"""Numbers a task sums."""
+"""Numbers that a task sums."""
 
 
 @kernel
@@ -33,7 +33,7 @@ def state_of(state, who):
 
 @kernel
 def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, turning, own, losses):
-    """The sampled Gaussians ``sample`` of one task; gradients are added to ``own`` [M, 8], losses to ``losses`` [3]."""
+    """Sums losses [3] of the Gaussians ``sample`` of one task; gradients are added to ``own`` [M, 8]."""
     count = neighbours.shape[1]
     who, other = np.empty(lanes.COUNT, np.int64), np.empty(lanes.COUNT, np.int64)
     present = np.empty(lanes.COUNT, np.float32)
@@ -58,7 +58,7 @@ def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, 
             weight = lanes.load(present, 0) * lanes.pick(weights, who, 0, count, k)
             counts = weight > ZERO
             ox, oy, oz = there[0] - mx, there[1] - my, there[2] - mz
-            # Rigidity: the neighbour's offset, turned back, is what it was.
+            # Rigidity: the neighbour's offset, turned back, equals that of frame t−1.
             ex = r0 * ox + r3 * oy + r6 * oz - (there[7] - px)
             ey = r1 * ox + r4 * oy + r7 * oz - (there[8] - py)
             ez = r2 * ox + r5 * oy + r8 * oz - (there[9] - pz)
@@ -78,7 +78,7 @@ def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, 
             g6 += oz * ex
             g7 += oz * ey
             g8 += oz * ez
-            # Isometry: its distance is that of frame 0.
+            # Isometry: the distance equals that of frame 0.
             distance = lanes.square_root(ox * ox + oy * oy + oz * oz + UNDER_ROOT)
             stretch = distance - lanes.pick(distances, who, 0, count, k)
             length = lanes.square_root(weight * stretch * stretch + UNDER_ROOT)
@@ -87,7 +87,7 @@ def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, 
             gx += pull * ox
             gy += pull * oy
             gz += pull * oz
-            # Rotation: it has turned as this one has.
+            # Rotation: both have turned alike.
             dw, dx, dy, dz = there[3] - w, there[4] - x, there[5] - y, there[6] - z
             length = lanes.square_root(weight * (dw * dw + dx * dx + dy * dy + dz * dz) + UNDER_ROOT)
             rotation += lanes.choose(counts, length, nothing)
@@ -111,10 +111,10 @@ def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, 
 
 @parallel_kernel
 def neighbour_terms(state, sample, neighbours, weights, distances, strengths, accumulators, losses):
-    """Weighted sum of the three losses over the sampled Gaussians and its gradient.
+    """Weighted sum of the three losses over the sampled Gaussians, and its gradient (Dynamic3DGaussians).
 
     Args:
-        state: [M, 16], columns as in ``deltas``. sample: [S] int64 rows whose neighbours are looked at.
+        state: [M, 16], columns as in ``deltas``. sample: [S] int64 rows whose neighbours are compared.
         neighbours [M, k] int32, weights [M, k] (0: no neighbour), distances [M, k] metres at frame 0.
         strengths: [3] float32, weights of rigidity, isometry and rotation over the mean's count S k.
         accumulators: out [4, M, 8]; the first holds the gradients, columns as in ``deltas``.

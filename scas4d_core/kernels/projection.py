@@ -25,7 +25,7 @@ CHUNK = 256
 """Gaussians a task: enough work for a thread, few enough for balance."""
 
 AHEAD = 16
-"""Gaussians that one's records are asked for before they are used: they lie anywhere in memory."""
+"""Gaussians by which records are prefetched: they lie anywhere in memory."""
 
 FARTHEST = np.float32(NOT_FINITE)
 BRIGHTEST = np.float32(FEATURE_CEILING)
@@ -33,11 +33,11 @@ WIDEST = np.float32(FOOTPRINT_CEILING)
 STEEPEST = np.float32(GRADIENT_NOT_FINITE)
 
 ACTED = ("not_finite", "footprint_ceiling")
-"""What ``project`` counts."""
+"""Guards that ``project`` counts."""
 ACTED_BACKWARD = ("gradient_not_finite",)
-"""What ``project_backward`` counts."""
+"""Guards that ``project_backward`` counts."""
 
-# Columns of ``splats`` [N, 16], what later kernels read of a Gaussian. REACH is the support's squared Mahalanobis
+# Columns of ``splats`` [N, 16], a Gaussian as later kernels read it. REACH is the support's squared Mahalanobis
 # radius. At a column dx right of the centre, the support is at SLOPE dx ± sqrt(SPREAD (REACH - THIN dx²)) below it; it
 # is lowest at dx = LOWEST_X, highest at -LOWEST_X.
 MEAN_X, MEAN_Y, CONIC_A, CONIC_B, CONIC_C, OPACITY, REACH, DEPTH = range(8)
@@ -47,7 +47,7 @@ SPLAT_COLUMNS = 16
 
 @inline
 def tangents(u, v, lens, margin):
-    """x/z and y/z, clamped for the Jacobian, and where each is inside."""
+    """x/z and y/z, clamped for the Jacobian, and masks of those inside the bounds."""
     fx, fy, cx, cy, width, height = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
     margin_x = margin * HALF * width / fx
     margin_y = margin * HALF * height / fy
@@ -82,7 +82,7 @@ def sound_features(features, first):
 
 @kernel
 def project_group(first, means, factors, opacities, features, pose, lens, limits, splats, place, boxes, acted):
-    """Project sixteen Gaussians from row ``first`` on; see ``project``.
+    """Projects sixteen Gaussians from row ``first`` on; see ``project``.
 
     Args:
         splats: out, from row ``place`` on. boxes: out [5 · 16]: tiles x0, y0, x1, y1 of each, and how many.
@@ -169,7 +169,7 @@ def project_group(first, means, factors, opacities, features, pose, lens, limits
 
 @parallel_kernel
 def project(means, factors, opacities, features, pose, lens, limits, splats, rects, counts, acted):
-    """Project N Gaussians, sixteen at a time.
+    """Projects N Gaussians, sixteen at a time.
 
     Args:
         means: [N, 3] float32 world. factors: [N, 3, 3] float32, Σ = F Fᵀ. opacities: [N] float32.
@@ -218,7 +218,7 @@ def project_backward_group(
     first, place, means, factors, pose, lens, limits, splats, sums, columns, depth_channel, g_means, g_factors,
     g_opacities, g_screen,
 ):  # fmt: skip
-    """Carry sixteen Gaussians' gradients from the picture to the world; see ``project_backward``.
+    """Carries sixteen Gaussians' gradients from the picture to the world; see ``project_backward``.
 
     Args:
         first: row of the Gaussians in ``means`` and ``factors``. place: their row in ``splats``.
@@ -310,7 +310,7 @@ def project_backward_group(
 
 @kernel
 def give_up_steep(sums, counts, first, some, used):
-    """Clear the sums of those of sixteen Gaussians whose pairs add up to more than ``STEEPEST``, and their mark."""
+    """Clears the sums and the mark of those of sixteen Gaussians whose pairs add up to more than ``STEEPEST``."""
     sums.shape[1] - 1
     for k in range(some):
         steep = ZERO
@@ -339,7 +339,7 @@ def project_backward(
     g_screen,
     acted,
 ):
-    """Sum each Gaussian's pairs (in a fixed order) and carry the gradients to the world, sixteen at a time.
+    """Sums each Gaussian's pairs (in a fixed order) and carries the gradients to the world, sixteen at a time.
 
     Args:
         records: [pairs, whole ``Lanes``] from ``blend_backward``; counts, firsts: [N], how many each Gaussian

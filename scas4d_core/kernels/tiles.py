@@ -1,4 +1,4 @@
-"""Depth order and tile lists. One global sort; lists filled in that order are sorted by construction."""
+"""Depth order and tile lists: one global sort; lists filled in that order are sorted by construction."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ RADIX_BITS = 12
 DIGITS = 1 << RADIX_BITS
 
 AHEAD = 8
-"""Gaussians that one's numbers are asked for before they are used: in depth order they lie anywhere in memory."""
+"""Gaussians by which numbers are prefetched: in depth order they lie anywhere in memory."""
 
 
 @inline
 def cover(splat, tile_x, tile_y):
     """The blocks of a tile that the support (an ellipse) meets: bit 8 x + y for column x and row y of blocks.
 
-    Exact, so culling by it is: block by block of a column, between the support's highest and lowest row there.
+    Culling by the cover is exact: per column of blocks, it spans the support's highest to lowest row there.
     """
     left = lanes.ramp(np.float32(tile_x * TILE) + HALF - splat[MEAN_X])
     # Eight lanes for the upper ends of the columns of blocks, eight for the lower.
@@ -52,9 +52,9 @@ def cover(splat, tile_x, tile_y):
 
 @kernel
 def depth_order(splats, counts, keys, order, keys_too, order_too, histogram):
-    """Sort the visible Gaussians by depth, nearest first; equal depths keep row order.
+    """Sorts the visible Gaussians by depth, nearest first; equal depths keep row order.
 
-    Depths are positive, so their float32 bits sort as integers: stable passes of 12 bits over what differs from the
+    Depths are positive, so their float32 bits sort as integers: stable passes of 12 bits over the difference from the
     nearest, two where the farthest is within four times the nearest.
 
     Args:
@@ -104,10 +104,10 @@ def depth_order(splats, counts, keys, order, keys_too, order_too, histogram):
 
 @kernel
 def share_pairs(order, visible, counts, begins):
-    """Where each task's pairs begin, ``begins`` [tasks] int64: tasks have equal shares of the order.
+    """Fills the first pair of each task, ``begins`` [tasks] int64: tasks have equal shares of the order.
 
     Returns:
-        Pairs of Gaussians and tiles at most: tiles of all boxes.
+        Largest number of pairs of Gaussians and tiles: the tiles of all boxes.
     """
     tasks = begins.shape[0]
     total = 0
@@ -120,7 +120,7 @@ def share_pairs(order, visible, counts, begins):
 
 @parallel_kernel
 def cover_tiles(splats, rects, order, visible, tiles_x, begins, ends, counts, firsts, pairs, covers, tile_counts):
-    """List the tiles that each Gaussian's support reaches, in depth order.
+    """Lists the tiles that each Gaussian's support reaches, in depth order.
 
     Args:
         begins: [tasks] from ``share_pairs``. ends: out [tasks] int64, where each task's pairs end.
@@ -143,7 +143,7 @@ def cover_tiles(splats, rects, order, visible, tiles_x, begins, ends, counts, fi
                 for tile_x in range(rects[i, 0], rects[i, 2]):
                     blocks = cover(splats[i], tile_x, tile_y)
                     tile = tile_y * tiles_x + tile_x
-                    # Written in any case, kept if reached: there is nothing to guess for the processor.
+                    # Written in any case, kept if reached: without a branch that the processor could mispredict.
                     reached = np.int64(blocks != 0)
                     pairs[pair, 0] = i
                     pairs[pair, 1] = tile
@@ -156,7 +156,7 @@ def cover_tiles(splats, rects, order, visible, tiles_x, begins, ends, counts, fi
 
 @kernel
 def tile_offsets(tile_counts, starts, cursors):
-    """Where each tile's list begins, ``starts`` [tiles + 1], and each task's part of it, ``cursors`` [tasks, tiles].
+    """Fills the start of each tile's list, ``starts`` [tiles + 1], and of each task's part, ``cursors`` [tasks, tiles].
 
     Returns:
         Entries of all lists.
@@ -173,7 +173,7 @@ def tile_offsets(tile_counts, starts, cursors):
 
 @parallel_kernel
 def fill_tiles(begins, ends, pairs, covers, cursors, items, slots, entry_covers):
-    """Write the tile lists in depth order, each task its share, whose place ``tile_offsets`` has set aside.
+    """Writes the tile lists in depth order, each task its share, at the places of ``tile_offsets``.
 
     Args:
         cursors: [tasks, tiles] int64, moved on. items, slots: out [entries] int32, the Gaussian and its pair.

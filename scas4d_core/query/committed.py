@@ -40,7 +40,7 @@ class View:
 
     >>> black = np.zeros((2, 2), np.float32)
     >>> view = View(np.zeros((2, 2, 3), np.float32), alpha=black, depth=np.full_like(black, np.nan))
-    >>> view.colour.shape, view.parts is None  # labels were not asked for
+    >>> view.colour.shape, view.parts is None  # no labels were given
     ((2, 2, 3), True)
     """
 

@@ -26,7 +26,7 @@ PER_FRAME = ("means", "rotations", "factors", "colours", "foreground")
 FIXED = ("opacities", "ids")
 """Arrays of ``Gaussians`` that a scene keeps after frame 0."""
 FRAMES_KEPT = 4
-"""Frames of a history on disk that stay in memory: the newest, and the last ones asked for."""
+"""Frames of a history on disk that stay in memory: the newest, and the last ones read."""
 
 
 class HistoryReader:
@@ -224,7 +224,7 @@ class HistoryReader:
         try:
             return self._files.read(index, names)
         except FileNotFoundError:
-            self._forget(index)  # deleted, by the process that appends or by somebody else
+            self._forget(index)  # deleted, by the process that appends or by another
             self._files.faults[self._files.path(index).name] = f"{self._files.path(index).name} is gone"
             self._require(index)
             raise

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from client.wire import FileKind, FrameState
+from scas4d_core.storage.frame_files import FrameFiles
 from scas4d_core.storage.history import History, HistoryError
 from server.storage.definition import FRAMES_FOLDER, JOURNAL_FILE
 from server.storage.disk import no_room
@@ -254,7 +255,7 @@ def _states(folder: Path, damage: list[str]) -> _States:
     try:
         history = History.load(folder)
     except HistoryError as error:
-        if folder.exists() and any(folder.glob("frame_*.npz")):
+        if folder.exists() and FrameFiles(folder).listed():
             damage.append(f"the committed states cannot be read: {error}")
         return _States()
     damage.extend(f"frame {index}: its state is damaged: {reason}" for index, reason in history.damaged.items())
