@@ -13,7 +13,7 @@ from server.ingest.open_frames import OpenFrames
 from server.ingest.upload import Received
 from server.problems import Problem, counted
 from server.storage.disk import full_disk, no_room
-from server.storage.events import Budgeted, Fact, Missing, Paused, Skipped, Taken
+from server.storage.events import BudgetChanged, FrameAccepted, FrameMissing, FramesSkipped, JournalEvent, PauseChanged
 from server.storage.frame_store import remove
 from server.storage.ledger import frame_identity
 
@@ -110,8 +110,8 @@ class Ingest:
             self.rules.admit(head.index, seconds)
             if received.file is None:  # it was known when it came, and is not any more: a scene forgets nothing
                 raise AssertionError(f"frame {head.index} was not written")
-            fact = Taken(index=head.index, time=seconds, identity=identity, files=(received.file,))
-            await self._append(*self.rules.skips(head.index), fact)
+            event = FrameAccepted(index=head.index, time=seconds, identity=identity, files=(received.file,))
+            await self._append(*self.rules.skips(head.index), event)
             scene.held.add(received.file, received.size)
             received.kept = True
             metrics.INGEST_BYTES.inc(received.size)
@@ -186,7 +186,7 @@ class Ingest:
                     409, f"frame {index} is just coming in", field="n", value=index, remedy="wait for its end"
                 )
             parts = scene.ledger.open.get(index)
-            await self._append(Missing(index=index, reason=reason or "declared missing"))
+            await self._append(FrameMissing(index=index, reason=reason or "declared missing"))
             self._open.forget(index)
             if parts is not None:
                 scene.held.discard(parts.files)
@@ -202,7 +202,7 @@ class Ingest:
         async def change() -> None:
             async with self._scene.door:
                 if self._scene.ledger.paused != paused:
-                    await self._append(Paused(paused=paused))
+                    await self._append(PauseChanged(paused=paused))
 
         await whole(change())
 
@@ -220,22 +220,22 @@ class Ingest:
                 if scene.ledger.budgets[-1][1] == budget:
                     return
                 with scene.no_frame_begins():
-                    await self._append(Budgeted(index=scene.ledger.begins_next(), budget=budget))
+                    await self._append(BudgetChanged(index=scene.ledger.begins_next(), budget=budget))
 
         await whole(change())
 
-    async def _append(self, *facts: Fact) -> None:
-        """Facts on disk, then in the ledger."""
+    async def _append(self, *events: JournalEvent) -> None:
+        """Events on disk, then in the ledger."""
         try:
-            await self._scene.journal.append(*facts)
+            await self._scene.journal.append(*events)
         except OSError as error:
             if not no_room(error):
                 raise
             raise full_disk(error) from None
-        for fact in facts:
-            self._scene.ledger.apply(fact)
-            if isinstance(fact, Skipped):
-                for index in fact.frames:
+        for event in events:
+            self._scene.ledger.apply(event)
+            if isinstance(event, FramesSkipped):
+                for index in event.frames:
                     self._scene.finished(self._scene.frames[index].report)
 
     def stop(self) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from client.wire import FrameReceipt, FrameState
 from server.problems import Problem, counted
-from server.storage.events import Fact, Skipped
+from server.storage.events import FramesSkipped, JournalEvent
 from server.storage.frame_table import LOST
 
 if TYPE_CHECKING:
@@ -136,12 +136,12 @@ class Admission:
             retry_after_seconds=round(seconds, 3),
         )
 
-    def skips(self, index: int) -> list[Fact]:
+    def skips(self, index: int) -> list[JournalEvent]:
         """What has to be skipped to make room for a frame."""
         scene = self._scene
         if scene.queued < scene.queue_limit:
             return []
-        return [Skipped(frames=tuple(scene.ledger.waiting()), by=index)]
+        return [FramesSkipped(frames=tuple(scene.ledger.waiting()), by=index)]
 
     def never_taken(self, index: int) -> Problem:
         """409 for a frame that is finished and never had pictures."""

@@ -12,7 +12,7 @@ from server.health import metrics
 from server.ingest.admission import Admission
 from server.ingest.upload import Received
 from server.problems import Problem, counted
-from server.storage.events import Fact, PartTaken, Taken
+from server.storage.events import FrameAccepted, JournalEvent, PartAccepted
 from server.storage.frame_store import FrameDamage, read_pictures
 from server.storage.journal import replay
 from server.storage.ledger import OpenFrame, frame_identity
@@ -28,7 +28,7 @@ class OpenFrames:
     """The open frames of one scene.
 
     Args:
-        scene: their scene. rules: of its door. append: puts facts on disk and into the ledger.
+        scene: their scene. rules: of its door. append: puts events on disk and into the ledger.
     """
 
     def __init__(self, scene: Scene, rules: Admission, append: Callable[..., Awaitable[None]]) -> None:
@@ -95,8 +95,8 @@ class OpenFrames:
                     )
                 self.expects(head, camera)
                 assert received.file is not None
-                fact = PartTaken(index=index, time=head.time, camera=camera, file=received.file, hashes=kinds)
-                await self._append(fact)
+                event = PartAccepted(index=index, time=head.time, camera=camera, file=received.file, hashes=kinds)
+                await self._append(event)
                 scene.held.add(received.file, received.size)
                 received.kept = True
                 metrics.INGEST_BYTES.inc(received.size)
@@ -196,8 +196,10 @@ class OpenFrames:
         seconds = self.rules.time_of(frame.index, frame.time)
         hashes = {camera: kinds for camera, kinds in frame.hashes.items() if FileKind.IMAGE in kinds}
         identity = frame_identity(hashes, seconds)
-        fact = Taken(index=frame.index, time=seconds, identity=identity, files=tuple(sorted(frame.files)), closed_by=by)
-        await self._append(*self.rules.skips(frame.index), fact)
+        event = FrameAccepted(
+            index=frame.index, time=seconds, identity=identity, files=tuple(sorted(frame.files)), closed_by=by
+        )
+        await self._append(*self.rules.skips(frame.index), event)
         self.forget(frame.index)
         metrics.FRAMES.labels("acknowledged").inc()
         receipt = scene.frames[frame.index].receipt
@@ -220,9 +222,9 @@ def _parts_told(journal: Path, index: int) -> OpenFrame | None:
     """What the journal says that a frame was closed from: slow, for who sends again what was deleted long ago."""
     parts = OpenFrame(index)
 
-    def look(fact: Fact) -> None:
-        if isinstance(fact, PartTaken) and fact.index == index:
-            parts.add(fact)
+    def look(event: JournalEvent) -> None:
+        if isinstance(event, PartAccepted) and event.index == index:
+            parts.add(event)
 
     replay(journal, look)
     return parts if parts.hashes else None

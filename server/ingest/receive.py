@@ -190,7 +190,7 @@ async def _part_taken(scene: Scene, head: FrameHead, camera: str, receiving: Rec
 
 
 async def _kept_or_removed(receiving: Receiving, take: Callable[[Received], Coroutine[Any, Any, T]]) -> T:
-    """Whole, even where the request is cancelled: what a fact names, or is just about to name, must not be removed."""
+    """Completes even where the request is cancelled: a record that an event names, or will, must not be removed."""
 
     async def taken() -> T:
         received = await _finished(receiving)

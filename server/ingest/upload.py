@@ -36,7 +36,7 @@ class Received:
     file: str | None
     size: int
     kept: bool = False
-    """A fact names the record: it is not debris."""
+    """An event names the record: it is not debris."""
 
 
 class Receiving:

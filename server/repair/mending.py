@@ -17,7 +17,7 @@ from client.wire import FrameState
 from scas4d_core.storage.frame_files import checkpoint_of, frame_file, frame_of
 from server.processes.messages import FrameReady, Mend, Mended, MendOutcome, Remake
 from server.repair.damage import DamageKind, DamageLog
-from server.storage.events import Fact, StatesDeleted
+from server.storage.events import JournalEvent, StatesDeleted
 from server.storage.ledger import Ledger
 
 AGAIN_S = 5.0
@@ -39,8 +39,8 @@ class Hooks(Protocol):
     def states_changed(self, frames: tuple[int, ...]) -> None:
         """Files of states were written or lost: readers look again, and a frame may begin."""
 
-    def write_fact(self, fact: Fact) -> None:
-        """Journals a fact that was applied, in the background."""
+    def write_event(self, event: JournalEvent) -> None:
+        """Journals an event that was applied, in the background."""
 
 
 class Mending:
@@ -223,10 +223,10 @@ class Mending:
         reason = self._waiting.pop(index, "its state is damaged")
         said = f"the state of frame {index} was damaged on disk and cannot be made again: {why}"
         self._ledger.frames.set_unreadable(index, False)
-        fact = StatesDeleted(frames=(index,), reason=said)
-        self._ledger.apply(fact)
+        event = StatesDeleted(frames=(index,), reason=said)
+        self._ledger.apply(event)
         self._damage.say(DamageKind.STATE, f"{said} ({reason})")
-        self._hooks.write_fact(fact)
+        self._hooks.write_event(event)
 
     def _say(self, name: str, sentence: str, *, lasting: bool = False) -> None:
         kind = DamageKind.FIXED

@@ -38,7 +38,7 @@ from server.storage.ledger import Ledger
 
 AT_WORK = 0.25
 """Share of the rate while a frame is at work."""
-FACTS_WEIGH = 8
+EVENTS_WEIGH = 8
 """A byte of the journal, which is many small records, takes so many times the processor time of one of an array."""
 LOOK_S = 5.0
 """Whether the journal has its name is looked at so often."""
@@ -120,7 +120,7 @@ class Scrub:
         journal = self._scene.journal
         journal.look()
         file, good = journal.place
-        fault = await self._read(checked_journal(journal.path, good), FACTS_WEIGH)
+        fault = await self._read(checked_journal(journal.path, good), EVENTS_WEIGH)
         if fault is not None and fault != "gone" and journal.place[0] == file:  # else it was written anew meanwhile
             journal.renew(f"{journal.path.name} is damaged ({fault})")
 

@@ -45,18 +45,18 @@ from server.scene.work_clock import WorkClock
 from server.settings import ServerSettings
 from server.storage.definition import Definition
 from server.storage.disk import no_room
-from server.storage.events import Created, Died, Fact, FramesDeleted, SetAside, StatesDeleted
+from server.storage.events import FrameSetAside, JournalEvent, PicturesDeleted, SceneCreated, StatesDeleted, WorkerDied
 from server.storage.frame_store import remove
 from server.storage.frame_table import FrameTable
 from server.storage.journal import Journal
 from server.storage.recovery import Recovered
-from server.storage.snapshot import facts_of
+from server.storage.snapshot import events_of
 from server.stream.hub import Event, FrameFinished, Hub, SceneChanged
 
 log = logging.getLogger("scas4d.server")
 
 AGAIN_S = 1.0
-"""A fact that the disk has no room for is written again after so long."""
+"""An event that the disk has no room for is written again after so long."""
 
 
 class Scene:
@@ -93,7 +93,7 @@ class Scene:
         self.held = Held(found.sizes)
         self.damage = DamageLog(found.damage)
         self._definition = definition
-        self.journal = Journal(self.spec.journal, found.good, self._all_facts, self._journal_renewed)
+        self.journal = Journal(self.spec.journal, found.good, self._all_events, self._journal_renewed)
         self.supervision = Supervision()
         self.progress: ProgressModel | None = None
         self.points_sha256: str | None = None
@@ -117,8 +117,8 @@ class Scene:
         self.mending = Mending(self.ledger, self.damage, self, found.remake)
         self._worker: Process
         self._start_worker()
-        if found.facts:
-            self.background(self._write(*found.facts))
+        if found.events:
+            self.background(self._write(*found.events))
         scrubbed = Scrubbed(
             definition, self.spec, self.ledger, self.journal, self.damage, self.mending.noticed, lambda: self.at_work
         )
@@ -225,10 +225,10 @@ class Scene:
             case Committed():
                 self.background(self._commit(message))
             case SetAsideMessage():
-                fact = SetAside(
+                event = FrameSetAside(
                     index=message.index, reason=message.reason, dropped=message.dropped, fatal=message.fatal
                 )
-                self.background(self._set_aside(fact))
+                self.background(self._set_aside(event))
             case Mended():
                 self.mending.mended(message)
             case Stalled():
@@ -244,12 +244,12 @@ class Scene:
         """The worker has taken up what is committed: what it found decides which frames are still to be done."""
         newest = self.committed[-1] if self.committed else -1
         again = self.mending.frames | {index for index in ready.damaged if index < max(ready.indices, default=-1)}
-        facts = self.ledger.reconcile(ready.indices, ready.damaged, again)
+        events = self.ledger.reconcile(ready.indices, ready.damaged, again)
         for fault in ready.faults:
             log.warning("scene %s: %s", self.id, fault)
             self.damage.say(DamageKind.STATE, fault)
-        if facts:
-            await self._write(*facts)
+        if events:
+            await self._write(*events)
         if ready.indices and ready.report:
             self._fill(ready.indices[-1], ready.report)
             self._questions.refresh()
@@ -285,28 +285,28 @@ class Scene:
         await self.retain()
         await self.ingest.close_what_can_be()
 
-    async def _set_aside(self, fact: SetAside) -> None:
-        await self._write(fact)
-        self.ledger.apply(fact)
+    async def _set_aside(self, event: FrameSetAside) -> None:
+        await self._write(event)
+        self.ledger.apply(event)
         self.clock.end(committed=False)
         self._at_work, self.progress = None, None
-        self.trouble = reports.trouble(self.frames[fact.index].report)
-        if fact.fatal:
+        self.trouble = reports.trouble(self.frames[event.index].report)
+        if event.fatal:
             async with self.door:  # from here on none is taken; the one that is just being taken waits like the others
                 pass
             await self._fail_those_that_wait()
         log.warning("scene %s: %s", self.id, self.trouble)
-        self._tell(FrameFinished(self.frames[fact.index].report))
+        self._tell(FrameFinished(self.frames[event.index].report))
         self.work()
         await self.ingest.close_what_can_be()
 
     async def _fail_those_that_wait(self) -> None:
-        facts = self.ledger.hopeless()
-        if facts:
-            await self._write(*facts)
-        for fact in facts:
-            self.ledger.apply(fact)
-            self._tell(FrameFinished(self.frames[fact.index].report))
+        events = self.ledger.hopeless()
+        if events:
+            await self._write(*events)
+        for event in events:
+            self.ledger.apply(event)
+            self._tell(FrameFinished(self.frames[event.index].report))
 
     def _fill(self, index: int, committed: dict[str, Any]) -> None:
         self.frames.set_numbers(index, committed)
@@ -321,17 +321,17 @@ class Scene:
             return
         names = [name for index in gone for name in self.frames[index].files]
         self.held.discard(names)
-        fact = FramesDeleted(frames=tuple(gone))
-        self.ledger.apply(fact)
+        event = PicturesDeleted(frames=tuple(gone))
+        self.ledger.apply(event)
         self._tell(SceneChanged())
         await asyncio.to_thread(remove, self.spec.frames, names)
-        await self._write(fact)
+        await self._write(event)
 
-    async def _write(self, *facts: Fact) -> None:
-        """Appends facts that have happened and cannot be refused: again and again until there is room."""
+    async def _write(self, *events: JournalEvent) -> None:
+        """Appends events that have happened and cannot be refused: again and again until there is room."""
         while True:
             try:
-                await self.journal.append(*facts)
+                await self.journal.append(*events)
                 return
             except OSError as error:
                 if not no_room(error):
@@ -354,13 +354,13 @@ class Scene:
             self._questions.refresh(frames)
         self.work()
 
-    def write_fact(self, fact: Fact) -> None:
-        """Journals a fact that was applied, in the background."""
-        self.background(self._write(fact))
+    def write_event(self, event: JournalEvent) -> None:
+        """Journals an event that was applied, in the background."""
+        self.background(self._write(event))
 
-    def _all_facts(self) -> Iterator[Fact]:
+    def _all_events(self) -> Iterator[JournalEvent]:
         """What the journal has to say; see `Journal`."""
-        return chain((Created(definition=self._definition.as_json()),), facts_of(self.ledger.copy()))
+        return chain((SceneCreated(definition=self._definition.as_json()),), events_of(self.ledger.copy()))
 
     def _journal_renewed(self, fault: str) -> None:
         self.damage.say(DamageKind.JOURNAL, f"{fault}; it was written anew from what the service knows")
@@ -387,13 +387,13 @@ class Scene:
         index, self._at_work = self._at_work, None
         if index is not None and self.frames[index].state == FrameState.UPDATING:
             self.ledger.move(index, FrameState.QUEUED)
-            death = Died(index=index, reason=reason, own=own)
+            death = WorkerDied(index=index, reason=reason, own=own)
             await self._write(death)
             self.ledger.apply(death)
             # It may have died between its commit and saying so: the next worker tells, and only then is it given up.
-            fact = given_up(self.frames[index], death)
-            if fact is not None and not await asyncio.to_thread(self._is_committed, index):
-                await self._set_aside(fact)
+            event = given_up(self.frames[index], death)
+            if event is not None and not await asyncio.to_thread(self._is_committed, index):
+                await self._set_aside(event)
         self._tell(SceneChanged())
         if not self._stopping:
             self._again = asyncio.get_running_loop().call_later(delay, self._start_worker)

@@ -27,7 +27,7 @@ from server.storage.definition import (
     write_definition,
 )
 from server.storage.disk import FolderLock, full_disk, no_room
-from server.storage.events import Created
+from server.storage.events import SceneCreated
 from server.storage.journal import Journal
 from server.storage.recovery import recover
 from server.stream.hub import Hub
@@ -185,7 +185,7 @@ class Scenes:
         (folder / FRAMES_FOLDER).mkdir(parents=True)
         journal = Journal(folder / JOURNAL_FILE)
         try:
-            await journal.append(Created(definition=definition.as_json()))
+            await journal.append(SceneCreated(definition=definition.as_json()))
         finally:
             await journal.close()
         sync_folder(folder.parent)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
-from server.storage.events import Died, SetAside
+from server.storage.events import FrameSetAside, WorkerDied
 from server.storage.frame_table import FrameEntry
 
 OWN_SIGNALS = frozenset(
@@ -63,7 +63,7 @@ class Supervision:
         return own, delay
 
 
-def given_up(entry: FrameEntry, death: Died) -> SetAside | None:
+def given_up(entry: FrameEntry, death: WorkerDied) -> FrameSetAside | None:
     """That the frame is set aside for this death, counted already; or None: it is tried again."""
     own, other = entry.note.own_deaths, entry.note.other_deaths
     if own >= OWN_DEATHS:
@@ -72,4 +72,4 @@ def given_up(entry: FrameEntry, death: Died) -> SetAside | None:
         reason = f"the worker was killed {other} times while it reconstructed this frame: {death.reason}"
     else:
         return None
-    return SetAside(index=death.index, reason=reason)
+    return FrameSetAside(index=death.index, reason=reason)

@@ -14,7 +14,7 @@ from client.wire import SceneCreate
 from scas4d_core.settings import Settings
 from scas4d_core.storage.error_text import told
 from scas4d_core.storage.npz import written_whole
-from server.storage.events import Created, Fact
+from server.storage.events import JournalEvent, SceneCreated
 from server.storage.journal import replay
 
 FORMAT = 1
@@ -82,8 +82,8 @@ def read_definition(folder: Path) -> tuple[Definition, str | None]:
     found, said = _checked(folder)
     if isinstance(found, Definition):
         return found, None
-    created: list[Created] = []
-    replay(folder / JOURNAL_FILE, lambda fact: created.append(fact) if isinstance(fact, Created) else None)
+    created: list[SceneCreated] = []
+    replay(folder / JOURNAL_FILE, lambda event: created.append(event) if isinstance(event, SceneCreated) else None)
     if created:
         return Definition.of_json(created[0].definition), f"{said}; taken from the journal"
     raise DefinitionError(f"{said}, and the journal does not have it either")
@@ -110,15 +110,15 @@ def _checked(folder: Path) -> tuple[Definition | None, str | None]:
 def is_nothing(folder: Path) -> bool:
     """Whether a folder without `scene.json` is of a scene that was never acknowledged.
 
-    Then it has no frame, no state, no points, and no fact but that of its making.
+    Then it has no frame, no state, no points, and no event but that of its making.
     """
     if (folder / SCENE_FILE).exists() or (folder / POINTS_FILE).exists():
         return False
     if any(any((folder / inside).glob("*")) for inside in (FRAMES_FOLDER, STATES_FOLDER)):
         return False
-    facts: list[Fact] = []
-    replay(folder / JOURNAL_FILE, facts.append)
-    return len(facts) < 2
+    events: list[JournalEvent] = []
+    replay(folder / JOURNAL_FILE, events.append)
+    return len(events) < 2
 
 
 def _digest(text: str) -> str:

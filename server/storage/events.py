@@ -1,4 +1,4 @@
-"""What the journal of a scene says: small facts, for ever. Everything known of a frame follows from them in order."""
+"""What the journal of a scene says: small events, for ever. Everything known of a frame follows from them in order."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ Hashes = dict[str, dict[FileKind, str]]
 """BLAKE3 of each file, by camera and kind."""
 
 
-class _Fact(BaseModel):
+class _Event(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
-class Created(_Fact):
+class SceneCreated(_Event):
     """The scene's definition, once more: `scene.json` may be damaged."""
 
     fact: Literal["created"] = "created"
     definition: dict[str, Any]
 
 
-class Taken(_Fact):
+class FrameAccepted(_Event):
     """A whole frame was acknowledged: its pictures lie in `files` of the frame log, which are all on disk."""
 
     fact: Literal["taken"] = "taken"
@@ -35,7 +35,7 @@ class Taken(_Fact):
     """`found`: not told by the journal, which is damaged, but whole in the frame log at a start."""
 
 
-class PartTaken(_Fact):
+class PartAccepted(_Event):
     """One camera's files of a frame that is open were acknowledged. `time` is None where the camera gave none."""
 
     fact: Literal["part"] = "part"
@@ -46,7 +46,7 @@ class PartTaken(_Fact):
     hashes: dict[FileKind, str]
 
 
-class Missing(_Fact):
+class FrameMissing(_Event):
     """A frame was declared missing."""
 
     fact: Literal["missing"] = "missing"
@@ -54,7 +54,7 @@ class Missing(_Fact):
     reason: str
 
 
-class Skipped(_Fact):
+class FramesSkipped(_Event):
     """Frames were skipped because frame `by` came and the queue was full."""
 
     fact: Literal["skipped"] = "skipped"
@@ -62,7 +62,7 @@ class Skipped(_Fact):
     by: int
 
 
-class SetAside(_Fact):
+class FrameSetAside(_Event):
     """A frame could not be reconstructed. `fatal`: the scene cannot go on without it."""
 
     fact: Literal["set_aside"] = "set_aside"
@@ -72,7 +72,7 @@ class SetAside(_Fact):
     fatal: bool = False
 
 
-class Died(_Fact):
+class WorkerDied(_Event):
     """The worker died at a frame; `own`: through its own doing, not by a signal from outside."""
 
     fact: Literal["died"] = "died"
@@ -81,14 +81,14 @@ class Died(_Fact):
     own: bool
 
 
-class FramesDeleted(_Fact):
+class PicturesDeleted(_Event):
     """Retention deleted the pictures of frames."""
 
     fact: Literal["frames_deleted"] = "frames_deleted"
     frames: tuple[int, ...]
 
 
-class StatesDeleted(_Fact):
+class StatesDeleted(_Event):
     """Retention deleted committed states, or they were found damaged or gone (`reason`)."""
 
     fact: Literal["states_deleted"] = "states_deleted"
@@ -96,7 +96,7 @@ class StatesDeleted(_Fact):
     reason: str = "retention"
 
 
-class StateFound(_Fact):
+class StateFound(_Event):
     """A committed state was found whose acknowledgement the journal has lost; `time` is that of the state."""
 
     fact: Literal["state_found"] = "state_found"
@@ -104,14 +104,14 @@ class StateFound(_Fact):
     time: float | None
 
 
-class Paused(_Fact):
+class PauseChanged(_Event):
     """The scene was paused, or told to go on."""
 
     fact: Literal["paused"] = "paused"
     paused: bool
 
 
-class Budgeted(_Fact):
+class BudgetChanged(_Event):
     """Another budget holds from frame `index` on: a frame that is done again gets the one that held for it."""
 
     fact: Literal["budget"] = "budget"
@@ -119,29 +119,29 @@ class Budgeted(_Fact):
     budget: Budget
 
 
-Fact = Annotated[
-    Created
-    | Taken
-    | PartTaken
-    | Missing
-    | Skipped
-    | SetAside
-    | Died
-    | FramesDeleted
+JournalEvent = Annotated[
+    SceneCreated
+    | FrameAccepted
+    | PartAccepted
+    | FrameMissing
+    | FramesSkipped
+    | FrameSetAside
+    | WorkerDied
+    | PicturesDeleted
     | StatesDeleted
     | StateFound
-    | Paused
-    | Budgeted,
+    | PauseChanged
+    | BudgetChanged,
     Field(discriminator="fact"),
 ]
-_adapter: TypeAdapter[Fact] = TypeAdapter(Fact)
+_adapter: TypeAdapter[JournalEvent] = TypeAdapter(JournalEvent)
 
 
-parse_fact = _adapter.validate_json
-"""A fact from a record's head; raises `ValidationError`."""
+parse_event = _adapter.validate_json
+"""An event from a record's head; raises `ValidationError`."""
 
 
-def no_fact(error: ValidationError) -> str:
-    """Why a head is no fact."""
+def why_no_event(error: ValidationError) -> str:
+    """Why a head is no event."""
     first = error.errors()[0]
-    return f"{'.'.join(map(str, first['loc'])) or 'fact'}: {first['msg']}"
+    return f"{'.'.join(map(str, first['loc'])) or 'event'}: {first['msg']}"

@@ -1,6 +1,6 @@
-"""The journal of a scene: one append-only file of facts. A fact is acknowledged when it is on disk.
+"""The journal of a scene: one append-only file of events. An event is acknowledged when it is on disk.
 
-A file that is deleted, or that another takes the place of, while the service runs would take facts that nobody finds
+A file that is deleted, or that another takes the place of, while the service runs would take events that nobody finds
 again: each write looks whether the file still has its name. Then, and where a scrub finds it damaged, the journal is
 written anew from what the service knows (`snapshot`), beside its place, and renamed.
 """
@@ -19,39 +19,39 @@ from pydantic import ValidationError
 from scas4d_core.storage.npz import sync_folder, written_whole
 from server.problems import Problem
 from server.storage.disk import no_room
-from server.storage.events import Created, Died, Fact, no_fact, parse_fact
+from server.storage.events import JournalEvent, SceneCreated, WorkerDied, parse_event, why_no_event
 from server.storage.record_log import Damage, Kind, encoded, streamed
 
 PIECE = 1 << 16
 """Bytes that are compared at a time."""
 TOGETHER = 1000
-"""Facts that are encoded at a time where a whole journal is written."""
+"""Events that are encoded at a time where a whole journal is written."""
 
-Snapshot = Callable[[], Iterator[Fact]]
-"""Taken at once, on the event loop; its facts may be told in another thread."""
+Snapshot = Callable[[], Iterator[JournalEvent]]
+"""Taken at once, on the event loop; its events may be told in another thread."""
 
 
 @dataclass(frozen=True)
 class JournalRead:
-    """What a journal holds: its facts in order, the bytes that are whole, and a sentence for each damage."""
+    """What a journal holds: its events in order, the bytes that are whole, and a sentence for each damage."""
 
-    facts: list[Fact]
+    events: list[JournalEvent]
     good: int
     damage: list[str]
 
 
 def read_journal(path: Path) -> JournalRead:
     """All of a journal that is not large; see `replay`."""
-    facts: list[Fact] = []
-    told = replay(path, facts.append)
-    return JournalRead(facts, told.good, told.damage)
+    events: list[JournalEvent] = []
+    told = replay(path, events.append)
+    return JournalRead(events, told.good, told.damage)
 
 
 @dataclass(frozen=True)
-class Replayed:
+class JournalReading:
     """How a journal was read: the bytes that are whole, and a sentence for each damage.
 
-    `broken`: more than a torn tail is damaged; what it said may be lost. `begun`: its first fact is `Created`.
+    `broken`: more than a torn tail is damaged; what it said may be lost. `begun`: its first event is `SceneCreated`.
     """
 
     good: int
@@ -60,8 +60,8 @@ class Replayed:
     begun: bool = False
 
 
-def replay(path: Path, take: Callable[[Fact], object]) -> Replayed:
-    """Tells `take` every fact that is whole, in order, reading piece by piece; never raises for what the file holds.
+def replay(path: Path, take: Callable[[JournalEvent], object]) -> JournalReading:
+    """Tells `take` every event that is whole, in order, reading piece by piece; never raises for what the file holds.
 
     A torn tail is what an append leaves that was cut short: it was never acknowledged, and it is dropped.
     """
@@ -71,7 +71,7 @@ def replay(path: Path, take: Callable[[Fact], object]) -> Replayed:
     try:
         opened = path.open("rb")
     except FileNotFoundError:
-        return Replayed(0, said)
+        return JournalReading(0, said)
     with opened as file:
         good = os.fstat(file.fileno()).st_size
         for found in streamed(file):
@@ -82,23 +82,23 @@ def replay(path: Path, take: Callable[[Fact], object]) -> Replayed:
                 said.append(f"{path.name}: bytes {found.start} to {found.end} dropped: {found.reason}")
                 continue
             try:
-                fact = parse_fact(found.text)
+                event = parse_event(found.text)
             except ValidationError as error:
-                fault = no_fact(error)
+                fault = why_no_event(error)
                 broken = True
-                said.append(f"{path.name}: a record of kind {found.kind}, frame {found.frame}, is no fact: {fault}")
+                said.append(f"{path.name}: a record of kind {found.kind}, frame {found.frame}, is no event: {fault}")
                 continue
-            begun = isinstance(fact, Created) if begun is None else begun
-            take(fact)
-    return Replayed(good, said, broken, bool(begun))
+            begun = isinstance(event, SceneCreated) if begun is None else begun
+            take(event)
+    return JournalReading(good, said, broken, bool(begun))
 
 
-def bytes_of(facts: Iterable[Fact]) -> bytes:
-    """Facts as records, one after the other."""
-    return b"".join(encoded(Kind.FACT, _index(fact), fact.model_dump(mode="json")) for fact in facts)
+def bytes_of(events: Iterable[JournalEvent]) -> bytes:
+    """Events as records, one after the other."""
+    return b"".join(encoded(Kind.EVENT, _index(event), event.model_dump(mode="json")) for event in events)
 
 
-def write_journal(path: Path, facts: Iterator[Fact]) -> int:
+def write_journal(path: Path, events: Iterator[JournalEvent]) -> int:
     """A journal that is whole at `path`, in place of what is there; blocking.
 
     Returns:
@@ -110,8 +110,8 @@ def write_journal(path: Path, facts: Iterator[Fact]) -> int:
     beside = path.with_name(f".{path.name}.part")
     size, batch = 0, []
     with written_whole(path, beside) as file:
-        for fact in facts:
-            batch.append(fact)
+        for event in events:
+            batch.append(event)
             if len(batch) == TOGETHER:
                 size += file.write(bytes_of(batch))
                 batch = []
@@ -154,12 +154,12 @@ def checked_journal(path: Path, good: int) -> Iterator[int]:
 
 
 class Journal:
-    """Appends facts. Those that come while one write is under way share the next one.
+    """Appends events. Those that come while one write is under way share the next one.
 
     Args:
         path: of the file; made where there is none.
         good: bytes of it that are whole; what follows is cut off.
-        snapshot: all facts that are known now, which the journal is written anew from; None: it never is.
+        snapshot: all events that are known now, which the journal is written anew from; None: it never is.
         renewed: told of the fault each time that it was.
     """
 
@@ -179,9 +179,9 @@ class Journal:
         os.ftruncate(self._file, good)
         os.fsync(self._file)
         sync_folder(path.parent)
-        self._waiting: list[tuple[Sequence[Fact], asyncio.Future[None]]] = []
-        self._last: list[Fact] = []
-        """Facts that were written last: whoever appended them may not have taken them in yet."""
+        self._waiting: list[tuple[Sequence[JournalEvent], asyncio.Future[None]]] = []
+        self._last: list[JournalEvent] = []
+        """Events that were written last: whoever appended them may not have taken them in yet."""
         self._fault: str | None = None
         self._flushing: asyncio.Task[None] | None = None
 
@@ -190,8 +190,8 @@ class Journal:
         """Which file it is written to, and the bytes of it that are whole: whether it was written anew meanwhile."""
         return os.fstat(self._file).st_ino, self._good
 
-    async def append(self, *facts: Fact) -> None:
-        """Returns when the facts are on disk, all or none of them.
+    async def append(self, *events: JournalEvent) -> None:
+        """Returns when the events are on disk, all or none of them.
 
         Raises:
             OSError: they are not; the file is as it was.
@@ -200,7 +200,7 @@ class Journal:
         if self._closed:
             raise Problem(503, "the scene has ended", remedy="ask again: a scene that was deleted is not found then")
         done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._waiting.append((facts, done))
+        self._waiting.append((events, done))
         self._begin()
         await asyncio.shield(done)
 
@@ -235,17 +235,17 @@ class Journal:
         try:
             while self._waiting or self._fault is not None:
                 batch, self._waiting = self._waiting, []
-                facts = [fact for some, _ in batch for fact in some]
+                events = [event for some, _ in batch for event in some]
                 fault: Exception | None = None
                 try:
                     if self._fault is None:
-                        self._fault = await asyncio.to_thread(self._write, facts)
+                        self._fault = await asyncio.to_thread(self._write, events)
                     if self._fault is not None:
-                        await self._renew_or_append(facts)
+                        await self._renew_or_append(events)
                 except Exception as error:  # whatever it is, those who wait are told
                     fault = error
                 else:
-                    self._last = facts or self._last
+                    self._last = events or self._last
                 for _, done in batch:
                     if done.done():
                         continue
@@ -255,16 +255,16 @@ class Journal:
                         done.set_exception(fault)
                         done.exception()  # whoever asked may have gone: not a fault of the event loop
                 if fault is not None and not batch and not self._waiting:
-                    break  # the next fact tries again
+                    break  # the next event tries again
         finally:
             self._flushing = None
 
-    def _write(self, facts: Sequence[Fact]) -> str | None:
-        """Appends; answers what is wrong with the file's place, and then the facts are not where they should be."""
+    def _write(self, events: Sequence[JournalEvent]) -> str | None:
+        """Appends; answers what is wrong with the file's place, and then the events are not where they should be."""
         watched = self._snapshot is not None
         if watched and (fault := self.misplaced()) is not None:
             return fault
-        data = bytes_of(facts)
+        data = bytes_of(events)
         view = memoryview(data)
         try:
             while view:
@@ -276,38 +276,38 @@ class Journal:
         self._good += len(data)
         return self.misplaced() if watched else None
 
-    async def _renew_or_append(self, facts: Sequence[Fact]) -> None:
+    async def _renew_or_append(self, events: Sequence[JournalEvent]) -> None:
         """Writes it anew; where there is no room for that and the file is in its place, what comes goes behind.
 
         A damaged record costs what it said, a refused frame costs the frame; the next scrub finds the damage again.
         """
         try:
-            await self._renew(facts)
+            await self._renew(events)
         except OSError as error:
             if not no_room(error) or self.misplaced() is not None:
                 raise
             self._fault = None
-            if facts and (fault := await asyncio.to_thread(self._write, facts)) is not None:
+            if events and (fault := await asyncio.to_thread(self._write, events)) is not None:
                 self._fault = fault
                 raise
 
-    async def _renew(self, facts: Sequence[Fact]) -> None:
+    async def _renew(self, events: Sequence[JournalEvent]) -> None:
         """Writes it anew: what the snapshot tells, and behind it what that may lack."""
         assert self._snapshot is not None
         assert self._fault is not None
         told = self._snapshot()
-        # Facts may be told twice, but for a death, which would be counted twice: whoever appended it takes it in after.
-        last = [fact for fact in self._last if not isinstance(fact, Died)]
-        self._good = await asyncio.to_thread(self._replace, told, [*last, *facts])
+        # Events may be told twice, except a death, which would be counted twice: its sender applies it afterwards.
+        last = [event for event in self._last if not isinstance(event, WorkerDied)]
+        self._good = await asyncio.to_thread(self._replace, told, [*last, *events])
         fault, self._fault = self._fault, None
         self._renewed(fault)
 
-    def _replace(self, told: Iterator[Fact], behind: Sequence[Fact]) -> int:
-        def all_facts() -> Iterator[Fact]:
+    def _replace(self, told: Iterator[JournalEvent], behind: Sequence[JournalEvent]) -> int:
+        def all_events() -> Iterator[JournalEvent]:
             yield from told
             yield from behind
 
-        size = write_journal(self.path, all_facts())
+        size = write_journal(self.path, all_events())
         file = os.open(self.path, os.O_RDWR | os.O_CLOEXEC)
         os.close(self._file)
         self._file = file
@@ -321,6 +321,6 @@ class Journal:
         os.close(self._file)
 
 
-def _index(fact: Fact) -> int:
-    frames: Sequence[int] = getattr(fact, "frames", ())
-    return int(getattr(fact, "index", frames[0] if frames else 0))
+def _index(event: JournalEvent) -> int:
+    frames: Sequence[int] = getattr(event, "frames", ())
+    return int(getattr(event, "index", frames[0] if frames else 0))

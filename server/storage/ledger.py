@@ -1,4 +1,4 @@
-"""What is known of the frames of a scene: the fold of its journal's facts. No disk, no processes, no clock.
+"""What is known of the frames of a scene: the fold of its journal's events. No disk, no processes, no clock.
 
 The running scene and the one that is found again after a restart go through the same `apply`.
 """
@@ -15,19 +15,19 @@ from blake3 import blake3
 
 from client.wire import Budget, FileKind, FrameState
 from server.storage.events import (
-    Budgeted,
-    Died,
-    Fact,
-    FramesDeleted,
+    BudgetChanged,
+    FrameAccepted,
+    FrameMissing,
+    FrameSetAside,
+    FramesSkipped,
     Hashes,
-    Missing,
-    PartTaken,
-    Paused,
-    SetAside,
-    Skipped,
+    JournalEvent,
+    PartAccepted,
+    PauseChanged,
+    PicturesDeleted,
     StateFound,
     StatesDeleted,
-    Taken,
+    WorkerDied,
 )
 from server.storage.frame_table import CODES, DELETED, FEW, LOST, RECEIPT, FrameTable
 
@@ -58,7 +58,7 @@ class OpenFrame:
         """Whose picture is here."""
         return sorted(camera for camera, kinds in self.hashes.items() if FileKind.IMAGE in kinds)
 
-    def add(self, part: PartTaken) -> None:
+    def add(self, part: PartAccepted) -> None:
         """One more camera, or one more file of a camera."""
         self.time = part.time if self.time is None else self.time
         self.hashes.setdefault(part.camera, {}).update(part.hashes)
@@ -103,52 +103,52 @@ class Ledger:
         """Frames acknowledged and not finished."""
         return self.counts[FrameState.QUEUED] + self.counts[FrameState.UPDATING]
 
-    def apply(self, fact: Fact) -> None:
-        """Takes one fact in. Facts may come twice, and those before them may be lost."""
-        match fact:
-            case Taken():
-                parts = self.open.pop(fact.index, None)
-                self._have(fact.index)
-                self.frames.take(fact.index, fact.time, fact.identity, fact.files, parts)
-            case PartTaken() if fact.index >= self.next_frame:
-                self.open.setdefault(fact.index, OpenFrame(fact.index)).add(fact)
-            case Missing():
-                self._have(fact.index)
-                self.frames.note(fact.index).error = fact.reason
-                self.move(fact.index, FrameState.MISSING)
-            case Skipped():
-                for index in fact.frames:
+    def apply(self, event: JournalEvent) -> None:
+        """Takes one event in. Events may come twice, and those before them may be lost."""
+        match event:
+            case FrameAccepted():
+                parts = self.open.pop(event.index, None)
+                self._have(event.index)
+                self.frames.take(event.index, event.time, event.identity, event.files, parts)
+            case PartAccepted() if event.index >= self.next_frame:
+                self.open.setdefault(event.index, OpenFrame(event.index)).add(event)
+            case FrameMissing():
+                self._have(event.index)
+                self.frames.note(event.index).error = event.reason
+                self.move(event.index, FrameState.MISSING)
+            case FramesSkipped():
+                for index in event.frames:
                     self._have(index)
-                    self.frames.skip(index, fact.by)
-            case SetAside():
-                self._have(fact.index)
-                note = self.frames.note(fact.index)
-                note.error, note.dropped = fact.reason, dict(fact.dropped)
-                self.fatal = fact.reason if fact.fatal else self.fatal
-                self.move(fact.index, FrameState.SET_ASIDE)
-            case Died():
-                self._have(fact.index)
-                note = self.frames.note(fact.index)
-                note.own_deaths += fact.own
-                note.other_deaths += not fact.own
-            case FramesDeleted():
-                for index in fact.frames:
+                    self.frames.skip(index, event.by)
+            case FrameSetAside():
+                self._have(event.index)
+                note = self.frames.note(event.index)
+                note.error, note.dropped = event.reason, dict(event.dropped)
+                self.fatal = event.reason if event.fatal else self.fatal
+                self.move(event.index, FrameState.SET_ASIDE)
+            case WorkerDied():
+                self._have(event.index)
+                note = self.frames.note(event.index)
+                note.own_deaths += event.own
+                note.other_deaths += not event.own
+            case PicturesDeleted():
+                for index in event.frames:
                     self._have(index)
                     self.frames.set_files(index, ())
             case StatesDeleted():
-                self._have(max(fact.frames, default=-1))
-                self.states_deleted += self.frames.delete_states(fact.frames)
-                if fact.reason != RETENTION and len(fact.frames) < FEW:
-                    for index in fact.frames:
-                        self.frames.note(index).error = fact.reason
+                self._have(max(event.frames, default=-1))
+                self.states_deleted += self.frames.delete_states(event.frames)
+                if event.reason != RETENTION and len(event.frames) < FEW:
+                    for index in event.frames:
+                        self.frames.note(index).error = event.reason
             case StateFound():
-                self._have(fact.index)
-                self.frames.found(fact.index, fact.time)
-            case Paused():
-                self.paused = fact.paused
-            case Budgeted():
-                self.budgets = [one for one in self.budgets if one[0] < fact.index] or [(0, Budget())]
-                self.budgets.append((fact.index, fact.budget))
+                self._have(event.index)
+                self.frames.found(event.index, event.time)
+            case PauseChanged():
+                self.paused = event.paused
+            case BudgetChanged():
+                self.budgets = [one for one in self.budgets if one[0] < event.index] or [(0, Budget())]
+                self.budgets.append((event.index, event.budget))
             case _:  # created: the scene's own; a part of a frame that is closed
                 pass
 
@@ -164,7 +164,9 @@ class Ledger:
         """A frame is in another state."""
         self.frames.move(index, state)
 
-    def reconcile(self, indices: Sequence[int], damaged: Mapping[int, str], remake: Collection[int] = ()) -> list[Fact]:
+    def reconcile(
+        self, indices: Sequence[int], damaged: Mapping[int, str], remake: Collection[int] = ()
+    ) -> list[JournalEvent]:
         """Brings the frames in line with the committed states that are there, and tells what the journal lacks.
 
         Args:
@@ -172,11 +174,11 @@ class Ledger:
             remake: of those that are damaged or gone, states that will be made again: nothing is told of them.
 
         Returns:
-            Facts, already applied, that have to be appended: states that are gone, frames that have to be done again
+            Events, already applied, that have to be appended: states that are gone, frames that have to be done again
             and cannot.
         """
         last = indices[-1] if indices else -1
-        facts: list[Fact] = []
+        events: list[JournalEvent] = []
         if last >= self.next_frame:  # the journal is damaged
             self._have(last)
         frames, count = self.frames, self.next_frame
@@ -187,10 +189,12 @@ class Ledger:
             frames.move(int(index), FrameState.QUEUED)
             self.states_deleted -= frames.restore_state(int(index))
             if not frames[int(index)].files:
-                facts.append(SetAside(index=int(index), reason="its state is damaged, and its pictures are deleted"))
+                events.append(
+                    FrameSetAside(index=int(index), reason="its state is damaged, and its pictures are deleted")
+                )
         frames.commit_up_to(last)
         lost = readable & (codes == CODES[FrameState.SET_ASIDE]) & ~frames.flagged(RECEIPT)
-        for index in np.flatnonzero(lost):  # its fact is lost, its state is not
+        for index in np.flatnonzero(lost):  # its event is lost, its state is not
             frames.note(int(index)).error = None
             frames.move(int(index), FrameState.COMMITTED)
         unreadable = (frames.states() == CODES[FrameState.COMMITTED]) & ~frames.flagged(DELETED) & ~readable
@@ -200,10 +204,10 @@ class Ledger:
                 frames.set_unreadable(again, True)
         if gone:
             said = "; ".join(damaged[index] for index in gone if index in damaged)
-            facts.append(StatesDeleted(frames=gone, reason=said or "found gone"))
-        for fact in facts:
-            self.apply(fact)
-        return facts
+            events.append(StatesDeleted(frames=gone, reason=said or "found gone"))
+        for event in events:
+            self.apply(event)
+        return events
 
     def copy(self) -> Ledger:
         """As it is now, for who goes through it elsewhere; without the numbers of commits."""
@@ -223,11 +227,11 @@ class Ledger:
                 found.append(index)
         return found[::-1]
 
-    def hopeless(self) -> list[SetAside]:
-        """Nothing will become of frames that wait behind a first one that failed: as facts, not applied."""
+    def hopeless(self) -> list[FrameSetAside]:
+        """Nothing will become of frames that wait behind a first one that failed: as events, not applied."""
         if self.fatal is None:
             return []
-        return [SetAside(index=index, reason=f"{HOPELESS}: {self.fatal}") for index in self.waiting()]
+        return [FrameSetAside(index=index, reason=f"{HOPELESS}: {self.fatal}") for index in self.waiting()]
 
     def last_tried(self) -> int | None:
         """The newest frame that the worker has finished, well or not."""

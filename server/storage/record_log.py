@@ -47,7 +47,7 @@ MAX_HEAD = 1 << 22
 class Kind(IntEnum):
     """What a record holds."""
 
-    FACT = 1
+    EVENT = 1
     """What became of a frame or of the scene; all in the head."""
     PICTURES = 2
     """The encoded files of a frame, or of one camera of it."""
@@ -172,7 +172,7 @@ def records(data: bytes | memoryview) -> Iterator[Record | Damage]:
 PIECE = 1 << 22
 """Bytes that are read at a time."""
 ENOUGH = 2 * (MAX_HEAD + PREFIX + CHECKSUM)
-"""So much of a log behind a place tells whether a record without a body, as facts are, is whole there."""
+"""So much of a log behind a place tells whether a record without a body, as events are, is whole there."""
 
 
 class Readable(Protocol):

@@ -13,11 +13,19 @@ from client.wire import FileKind, FrameState
 from scas4d_core.storage.history import History, HistoryError
 from server.storage.definition import FRAMES_FOLDER, JOURNAL_FILE
 from server.storage.disk import no_room
-from server.storage.events import Created, Fact, Hashes, PartTaken, SetAside, StateFound, Taken
+from server.storage.events import (
+    FrameAccepted,
+    FrameSetAside,
+    Hashes,
+    JournalEvent,
+    PartAccepted,
+    SceneCreated,
+    StateFound,
+)
 from server.storage.frame_store import FrameDamage, Pictures, frame_of, read_pictures, remove, stored
 from server.storage.journal import replay, write_journal
 from server.storage.ledger import Ledger, frame_identity
-from server.storage.snapshot import facts_of
+from server.storage.snapshot import events_of
 
 NO_STATE = "the journal was lost, and there is no committed state of this frame"
 
@@ -27,14 +35,14 @@ class Recovered:
     """A scene as its folder tells it.
 
     Attributes:
-        good: bytes of the journal that are whole. facts: those that the journal lacks, applied already.
+        good: bytes of the journal that are whole. events: those that the journal lacks, applied already.
         sizes: bytes of each record of the frame log. damage: what was dropped, a sentence each.
         remake: frames whose states are damaged or gone, with the reason, and whose pictures are held.
     """
 
     ledger: Ledger
     good: int
-    facts: list[Fact]
+    events: list[JournalEvent]
     sizes: dict[str, int]
     damage: list[str]
     remake: dict[int, str] = field(default_factory=dict)
@@ -64,7 +72,7 @@ def recover(folder: Path, scene: str, definition: Mapping[str, Any] | None = Non
     pictures are found again, nothing is removed, and a new journal is written with what is known.
 
     Args:
-        folder: of the scene. scene: its id. definition: as in `Created`; without it no journal is written anew.
+        folder: of the scene. scene: its id. definition: as in `SceneCreated`; without it no journal is written anew.
     """
     frames = folder / FRAMES_FOLDER
     frames.mkdir(exist_ok=True)
@@ -77,12 +85,12 @@ def recover(folder: Path, scene: str, definition: Mapping[str, Any] | None = Non
     sizes = stored(frames)
     in_states: list[str] = []
     states = _states(folder / "states", in_states)
-    facts: list[Fact] = []
+    events: list[JournalEvent] = []
     if broken:
-        facts.extend(_found_states(states, ledger))
+        events.extend(_found_states(states, ledger))
     if damage:
-        facts.extend(_found(frames, sorted(_unnamed(ledger, sizes)), ledger, states, broken))
-    if found := sorted({fact.index for fact in facts if isinstance(fact, Taken | PartTaken)}):
+        events.extend(_found(frames, sorted(_unnamed(ledger, sizes)), ledger, states, broken))
+    if found := sorted({event.index for event in events if isinstance(event, FrameAccepted | PartAccepted)}):
         said = ", ".join(map(str, found))
         damage.append(f"the journal does not name the records of frames {said} any more; taken as they were found")
     damage += in_states
@@ -94,12 +102,12 @@ def recover(folder: Path, scene: str, definition: Mapping[str, Any] | None = Non
     sizes = {name: size for name, size in sizes.items() if name not in debris}
     remake = _remade(ledger, states, broken, _deletes_states(definition or {}))
     damage.extend(f"frame {index}: {reason}" for index, reason in remake.items() if index not in states.damaged)
-    facts += ledger.reconcile(states.indices, states.damaged, remake)
+    events += ledger.reconcile(states.indices, states.damaged, remake)
     if states.newest:
         ledger.frames.set_numbers(states.last, states.newest)
-    for fact in ledger.hopeless():  # its scene failed, and the service ended before it could say so of this one
-        ledger.apply(fact)
-        facts.append(fact)
+    for event in ledger.hopeless():  # its scene failed, and the service ended before it could say so of this one
+        ledger.apply(event)
+        events.append(event)
     for entry in list(ledger.frames.held()):
         lost = [name for name in entry.files if name not in sizes]
         if lost:
@@ -108,24 +116,24 @@ def recover(folder: Path, scene: str, definition: Mapping[str, Any] | None = Non
                 damage.append(f"frame {entry.index}: its record is gone from the frame log: {', '.join(lost)}")
         if entry.state == FrameState.QUEUED and (reason := _unusable(frames, entry.files, lost)):
             damage.append(f"frame {entry.index}: {reason}")
-            gone = SetAside(index=entry.index, reason=reason)
+            gone = FrameSetAside(index=entry.index, reason=reason)
             ledger.apply(gone)
-            facts.append(gone)
+            events.append(gone)
     good = told.good
     if broken and definition is not None:
         try:
-            known = Created(definition=dict(definition))
-            good = write_journal(folder / JOURNAL_FILE, iter((known, *facts_of(ledger))))
-            facts = []
+            known = SceneCreated(definition=dict(definition))
+            good = write_journal(folder / JOURNAL_FILE, iter((known, *events_of(ledger))))
+            events = []
             damage.append(f"{JOURNAL_FILE} was written anew from what is known")
         except OSError as error:
             if not no_room(error):
                 raise
-    return Recovered(ledger, good, facts, sizes, damage, remake)
+    return Recovered(ledger, good, events, sizes, damage, remake)
 
 
 def _unnamed(ledger: Ledger, sizes: dict[str, int]) -> set[str]:
-    """Records that no fact names."""
+    """Records that no event names."""
     named = {name for entry in ledger.frames.held() for name in entry.files}
     named |= {name for frame in ledger.open.values() for name in frame.files}
     return set(sizes) - named
@@ -140,7 +148,7 @@ def _deletes_states(definition: Mapping[str, Any]) -> bool:
 def _remade(ledger: Ledger, states: _States, broken: bool, deletes: bool) -> dict[int, str]:
     """Frames that were committed, whose states cannot be read, and whose pictures are held: they can be made again.
 
-    Where facts are lost, a frame without a state may never have been committed. Where old states are deleted by a rule,
+    Where events are lost, a frame without a state may never have been committed. Where a rule deletes old states,
     those before the oldest (but the first, which stays) are not missed: the journal may not have heard of it.
     """
     oldest = min(sorted(states.times)[1:], default=0) if deletes else 0
@@ -156,17 +164,17 @@ def _remade(ledger: Ledger, states: _States, broken: bool, deletes: bool) -> dic
 
 
 def _found_states(states: _States, ledger: Ledger) -> Iterator[StateFound]:
-    """Committed states of frames whose facts the damaged journal has lost, applied."""
+    """Committed states of frames whose events the damaged journal has lost, applied."""
     for index, time in states.times.items():
         entry = ledger.frames.get(index)
         if entry is None or (entry.receipt is None and entry.time is None):
-            fact = StateFound(index=index, time=time)
-            ledger.apply(fact)
-            yield fact
+            event = StateFound(index=index, time=time)
+            ledger.apply(event)
+            yield event
 
 
-def _found(folder: Path, names: list[str], ledger: Ledger, states: _States, broken: bool) -> Iterator[Fact]:
-    """Whole records of frames whose facts the damaged journal has lost, applied.
+def _found(folder: Path, names: list[str], ledger: Ledger, states: _States, broken: bool) -> Iterator[JournalEvent]:
+    """Whole records of frames whose events the damaged journal has lost, applied.
 
     Only where one record can be meant: two whole ones of a frame would leave open which was acknowledged.
     """
@@ -179,12 +187,12 @@ def _found(folder: Path, names: list[str], ledger: Ledger, states: _States, brok
         known = entry is not None and not (without and entry.state in (FrameState.SET_ASIDE, FrameState.COMMITTED))
         if known or (entry is None and index != ledger.next_frame and not broken):
             continue
-        for fact in _facts_of(folder, index, records, ledger, states):
-            ledger.apply(fact)
-            yield fact
+        for event in _events_of(folder, index, records, ledger, states):
+            ledger.apply(event)
+            yield event
 
 
-def _facts_of(folder: Path, index: int, names: list[str], ledger: Ledger, states: _States) -> list[Fact]:
+def _events_of(folder: Path, index: int, names: list[str], ledger: Ledger, states: _States) -> list[JournalEvent]:
     """What the records of one frame tell."""
     pictures: dict[str, Pictures] = {}
     for name in names:
@@ -198,11 +206,11 @@ def _facts_of(folder: Path, index: int, names: list[str], ledger: Ledger, states
         taken = _closed(index, parts, states.times.get(index))
     else:
         found = [_part(index, name, pictures) for name, pictures in parts.items()]
-        return [fact for fact in found if fact is not None]
+        return [event for event in found if event is not None]
     if taken is None:
         return []
     if index < states.last and index not in states.times and index not in states.damaged:
-        return [taken, SetAside(index=index, reason=NO_STATE)]
+        return [taken, FrameSetAside(index=index, reason=NO_STATE)]
     return [taken]
 
 
@@ -218,7 +226,7 @@ def _unusable(folder: Path, files: tuple[str, ...], lost: list[str]) -> str | No
     return None
 
 
-def _whole(index: int, name: str, pictures: Pictures, ledger: Ledger) -> Taken | None:
+def _whole(index: int, name: str, pictures: Pictures, ledger: Ledger) -> FrameAccepted | None:
     before = max(
         (time for i in range(min(index, ledger.next_frame)) if (time := ledger.frames[i].time) is not None),
         default=None,
@@ -226,10 +234,10 @@ def _whole(index: int, name: str, pictures: Pictures, ledger: Ledger) -> Taken |
     if pictures.time is None or (before is not None and pictures.time <= before):
         return None
     identity = frame_identity(pictures.hashes, pictures.time)
-    return Taken(index=index, time=pictures.time, identity=identity, files=(name,), closed_by="found")
+    return FrameAccepted(index=index, time=pictures.time, identity=identity, files=(name,), closed_by="found")
 
 
-def _closed(index: int, parts: Mapping[str, Pictures], time: float | None) -> Taken | None:
+def _closed(index: int, parts: Mapping[str, Pictures], time: float | None) -> FrameAccepted | None:
     """A committed frame that its cameras sent one by one."""
     hashes: Hashes = {}
     for pictures in parts.values():
@@ -239,14 +247,14 @@ def _closed(index: int, parts: Mapping[str, Pictures], time: float | None) -> Ta
     if time is None or not hashes:
         return None
     files = tuple(sorted(parts))
-    return Taken(index=index, time=time, identity=frame_identity(hashes, time), files=files, closed_by="found")
+    return FrameAccepted(index=index, time=time, identity=frame_identity(hashes, time), files=files, closed_by="found")
 
 
-def _part(index: int, name: str, pictures: Pictures) -> PartTaken | None:
+def _part(index: int, name: str, pictures: Pictures) -> PartAccepted | None:
     if len(pictures.hashes) != 1:
         return None
     ((camera, kinds),) = pictures.hashes.items()
-    return PartTaken(index=index, time=pictures.time, camera=camera, file=name, hashes=kinds)
+    return PartAccepted(index=index, time=pictures.time, camera=camera, file=name, hashes=kinds)
 
 
 def _states(folder: Path, damage: list[str]) -> _States:

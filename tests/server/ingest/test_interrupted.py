@@ -16,7 +16,7 @@ from client.wire import FRAME_MEDIA_TYPE
 from server.ingest import receive as door
 from server.ingest import upload
 from server.scene import scene
-from server.storage.events import SetAside, Taken
+from server.storage.events import FrameAccepted, FrameSetAside
 from server.storage.journal import Journal
 from server.storage.recovery import recover
 
@@ -75,7 +75,7 @@ def test_a_frame_taken_while_the_first_one_fails_does_not_wait_for_ever(http, ma
         real(self, data)
 
     async def race():
-        fact = SetAside(index=0, reason="told to", fatal=True)
+        fact = FrameSetAside(index=0, reason="told to", fatal=True)
         setting = asyncio.ensure_future(scene._set_aside(fact))
         await asyncio.sleep(0.1)
 
@@ -96,16 +96,16 @@ def test_a_scene_that_failed_is_found_with_nothing_waiting(tmp_path):
     async def write():
         journal = Journal(tmp_path / "journal.log")
         taken = [
-            Taken(index=index, time=index / 10, identity="ab" * 32, files=(f"{index:010d}-{0:012x}.frame",))
+            FrameAccepted(index=index, time=index / 10, identity="ab" * 32, files=(f"{index:010d}-{0:012x}.frame",))
             for index in (0, 1)
         ]
-        await journal.append(taken[0], SetAside(index=0, reason="told to", fatal=True), taken[1])
+        await journal.append(taken[0], FrameSetAside(index=0, reason="told to", fatal=True), taken[1])
         await journal.close()
 
     asyncio.run(write())
     found = recover(tmp_path, "s")
     assert found.ledger.waiting() == []
-    assert [(fact.index, fact.fact) for fact in found.facts] == [(1, "set_aside")]
+    assert [(fact.index, fact.fact) for fact in found.events] == [(1, "set_aside")]
     assert "told to" in found.ledger.frames[1].report.error
 
 

@@ -8,7 +8,16 @@ import pytest
 
 from client.wire import FrameState
 from server.scene import reports
-from server.storage.events import Died, FramesDeleted, Missing, PartTaken, SetAside, Skipped, StatesDeleted, Taken
+from server.storage.events import (
+    FrameAccepted,
+    FrameMissing,
+    FrameSetAside,
+    FramesSkipped,
+    PartAccepted,
+    PicturesDeleted,
+    StatesDeleted,
+    WorkerDied,
+)
 from server.storage.frame_table import LOST, FrameTable
 from server.storage.ledger import Ledger
 
@@ -20,7 +29,7 @@ def identity(index):
 
 
 def taken(index, **more):
-    return Taken(
+    return FrameAccepted(
         index=index, time=index / 10, identity=identity(index), files=(f"{index:010d}-{0:012x}.frame",), **more
     )
 
@@ -33,9 +42,13 @@ def ledger_of(*facts):
 
 
 def test_an_entry_says_what_the_facts_said():
-    facts = [taken(0), Missing(index=1, reason="cable"), taken(2), Skipped(frames=(2,), by=3), taken(3)]
-    facts += [Died(index=3, reason="x", own=True), Died(index=3, reason="x", own=False)]
-    facts += [SetAside(index=3, reason="two deaths", dropped={"c0": "torn"}), taken(4), FramesDeleted(frames=(0, 4))]
+    facts = [taken(0), FrameMissing(index=1, reason="cable"), taken(2), FramesSkipped(frames=(2,), by=3), taken(3)]
+    facts += [WorkerDied(index=3, reason="x", own=True), WorkerDied(index=3, reason="x", own=False)]
+    facts += [
+        FrameSetAside(index=3, reason="two deaths", dropped={"c0": "torn"}),
+        taken(4),
+        PicturesDeleted(frames=(0, 4)),
+    ]
     ledger = ledger_of(*facts)
     reports_ = [ledger.frames[index].report for index in range(5)]
     states = [FrameState.QUEUED, FrameState.MISSING, FrameState.SKIPPED, FrameState.SET_ASIDE, FrameState.QUEUED]
@@ -57,7 +70,7 @@ def test_an_entry_says_what_the_facts_said():
 
 
 def test_what_is_lost_before_a_fact_is_set_aside():
-    ledger = ledger_of(PartTaken(index=1, time=None, camera="c0", file="f", hashes={}), taken(2))
+    ledger = ledger_of(PartAccepted(index=1, time=None, camera="c0", file="f", hashes={}), taken(2))
     assert ledger.next_frame == 3
     assert [ledger.frames[index].error for index in range(3)] == [LOST, LOST, None]
     assert ledger.open == {}
@@ -67,7 +80,7 @@ def test_what_is_lost_before_a_fact_is_set_aside():
 
 
 def test_states_that_are_there_commit_and_those_that_are_gone_are_told():
-    ledger = ledger_of(*map(taken, range(6)), StatesDeleted(frames=(1,)), FramesDeleted(frames=(0, 1, 2)))
+    ledger = ledger_of(*map(taken, range(6)), StatesDeleted(frames=(1,)), PicturesDeleted(frames=(0, 1, 2)))
     facts = ledger.reconcile([0, 2, 4], {3: "torn"})
     assert list(ledger.committed) == [0, 2, 4]
     assert facts == [StatesDeleted(frames=(3,), reason="torn")]
@@ -77,7 +90,7 @@ def test_states_that_are_there_commit_and_those_that_are_gone_are_told():
     assert ledger.reconcile([0, 2], {4: "torn"}) == []
     assert (list(ledger.committed), ledger.waiting()) == ([0, 2], [3, 4, 5])
     gone = "its state is damaged, and its pictures are deleted"
-    assert ledger.reconcile([0], {}) == [SetAside(index=1, reason=gone), SetAside(index=2, reason=gone)]
+    assert ledger.reconcile([0], {}) == [FrameSetAside(index=1, reason=gone), FrameSetAside(index=2, reason=gone)]
     assert ledger.frames[2].state == FrameState.SET_ASIDE
 
 
@@ -126,7 +139,7 @@ def test_a_day_of_frames_fits_in_memory():
         ledger.apply(taken(index))
         ledger.move(index - 1, FrameState.COMMITTED)
         if index > 40:
-            ledger.apply(FramesDeleted(frames=(index - 40,)))
+            ledger.apply(PicturesDeleted(frames=(index - 40,)))
             ledger.apply(StatesDeleted(frames=(index - 40,)))
     used, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
