@@ -52,7 +52,7 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     os.nice(NICE)
     end_with_parent()
     # A service that was killed leaves a worker in the middle of an update: two must not commit to one history.
-    lock = FolderLock(spec.folder / "worker.lock", wait=True)
+    lock = FolderLock(spec.folder.worker_lock, wait=True)
     with contextlib.suppress(OSError):  # a full disk is no reason not to work
         lock.write(f"{os.getpid()}\n")
     worker = Worker(spec, connection)
@@ -111,12 +111,12 @@ class Worker:
     def open(self) -> bool:
         """Takes up what is committed and says so; False where it cannot be gone on from."""
         try:
-            self.states = history = History.open(self.spec.states)
+            self.states = history = History.open(self.spec.folder.states)
             undone: tuple[int, ...] = ()
             faults: tuple[str, ...] = ()
             if history.indices:
                 self.reconstruction = self.engine.resume(
-                    self.spec.rig, self.spec.settings, history, held=lambda index: holds(self.spec.frames, index)
+                    self.spec.rig, self.spec.settings, history, held=lambda index: holds(self.spec.folder.frames, index)
                 )
                 if self.reconstruction.resumed is not None:
                     undone = tuple(self.reconstruction.resumed.undone)
@@ -174,7 +174,7 @@ class Worker:
         dropped: dict[str, str] = {}
         began = time.perf_counter()
         try:
-            frame, dropped = decode(self.spec.rig, message, read(self.spec.frames, message))
+            frame, dropped = decode(self.spec.rig, message, read(self.spec.folder.frames, message))
             least = self.spec.minimum_cameras
             if len(frame.images) < least:
                 reason = f"{len(frame.images)} cameras' pictures are left, the scene's minimum is {least}"
@@ -202,7 +202,7 @@ class Worker:
         frame = message.frame
 
         def pictures() -> tuple[Frame, dict[str, str]]:
-            return decode(self.spec.rig, frame, read(self.spec.frames, frame))
+            return decode(self.spec.rig, frame, read(self.spec.folder.frames, frame))
 
         for mended in repairs.remake(self.engine, self.spec, self.states, message, pictures):
             self.connection.send(mended)
@@ -248,9 +248,9 @@ class Worker:
 
     def points(self) -> InitialPoints | None:
         """The initial cloud that was put before the first frame."""
-        if not self.spec.points.exists():
+        if not self.spec.folder.points.exists():
             return None
-        arrays = read_npz(self.spec.points)
+        arrays = read_npz(self.spec.folder.points)
         return InitialPoints(arrays["positions"], arrays["colours"], arrays.get("foreground"))
 
     def progress(self, progress: Any) -> None:

@@ -1,7 +1,11 @@
-"""What the journal of a scene says: small events, for ever. Everything known of a frame follows from them in order."""
+"""Events of a scene's journal: the only record of its frames, from which the ledger is folded in order.
+
+The tag of each event, `fact`, and its fields are written in `journal.log` and stay as they are.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -17,7 +21,7 @@ class _Event(BaseModel):
 
 
 class SceneCreated(_Event):
-    """The scene's definition, once more: `scene.json` may be damaged."""
+    """The scene was created; holds its definition again, because `scene.json` may be damaged."""
 
     fact: Literal["created"] = "created"
     definition: dict[str, Any]
@@ -32,11 +36,11 @@ class FrameAccepted(_Event):
     identity: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     files: tuple[str, ...]
     closed_by: Literal["whole", "complete", "request", "deadline", "found"] = "whole"
-    """`found`: not told by the journal, which is damaged, but whole in the frame log at a start."""
+    """`found`: the journal had lost the frame, and a start found its whole record in the frame log."""
 
 
 class PartAccepted(_Event):
-    """One camera's files of a frame that is open were acknowledged. `time` is None where the camera gave none."""
+    """One camera's files of an open frame were acknowledged. `time` is None where the camera gave none."""
 
     fact: Literal["part"] = "part"
     index: int
@@ -55,7 +59,7 @@ class FrameMissing(_Event):
 
 
 class FramesSkipped(_Event):
-    """Frames were skipped because frame `by` came and the queue was full."""
+    """Frames were skipped because frame `by` arrived while the queue was full."""
 
     fact: Literal["skipped"] = "skipped"
     frames: tuple[int, ...]
@@ -73,7 +77,7 @@ class FrameSetAside(_Event):
 
 
 class WorkerDied(_Event):
-    """The worker died at a frame; `own`: through its own doing, not by a signal from outside."""
+    """The worker died at a frame; `own`: by a fault of its own, not by a signal from outside."""
 
     fact: Literal["died"] = "died"
     index: int
@@ -82,7 +86,7 @@ class WorkerDied(_Event):
 
 
 class PicturesDeleted(_Event):
-    """Retention deleted the pictures of frames."""
+    """Retention deleted the pictures of frames from the frame log."""
 
     fact: Literal["frames_deleted"] = "frames_deleted"
     frames: tuple[int, ...]
@@ -105,18 +109,40 @@ class StateFound(_Event):
 
 
 class PauseChanged(_Event):
-    """The scene was paused, or told to go on."""
+    """The scene was paused or resumed."""
 
     fact: Literal["paused"] = "paused"
     paused: bool
 
 
 class BudgetChanged(_Event):
-    """Another budget holds from frame `index` on: a frame that is done again gets the one that held for it."""
+    """Another budget holds from frame `index` on; a frame that is updated again gets the budget that held for it."""
 
     fact: Literal["budget"] = "budget"
     index: int
     budget: Budget
+
+
+@dataclass
+class OpenFrame:
+    """A frame whose cameras send one by one: its `PartAccepted` events, gathered."""
+
+    index: int
+    time: float | None = None
+    hashes: Hashes = field(default_factory=dict)
+    files: list[str] = field(default_factory=list)
+
+    @property
+    def cameras(self) -> list[str]:
+        """Cameras whose picture has arrived, sorted."""
+        return sorted(camera for camera, kinds in self.hashes.items() if FileKind.IMAGE in kinds)
+
+    def add(self, part: PartAccepted) -> None:
+        """Adds a camera, or another file of a camera."""
+        self.time = part.time if self.time is None else self.time
+        self.hashes.setdefault(part.camera, {}).update(part.hashes)
+        if part.file not in self.files:
+            self.files.append(part.file)
 
 
 JournalEvent = Annotated[
@@ -138,10 +164,10 @@ _adapter: TypeAdapter[JournalEvent] = TypeAdapter(JournalEvent)
 
 
 parse_event = _adapter.validate_json
-"""An event from a record's head; raises `ValidationError`."""
+"""Reads an event from a record's head; raises `ValidationError`."""
 
 
 def why_no_event(error: ValidationError) -> str:
-    """Why a head is no event."""
+    """Names the field of a record's head that makes it no event, and the fault."""
     first = error.errors()[0]
     return f"{'.'.join(map(str, first['loc'])) or 'event'}: {first['msg']}"

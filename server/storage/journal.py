@@ -1,8 +1,8 @@
-"""The journal of a scene: one append-only file of events. An event is acknowledged when it is on disk.
+"""Journal of a scene: one append-only file of events. An event is acknowledged when it is on disk.
 
-A file that is deleted, or that another takes the place of, while the service runs would take events that nobody finds
-again: each write looks whether the file still has its name. Then, and where a scrub finds it damaged, the journal is
-written anew from what the service knows (`snapshot`), beside its place, and renamed.
+A file that is deleted or replaced while the service runs would receive events that nobody finds again: each write
+checks that the file still has its name. If it has not, or if a scrub finds it damaged, the journal is written anew from
+the ledger (`snapshot`), beside its place, and renamed.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ TOGETHER = 1000
 """Events that are encoded at a time where a whole journal is written."""
 
 Snapshot = Callable[[], Iterator[JournalEvent]]
-"""Taken at once, on the event loop; its events may be told in another thread."""
+"""Called on the event loop; the events may be read in another thread."""
 
 
 @dataclass(frozen=True)
 class JournalRead:
-    """What a journal holds: its events in order, the bytes that are whole, and a sentence for each damage."""
+    """Content of a journal: its events in order, the bytes that are whole, and a sentence for each damage."""
 
     events: list[JournalEvent]
     good: int
@@ -41,17 +41,17 @@ class JournalRead:
 
 
 def read_journal(path: Path) -> JournalRead:
-    """All of a journal that is not large; see `replay`."""
+    """Reads a whole journal that is not large; see `replay`."""
     events: list[JournalEvent] = []
-    told = replay(path, events.append)
-    return JournalRead(events, told.good, told.damage)
+    reading = replay(path, events.append)
+    return JournalRead(events, reading.good, reading.damage)
 
 
 @dataclass(frozen=True)
 class JournalReading:
-    """How a journal was read: the bytes that are whole, and a sentence for each damage.
+    """Result of reading a journal: the bytes that are whole, and a sentence for each damage.
 
-    `broken`: more than a torn tail is damaged; what it said may be lost. `begun`: its first event is `SceneCreated`.
+    `broken`: more than a torn tail is damaged; events may be lost. `begun`: its first event is `SceneCreated`.
     """
 
     good: int
@@ -61,17 +61,17 @@ class JournalReading:
 
 
 def replay(path: Path, take: Callable[[JournalEvent], object]) -> JournalReading:
-    """Tells `take` every event that is whole, in order, reading piece by piece; never raises for what the file holds.
+    """Calls `take` with every whole event, in order, reading piece by piece; never raises for the file's content.
 
-    A torn tail is what an append leaves that was cut short: it was never acknowledged, and it is dropped.
+    An append that was cut short leaves a torn tail: it was never acknowledged, and it is dropped.
     """
-    said: list[str] = []
+    damage: list[str] = []
     broken = False
     begun: bool | None = None
     try:
         opened = path.open("rb")
     except FileNotFoundError:
-        return JournalReading(0, said)
+        return JournalReading(0, damage)
     with opened as file:
         good = os.fstat(file.fileno()).st_size
         for found in streamed(file):
@@ -79,33 +79,33 @@ def replay(path: Path, take: Callable[[JournalEvent], object]) -> JournalReading
                 if found.torn:
                     good = found.start
                 broken |= not found.torn
-                said.append(f"{path.name}: bytes {found.start} to {found.end} dropped: {found.reason}")
+                damage.append(f"{path.name}: bytes {found.start} to {found.end} dropped: {found.reason}")
                 continue
             try:
                 event = parse_event(found.text)
             except ValidationError as error:
                 fault = why_no_event(error)
                 broken = True
-                said.append(f"{path.name}: a record of kind {found.kind}, frame {found.frame}, is no event: {fault}")
+                damage.append(f"{path.name}: a record of kind {found.kind}, frame {found.frame}, is no event: {fault}")
                 continue
             begun = isinstance(event, SceneCreated) if begun is None else begun
             take(event)
-    return JournalReading(good, said, broken, bool(begun))
+    return JournalReading(good, damage, broken, bool(begun))
 
 
 def bytes_of(events: Iterable[JournalEvent]) -> bytes:
-    """Events as records, one after the other."""
+    """Encodes events as records, one after the other."""
     return b"".join(encoded(Kind.EVENT, _index(event), event.model_dump(mode="json")) for event in events)
 
 
 def write_journal(path: Path, events: Iterator[JournalEvent]) -> int:
-    """A journal that is whole at `path`, in place of what is there; blocking.
+    """Writes a whole journal at `path`, in place of the file there; blocking.
 
     Returns:
-        Its bytes.
+        Its size in bytes.
 
     Raises:
-        OSError: it could not be written; what was there is there.
+        OSError: it could not be written; the file that was there stays.
     """
     beside = path.with_name(f".{path.name}.part")
     size, batch = 0, []
@@ -120,7 +120,7 @@ def write_journal(path: Path, events: Iterator[JournalEvent]) -> int:
 
 
 class _Beginning:
-    """So many bytes of a file."""
+    """The first bytes of a file, as a file."""
 
     def __init__(self, file: BinaryIO, left: int) -> None:
         self._file = file
@@ -133,10 +133,10 @@ class _Beginning:
 
 
 def checked_journal(path: Path, good: int) -> Iterator[int]:
-    """Reads the first bytes of a journal again and yields how many, piece by piece.
+    """Reads the first bytes of a journal again; yields the number of bytes of each piece.
 
     Raises:
-        FileNotFoundError: it is gone. ValueError: not all of them are whole records.
+        FileNotFoundError: the journal is gone. ValueError: not all of the bytes are whole records.
     """
     read = since = 0
     with path.open("rb") as file:
@@ -154,13 +154,13 @@ def checked_journal(path: Path, good: int) -> Iterator[int]:
 
 
 class Journal:
-    """Appends events. Those that come while one write is under way share the next one.
+    """Appends events. Those that arrive while one write is under way share the next one.
 
     Args:
-        path: of the file; made where there is none.
-        good: bytes of it that are whole; what follows is cut off.
-        snapshot: all events that are known now, which the journal is written anew from; None: it never is.
-        renewed: told of the fault each time that it was.
+        path: of the file; made when missing.
+        good: bytes of it that are whole; the rest is cut off.
+        snapshot: returns all events that are known now, to write the journal anew; None: it is never written anew.
+        renewed: called with the fault each time that it was written anew.
     """
 
     def __init__(
@@ -181,20 +181,20 @@ class Journal:
         sync_folder(path.parent)
         self._waiting: list[tuple[Sequence[JournalEvent], asyncio.Future[None]]] = []
         self._last: list[JournalEvent] = []
-        """Events that were written last: whoever appended them may not have taken them in yet."""
+        """Events that were written last: the ledger may not have applied them yet."""
         self._fault: str | None = None
         self._flushing: asyncio.Task[None] | None = None
 
     @property
     def place(self) -> tuple[int, int]:
-        """Which file it is written to, and the bytes of it that are whole: whether it was written anew meanwhile."""
+        """Inode of the file, which changes when it is written anew, and the bytes of it that are whole."""
         return os.fstat(self._file).st_ino, self._good
 
     async def append(self, *events: JournalEvent) -> None:
-        """Returns when the events are on disk, all or none of them.
+        """Returns when the events are on disk, all of them.
 
         Raises:
-            OSError: they are not; the file is as it was.
+            OSError: none of them is on disk; the file is as it was.
             Problem: 503, the journal is closed.
         """
         if self._closed:
@@ -205,18 +205,18 @@ class Journal:
         await asyncio.shield(done)
 
     def renew(self, fault: str) -> None:
-        """It was found damaged: it is written anew, in turn with what is appended. `fault`: a sentence."""
+        """Writes the journal anew because it was found damaged, in turn with appends. `fault`: a sentence."""
         if not self._closed and self._snapshot is not None:
             self._fault = fault
             self._begin()
 
     def look(self) -> None:
-        """Writes it anew where its file has lost its name; while nothing is being written."""
+        """Writes the journal anew where its file has lost its name; does nothing during a write."""
         if self._flushing is None and not self._closed and (fault := self.misplaced()) is not None:
             self.renew(fault)
 
     def misplaced(self) -> str | None:
-        """Whether the file that is written to still has its name and its bytes; a sentence where not."""
+        """Checks that the open file still has its name and its bytes; returns the fault, or None."""
         try:
             there, own = os.stat(self.path), os.fstat(self._file)
         except FileNotFoundError:
@@ -242,7 +242,7 @@ class Journal:
                         self._fault = await asyncio.to_thread(self._write, events)
                     if self._fault is not None:
                         await self._renew_or_append(events)
-                except Exception as error:  # whatever it is, those who wait are told
+                except Exception as error:  # of any kind: the callers that wait must get it
                     fault = error
                 else:
                     self._last = events or self._last
@@ -253,14 +253,14 @@ class Journal:
                         done.set_result(None)
                     else:
                         done.set_exception(fault)
-                        done.exception()  # whoever asked may have gone: not a fault of the event loop
+                        done.exception()  # the caller may be gone: not a fault of the event loop
                 if fault is not None and not batch and not self._waiting:
                     break  # the next event tries again
         finally:
             self._flushing = None
 
     def _write(self, events: Sequence[JournalEvent]) -> str | None:
-        """Appends; answers what is wrong with the file's place, and then the events are not where they should be."""
+        """Appends; returns a fault where the file has lost its name: then the events are not in the journal."""
         watched = self._snapshot is not None
         if watched and (fault := self.misplaced()) is not None:
             return fault
@@ -277,9 +277,9 @@ class Journal:
         return self.misplaced() if watched else None
 
     async def _renew_or_append(self, events: Sequence[JournalEvent]) -> None:
-        """Writes it anew; where there is no room for that and the file is in its place, what comes goes behind.
+        """Writes the journal anew; where there is no room for that and the file has its name, appends to it.
 
-        A damaged record costs what it said, a refused frame costs the frame; the next scrub finds the damage again.
+        A damaged record costs its event, a refused frame costs the frame; the next scrub finds the damage again.
         """
         try:
             await self._renew(events)
@@ -292,19 +292,19 @@ class Journal:
                 raise
 
     async def _renew(self, events: Sequence[JournalEvent]) -> None:
-        """Writes it anew: what the snapshot tells, and behind it what that may lack."""
+        """Writes the journal anew: the snapshot, and behind it the events that the snapshot may lack."""
         assert self._snapshot is not None
         assert self._fault is not None
-        told = self._snapshot()
-        # Events may be told twice, except a death, which would be counted twice: its sender applies it afterwards.
+        snapshot = self._snapshot()
+        # Events may come twice, except a death, which would be counted twice: its caller applies it afterwards.
         last = [event for event in self._last if not isinstance(event, WorkerDied)]
-        self._good = await asyncio.to_thread(self._replace, told, [*last, *events])
+        self._good = await asyncio.to_thread(self._replace, snapshot, [*last, *events])
         fault, self._fault = self._fault, None
         self._renewed(fault)
 
-    def _replace(self, told: Iterator[JournalEvent], behind: Sequence[JournalEvent]) -> int:
+    def _replace(self, snapshot: Iterator[JournalEvent], behind: Sequence[JournalEvent]) -> int:
         def all_events() -> Iterator[JournalEvent]:
-            yield from told
+            yield from snapshot
             yield from behind
 
         size = write_journal(self.path, all_events())
@@ -314,7 +314,7 @@ class Journal:
         return size
 
     async def close(self) -> None:
-        """Waits for what is being written; nothing is written after that, its number may be another file's by then."""
+        """Waits for the write under way; nothing is written later: the descriptor may be another file's by then."""
         self._closed = True
         while self._flushing is not None:
             await asyncio.wait([self._flushing])

@@ -1,4 +1,4 @@
-"""The events that a ledger follows from: a journal that was damaged or deleted is written anew with them."""
+"""Makes events from a ledger: a damaged or deleted journal is written anew with them."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from server.storage.events import (
     FrameSetAside,
     FramesSkipped,
     JournalEvent,
+    OpenFrame,
     PartAccepted,
     PauseChanged,
     PicturesDeleted,
@@ -20,19 +21,20 @@ from server.storage.events import (
     WorkerDied,
 )
 from server.storage.frame_table import FrameEntry
-from server.storage.ledger import RETENTION, Ledger, OpenFrame
+from server.storage.ledger import RETENTION, Ledger
 
 TOGETHER = 10_000
-"""Frames that one event names at most: the head of a record is bounded."""
+"""An event names at most so many frames: the head of a record is bounded."""
 OWN_ERROR = (FrameState.SET_ASIDE, FrameState.MISSING)
-"""What is noted of such a frame is why it is in that state; of another one, why its state is gone."""
+"""The error noted of a frame in such a state explains the state; of another frame, why its committed state is gone."""
 BEFORE = "before the journal was written anew"
 
 
 def events_of(ledger: Ledger) -> Iterator[JournalEvent]:
-    """Events in an order that gives an equal ledger, but for what the states on disk say (`Ledger.reconcile`).
+    """Yields events in an order that gives an equal ledger, but for the states on disk (`Ledger.reconcile`).
 
-    A frame that is committed or at work is queued in it. How a frame was closed and why the worker died are not kept.
+    A frame that is committed or at work is queued in it. The ways that frames were closed, and the reasons of deaths,
+    are not kept.
     """
     bare: list[int] = []
     deleted: list[int] = []
@@ -82,7 +84,7 @@ def _of_frame(entry: FrameEntry, fatal: str | None) -> Iterator[JournalEvent]:
 
 
 def _parts(frame: OpenFrame) -> Iterator[PartAccepted]:
-    """An event a file; a camera may have sent several, and which was in which is not kept."""
+    """Yields an event a file; a camera may have sent several, and their order is not kept."""
     cameras = list(frame.hashes)
     for place, file in enumerate(frame.files):
         camera = cameras[min(place, len(cameras) - 1)]

@@ -13,16 +13,16 @@ from test_restart import create, serving
 from test_restart import put as put_form
 
 from client.wire import FRAME_MEDIA_TYPE
-from server.ingest import receive as door
-from server.ingest import upload
+from server.ingest import camera_files, receive
 from server.scene import scene
 from server.storage.events import FrameAccepted, FrameSetAside
 from server.storage.journal import Journal
+from server.storage.layout import SceneFolder
 from server.storage.recovery import recover
 
 
 def test_a_refused_sender_that_goes_in_the_middle_leaves_the_frame_free(http, make, service, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(upload, "BATCH", 1)  # file by file: the first is refused while the third is on its way
+    monkeypatch.setattr(receive, "BATCH", 1)  # file by file: the first is refused while the third is on its way
     id = make(3)
     body = framed(0, {"c0": picture()[:-9], "c1": picture(), "c2": picture() + bytes(500_000)})
     head = f"PUT /v1/scenes/{id}/frames/0 HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: {FRAME_MEDIA_TYPE}\r\n"
@@ -36,7 +36,7 @@ def test_a_refused_sender_that_goes_in_the_middle_leaves_the_frame_free(http, ma
 
 
 def on_the_loop(scene, coroutine):
-    return asyncio.run_coroutine_threadsafe(coroutine, scene._worker._loop)
+    return asyncio.run_coroutine_threadsafe(coroutine, scene.updates._worker._loop)
 
 
 @pytest.mark.parametrize("part", [False, True])
@@ -54,13 +54,16 @@ def test_a_request_cancelled_while_its_fact_is_written_keeps_its_pictures(http, 
         yield framed(0, {"c0": picture()}, part=part)
 
     monkeypatch.setattr(Journal, "_write", slow)
-    take = door.take_camera(scene, 0, "c0", body(), None) if part else door.take_framed(scene, 0, body(), None)
+    if part:
+        take = camera_files.take_camera(scene.open_frames, 0, "c0", body(), None)
+    else:
+        take = receive.take_framed(scene.ingest, 0, body(), None)
     request = on_the_loop(scene, take)
     time.sleep(0.25)
     request.cancel()
     wait_for(lambda: scene.next_frame == 1)
     time.sleep(0.2)
-    assert len(list(scene.spec.frames.iterdir())) == 1
+    assert len(list(scene.spec.folder.frames.iterdir())) == 1
     http.post(f"/v1/scenes/{id}/resume")
     assert finished(http, id, 0)["state"] == "committed"
 
@@ -76,13 +79,13 @@ def test_a_frame_taken_while_the_first_one_fails_does_not_wait_for_ever(http, ma
 
     async def race():
         fact = FrameSetAside(index=0, reason="told to", fatal=True)
-        setting = asyncio.ensure_future(scene._set_aside(fact))
+        setting = asyncio.ensure_future(scene.updates._set_aside(fact))
         await asyncio.sleep(0.1)
 
         async def body():
             yield framed(1)
 
-        await asyncio.gather(setting, door.take_framed(scene, 1, body(), None))
+        await asyncio.gather(setting, receive.take_framed(scene.ingest, 1, body(), None))
 
     http.post(f"/v1/scenes/{id}/pause")
     put(http, id, 0)
@@ -103,7 +106,7 @@ def test_a_scene_that_failed_is_found_with_nothing_waiting(tmp_path):
         await journal.close()
 
     asyncio.run(write())
-    found = recover(tmp_path, "s")
+    found = recover(SceneFolder(tmp_path), "s")
     assert found.ledger.waiting() == []
     assert [(fact.index, fact.fact) for fact in found.events] == [(1, "set_aside")]
     assert "told to" in found.ledger.frames[1].report.error

@@ -17,7 +17,7 @@ from client.sdk import Client
 from client.wire import RigModel
 from scas4d_core.captures import InitialPoints
 from server.storage import recovery
-from server.storage.ledger import LOST
+from server.storage.frame_table import LOST
 
 
 @contextlib.contextmanager

@@ -1,13 +1,15 @@
-"""What is known of frames: the fold of facts, in little memory, brought in line with the states that are there."""
+"""The ledger: folded from events, in little memory, and brought in line with the committed states."""
 
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import fields
 
 import pytest
 
-from client.wire import FrameState
-from server.scene import reports
+from client.wire import CameraFitModel, CurvePointModel, FrameReportModel, FrameState
+from scas4d_core.frame_report import CurvePoint, FrameReport
+from scas4d_core.update.result import CameraFit
 from server.storage.events import (
     FrameAccepted,
     FrameMissing,
@@ -18,7 +20,7 @@ from server.storage.events import (
     StatesDeleted,
     WorkerDied,
 )
-from server.storage.frame_table import LOST, FrameTable
+from server.storage.frame_table import LOST, NOT_SENT, RECORDS_KEPT, WIRE_NAMES, FrameTable
 from server.storage.ledger import Ledger
 
 REPORT = {"iterations": 100, "psnr": 31.5, "gaussians": 2, "seconds": {"update": 0.5}, "dropped": {"c1": "dark"}}
@@ -120,15 +122,34 @@ def test_many_states_deleted_at_once_are_those_deleted_one_by_one():
 
 def test_the_numbers_of_the_newest_commits_are_in_memory():
     table = FrameTable("abc")
-    table.grow(reports.KEPT + 1)
-    for index in range(reports.KEPT + 1):
+    table.grow(RECORDS_KEPT + 1)
+    for index in range(RECORDS_KEPT + 1):
         table.take(index, index / 10, identity(index), (), None)
         table.move(index, FrameState.COMMITTED)
-        table.set_numbers(index, REPORT)
-    assert (table[0].measured, table[1].measured) == (False, True)
-    report = table[reports.KEPT].report
+        table.set_record(index, REPORT)
+    assert (table[0].record is None, table[1].record is None) == (True, False)
+    report = table[RECORDS_KEPT].report
     assert (report.psnr, report.iterations, report.dropped_cameras) == (31.5, 100, {"c1": "dark"})
     assert report.seconds == {"update": 0.5, "total": 0.5}
+
+
+def test_every_field_of_a_commit_reaches_the_wire_or_is_named_as_left_out():
+    own = {"scene", "state", "error", "identity", "deleted", "received"}  # the service knows these itself
+    noted = {
+        "budget",
+        "write_seconds",
+        "publish_seconds",
+        "threads",
+        "remade",
+        "resumed",
+    }  # the worker adds them to the record
+    committed = {field.name for field in fields(FrameReport)} | noted
+    sent = {WIRE_NAMES.get(name, name) for name in committed - NOT_SENT}
+    assert sent <= set(FrameReportModel.model_fields) - own
+    assert committed >= NOT_SENT
+    assert set(WIRE_NAMES) <= committed
+    for core, wire in ((CameraFit, CameraFitModel), (CurvePoint, CurvePointModel)):
+        assert {field.name for field in fields(core)} == set(wire.model_fields)
 
 
 def test_a_day_of_frames_fits_in_memory():
