@@ -113,7 +113,7 @@ class Progressed:
 
 
 @dataclass(frozen=True)
-class Committed:
+class FrameCommitted:
     """The frame's state is on disk, with `report` (as `History.report` gives it back).
 
     `deleted`: states that retention deleted after it.
@@ -125,7 +125,7 @@ class Committed:
 
 
 @dataclass(frozen=True)
-class SetAside:
+class FrameFailed:
     """The frame was not committed; the state is that of the frame before. `fatal`: the scene cannot go on."""
 
     index: int

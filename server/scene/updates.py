@@ -13,13 +13,13 @@ from server.health import metrics
 from server.processes import worker
 from server.processes.messages import (
     Broken,
-    Committed,
+    FrameCommitted,
+    FrameFailed,
     FrameReady,
     Mended,
     Progressed,
     Ready,
     SceneSpec,
-    SetAside,
     Stalled,
 )
 from server.processes.placement import Ended, Placement, Process
@@ -144,9 +144,9 @@ class Updates:
                 )
                 self.clock.progress(message.stage, message.done, message.total)
                 self._tell(SceneChanged())
-            case Committed():
+            case FrameCommitted():
                 self._background.run(self._commit(message))
-            case SetAside():
+            case FrameFailed():
                 event = FrameSetAside(
                     index=message.index, reason=message.reason, dropped=message.dropped, fatal=message.fatal
                 )
@@ -183,7 +183,7 @@ class Updates:
         self.mending.taken_up(ready.damaged)
         self.begin()
 
-    async def _commit(self, message: Committed) -> None:
+    async def _commit(self, message: FrameCommitted) -> None:
         self.deaths.committed()
         self.clock.end(committed=True)
         self._index, self.progress = None, None

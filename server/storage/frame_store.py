@@ -33,7 +33,7 @@ class FrameDamage(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class Pictures:
+class StoredPictures:
     """The encoded files of a record, by camera (views, not copies), and the BLAKE3 of each.
 
     `time` in seconds, None where the upload did not know it; `part`: the record holds one camera only.
@@ -138,7 +138,7 @@ class Upload:
                 self._direct(False)
 
 
-def read_pictures(folder: Path, name: str) -> Pictures:
+def read_pictures(folder: Path, name: str) -> StoredPictures:
     """Reads the files of a record and checks them.
 
     Raises:
@@ -161,7 +161,7 @@ def read_pictures(folder: Path, name: str) -> Pictures:
             kind, camera = FileKind(file["kind"]), file["camera"]
             (images if kind == FileKind.IMAGE else masks)[camera] = piece
             hashes.setdefault(camera, {})[kind] = digest.hex()
-        return Pictures(found.index, found.head["time"], bool(found.head["part"]), images, masks, hashes)
+        return StoredPictures(found.index, found.head["time"], bool(found.head["part"]), images, masks, hashes)
     except (KeyError, TypeError, ValueError) as error:
         raise FrameDamage(f"{name}: its head is not one of pictures ({error!r})") from None
 

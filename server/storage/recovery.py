@@ -21,7 +21,7 @@ from server.storage.events import (
     SceneCreated,
     StateFound,
 )
-from server.storage.frame_store import FrameDamage, Pictures, frame_of, read_pictures, remove, stored
+from server.storage.frame_store import FrameDamage, StoredPictures, frame_of, read_pictures, remove, stored
 from server.storage.journal import replay, write_journal
 from server.storage.layout import SceneFolder
 from server.storage.ledger import Ledger, frame_identity
@@ -194,7 +194,7 @@ def _found(folder: Path, names: list[str], ledger: Ledger, states: _States, brok
 
 def _events_of(folder: Path, index: int, names: list[str], ledger: Ledger, states: _States) -> list[JournalEvent]:
     """Makes the events of one frame from its records."""
-    pictures: dict[str, Pictures] = {}
+    pictures: dict[str, StoredPictures] = {}
     for name in names:
         with contextlib.suppress(FrameDamage):
             pictures[name] = read_pictures(folder, name)
@@ -226,7 +226,7 @@ def _unusable(folder: Path, files: tuple[str, ...], lost: list[str]) -> str | No
     return None
 
 
-def _whole(index: int, name: str, pictures: Pictures, ledger: Ledger) -> FrameAccepted | None:
+def _whole(index: int, name: str, pictures: StoredPictures, ledger: Ledger) -> FrameAccepted | None:
     before = max(
         (time for i in range(min(index, ledger.next_frame)) if (time := ledger.frames[i].time) is not None),
         default=None,
@@ -237,7 +237,7 @@ def _whole(index: int, name: str, pictures: Pictures, ledger: Ledger) -> FrameAc
     return FrameAccepted(index=index, time=pictures.time, identity=identity, files=(name,), closed_by="found")
 
 
-def _closed(index: int, parts: Mapping[str, Pictures], time: float | None) -> FrameAccepted | None:
+def _closed(index: int, parts: Mapping[str, StoredPictures], time: float | None) -> FrameAccepted | None:
     """Makes the event of a committed frame that its cameras sent one by one."""
     hashes: Hashes = {}
     for pictures in parts.values():
@@ -250,7 +250,7 @@ def _closed(index: int, parts: Mapping[str, Pictures], time: float | None) -> Fr
     return FrameAccepted(index=index, time=time, identity=frame_identity(hashes, time), files=files, closed_by="found")
 
 
-def _part(index: int, name: str, pictures: Pictures) -> PartAccepted | None:
+def _part(index: int, name: str, pictures: StoredPictures) -> PartAccepted | None:
     if len(pictures.hashes) != 1:
         return None
     ((camera, kinds),) = pictures.hashes.items()

@@ -153,7 +153,7 @@ def damaged_log(study: Study, expected: Mapping[int, str], cuts: int, flips: int
 def _damage(folder: Path, kind: str, random_: random.Random, half: int) -> tuple[str, int | None]:
     """Damages the journal or the record of a frame that waits; says how, and which frame is hit."""
     journal = folder / "journal.log"
-    taken = {fact.index: fact for fact in read_journal(journal).events if isinstance(fact, FrameAccepted)}
+    taken = {event.index: event for event in read_journal(journal).events if isinstance(event, FrameAccepted)}
     waiting = [index for index in taken if index >= half]
     hit = random_.choice([None, random_.choice(waiting)])
     file = journal if hit is None else folder / "frames" / taken[hit].files[0]

@@ -1,4 +1,4 @@
-"""What is cut short in the middle: senders that go, requests that are cancelled, facts that race, folders half lost."""
+"""Interruptions: senders that leave, cancelled requests, events that race, folders half lost."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def on_the_loop(scene, coroutine):
 
 
 @pytest.mark.parametrize("part", [False, True])
-def test_a_request_cancelled_while_its_fact_is_written_keeps_its_pictures(http, make, service, monkeypatch, part):  # noqa: F811
+def test_a_request_cancelled_while_its_event_is_written_keeps_its_pictures(http, make, service, monkeypatch, part):  # noqa: F811
     id = make(1)
     http.post(f"/v1/scenes/{id}/pause")
     scene = service.app.state.scenes[id]
@@ -68,7 +68,7 @@ def test_a_request_cancelled_while_its_fact_is_written_keeps_its_pictures(http, 
     assert finished(http, id, 0)["state"] == "committed"
 
 
-def test_a_frame_taken_while_the_first_one_fails_does_not_wait_for_ever(http, make, service, monkeypatch):  # noqa: F811
+def test_a_frame_accepted_while_the_first_one_fails_does_not_wait_for_ever(http, make, service, monkeypatch):  # noqa: F811
     id = make(queue_frames=9)
     scene = service.app.state.scenes[id]
     real = Journal._write
@@ -78,8 +78,8 @@ def test_a_frame_taken_while_the_first_one_fails_does_not_wait_for_ever(http, ma
         real(self, data)
 
     async def race():
-        fact = FrameSetAside(index=0, reason="told to", fatal=True)
-        setting = asyncio.ensure_future(scene.updates._set_aside(fact))
+        event = FrameSetAside(index=0, reason="told to", fatal=True)
+        setting = asyncio.ensure_future(scene.updates._set_aside(event))
         await asyncio.sleep(0.1)
 
         async def body():
@@ -108,7 +108,7 @@ def test_a_scene_that_failed_is_found_with_nothing_waiting(tmp_path):
     asyncio.run(write())
     found = recover(SceneFolder(tmp_path), "s")
     assert found.ledger.waiting() == []
-    assert [(fact.index, fact.fact) for fact in found.events] == [(1, "set_aside")]
+    assert [(event.index, event.fact) for event in found.events] == [(1, "set_aside")]
     assert "told to" in found.ledger.frames[1].report.error
 
 

@@ -131,7 +131,7 @@ def test_a_scene_that_failed_takes_none(http, sdk):
     sdk.delete_scene(id)
 
 
-def test_later_facts_win_and_each_frame_finds_its_own():
+def test_later_events_win_and_each_frame_finds_its_own():
     ledger = Ledger("s")
     for index in range(6):
         ledger.apply(FrameAccepted(index=index, time=float(index), identity="0" * 64, files=("f",)))

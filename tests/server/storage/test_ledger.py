@@ -36,22 +36,22 @@ def taken(index, **more):
     )
 
 
-def ledger_of(*facts):
+def ledger_of(*events):
     ledger = Ledger("abc")
-    for fact in facts:
-        ledger.apply(fact)
+    for event in events:
+        ledger.apply(event)
     return ledger
 
 
-def test_an_entry_says_what_the_facts_said():
-    facts = [taken(0), FrameMissing(index=1, reason="cable"), taken(2), FramesSkipped(frames=(2,), by=3), taken(3)]
-    facts += [WorkerDied(index=3, reason="x", own=True), WorkerDied(index=3, reason="x", own=False)]
-    facts += [
+def test_an_entry_says_what_the_events_said():
+    events = [taken(0), FrameMissing(index=1, reason="cable"), taken(2), FramesSkipped(frames=(2,), by=3), taken(3)]
+    events += [WorkerDied(index=3, reason="x", own=True), WorkerDied(index=3, reason="x", own=False)]
+    events += [
         FrameSetAside(index=3, reason="two deaths", dropped={"c0": "torn"}),
         taken(4),
         PicturesDeleted(frames=(0, 4)),
     ]
-    ledger = ledger_of(*facts)
+    ledger = ledger_of(*events)
     reports_ = [ledger.frames[index].report for index in range(5)]
     states = [FrameState.QUEUED, FrameState.MISSING, FrameState.SKIPPED, FrameState.SET_ASIDE, FrameState.QUEUED]
     assert [report.state for report in reports_] == states
@@ -71,7 +71,7 @@ def test_an_entry_says_what_the_facts_said():
         ledger.frames[5]
 
 
-def test_what_is_lost_before_a_fact_is_set_aside():
+def test_what_is_lost_before_an_event_is_set_aside():
     ledger = ledger_of(PartAccepted(index=1, time=None, camera="c0", file="f", hashes={}), taken(2))
     assert ledger.next_frame == 3
     assert [ledger.frames[index].error for index in range(3)] == [LOST, LOST, None]
@@ -83,9 +83,9 @@ def test_what_is_lost_before_a_fact_is_set_aside():
 
 def test_states_that_are_there_commit_and_those_that_are_gone_are_told():
     ledger = ledger_of(*map(taken, range(6)), StatesDeleted(frames=(1,)), PicturesDeleted(frames=(0, 1, 2)))
-    facts = ledger.reconcile([0, 2, 4], {3: "torn"})
+    events = ledger.reconcile([0, 2, 4], {3: "torn"})
     assert list(ledger.committed) == [0, 2, 4]
-    assert facts == [StatesDeleted(frames=(3,), reason="torn")]
+    assert events == [StatesDeleted(frames=(3,), reason="torn")]
     assert (ledger.states_deleted, ledger.waiting()) == (2, [5])
     assert ledger.frames[3].deleted
     # The newest state turns out damaged: what comes after the one before is done again where its pictures are held.
@@ -96,7 +96,7 @@ def test_states_that_are_there_commit_and_those_that_are_gone_are_told():
     assert ledger.frames[2].state == FrameState.SET_ASIDE
 
 
-def test_a_state_whose_fact_is_lost_is_committed():
+def test_a_state_whose_event_is_lost_is_committed():
     ledger = ledger_of(taken(0), taken(2))
     assert ledger.reconcile([0, 1, 2], {}) == []
     assert list(ledger.committed) == [0, 1, 2]

@@ -90,10 +90,10 @@ FACTS = [
 ]
 
 
-def write_journal(path, *facts, good=0):
+def write_journal(path, *events, good=0):
     async def write():
         journal = Journal(path, good)
-        await asyncio.gather(*(journal.append(fact) for fact in facts))
+        await asyncio.gather(*(journal.append(event) for event in events))
         await journal.close()
 
     asyncio.run(write())
@@ -129,11 +129,11 @@ def test_a_journal_cut_at_every_byte_starts_and_says_what_it_dropped(tmp_path):
 def test_a_log_that_is_read_piece_by_piece_says_the_same(monkeypatch):
     """Wherever a piece ends: of a log that is whole, cut, damaged by flipped bits, or has rubbish in it."""
     rng = np.random.default_rng(0)
-    facts = [
+    events = [
         encoded(Kind.EVENT, index, {"fact": "missing", "index": index, "reason": "é" * index}) for index in range(9)
     ]
-    log = b"".join(facts)
-    logs = [log, log[:-1], log[: len(log) // 2], b"", b"S4DR", facts[0] + b"S4DR" * 40 + facts[1], bytes(300) + log]
+    log = b"".join(events)
+    logs = [log, log[:-1], log[: len(log) // 2], b"", b"S4DR", events[0] + b"S4DR" * 40 + events[1], bytes(300) + log]
     for at in rng.integers(0, len(log), 40):
         damaged = bytearray(log)
         damaged[at] ^= 1 << int(rng.integers(8))
