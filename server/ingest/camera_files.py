@@ -13,12 +13,12 @@ from scas4d_core.cameras import Camera, Rig
 from server.ingest.acknowledge import Ingest
 from server.ingest.open_frames import OpenFrames
 from server.ingest.pictures import MASK, check_files, check_size
-from server.ingest.receive import Receiving, accepted_or_removed, check_index, drain, receive_framed, receiving_of
+from server.ingest.receive import Receiving, accepted_or_removed, check_index, drain, read_framed, receiving_of
 from server.problems import Problem, counted
 from server.storage.disk import full_disk, no_room
 
 
-async def take_form(ingest: Ingest, index: int, request: Request) -> FrameReceipt:
+async def receive_form(ingest: Ingest, index: int, request: Request) -> FrameReceipt:
     """Receives a whole frame as multipart/form-data, which is easy to send and slow to read."""
     # A picture sent as a plain field (no file name) would be read as text: such fields are kept short.
     async with request.form(max_files=2 * len(ingest.rules.rig) + 8, max_fields=8, max_part_size=4096) as form:
@@ -58,7 +58,7 @@ async def take_form(ingest: Ingest, index: int, request: Request) -> FrameReceip
                 ingest.came(index)
 
 
-async def take_camera(
+async def receive_camera(
     frames: OpenFrames, index: int | None, camera: str | None, body: AsyncIterator[bytes], length: int | None
 ) -> PartReceipt:
     """Receives one camera's picture and mask as S4DF; `index` and `camera` as the address gives them, if it does."""
@@ -74,13 +74,13 @@ async def take_camera(
         return receiving_of(ingest, head.model_copy(update={"part": True}), head.time, keep=keep)
 
     try:
-        head, receiving = await receive_framed(body, begin, length)
+        head, receiving = await read_framed(body, begin, length)
         return await accepted_or_removed(receiving, lambda received: frames.accept(head, names[0], received))
     finally:
         await drain(body)
 
 
-async def take_file(
+async def receive_file(
     frames: OpenFrames,
     index: int,
     camera: str,

@@ -134,7 +134,7 @@ class Receiving:
         self._buffers = []
 
 
-async def receive_framed(
+async def read_framed(
     chunks: AsyncIterator[bytes], begin: Callable[[FrameHead], Receiving], total: int | None
 ) -> tuple[FrameHead, Receiving]:
     """Reads a frame as `client.wire.framing` writes it; holds two batches of its bytes at most.
@@ -224,7 +224,7 @@ def _buffer(size: int) -> mmap.mmap:
     return mmap.mmap(-1, max(size, _STANDARD))
 
 
-async def take_framed(
+async def receive_frame(
     ingest: Ingest, index: int | None, body: AsyncIterator[bytes], length: int | None
 ) -> FrameReceipt:
     """Receives and acknowledges a whole frame as S4DF.
@@ -248,7 +248,7 @@ async def take_framed(
         return receiving_of(ingest, head, ingest.time_of(head.index, head.time), keep=keep)
 
     try:
-        head, receiving = await receive_framed(body, begin, length)
+        head, receiving = await read_framed(body, begin, length)
         return await accepted_or_removed(receiving, lambda received: ingest.accept(head, received))
     finally:
         for number in begun:

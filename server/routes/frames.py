@@ -16,8 +16,8 @@ from client.wire import (
     MissingRequest,
     PartReceipt,
 )
-from server.ingest.camera_files import take_camera, take_file, take_form
-from server.ingest.receive import take_framed
+from server.ingest.camera_files import receive_camera, receive_file, receive_form
+from server.ingest.receive import receive_frame
 from server.problems import Problem
 from server.processes.messages import PlyQuery
 from server.routes.access import FrameIndex, TheScene
@@ -69,9 +69,9 @@ async def put(scene: TheScene, n: FrameIndex, request: Request) -> FrameReceipt:
     kind = _media_type(request)
     try:
         if kind == FRAME_MEDIA_TYPE:
-            return await take_framed(scene.ingest, n, _body(request), _length(request))
+            return await receive_frame(scene.ingest, n, _body(request), _length(request))
         if kind == "multipart/form-data":
-            return await take_form(scene.ingest, n, request)
+            return await receive_form(scene.ingest, n, request)
     except ClientDisconnect:
         raise Problem(400, "the sender went away", field="body", remedy="send the frame again") from None
     raise Problem(
@@ -101,8 +101,8 @@ async def put_camera(
     """
     try:
         if _media_type(request) == FRAME_MEDIA_TYPE:
-            return await take_camera(scene.open_frames, n, c, _body(request), _length(request))
-        return await take_file(scene.open_frames, n, c, kind, time, _body(request), _length(request))
+            return await receive_camera(scene.open_frames, n, c, _body(request), _length(request))
+        return await receive_file(scene.open_frames, n, c, kind, time, _body(request), _length(request))
     except ClientDisconnect:
         raise Problem(400, "the sender went away", field="body", remedy="send the picture again") from None
 

@@ -32,7 +32,7 @@ Snapshot = Callable[[], Iterator[JournalEvent]]
 
 
 @dataclass(frozen=True)
-class JournalRead:
+class JournalContent:
     """Content of a journal: its events in order, the bytes that are whole, and a sentence for each damage."""
 
     events: list[JournalEvent]
@@ -40,11 +40,11 @@ class JournalRead:
     damage: list[str]
 
 
-def read_journal(path: Path) -> JournalRead:
+def read_journal(path: Path) -> JournalContent:
     """Reads a whole journal that is not large; see `replay`."""
     events: list[JournalEvent] = []
     reading = replay(path, events.append)
-    return JournalRead(events, reading.good, reading.damage)
+    return JournalContent(events, reading.good, reading.damage)
 
 
 @dataclass(frozen=True)

@@ -55,9 +55,9 @@ def test_a_request_cancelled_while_its_event_is_written_keeps_its_pictures(http,
 
     monkeypatch.setattr(Journal, "_write", slow)
     if part:
-        take = camera_files.take_camera(scene.open_frames, 0, "c0", body(), None)
+        take = camera_files.receive_camera(scene.open_frames, 0, "c0", body(), None)
     else:
-        take = receive.take_framed(scene.ingest, 0, body(), None)
+        take = receive.receive_frame(scene.ingest, 0, body(), None)
     request = on_the_loop(scene, take)
     time.sleep(0.25)
     request.cancel()
@@ -85,7 +85,7 @@ def test_a_frame_accepted_while_the_first_one_fails_does_not_wait_for_ever(http,
         async def body():
             yield framed(1)
 
-        await asyncio.gather(setting, receive.take_framed(scene.ingest, 1, body(), None))
+        await asyncio.gather(setting, receive.receive_frame(scene.ingest, 1, body(), None))
 
     http.post(f"/v1/scenes/{id}/pause")
     put(http, id, 0)
