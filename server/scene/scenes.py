@@ -64,8 +64,7 @@ class Scenes:
         self.hub = hub
         self.by_id: dict[str, Scene] = {}
         self.unreadable: dict[str, str] = {}
-        data = DataFolder(server.data.resolve())
-        self._folder, self._deleted = data.scenes, data.deleted
+        self._data = DataFolder(server.data.resolve())
         self._lock: FolderLock | None = None
         self._making = 0
         self._found: list[str] = []
@@ -78,7 +77,7 @@ class Scenes:
         Raises:
             RuntimeError: another service is at work in the data folder.
         """
-        for folder in (self._folder, self._deleted):
+        for folder in (self._data.scenes, self._data.deleted):
             folder.mkdir(parents=True, exist_ok=True)
         self._lock = lock_data(self.server.data)
         self._found = await asyncio.to_thread(self._folders)
@@ -87,20 +86,20 @@ class Scenes:
     def _folders(self) -> list[str]:
         """Lists the folders of scenes; moves those that were never acknowledged to the deleted ones."""
         found = []
-        for path in sorted(path for path in self._folder.iterdir() if path.is_dir()):
+        for path in sorted(path for path in self._data.scenes.iterdir() if path.is_dir()):
             if never_acknowledged(SceneFolder(path)):
-                path.rename(self._deleted / f"{path.name}-{secrets.token_hex(4)}")
+                path.rename(self._data.deleted / f"{path.name}-{secrets.token_hex(4)}")
             else:
                 found.append(path.name)
-        sync_folder(self._folder)
+        sync_folder(self._data.scenes)
         return found
 
     async def _recover(self) -> None:
         """Recovers the scenes that were found, one after the other, and finishes interrupted deletions."""
-        graves = list(self._deleted.iterdir())
+        graves = list(self._data.deleted.iterdir())
         for name in self._found:
             try:
-                await self._restore(SceneFolder(self._folder / name))
+                await self._restore(self._data.scene(name))
             except Exception as error:  # a fault of one scene is no fault of the others
                 self.unreadable[name] = f"the service failed: {type(error).__name__}: {told(error)}"
                 log.exception("scene %s cannot be recovered", name)
@@ -163,7 +162,7 @@ class Scenes:
                 headers={"Retry-After": "60"},
             )
         definition = Definition(secrets.token_hex(6), datetime.now(UTC), request, settings)
-        folder = SceneFolder(self._folder / definition.id)
+        folder = self._data.scene(definition.id)
         self._making += 1
         try:
             await self._write(folder, definition)
@@ -210,10 +209,10 @@ class Scenes:
         await asyncio.to_thread(self._remove, scene.spec.folder.path)
 
     def _remove(self, folder: Path) -> None:
-        grave = self._deleted / f"{folder.name}-{secrets.token_hex(4)}"
+        grave = self._data.deleted / f"{folder.name}-{secrets.token_hex(4)}"
         folder.rename(grave)
-        sync_folder(self._deleted)
-        sync_folder(self._folder)
+        sync_folder(self._data.deleted)
+        sync_folder(self._data.scenes)
         shutil.rmtree(grave, ignore_errors=True)
 
     async def stop(self) -> None:

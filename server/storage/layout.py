@@ -30,6 +30,10 @@ class DataFolder:
         """Folders of deleted scenes until they are removed."""
         return self.path / "deleted"
 
+    def scene(self, id: str) -> SceneFolder:
+        """Folder of a scene."""
+        return SceneFolder(self.scenes / id)
+
 
 @dataclass(frozen=True)
 class SceneFolder:
