@@ -164,10 +164,10 @@ class Mending:
         if message := tuple(names):
             self._to_worker(Mend(message, times, known))
 
-    def begin(self) -> bool:
-        """Gives an idle worker the next state to make again, if one waits; returns whether it did."""
-        if self.waiting and asyncio.get_running_loop().time() < self._full_until:
-            return False
+    def begin(self) -> None:
+        """Gives an idle worker the next state to make again, if one waits."""
+        if asyncio.get_running_loop().time() < self._full_until:
+            return
         for index in sorted(self.waiting):
             base = self._base(index)
             if base is None:
@@ -181,9 +181,7 @@ class Mending:
             frame = FrameReady(index, receipt.time, entry.files, receipt.identity, self._ledger.budget_of(index))
             if self._to_worker(Remake(frame, base)):
                 self.at_work = index
-                return True
-            return False
-        return False
+            return
 
     def mended(self, message: Mended) -> None:
         """Acts on the worker's answer about a file or a state."""
