@@ -18,7 +18,7 @@ from server.connections.config import guarded
 from server.connections.process import keep_freed_memory, room_for_connections
 from server.health import logs
 from server.processes.local_placement import LocalPlacement
-from server.scene.scenes import hold
+from server.scene.scenes import lock_data
 from server.settings import ServerSettings, unknown
 
 log = logging.getLogger("scas4d.server")
@@ -57,7 +57,7 @@ def serve(settings: ServerSettings) -> None:
     for name in unknown(os.environ):
         log.warning("%s is no setting and was ignored; docs/operations.md lists them", name)
     try:
-        hold(settings.data).release()  # said here in a sentence; taken for good when the application starts
+        lock_data(settings.data).release()  # said here in a sentence; taken for good when the application starts
     except OSError as error:
         raise RuntimeError(f"data folder {settings.data}: {error.strerror}; name another with --data") from None
     sockets = listen(settings.host, settings.port)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Unpack
 
 from client.calls.call import Call, body, path, reads
 from client.wire import Budget, ReplayRequest, SceneBudget, TradeoffModel
+from client.wire.budgets import BudgetFields
 
 
 def budget(id: str) -> Call[SceneBudget]:
@@ -13,25 +15,15 @@ def budget(id: str) -> Call[SceneBudget]:
     return Call("GET", path(id, "budget"), reads(SceneBudget))
 
 
-def set_budget(
-    id: str,
-    *,
-    iterations: int | None = None,
-    budget_ms: float | None = None,
-    stop_gain: float | None = None,
-    still: float | None = None,
-) -> Call[SceneBudget]:
-    """Another budget, from the first frame on that is not begun. What is None is as the scene was made.
+def set_budget(id: str, **budget: Unpack[BudgetFields]) -> Call[SceneBudget]:
+    """Sets another budget, from the first frame on that is not begun.
 
     Args:
         id: of the scene.
-        iterations: a frame.
-        budget_ms: milliseconds a frame, decoding and commit included; then as many iterations as fit.
-        stop_gain: ten iterations that lower the error by less than this share end the update.
-        still: a frame needs no iteration where the one before shows it with at most 1 + this times the usual error.
+        budget: fields of `client.wire.Budget`: iterations, budget_ms, stop_gain, still. A field that is left out, or
+            None, is as the scene was made.
     """
-    request = Budget(iterations=iterations, budget_ms=budget_ms, stop_gain=stop_gain, still=still)
-    return Call("PUT", path(id, "budget"), reads(SceneBudget), arguments=body(request))
+    return Call("PUT", path(id, "budget"), reads(SceneBudget), arguments=body(Budget(**budget)))
 
 
 def tradeoff(id: str) -> Call[TradeoffModel]:

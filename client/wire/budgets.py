@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, TypedDict
 
 from pydantic import Field
 
@@ -44,6 +44,15 @@ class Budget(Model):
         description="A frame needs no iteration where the one before shows it with at most 1 + this times the usual "
         "error; -1: every frame is updated.",
     )
+
+
+class BudgetFields(TypedDict, total=False):
+    """Fields of `Budget` as keyword arguments; one that is left out is as the scene was made."""
+
+    iterations: int | None
+    budget_ms: float | None
+    stop_gain: float | None
+    still: float | None
 
 
 class EffectiveBudget(Model):

@@ -1,248 +1,307 @@
-"""The door of a scene for frames: what is taken, in which order, and what is answered. Acknowledged means on disk."""
+"""Accepts frames: admits them in order, journals them, acknowledges them. An acknowledged frame is on disk."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine
-from typing import TYPE_CHECKING, Any, TypeVar
+import math
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
 
-from client.wire import Budget, FrameHead, FrameReceipt, FrameReportModel, FrameState, PartReceipt
+from client.wire import FrameHead, FrameReceipt, FrameState, SceneState
+from scas4d_core.cameras import Rig
 from server.health import metrics
-from server.ingest.admission import Admission
-from server.ingest.open_frames import OpenFrames
-from server.ingest.upload import Received
 from server.problems import Problem, counted
-from server.storage.disk import full_disk, no_room
-from server.storage.events import Budgeted, Fact, Missing, Paused, Skipped, Taken
-from server.storage.frame_store import remove
-from server.storage.ledger import frame_identity
-
-if TYPE_CHECKING:
-    from server.scene.scene import Scene
+from server.storage.events import FrameAccepted, FramesSkipped, Hashes
+from server.storage.frame_table import LOST
+from server.storage.ledger import SceneLog, frame_identity
 
 T = TypeVar("T")
 
+MOST_SOCKETS = 64
+"""WebSockets that send frames to one scene: one a camera where each has a sender of its own."""
+LONGEST_S = 60.0
+"""The longest that a sender is told to wait: a prediction that far ahead is a guess."""
+PAUSED_S = 5.0
+"""A sender to a paused scene asks again after so long: nobody knows when a person resumes it."""
+
+
+@dataclass(eq=False)
+class Received:
+    """Files of a frame, or of one camera, on disk. `file` is None where they were only compared with a known frame."""
+
+    hashes: Hashes
+    file: str | None
+    size: int
+    kept: bool = False
+    """An event names the record: it must not be removed."""
+
+
+@dataclass(frozen=True, eq=False)
+class IngestRules:
+    """Rules by which a scene accepts frames, the service's defaults filled in.
+
+    Attributes:
+        frames_per_second: gives a frame without a time its time. queue_frames: frames acknowledged and not finished, at
+            most. when_full: refuse the next frame, or skip those that wait. minimum_cameras: that a frame needs.
+        part_seconds: a frame sent camera by camera is closed so long after its first part; None: never.
+    """
+
+    rig: Rig
+    frames_per_second: float
+    queue_frames: int
+    when_full: Literal["refuse", "skip"]
+    minimum_cameras: int
+    part_seconds: float | None
+
 
 class Ingest:
-    """Takes frames into a scene's ledger, the journal first. One at a time; uploads come in side by side."""
+    """Admits and acknowledges the frames of one scene, one at a time; uploads arrive side by side.
 
-    def __init__(self, scene: Scene) -> None:
-        self._scene = scene
-        self.rules = Admission(scene)
-        self._open = OpenFrames(scene, self.rules, self._append)
+    Args:
+        log: of the scene. rules: of the scene.
+        remaining: predicts the seconds until the frame at work ends.
+        accepted: called when the queue has changed. ended: called for each frame that ends without the worker.
+    """
+
+    def __init__(
+        self,
+        log: SceneLog,
+        rules: IngestRules,
+        *,
+        remaining: Callable[[], float],
+        accepted: Callable[[], None],
+        ended: Callable[[int], None],
+    ) -> None:
+        self.log = log
+        self.ledger = log.ledger
+        self.rules = rules
+        self.accepted = accepted
+        self.ended = ended
+        self._remaining = remaining
         self._sockets = 0
         self._coming: dict[int, asyncio.Event] = {}
-        """Whole frames that are being received, and the event of their end: the next may come in meanwhile."""
+        """Whole frames that are being received, and the event of their end: the next may arrive meanwhile."""
 
     def join(self) -> None:
-        """One more WebSocket sends frames; to be told `leave` when it ends.
+        """Counts one more WebSocket that sends frames; to be followed by `leave` when it ends.
 
         Raises:
-            Problem: 429, as many do as may.
+            Problem: 429, as many send as may.
         """
-        most = self._scene.server.max_ingest_sockets
-        if self._sockets >= most:
+        if self._sockets >= MOST_SOCKETS:
             raise Problem(
                 429,
                 f"{counted(self._sockets, 'WebSocket')} send frames to this scene already",
-                field="SCAS4D_MAX_INGEST_SOCKETS",
-                value=most,
-                remedy="close another one, send over HTTP, or raise the limit",
+                field="id",
+                value=self.ledger.scene,
+                remedy="close another one, or send over HTTP",
                 headers={"Retry-After": "5"},
             )
         self._sockets += 1
 
     def leave(self) -> None:
-        """A WebSocket has ended."""
+        """Counts a WebSocket that has ended."""
         self._sockets -= 1
 
-    def time_of(self, index: int, time: float | None) -> float:
-        """Seconds of a frame: as given, or by the scene's frame rate."""
-        return self.rules.time_of(index, time)
+    # Whole frames.
 
     def expects(self, head: FrameHead) -> bool:
-        """Whether a whole frame is worth writing: False for one that is known, whose content is only compared.
+        """Returns whether a whole frame has to be written; False for a known one, whose content is only compared.
 
         Raises:
-            Problem: it will be refused, whatever it holds.
+            Problem: the frame will be refused, whatever it holds.
         """
-        ledger = self._scene.ledger
-        if head.index < ledger.next_frame:
+        next_frame = self.ledger.next_frame
+        if head.index < next_frame:
             return False
-        awaited = ledger.next_frame
+        awaited = next_frame
         while awaited in self._coming:
             awaited += 1
-        if head.index == ledger.next_frame:
-            self.rules.admit(head.index, self.rules.time_of(head.index, head.time))
+        if head.index == next_frame:
+            self.admit(head.index, self.time_of(head.index, head.time))
         elif head.index > awaited:
-            raise self.rules.gap(head.index)
-        else:  # those before it are just coming in: it is judged when they are here
-            self.rules.refuse_if_failed()
+            raise self.gap(head.index)
+        else:  # the frames before it are arriving: it is judged when they are here
+            self.refuse_if_failed()
         return True
 
-    def coming(self, index: int) -> asyncio.Event:
-        """The frame is being received; to be set, and forgotten by `came`, when it is taken or refused."""
-        return self._coming.setdefault(index, asyncio.Event())
+    def is_coming(self, index: int) -> bool:
+        """True while the whole frame is being received."""
+        return index in self._coming
+
+    def coming(self, index: int) -> None:
+        """Notes that the frame is being received, until `came`."""
+        self._coming.setdefault(index, asyncio.Event())
 
     def came(self, index: int) -> None:
-        """The frame is taken or refused."""
+        """Notes that the frame is accepted or refused."""
         if (event := self._coming.pop(index, None)) is not None:
             event.set()
 
-    async def take(self, head: FrameHead, received: Received) -> FrameReceipt:
-        """Acknowledges a frame whose pictures are on disk, and queues it; or answers as the first time.
+    async def accept(self, head: FrameHead, received: Received) -> FrameReceipt:
+        """Acknowledges a frame whose pictures are on disk, and queues it; a known frame gets its receipt again.
 
         Raises:
             Problem: 409 for a gap, for other content under a known index and for a failed scene; 422 for a time that
                 does not rise; 429 when the queue is full; 507 when the disk is.
         """
-        while (before := self._coming.get(head.index - 1)) is not None and head.index > self._scene.next_frame:
+        while (before := self._coming.get(head.index - 1)) is not None and head.index > self.ledger.next_frame:
             await before.wait()
-        return await whole(self._take(head, received))
+        return await uncancelled(self._accept(head, received))
 
-    async def _take(self, head: FrameHead, received: Received) -> FrameReceipt:
-        scene = self._scene
-        seconds = self.rules.time_of(head.index, head.time)
+    async def _accept(self, head: FrameHead, received: Received) -> FrameReceipt:
+        seconds = self.time_of(head.index, head.time)
         identity = frame_identity(received.hashes, seconds)
-        async with scene.door:
-            if head.index < scene.next_frame:
-                return self.rules.again(head.index, identity)
-            self.rules.admit(head.index, seconds)
-            if received.file is None:  # it was known when it came, and is not any more: a scene forgets nothing
+        async with self.log.lock:
+            if head.index < self.ledger.next_frame:
+                return self._known(head.index, identity)
+            self.admit(head.index, seconds)
+            if received.file is None:  # the frame was known when it arrived, and a scene forgets none
                 raise AssertionError(f"frame {head.index} was not written")
-            fact = Taken(index=head.index, time=seconds, identity=identity, files=(received.file,))
-            await self._append(*self.rules.skips(head.index), fact)
-            scene.held.add(received.file, received.size)
+            event = FrameAccepted(index=head.index, time=seconds, identity=identity, files=(received.file,))
+            receipt = await self.acknowledge(event)
+            self.log.pictures.add(received.file, received.size)
             received.kept = True
             metrics.INGEST_BYTES.inc(received.size)
-            metrics.FRAMES.labels("acknowledged").inc()
-            receipt = scene.frames[head.index].receipt
-            assert receipt is not None
-        scene.work()
+        self.accepted()
         return receipt
 
-    def expects_part(self, head: FrameHead, camera: str) -> None:
-        """Refuses a part that will be refused, whatever it holds.
+    async def acknowledge(self, event: FrameAccepted) -> FrameReceipt:
+        """Journals a frame, and those that are skipped for it; the log's lock is held.
 
         Raises:
-            Problem: 409 for a frame too far ahead or that is being sent whole, 422 for its time, 429 where nothing can
-                be taken.
+            Problem: 507.
         """
-        index = head.index
-        if index >= self._scene.next_frame and index in self._coming:
-            raise Problem(409, f"frame {index} is being sent whole", field="n", value=index, remedy="wait for its end")
-        self._open.expects(head, camera)
+        skipped = self._skipped_for(event.index)
+        await self.log.append(*skipped, event)
+        for index in (index for one in skipped for index in one.frames):
+            self.ended(index)
+        metrics.FRAMES.labels("acknowledged").inc()
+        receipt = self.ledger.frames[event.index].receipt
+        assert receipt is not None
+        return receipt
 
-    async def take_part(self, head: FrameHead, camera: str, received: Received) -> PartReceipt:
-        """Acknowledges one camera's files of a frame.
+    # Rules: they change nothing.
+
+    def time_of(self, index: int, time: float | None) -> float:
+        """Returns the seconds of a frame: as given, or by the scene's frame rate."""
+        return index / self.rules.frames_per_second if time is None else time
+
+    def admit(self, index: int, seconds: float) -> None:
+        """Refuses a frame that cannot be the next."""
+        self.refuse_if_failed()
+        if index != self.ledger.next_frame:
+            raise self.gap(index)
+        if index in self.ledger.open:
+            raise Problem(
+                409,
+                f"frame {index} is being sent camera by camera",
+                field="n",
+                value=index,
+                remedy=f"send the other cameras, or close it: POST /v1/scenes/{self.ledger.scene}/frames/{index}/close",
+                received=self.ledger.open[index].cameras,
+            )
+        self.check_time(index, seconds)
+        if not self.has_room():
+            raise self.full(index)
+
+    def refuse_if_failed(self) -> None:
+        """Refuses any frame of a scene that cannot go on: 409."""
+        if self.ledger.fatal is not None:
+            raise Problem(
+                409,
+                f"the scene has failed: {self.ledger.fatal}",
+                field="id",
+                value=self.ledger.scene,
+                remedy="delete the scene and create it anew",
+                state=SceneState.FAILED,
+            )
+
+    def gap(self, index: int) -> Problem:
+        """Makes the answer to a frame that is not the next: 409, with the expected index."""
+        expected = self.ledger.next_frame
+        return Problem(
+            409,
+            f"frame {index} would leave a gap: frame t is found from frame t−1",
+            field="n",
+            value=index,
+            remedy=f"send frame {expected} first, or declare it missing: POST …/frames/{expected}/missing",
+            expected=expected,
+        )
+
+    def check_time(self, index: int, seconds: float) -> None:
+        """Refuses a time that is not after the last one: 422."""
+        before = self.ledger.last_time()
+        if not (math.isfinite(seconds) and (before is None or seconds > before)):
+            raise Problem(
+                422,
+                f"the time of frame {index} is not after that of the frame before it",
+                field="time",
+                value=seconds,
+                remedy="give finite seconds" if before is None else f"give seconds above {before:g}",
+            )
+
+    def has_room(self) -> bool:
+        """True where the queue accepts one more frame, if need be by skipping others."""
+        if self.ledger.unfinished < self.rules.queue_frames:
+            return True
+        return self.rules.when_full == "skip" and bool(self.ledger.waiting())
+
+    def full(self, index: int) -> Problem:
+        """Makes the answer of a full queue: 429, with the predicted time until the frame at work ends.
+
+        ``Retry-After`` holds whole seconds, the document's ``retry_after_seconds`` the same unrounded.
+        """
+        ledger = self.ledger
+        if ledger.paused:
+            seconds, remedy = PAUSED_S, f"let the scene go on: POST /v1/scenes/{ledger.scene}/resume"
+        else:
+            seconds = min(self._remaining(), LONGEST_S)
+            remedy = f"send the same frame again in {counted(math.ceil(seconds), 'second')}"
+        return Problem(
+            429,
+            f"{counted(ledger.unfinished, 'frame')} of at most {self.rules.queue_frames} wait already"
+            + (" and the scene is paused" if ledger.paused else ""),
+            field="n",
+            value=index,
+            remedy=remedy,
+            headers={"Retry-After": str(max(1, math.ceil(seconds)))},
+            queued=ledger.unfinished,
+            retry_after_seconds=round(seconds, 3),
+        )
+
+    def _skipped_for(self, index: int) -> list[FramesSkipped]:
+        """Returns the event that skips waiting frames to make room for a frame, where the queue is full."""
+        if self.ledger.unfinished < self.rules.queue_frames:
+            return []
+        return [FramesSkipped(frames=tuple(self.ledger.waiting()), by=index)]
+
+    def _known(self, index: int, identity: str) -> FrameReceipt:
+        """Returns the receipt of a known frame, if it has the same content.
 
         Raises:
-            Problem: as `take`; 409 for other content than the camera has sent before, and for a part of a frame that
-                was closed without it.
+            Problem: 409, it has not.
         """
-        return await whole(self._open.take(head, camera, received))
-
-    async def close_what_can_be(self) -> None:
-        """Closes frames, in order, whose cameras are all in or whose deadline is over, while there is room for them."""
-        await whole(self._open.close_due())
-
-    async def close(self, index: int) -> FrameReceipt:
-        """Closes a frame on request, with the cameras that are in. Closed already, it answers as before.
-
-        Raises:
-            Problem: 404, nothing of it is here; 409, one before it is not closed, or fewer cameras are in than the
-                scene's minimum; 429, 507 as `take`.
-        """
-        return await whole(self._open.close(index))
-
-    async def declare_missing(self, index: int, reason: str) -> FrameReportModel:
-        """Declares the next frame missing, for ever; declared already, it answers the same.
-
-        Raises:
-            Problem: 409 for a gap, for a frame that was taken, and for a failed scene; 507 when the disk is full.
-        """
-        return await whole(self._declare_missing(index, reason))
-
-    async def _declare_missing(self, index: int, reason: str) -> FrameReportModel:
-        scene = self._scene
-        async with scene.door:
-            if index < scene.next_frame:
-                report = scene.frames[index].report
-                if report.state != FrameState.MISSING:
-                    raise Problem(
-                        409,
-                        f"frame {index} is {report.state}: it was taken",
-                        field="n",
-                        value=index,
-                        remedy=f"only frames that never came can be missing; the next is {scene.next_frame}",
-                        expected=scene.next_frame,
-                    )
-                return report
-            self.rules.refuse_if_failed()
-            if index > scene.next_frame:
-                raise self.rules.gap(index)
-            if index in self._coming:
-                raise Problem(
-                    409, f"frame {index} is just coming in", field="n", value=index, remedy="wait for its end"
-                )
-            parts = scene.ledger.open.get(index)
-            await self._append(Missing(index=index, reason=reason or "declared missing"))
-            self._open.forget(index)
-            if parts is not None:
-                scene.held.discard(parts.files)
-                await asyncio.to_thread(remove, scene.spec.frames, parts.files)
-            report = scene.frames[index].report
-        scene.finished(report)
-        await self.close_what_can_be()
-        return report
-
-    async def pause(self, paused: bool) -> None:
-        """The scene reconstructs nothing more, or goes on; stays so over a restart."""
-
-        async def change() -> None:
-            async with self._scene.door:
-                if self._scene.ledger.paused != paused:
-                    await self._append(Paused(paused=paused))
-
-        await whole(change())
-
-    async def budget(self, budget: Budget) -> None:
-        """Another budget from the first frame on that is not begun; none begins while that is written down.
-
-        Raises:
-            Problem: 409 for a failed scene, 507 when the disk is full.
-        """
-
-        async def change() -> None:
-            scene = self._scene
-            async with scene.door:
-                self.rules.refuse_if_failed()
-                if scene.ledger.budgets[-1][1] == budget:
-                    return
-                with scene.no_frame_begins():
-                    await self._append(Budgeted(index=scene.ledger.begins_next(), budget=budget))
-
-        await whole(change())
-
-    async def _append(self, *facts: Fact) -> None:
-        """Facts on disk, then in the ledger."""
-        try:
-            await self._scene.journal.append(*facts)
-        except OSError as error:
-            if not no_room(error):
-                raise
-            raise full_disk(error) from None
-        for fact in facts:
-            self._scene.ledger.apply(fact)
-            if isinstance(fact, Skipped):
-                for index in fact.frames:
-                    self._scene.finished(self._scene.frames[index].report)
-
-    def stop(self) -> None:
-        """No deadline comes any more."""
-        self._open.stop()
+        entry = self.ledger.frames[index]
+        receipt = entry.receipt
+        if receipt is not None and receipt.identity == identity:
+            return receipt
+        known = "known with other content or another time"
+        if receipt is None:
+            missing = entry.state == FrameState.MISSING
+            known = "declared missing" if missing else f"{entry.state}: {entry.error or LOST}"
+        raise Problem(
+            409,
+            f"frame {index} is {known}",
+            field="n",
+            value=index,
+            remedy=f"send the next frame, {self.ledger.next_frame}; an acknowledged frame does not change",
+            expected=self.ledger.next_frame,
+            identity=entry.identity,
+        )
 
 
-async def whole(coroutine: Coroutine[Any, Any, T]) -> T:
-    """Runs to its end even where whoever asked is gone: the ledger must not stay behind the journal."""
+async def uncancelled(coroutine: Coroutine[Any, Any, T]) -> T:
+    """Runs to the end even where the caller is cancelled: the ledger must not stay behind the journal."""
     return await asyncio.shield(asyncio.ensure_future(coroutine))

@@ -1,39 +1,46 @@
-"""Whether the files of a frame are what its scene's rig takes, as far as a door can tell without decoding pixels."""
+"""Checks the picture files of a frame without decoding pixels: names, sizes, and the structure of the file.
+
+JPEG is walked by its segments to the end marker, PNG by its chunks with their checksums, WebP by its RIFF chunks.
+"""
 
 from __future__ import annotations
 
 import io
+import re
+import struct
+import zlib
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from PIL import Image
 
 from client.wire import FileKind, FrameFile
 from client.wire.framing import MAX_HEAD, PREFIX
 from scas4d_core.cameras import Camera, Rig
-from server.ingest.image_structure import StructureError, walk
 from server.problems import Problem, counted
 
+_SCAN_END = re.compile(rb"\xff(?![\x00\xd0-\xd7\xff])(?=[\x00-\xff])", re.DOTALL)
 MASK = "mask."
 EXIF_ORIENTATION = 0x0112
 
 PIXEL_BYTES = 5
-"""Of one file for each of its pixels, at most: RGBA of noise as PNG has 4, and a little."""
+"""Bytes a pixel that one file has at most: noise in RGBA as PNG has a little over 4."""
 METADATA_BYTES = 1_000_000
-"""Beside the pixels: a colour profile, a preview."""
+"""Bytes beside the pixels at most: a colour profile, a preview."""
 
 
 def field_of(file: FrameFile) -> str:
-    """How a file is called in a form and in answers: `<camera>`, or `mask.<camera>`."""
+    """Names a file as forms and answers do: `<camera>`, or `mask.<camera>`."""
     return MASK + file.camera if file.kind == FileKind.MASK else file.camera
 
 
 def largest_file(camera: Camera) -> int:
-    """Bytes that one encoded picture or mask of the camera can have at most; what is larger is something else."""
+    """Returns the most bytes that a picture or mask of the camera can have, encoded."""
     return camera.width * camera.height * PIXEL_BYTES + METADATA_BYTES
 
 
 def largest_frame(rig: Rig) -> int:
-    """Bytes that a frame with masks can have at most on the wire."""
+    """Returns the most bytes that a frame with masks can have on the wire."""
     return PREFIX.size + MAX_HEAD + 2 * sum(largest_file(camera) for camera in rig.cameras)
 
 
@@ -54,10 +61,10 @@ def check_size(camera: Camera, field: str, size: int) -> None:
 
 
 def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
-    """Every camera once, of the rig; of a whole frame all of them, and masks of all or of none.
+    """Checks that each file is of a camera of the rig, once; of a whole frame all cameras, and masks of all or none.
 
     Raises:
-        Problem: 422, names the file; 413, it announces more bytes than it can have.
+        Problem: 422, names the file; 413, the file announces more bytes than it can have.
     """
     names = set(rig.names)
     seen: dict[FileKind, set[str]] = {FileKind.IMAGE: set(), FileKind.MASK: set()}
@@ -100,14 +107,14 @@ def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
 
 
 def check_picture(rig: Rig, file: FrameFile, data: memoryview) -> None:
-    """A whole file of a kind that is taken, of the camera's size, not turned.
+    """Checks that a file is whole, of an accepted format, of the camera's size, and not turned.
 
     Raises:
-        Problem: 422, names the file, what it is, and the remedy.
+        Problem: 422, names the file, its fault, and the remedy.
     """
     camera, field = rig[file.camera], field_of(file)
     try:
-        header = walk(data)
+        header = image_header(data)
     except StructureError as error:
         value = error.value or counted(len(data), "byte")
         raise Problem(422, f"{field}: {error.fault}", field=field, value=value, remedy=error.remedy) from None
@@ -137,5 +144,175 @@ def _orientation(data: memoryview) -> int:
     try:
         with Image.open(io.BytesIO(data), formats=["JPEG"]) as picture:  # reads the segments, decodes nothing
             return int(picture.getexif().get(EXIF_ORIENTATION, 1))
-    except Exception:  # damaged metadata: the worker finds out what it means, and says so
+    except Exception:  # damaged metadata: the worker decodes the file, and reports it
         return 1
+
+
+class StructureError(ValueError):
+    """A file is not a whole picture of an accepted format.
+
+    Attributes:
+        fault: what is wrong with it. remedy: what to send instead. value: the part at fault; None: the whole file.
+    """
+
+    def __init__(self, fault: str, remedy: str, value: str | None = None) -> None:
+        super().__init__(f"{fault}; {remedy}")
+        self.fault = fault
+        self.remedy = remedy
+        self.value = value
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """Header of a file: format "jpeg", "png" or "webp", and the size in pixels."""
+
+    format: str
+    width: int
+    height: int
+    exif: bool = False
+    """A JPEG has a segment of EXIF metadata, which may say that the picture is to be turned."""
+
+
+def image_header(data: bytes | memoryview) -> ImageHeader:
+    """Walks a file to its end and returns its header.
+
+    Args:
+        data: the file, one contiguous buffer of bytes; not copied.
+
+    Raises:
+        StructureError: another format, truncated, damaged, CMYK, animated, or of a bit depth that is not accepted.
+    """
+    data = memoryview(data)
+    start = bytes(data[:12])
+    if start.startswith(b"\xff\xd8\xff"):
+        return _jpeg(data)
+    if start.startswith(b"\x89PNG\r\n\x1a\n"):
+        return _png(data)
+    if start[:4] == b"RIFF" and start[8:] == b"WEBP":
+        return _webp(data)
+    if not start:
+        raise StructureError("an empty file", "send the picture as JPEG, PNG or WebP")
+    raise StructureError(
+        f"begins with {start[:8].hex(' ')}, which is no JPEG, PNG or WebP", "encode the picture as one of these"
+    )
+
+
+def _truncated(kind: str, size: int) -> StructureError:
+    return StructureError(
+        f"a {kind} that ends early, after {size} bytes",
+        "it was cut short on its way here: send it again from its source",
+    )
+
+
+def _jpeg(data: memoryview) -> ImageHeader:
+    at, header, components, exif = 2, None, 0, False
+    while True:
+        while bytes(data[at : at + 2]) == b"\xff\xff":  # fill bytes
+            at += 1
+        if at + 2 > len(data):
+            raise _truncated("JPEG", len(data))
+        if data[at] != 0xFF:
+            raise StructureError(
+                f"a JPEG without a marker at byte {at}", "the file is damaged: send it again from its source"
+            )
+        marker = data[at + 1]
+        if marker == 0xD9:
+            break
+        if at + 4 > len(data):
+            raise _truncated("JPEG", len(data))
+        length = struct.unpack(">H", data[at + 2 : at + 4])[0]
+        if length < 2 or at + 2 + length > len(data):
+            raise _truncated("JPEG", len(data))
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            if length < 8:
+                raise StructureError(
+                    "a JPEG with a short frame header", "the file is damaged: send it again from its source"
+                )
+            bits, height, width, channels = struct.unpack(">BHHB", data[at + 4 : at + 10])
+            if bits != 8 or channels not in (1, 3):
+                kind = "CMYK, " if channels == 4 else ""
+                value = f"{kind}{channels} channels of {bits} bits"
+                raise StructureError(f"a JPEG of {value}", "send RGB or grey of 8 bits", value)
+            header = ImageHeader("jpeg", width, height)
+            components = channels if marker in (0xC0, 0xC1) else 0
+        exif |= marker == 0xE1 and bytes(data[at + 4 : at + 10]) == b"Exif\0\0"
+        at += 2 + length
+        if marker == 0xDA:
+            # The one scan of a sequential picture is followed by the end only, and holds no end marker itself: where
+            # the file ends with one, it is whole. Others are walked from scan to scan.
+            if at <= len(data) - 2 and data[at - length + 2] == components and bytes(data[-2:]) == b"\xff\xd9":
+                break
+            at = _end_of_scan(data, at)
+    if header is None:
+        raise StructureError("a JPEG without a frame header", "the file is damaged: send it again from its source")
+    return replace(header, exif=exif)
+
+
+def _end_of_scan(data: memoryview, at: int) -> int:
+    """Finds the end of the entropy-coded data from `at` on: the next marker that is no stuffed zero and no restart."""
+    found = _SCAN_END.search(data, at)
+    if found is None:
+        raise _truncated("JPEG", len(data))
+    return found.start()
+
+
+def _png(data: memoryview) -> ImageHeader:
+    at, header, pixels = 8, None, False
+    while True:
+        if at + 12 > len(data):
+            raise _truncated("PNG", len(data))
+        length, kind = struct.unpack(">I4s", data[at : at + 8])
+        end = at + 12 + length
+        if end > len(data):
+            raise _truncated("PNG", len(data))
+        if zlib.crc32(data[at + 4 : end - 4]) != struct.unpack(">I", data[end - 4 : end])[0]:
+            raise StructureError(
+                f"a PNG whose {kind!r} chunk at byte {at} fails its checksum",
+                "it was damaged on its way: send it again",
+            )
+        if header is None:
+            if kind != b"IHDR" or length != 13:
+                raise StructureError(
+                    "a PNG that does not begin with its header", "the file is damaged: send it again from its source"
+                )
+            header = ImageHeader("png", *struct.unpack(">II", data[at + 8 : at + 16]))
+            if data[at + 16] == 16:
+                raise StructureError(
+                    "a PNG of 16 bits a channel", "send 8 bits: you choose how they are scaled", "16 bits"
+                )
+        if kind == b"acTL":
+            raise StructureError("an animated PNG", "send one picture a file", "animated")
+        pixels |= kind == b"IDAT"
+        if kind == b"IEND":
+            break
+        at = end
+    if not pixels:
+        raise StructureError("a PNG without pixels", "the file is damaged: send it again from its source")
+    return header
+
+
+def _webp(data: memoryview) -> ImageHeader:
+    size = struct.unpack("<I", data[4:8])[0] + 8
+    if size > len(data):
+        raise _truncated("WebP", len(data))
+    at, header, pixels = 12, None, False
+    while at + 8 <= size:
+        kind, length = struct.unpack("<4sI", data[at : at + 8])
+        body = data[at + 8 : at + 8 + length]
+        if len(body) < length or at + 8 + length > size:
+            raise _truncated("WebP", len(data))
+        if kind in (b"ANIM", b"ANMF"):
+            raise StructureError("an animated WebP", "send one picture a file", "animated")
+        if kind == b"VP8X" and length >= 10:
+            width, height = int.from_bytes(body[4:7], "little") + 1, int.from_bytes(body[7:10], "little") + 1
+            header = ImageHeader("webp", width, height)
+        if kind == b"VP8 " and length >= 10:
+            width, height = struct.unpack("<HH", body[6:10])
+            header, pixels = header or ImageHeader("webp", width & 0x3FFF, height & 0x3FFF), True
+        if kind == b"VP8L" and length >= 5:
+            bits = struct.unpack("<I", body[1:5])[0]
+            header, pixels = header or ImageHeader("webp", (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1), True
+        at += 8 + length + length % 2
+    if header is None or not pixels:
+        raise StructureError("a WebP without pixels", "the file is damaged: send it again from its source")
+    return header

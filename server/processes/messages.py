@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from client.wire import Budget, Retention
 from scas4d_core.cameras import Camera, Rig
+from server.storage.layout import SceneFolder
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,31 +19,11 @@ class SceneSpec:
     """What both processes of a scene are started with. `settings` is the engine's own object."""
 
     engine: str
-    folder: Path
+    folder: SceneFolder
     rig: Rig
     settings: Any
     minimum_cameras: int = 1
     keep_states: Retention = field(default_factory=Retention)
-
-    @property
-    def states(self) -> Path:
-        """The folder of the committed states (`scas4d_core.storage.history.History`)."""
-        return self.folder / "states"
-
-    @property
-    def frames(self) -> Path:
-        """The folder of the frame log (`server.storage.frame_store`)."""
-        return self.folder / "frames"
-
-    @property
-    def journal(self) -> Path:
-        """Of the scene's facts (`server.storage.journal`)."""
-        return self.folder / "journal.log"
-
-    @property
-    def points(self) -> Path:
-        """The initial cloud, where one was given."""
-        return self.folder / "points.npz"
 
 
 # To the worker.
@@ -133,7 +113,7 @@ class Progressed:
 
 
 @dataclass(frozen=True)
-class Committed:
+class FrameCommitted:
     """The frame's state is on disk, with `report` (as `History.report` gives it back).
 
     `deleted`: states that retention deleted after it.
@@ -145,7 +125,7 @@ class Committed:
 
 
 @dataclass(frozen=True)
-class SetAside:
+class FrameFailed:
     """The frame was not committed; the state is that of the frame before. `fatal`: the scene cannot go on."""
 
     index: int

@@ -87,13 +87,13 @@ class Renderer:
         self._stale: set[int] | None = set()
         self._history: History | None = None
         self._reader: Reader | None = None
-        self._parts = PartLabels(spec.folder / "parts")
+        self._parts = PartLabels(spec.folder.parts)
 
     @property
     def history(self) -> History:
         """What is committed now: opened once, then kept up to date by what is new in its folder."""
         if self._history is None:
-            self._history = History.load(self.spec.states)
+            self._history = History.load(self.spec.folder.states)
         elif self._stale is None or self._stale:
             self._history.refresh(self._stale)
         self._stale = set()
@@ -171,6 +171,6 @@ class Renderer:
                 headers = {"X-Parts-Frame": str(self.history.indices[-1])}
                 return Answer(number, body, "application/octet-stream", headers)
             case PlyQuery():
-                file = self.spec.folder / "splat.ply"
+                file = self.spec.folder.export
                 self.reader.write_ply(file, query.frame)
                 return Answer(number, file.read_bytes(), "application/octet-stream")

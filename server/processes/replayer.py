@@ -46,8 +46,8 @@ def main(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
 def _replay(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
     scene = spec.scene
     # Read once: while this goes on, the scene's retention may delete records and states.
-    frames = [partial(decode, scene.rig, message, read(scene.frames, message)) for message in spec.frames]
-    history = History.load(scene.states, only=(spec.first, spec.base))
+    frames = [partial(decode, scene.rig, message, read(scene.folder.frames, message)) for message in spec.frames]
+    history = History.load(scene.folder.states, only=(spec.first, spec.base))
     try:
         for index in (spec.first, spec.base):
             history.gaussians(index)

@@ -21,14 +21,14 @@ from server.processes.decoding import decode, read
 from server.processes.engine import Reconstruction, load_engine
 from server.processes.messages import (
     Broken,
-    Committed,
+    FrameCommitted,
+    FrameFailed,
     FrameReady,
     Mend,
     Progressed,
     Ready,
     Remake,
     SceneSpec,
-    SetAside,
     Stalled,
     Stop,
 )
@@ -52,7 +52,7 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     os.nice(NICE)
     end_with_parent()
     # A service that was killed leaves a worker in the middle of an update: two must not commit to one history.
-    lock = FolderLock(spec.folder / "worker.lock", wait=True)
+    lock = FolderLock(spec.folder.worker_lock, wait=True)
     with contextlib.suppress(OSError):  # a full disk is no reason not to work
         lock.write(f"{os.getpid()}\n")
     worker = Worker(spec, connection)
@@ -94,7 +94,7 @@ class _Stopped(Exception):
 
 
 class Worker:
-    """One scene. Every frame ends as `Committed` or `SetAside`, or with the process."""
+    """One scene. Every frame ends as `FrameCommitted` or `FrameFailed`, or with the process."""
 
     def __init__(self, spec: SceneSpec, connection: Connection[Any, Any]) -> None:
         self.spec = spec
@@ -111,12 +111,12 @@ class Worker:
     def open(self) -> bool:
         """Takes up what is committed and says so; False where it cannot be gone on from."""
         try:
-            self.states = history = History.open(self.spec.states)
+            self.states = history = History.open(self.spec.folder.states)
             undone: tuple[int, ...] = ()
             faults: tuple[str, ...] = ()
             if history.indices:
                 self.reconstruction = self.engine.resume(
-                    self.spec.rig, self.spec.settings, history, held=lambda index: holds(self.spec.frames, index)
+                    self.spec.rig, self.spec.settings, history, held=lambda index: holds(self.spec.folder.frames, index)
                 )
                 if self.reconstruction.resumed is not None:
                     undone = tuple(self.reconstruction.resumed.undone)
@@ -165,7 +165,7 @@ class Worker:
                 raise _Stopped
             self._later.append(message)
 
-    def finish(self, message: FrameReady) -> Committed | SetAside:
+    def finish(self, message: FrameReady) -> FrameCommitted | FrameFailed:
         """Commits a frame, or says why not.
 
         Raises:
@@ -174,21 +174,21 @@ class Worker:
         dropped: dict[str, str] = {}
         began = time.perf_counter()
         try:
-            frame, dropped = decode(self.spec.rig, message, read(self.spec.frames, message))
+            frame, dropped = decode(self.spec.rig, message, read(self.spec.folder.frames, message))
             least = self.spec.minimum_cameras
             if len(frame.images) < least:
                 reason = f"{len(frame.images)} cameras' pictures are left, the scene's minimum is {least}"
-                return SetAside(message.index, reason, dropped)
+                return FrameFailed(message.index, reason, dropped)
             return self.reconstruct(frame, dropped, message.budget, began)
         except FrameDamage as error:
-            return SetAside(message.index, f"its record in the frame log is damaged: {error}", dropped)
+            return FrameFailed(message.index, f"its record in the frame log is damaged: {error}", dropped)
         except Exception as error:  # whatever the engine raises, the service goes on and says so
             if no_room(error):
                 raise
             log.exception("scene %s, frame %d", self.spec.folder.name, message.index)
             # Without a first frame there is nothing to go on from.
             first = self.reconstruction is None
-            return SetAside(message.index, f"{type(error).__name__}: {message_of(error)}", dropped, fatal=first)
+            return FrameFailed(message.index, f"{type(error).__name__}: {message_of(error)}", dropped, fatal=first)
 
     def mend(self, message: Mend) -> None:
         """Looks at files that were found damaged, and says what came of each."""
@@ -202,12 +202,12 @@ class Worker:
         frame = message.frame
 
         def pictures() -> tuple[Frame, dict[str, str]]:
-            return decode(self.spec.rig, frame, read(self.spec.frames, frame))
+            return decode(self.spec.rig, frame, read(self.spec.folder.frames, frame))
 
         for mended in repairs.remake(self.engine, self.spec, self.states, message, pictures):
             self.connection.send(mended)
 
-    def reconstruct(self, frame: Frame, dropped: dict[str, str], budget: Budget, began: float) -> Committed:
+    def reconstruct(self, frame: Frame, dropped: dict[str, str], budget: Budget, began: float) -> FrameCommitted:
         """Runs the first frame or an update, and commits. `began`: `perf_counter` before decoding."""
         assert self.states is not None
         if self.reconstruction is None:
@@ -235,7 +235,7 @@ class Worker:
         ended = time.perf_counter()
         committed = self.states.report(frame.index)
         self._publish_seconds = time.perf_counter() - ended
-        return Committed(frame.index, committed, tuple(self.retain()))
+        return FrameCommitted(frame.index, committed, tuple(self.retain()))
 
     def retain(self) -> list[int]:
         """Deletes old states by the scene's rule; what cannot be deleted now is next time."""
@@ -248,9 +248,9 @@ class Worker:
 
     def points(self) -> InitialPoints | None:
         """The initial cloud that was put before the first frame."""
-        if not self.spec.points.exists():
+        if not self.spec.folder.points.exists():
             return None
-        arrays = read_npz(self.spec.points)
+        arrays = read_npz(self.spec.folder.points)
         return InitialPoints(arrays["positions"], arrays["colours"], arrays.get("foreground"))
 
     def progress(self, progress: Any) -> None:

@@ -1,65 +1,119 @@
-"""What was found damaged while a scene runs: said, written or made again by its worker, or named as lost.
+"""Decides about damage that is found while a scene runs: reports it, and has the worker write or make states again.
 
-Files of the states' folder come here by name, from whoever could not read one: a reader, a replay, a scrub. The worker
-looks at each between two frames and writes again what it has in memory or a copy of. A state that it has not is made
-again from its pictures when no frame waits; until then views of it are asked to come back, and where that is not
-possible it is named.
+Damaged files of the states' folder are noticed by a reader, a replay or a scrub. Between two frames the worker checks
+each and writes again what it has in memory or as a copy. Other states are made again from their pictures when no frame
+waits; until then queries for them get 503, and where that is not possible the state is reported as lost.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Protocol
+from enum import StrEnum
+from typing import Any
 
 from client.wire import FrameState
+from scas4d_core.error_text import without_paths
 from scas4d_core.storage.frame_files import checkpoint_of, frame_file, frame_of
+from server.health import metrics
 from server.processes.messages import FrameReady, Mend, Mended, MendOutcome, Remake
-from server.repair.damage import DamageKind, DamageLog
-from server.storage.events import Fact, StatesDeleted
+from server.storage.events import JournalEvent, StatesDeleted
 from server.storage.ledger import Ledger
 
+SENTENCES_KEPT = 100
+"""Sentences about damage that are kept: the newest."""
 AGAIN_S = 5.0
-"""What the disk had no room for is tried again after so long."""
+"""Mending for which the disk had no room is tried again after so long."""
 OF_REMAKE = frozenset({MendOutcome.REMADE, MendOutcome.LOST, MendOutcome.LATER, MendOutcome.NO_ROOM})
-"""Answers that end the making of a state; others may be of the same file, asked about before."""
+"""Outcomes that end the remaking of a state; others may be of the same file, asked about before."""
 DEATHS = 2
-"""A state at whose making the worker dies so often is given up."""
+"""A state is given up after so many deaths of the worker while it made it again."""
 
 log = logging.getLogger("scas4d.server")
 
 
-class Hooks(Protocol):
-    """What mending needs of its scene."""
+class DamageKind(StrEnum):
+    """Kinds of damaged file."""
 
-    def to_worker(self, message: Any) -> bool:
-        """Posts a message; False where there is no worker that takes any."""
+    STATE = "state"
+    CHECKPOINT = "checkpoint"
+    FIXED = "fixed"
+    JOURNAL = "journal"
+    FRAME = "frame"
+    DEFINITION = "definition"
+    POINTS = "points"
 
-    def states_changed(self, frames: tuple[int, ...]) -> None:
-        """Files of states were written or lost: readers look again, and a frame may begin."""
 
-    def write_fact(self, fact: Fact) -> None:
-        """Journals a fact that was applied, in the background."""
+class DamageLog:
+    """Sentences about damage found in one scene; the newest, so that a dying disk does not fill the memory.
+
+    A sentence that comes again is counted, or left out where it is of the same damage.
+
+    Args:
+        sentences: from the start of the service.
+    """
+
+    def __init__(self, sentences: Iterable[str] = ()) -> None:
+        self._counts: OrderedDict[str, int] = OrderedDict()
+        self._more = 0
+        for sentence in sentences:
+            self._keep(without_paths(sentence))
+
+    def say(self, kind: DamageKind, sentence: str, *, lasting: bool = False) -> None:
+        """Adds a sentence. `lasting`: nothing mends the damage, and each check finds it again."""
+        sentence = without_paths(sentence)
+        if lasting and sentence in self._counts:
+            return
+        metrics.DAMAGE.labels(kind.value).inc()
+        self._keep(sentence)
+
+    def _keep(self, sentence: str) -> None:
+        self._counts[sentence] = self._counts.pop(sentence, 0) + 1
+        while len(self._counts) > SENTENCES_KEPT:
+            self._counts.popitem(last=False)
+            self._more += 1
+
+    @property
+    def sentences(self) -> list[str]:
+        """The newest sentences, in order; the first one says how many came before them."""
+        before = [f"{self._more} more before these; the service's log has them"] if self._more else []
+        return [*before, *(text if count == 1 else f"{text} ({count} times)" for text, count in self._counts.items())]
 
 
 class Mending:
-    """Of one scene. On the event loop.
+    """Mends the damage of one scene. On the event loop.
 
     Args:
-        ledger: of the scene. damage: where it is said. hooks: of the scene.
+        ledger, damage: of the scene.
+        to_worker: posts a message; returns False where no worker can receive one.
+        changed: called with frames whose states were written or lost; a frame may begin, too.
+        journal: journals an event that is applied already, in the background.
         remake: frames whose states were found damaged at the start, with the reason.
 
     Attributes:
         at_work: the frame whose state the worker is making again, or None.
+        waiting: frames whose states are to be made again, with the reason: their pictures are needed.
     """
 
-    def __init__(self, ledger: Ledger, damage: DamageLog, hooks: Hooks, remake: Mapping[int, str]) -> None:
+    def __init__(
+        self,
+        ledger: Ledger,
+        damage: DamageLog,
+        *,
+        to_worker: Callable[[Any], bool],
+        changed: Callable[[tuple[int, ...]], None],
+        journal: Callable[[JournalEvent], None],
+        remake: Mapping[int, str],
+    ) -> None:
         self._ledger = ledger
         self._damage = damage
-        self._hooks = hooks
+        self._to_worker = to_worker
+        self._changed = changed
+        self._journal = journal
         self._asked: dict[str, str] = {}
-        self._waiting: dict[int, str] = {}
+        self.waiting: dict[int, str] = {}
         self._deaths: dict[int, int] = {}
         self._timers: dict[str, asyncio.TimerHandle] = {}
         self._full_until = 0.0
@@ -68,33 +122,28 @@ class Mending:
             self._decide(index, reason)
 
     @property
-    def frames(self) -> frozenset[int]:
-        """Whose states are to be made again: their pictures are needed."""
-        return frozenset(self._waiting)
-
-    @property
     def trouble(self) -> str | None:
-        """What is wrong now and may be mended; None: nothing."""
-        if self._waiting:
-            return f"the state of frame {min(self._waiting)} was damaged on disk and is being made again"
+        """A sentence about damage that is being mended, or None."""
+        if self.waiting:
+            return f"the state of frame {min(self.waiting)} was damaged on disk and is being made again"
         if self._asked:
-            return f"{next(iter(self._asked))} was found damaged on disk and is being looked at"
+            return f"{next(iter(self._asked))} was found damaged on disk and is being checked"
         return None
 
     def noticed(self, files: Mapping[str, str]) -> None:
-        """Files of the states' folder could not be read, by name with the reason."""
+        """Has the worker check files of the states' folder that could not be read, by name with the reason."""
         new = {}
         for name, reason in files.items():
             index = frame_of(name)
             entry = None if index is None else self._ledger.frames.get(index)
             gone = index is not None and (entry is None or entry.deleted or entry.state != FrameState.COMMITTED)
-            if not gone and name not in self._asked and index not in self._waiting:
+            if not gone and name not in self._asked and index not in self.waiting:
                 new[name] = reason
         self._asked |= new
         self._ask(new)
 
     def taken_up(self, damaged: Mapping[int, str]) -> None:
-        """There is a worker: it is asked what the one before did not answer, and of states that it found damaged."""
+        """Asks a new worker about all that the one before did not answer, and about states that it found damaged."""
         if self.at_work is not None:
             self._deaths[self.at_work] = self._deaths.get(self.at_work, 0) + 1
             if self._deaths[self.at_work] >= DEATHS:
@@ -110,16 +159,16 @@ class Mending:
             if (index := frame_of(name)) is not None and (entry := self._ledger.frames.get(index)) is not None:
                 if entry.time is not None:
                     times[index] = entry.time
-                if (numbers := entry.numbers) is not None:
-                    known[index] = dict(numbers)
+                if (record := entry.record) is not None:
+                    known[index] = dict(record)
         if message := tuple(names):
-            self._hooks.to_worker(Mend(message, times, known))
+            self._to_worker(Mend(message, times, known))
 
-    def begin(self) -> bool:
-        """Gives the worker the next state to make again, if one waits; called when it has nothing else to do."""
-        if self._waiting and asyncio.get_running_loop().time() < self._full_until:
-            return False
-        for index in sorted(self._waiting):
+    def begin(self) -> None:
+        """Gives an idle worker the next state to make again, if one waits."""
+        if asyncio.get_running_loop().time() < self._full_until:
+            return
+        for index in sorted(self.waiting):
             base = self._base(index)
             if base is None:
                 self._lost(index, "the state before it cannot be read")
@@ -130,14 +179,12 @@ class Mending:
                 self._lost(index, "its pictures are no longer held")
                 continue
             frame = FrameReady(index, receipt.time, entry.files, receipt.identity, self._ledger.budget_of(index))
-            if self._hooks.to_worker(Remake(frame, base)):
+            if self._to_worker(Remake(frame, base)):
                 self.at_work = index
-                return True
-            return False
-        return False
+            return
 
     def mended(self, message: Mended) -> None:
-        """What the worker says of a file or of a state."""
+        """Acts on the worker's answer about a file or a state."""
         index = frame_of(message.name)
         reason = self._asked.pop(message.name, message.reason)
         if index is not None and index == self.at_work and message.outcome in OF_REMAKE:
@@ -159,7 +206,7 @@ class Mending:
                 self._say(message.name, f"{message.reason}; it cannot be made again", lasting=True)
             case MendOutcome.REMADE:
                 assert index is not None
-                reason = self._waiting.pop(index, reason)
+                reason = self.waiting.pop(index, reason)
                 self._ledger.frames.set_unreadable(index, False)
                 self._ledger.frames.amend(index, message.report)
                 self._say(
@@ -170,39 +217,39 @@ class Mending:
                 assert index is not None
                 self._lost(index, message.reason)
             case MendOutcome.NO_ROOM:
-                if index is None or index not in self._waiting:
+                if index is None or index not in self.waiting:
                     self._asked[message.name] = reason
                     self._later(message.name, lambda: self._ask({message.name} & self._asked.keys()))
                 else:
                     self._full_until = asyncio.get_running_loop().time() + AGAIN_S
-                    self._later(message.name, lambda: self._hooks.states_changed(()))
+                    self._later(message.name, lambda: self._changed(()))
             case MendOutcome.GONE | MendOutcome.LATER:
                 pass
-        self._hooks.states_changed(() if index is None else (index,))
+        self._changed(() if index is None else (index,))
 
     def _later(self, name: str, call: Callable[[], None]) -> None:
-        """Tries again after a while; one such timer a file, however often it is asked about."""
+        """Tries again after a while; there is one timer a file, however often it is asked about."""
         if (timer := self._timers.pop(name, None)) is not None:
             timer.cancel()
         self._timers[name] = asyncio.get_running_loop().call_later(AGAIN_S, call)
 
     def retired(self, frames: Iterable[int]) -> None:
-        """The scene's rule has deleted these states: there is nothing to mend of them any more."""
+        """Forgets states that retention has deleted."""
         for index in frames:
             self._asked.pop(frame_file(index), None)
-            if self._waiting.pop(index, None) is not None:
+            if self.waiting.pop(index, None) is not None:
                 self._ledger.frames.set_unreadable(index, False)
 
     def stop(self) -> None:
-        """Nothing is tried again."""
+        """Cancels the timers."""
         for timer in self._timers.values():
             timer.cancel()
 
     def _decide(self, index: int, reason: str) -> None:
-        """A state is damaged, and nothing but its pictures can bring it back."""
+        """Queues a damaged state to be made again from its pictures, or gives it up."""
         entry = self._ledger.frames[index]
-        degraded = None if entry.numbers is None else entry.numbers.get("degraded")
-        self._waiting[index] = reason
+        degraded = None if entry.record is None else entry.record.get("degraded")
+        self.waiting[index] = reason
         self._ledger.frames.set_unreadable(index, True)
         if not entry.files:
             self._lost(index, "its pictures are no longer held")
@@ -212,7 +259,7 @@ class Mending:
             self._lost(index, "the state before it cannot be read")
 
     def _base(self, index: int) -> int | None:
-        """The committed frame that one was updated from; None where its state is gone."""
+        """Returns the committed frame that a frame was updated from; None where its state is gone."""
         for before in range(index - 1, -1, -1):
             entry = self._ledger.frames[before]
             if entry.state == FrameState.COMMITTED:
@@ -220,13 +267,13 @@ class Mending:
         return None
 
     def _lost(self, index: int, why: str) -> None:
-        reason = self._waiting.pop(index, "its state is damaged")
-        said = f"the state of frame {index} was damaged on disk and cannot be made again: {why}"
+        reason = self.waiting.pop(index, "its state is damaged")
+        sentence = f"the state of frame {index} was damaged on disk and cannot be made again: {why}"
         self._ledger.frames.set_unreadable(index, False)
-        fact = StatesDeleted(frames=(index,), reason=said)
-        self._ledger.apply(fact)
-        self._damage.say(DamageKind.STATE, f"{said} ({reason})")
-        self._hooks.write_fact(fact)
+        event = StatesDeleted(frames=(index,), reason=sentence)
+        self._ledger.apply(event)
+        self._damage.say(DamageKind.STATE, f"{sentence} ({reason})")
+        self._journal(event)
 
     def _say(self, name: str, sentence: str, *, lasting: bool = False) -> None:
         kind = DamageKind.FIXED

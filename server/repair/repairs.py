@@ -1,4 +1,4 @@
-"""Damaged files of the states, in the process that owns them: written again from memory, copies or pictures."""
+"""Repairs damaged files of the states in the worker process: from memory, from copies, or from pictures."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ log = logging.getLogger("scas4d.worker")
 
 
 def mend_at_start(history: History) -> list[str]:
-    """What every frame needs, and its copies, written again where they are damaged; a sentence for each."""
+    """Writes `fixed.npz`, the first state and their copies again where damaged; returns a sentence for each."""
     try:
         mended = history.mend_fixed()
     except OSError as error:  # states can be read all the same: a disk that takes nothing must not keep them away
@@ -44,7 +44,7 @@ def mend_at_start(history: History) -> list[str]:
 
 
 def mend(history: History, reconstruction: Reconstruction | None, message: Mend) -> Iterator[Mended]:
-    """Looks at each file and writes it again where it can be, the same bits."""
+    """Checks each file and writes it again, the same bits, where that is possible; yields an answer for each."""
     assert history.files is not None
     for name in message.names:
         try:
@@ -80,7 +80,7 @@ def _mend(
 
 
 def _written_in_part(history: History, files: FrameFiles, index: int, message: Mend) -> MendOutcome:
-    """Writes a file again of which only the report or the time is damaged: the state is whole in it."""
+    """Writes a file again of which only the report or the time is damaged, and the state is whole."""
     try:
         arrays = files.read(index, PER_FRAME)
         report = message.reports.get(index)
@@ -96,7 +96,7 @@ def _written_in_part(history: History, files: FrameFiles, index: int, message: M
 
 
 def _report_of(files: FrameFiles, index: int) -> dict[str, Any] | None:
-    """The report of a frame, where that is what is whole."""
+    """Reads the report of a frame, or None where it is damaged."""
     try:
         report: dict[str, Any] = json.loads(files.read(index, ("report",))["report"].tobytes())
     except (ValueError, FileNotFoundError):
@@ -105,7 +105,7 @@ def _report_of(files: FrameFiles, index: int) -> dict[str, Any] | None:
 
 
 def remake(engine: Engine, spec: SceneSpec, history: History, message: Remake, decode: Decode) -> Iterator[Mended]:
-    """Makes a state again from its pictures; whatever comes of it, the scene goes on as before.
+    """Makes a state again from its pictures; the scene goes on as before in any case.
 
     Damage often has neighbours: where the state before it is damaged too, and nobody has noticed, that comes first.
     """

@@ -6,7 +6,6 @@ from fastapi import APIRouter
 
 from client.wire import Budget, SceneBudget
 from server.routes.access import TheScene
-from server.scene.budgets import scene_budget
 
 router = APIRouter(prefix="/v1/scenes", tags=["budget"])
 
@@ -14,7 +13,7 @@ router = APIRouter(prefix="/v1/scenes", tags=["budget"])
 @router.get("/{id}/budget")
 async def get(scene: TheScene) -> SceneBudget:
     """The budget of frames that are not begun."""
-    return scene_budget(scene)
+    return scene.budget()
 
 
 @router.put("/{id}/budget")
@@ -23,5 +22,5 @@ async def put(scene: TheScene, budget: Budget) -> SceneBudget:
 
     It is on disk when this answers: after any end of the service each frame gets the budget that held for it.
     """
-    await scene.ingest.budget(budget)
-    return scene_budget(scene)
+    await scene.set_budget(budget)
+    return scene.budget()

@@ -16,7 +16,8 @@ from client.wire import (
     MissingRequest,
     PartReceipt,
 )
-from server.ingest.receive import take_camera, take_file, take_form, take_framed
+from server.ingest.camera_files import receive_camera, receive_file, receive_form
+from server.ingest.receive import receive_frame
 from server.problems import Problem
 from server.processes.messages import PlyQuery
 from server.routes.access import FrameIndex, TheScene
@@ -68,9 +69,9 @@ async def put(scene: TheScene, n: FrameIndex, request: Request) -> FrameReceipt:
     kind = _media_type(request)
     try:
         if kind == FRAME_MEDIA_TYPE:
-            return await take_framed(scene, n, _body(request), _length(request))
+            return await receive_frame(scene.ingest, n, _body(request), _length(request))
         if kind == "multipart/form-data":
-            return await take_form(scene, n, request)
+            return await receive_form(scene.ingest, n, request)
     except ClientDisconnect:
         raise Problem(400, "the sender went away", field="body", remedy="send the frame again") from None
     raise Problem(
@@ -100,8 +101,8 @@ async def put_camera(
     """
     try:
         if _media_type(request) == FRAME_MEDIA_TYPE:
-            return await take_camera(scene, n, c, _body(request), _length(request))
-        return await take_file(scene, n, c, kind, time, _body(request), _length(request))
+            return await receive_camera(scene.open_frames, n, c, _body(request), _length(request))
+        return await receive_file(scene.open_frames, n, c, kind, time, _body(request), _length(request))
     except ClientDisconnect:
         raise Problem(400, "the sender went away", field="body", remedy="send the picture again") from None
 
@@ -109,7 +110,7 @@ async def put_camera(
 @router.post("/{id}/frames/{n}/close", status_code=202)
 async def close(scene: TheScene, n: FrameIndex) -> FrameReceipt:
     """Closes a frame that cameras send one by one, with those that are in; what comes later is refused."""
-    return await scene.ingest.close(n)
+    return await scene.open_frames.close(n)
 
 
 @router.post("/{id}/frames/{n}/missing")
@@ -118,7 +119,7 @@ async def missing(scene: TheScene, n: FrameIndex, request: MissingRequest | None
 
     Pictures of it that cameras have sent are dropped. The update after it covers the longer time.
     """
-    return await scene.ingest.declare_missing(n, "" if request is None else request.reason)
+    return await scene.open_frames.declare_missing(n, "" if request is None else request.reason)
 
 
 @router.get("/{id}/frames/{n}")

@@ -20,9 +20,9 @@ from client.wire import (
 from client.wire.framing import PREFIX
 from server import problems
 from server.connections.websocket import limit_messages
+from server.ingest.camera_files import receive_camera
 from server.ingest.pictures import largest_frame
-from server.ingest.receive import take_camera, take_framed
-from server.ingest.upload import framing_problem
+from server.ingest.receive import framing_problem, receive_frame
 from server.problems import Problem
 from server.scene.scene import Scene
 from server.scene.scenes import Scenes
@@ -124,9 +124,9 @@ async def _take(scene: Scene, head: FrameHead | Problem, data: bytes) -> IngestA
     try:
         receipt: FrameReceipt | PartReceipt
         if head.part:
-            receipt = await take_camera(scene, None, None, body, size)
+            receipt = await receive_camera(scene.open_frames, None, None, body, size)
         else:
-            receipt = await take_framed(scene, None, body, size)
+            receipt = await receive_frame(scene.ingest, None, body, size)
         return IngestAnswer(index=head.index, status=202, receipt=receipt)
     except Problem as problem:
         return _refusal(head.index, problem)

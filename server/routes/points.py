@@ -39,7 +39,7 @@ async def put(scene: TheScene, server: TheSettings, request: Request) -> PointsR
     sha256 = hashlib.sha256(body).hexdigest()
     arrays = await asyncio.to_thread(read_points, body, server.max_points)
     receipt = PointsReceipt(points=len(arrays["positions"]), sha256=sha256)
-    async with scene.door:
+    async with scene.log.lock:
         if scene.points_sha256 == sha256:
             return receipt
         if scene.next_frame > 0:
@@ -51,7 +51,7 @@ async def put(scene: TheScene, server: TheSettings, request: Request) -> PointsR
             )
         stored = {**arrays, "sha256": np.frombuffer(bytes.fromhex(sha256), np.uint8)}
         try:
-            await asyncio.to_thread(write_npz, scene.spec.points, stored)
+            await asyncio.to_thread(write_npz, scene.spec.folder.points, stored)
         except Exception as error:
             if no_room(error):
                 raise full_disk(error) from None

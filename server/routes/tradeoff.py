@@ -7,7 +7,6 @@ from fastapi import APIRouter
 from client.wire import ReplayRequest, TradeoffModel
 from server.routes.access import TheScene
 from server.scene import tradeoff
-from server.scene.budgets import scene_budget
 from server.scene.scenes import Scene
 
 router = APIRouter(prefix="/v1/scenes", tags=["budget"])
@@ -56,6 +55,6 @@ async def answer(scene: Scene) -> TradeoffModel:
         points=[*points, *tradeoff.extrapolated(model, points, threads)],
         curve=tradeoff.curve(reports),
         model=model,
-        budget=scene_budget(scene).effective,
+        budget=scene.budget().effective,
         replay=scene.replays.status,
     )

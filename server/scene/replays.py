@@ -1,37 +1,59 @@
-"""Replays of a scene's last frames with other budgets: one at a time, what came of them is kept in memory."""
+"""Replays a scene's last frames with other budgets, one replay at a time; the results stay in memory."""
 
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from client.wire import PointKind, ReplayRequest, ReplayState, ReplayStatus, TradeoffPoint
 from server.problems import Problem, counted
 from server.processes import replayer
-from server.processes.messages import Damaged, FrameReady, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
+from server.processes.messages import (
+    Damaged,
+    FrameReady,
+    ReplayEnded,
+    ReplayPoint,
+    ReplaySpec,
+    ReplayUpdated,
+    SceneSpec,
+)
 from server.processes.placement import Ended, Placement, Process
-from server.scene.budgets import effective
-
-if TYPE_CHECKING:
-    from server.scene.scene import Scene
+from server.scene.status import effective_budget
+from server.scene.supervision import Background
+from server.storage.ledger import Ledger
 
 KEPT = 32
-"""Points: those measured last."""
+"""Points that are kept: those measured last."""
 
 log = logging.getLogger("scas4d.server")
 
 
 class Replays:
-    """Of one scene.
+    """Replays of one scene.
+
+    Args:
+        spec, ledger, background: of the scene. placement: starts the process of a replay.
+        damaged: called with files that could not be read, by name with the reason.
 
     Attributes:
-        status: of the replay that was asked for last. points: by iterations, as they were measured last; of each the
-            milliseconds lack the writing of a commit.
+        status: of the replay that was asked for last. points: by iterations, as they were measured last; the
+            milliseconds of each lack the writing of a commit.
     """
 
-    def __init__(self, scene: Scene, placement: Placement) -> None:
-        self._scene = scene
+    def __init__(
+        self,
+        spec: SceneSpec,
+        ledger: Ledger,
+        placement: Placement,
+        damaged: Callable[[Mapping[str, str]], None],
+        background: Background,
+    ) -> None:
+        self._spec = spec
+        self._ledger = ledger
         self._placement = placement
+        self._damaged = damaged
+        self._background = background
         self._process: Process | None = None
         self._life: object = None
         self.status = ReplayStatus()
@@ -43,33 +65,33 @@ class Replays:
         Raises:
             Problem: 409, one is running; or the frames, their pictures or the state before them are not here.
         """
-        scene = self._scene
+        id, device = self._ledger.scene, self._spec.settings.device
         if self._process is not None:
             raise Problem(
                 409,
                 f"a replay of this scene is running: {self.status.done} of {counted(self.status.total, 'update')} over",
                 field="id",
-                value=scene.id,
-                remedy=f"wait for it: GET /v1/scenes/{scene.id}/tradeoff tells how far it is",
+                value=id,
+                remedy=f"wait for it: GET /v1/scenes/{id}/tradeoff tells how far it is",
             )
-        if scene.spec.settings.device != "cpu":
+        if device != "cpu":
             raise Problem(
                 409,
-                f"the scene is updated on {scene.spec.settings.device}: a replay there would stand in its way",
+                f"the scene is updated on {device}: a replay there would slow its updates down",
                 field="settings.device",
-                value=scene.spec.settings.device,
-                remedy="put other budgets in turn: PUT …/budget; what frames run with them is measured",
+                value=device,
+                remedy="put other budgets in turn: PUT …/budget; the frames that run with them are measured",
             )
         base, indices = self._chosen(request.frames)
         own = self._own_iterations()
         iterations = tuple(dict.fromkeys([own, *request.iterations]))
         messages = tuple(self._message(index) for index in indices)
-        spec = ReplaySpec(scene.spec, scene.committed[0], base, messages, iterations)
+        spec = ReplaySpec(self._spec, self._ledger.committed[0], base, messages, iterations)
         self._life = life = object()
         self._process = self._placement.start(
             replayer.main,
             spec,
-            lambda message: self._told(life, message),
+            lambda message: self._receive(life, message),
             lambda reason: self._ended(life, reason),
         )
         self.status = ReplayStatus(
@@ -82,9 +104,8 @@ class Replays:
         )
 
     def _chosen(self, count: int) -> tuple[int, list[int]]:
-        """The commit to start from, and the frames after it, the one that warms up first."""
-        scene = self._scene
-        committed = scene.committed
+        """Returns the commit to start from, and the frames after it; the first of them warms up."""
+        committed, frames = self._ledger.committed, self._ledger.frames
         if len(committed) < count + 2:
             raise Problem(
                 409,
@@ -96,7 +117,7 @@ class Replays:
                 "many states are kept)",
             )
         base, indices = committed[-count - 2], list(committed[-count - 1 :])
-        gone = [index for index in range(base + 1, indices[-1]) if scene.frames[index].deleted]
+        gone = [index for index in range(base + 1, indices[-1]) if frames[index].deleted]
         if gone:
             raise Problem(
                 409,
@@ -105,7 +126,7 @@ class Replays:
                 value=count,
                 remedy="ask for fewer frames, or make scenes that keep more states (ingest.keep_states)",
             )
-        bare = [index for index in indices if not scene.frames[index].files]
+        bare = [index for index in indices if not frames[index].files]
         if bare:
             held = len(indices) - 1 - indices.index(bare[-1])
             raise Problem(
@@ -119,33 +140,32 @@ class Replays:
         return base, indices
 
     def _own_iterations(self) -> int:
-        """What the scene runs: as its budget says, or, where that is a time, what fitted into it last.
+        """Returns the iterations that the scene runs: as its budget says, or as many as fitted into its time last.
 
-        A frame that stood still or was held says nothing of that.
+        A frame that stood still or was held tells nothing about that.
         """
-        scene = self._scene
-        budget = effective(scene.spec.settings, scene.ledger.budgets[-1][1])
+        budget = effective_budget(self._spec.settings, self._ledger.budgets[-1][1])
         if budget.budget_ms is not None:
-            for index in reversed(scene.committed[1:]):
-                report = scene.frames[index].report
-                if report.iterations is None:  # older than those in memory
+            for index in reversed(self._ledger.committed[1:]):
+                report = self._ledger.frames[index].report
+                if report.iterations is None:  # older than the records in memory
                     break
                 if report.iterations and report.degraded is None:
                     return report.iterations
         return budget.iterations
 
     def _message(self, index: int) -> FrameReady:
-        entry = self._scene.frames[index]
+        entry = self._ledger.frames[index]
         receipt = entry.receipt
         assert receipt is not None  # it has files
         return FrameReady(index, receipt.time, entry.files, receipt.identity)
 
-    def _told(self, life: object, message: Any) -> None:
+    def _receive(self, life: object, message: Any) -> None:
         if life is not self._life:
             return
         match message:
             case Damaged():
-                self._scene.mending.noticed(message.files)
+                self._damaged(message.files)
             case ReplayUpdated():
                 self.status.done += 1
             case ReplayPoint():
@@ -174,10 +194,10 @@ class Replays:
         self.status.error = fault
         self._life = None
         if fault is not None:
-            log.error("scene %s: a replay failed: %s", self._scene.id, fault)
+            log.error("scene %s: a replay failed: %s", self._ledger.scene, fault)
         process, self._process = self._process, None
         if process is not None:
-            self._scene.background(process.stop(1.0))
+            self._background.run(process.stop(1.0))
 
     async def end(self) -> None:
         """Ends the replay that is running, if one is; its points so far stay."""
@@ -187,7 +207,7 @@ class Replays:
         self.status.state, self.status.error = ReplayState.FAILED, "it was ended on request"
 
     async def stop(self) -> None:
-        """Ends what is running: nobody will ask."""
+        """Ends the replay that is running, because the scene ends."""
         self._life = None
         process, self._process = self._process, None
         if process is not None:

@@ -1,138 +1,137 @@
-"""A scene: its state, the way of its frames through the worker, and what happens when that dies. On the event loop."""
+"""A scene: wires its log, ingest, updates and readers, and answers questions about it. On the event loop."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Coroutine, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from itertools import chain
-from pathlib import Path
-from typing import Any
 
-from client.wire import FrameReportModel, FrameState, ProgressModel, SceneState, SceneStatus
+from client.wire import Budget, FrameReportModel, FrameState, SceneBudget, SceneState, SceneStatus
 from scas4d_core.cameras import Camera
 from scas4d_core.error_text import message_of
 from server.health import metrics
-from server.ingest.acknowledge import Ingest
-from server.processes import worker
-from server.processes.messages import (
-    Answer,
-    Broken,
-    Committed,
-    FrameReady,
-    Mended,
-    Progressed,
-    Query,
-    Ready,
-    SceneSpec,
-    Stalled,
-)
-from server.processes.messages import SetAside as SetAsideMessage
-from server.processes.placement import Ended, Placement, Process
+from server.ingest.acknowledge import Ingest, IngestRules, uncancelled
+from server.ingest.open_frames import OpenFrames
+from server.processes.messages import Answer, Query, SceneSpec
+from server.processes.placement import Placement
 from server.processes.readers import Readers
-from server.repair.damage import DamageKind, DamageLog
-from server.repair.mending import Mending
-from server.repair.scrub import Scrub, Scrubbed
-from server.scene import reports
-from server.scene.background import Background
-from server.scene.lookup import camera_of, committed_frame_of, report_of
+from server.repair.mending import DamageKind, DamageLog
+from server.repair.scrub import Scrub
 from server.scene.replays import Replays
-from server.scene.retention import Held, deletable
-from server.scene.status import state_of, status_of
-from server.scene.supervision import Supervision, given_up
-from server.scene.work_clock import WorkClock
+from server.scene.status import FrameReports, camera_of, committed_frame_of, effective_budget, state_of
+from server.scene.supervision import Background
+from server.scene.updates import Updates
 from server.settings import ServerSettings
 from server.storage.definition import Definition
-from server.storage.disk import no_room
-from server.storage.events import Created, Died, Fact, FramesDeleted, SetAside, StatesDeleted
-from server.storage.frame_store import remove
+from server.storage.events import BudgetChanged, JournalEvent, PauseChanged, SceneCreated
+from server.storage.frame_store import FrameLogIndex
 from server.storage.frame_table import FrameTable
 from server.storage.journal import Journal
+from server.storage.layout import SceneFolder
+from server.storage.ledger import SceneLog
 from server.storage.recovery import Recovered
-from server.storage.snapshot import facts_of
+from server.storage.snapshot import events_of
 from server.stream.hub import Event, FrameFinished, Hub, SceneChanged
 
 log = logging.getLogger("scas4d.server")
-
-AGAIN_S = 1.0
-"""A fact that the disk has no room for is written again after so long."""
 
 
 class Scene:
     """One rig, one reconstruction.
 
     Frames are numbered from 0 without gaps; a frame is acknowledged, waits in a bounded queue, and ends committed, set
-    aside, missing or skipped. What the scene knows of them is `ledger`; every change is in the journal first.
+    aside, missing or skipped. The ledger has all that is known of them; acknowledged changes are journalled first.
 
     Args:
-        found: what its folder tells, of a new scene too.
-        damage: what was found damaged before.
+        definition, folder: of the scene. found: the content of its folder, of a new scene too.
+        server: settings of the service. placement: starts its processes. hub: publishes its events.
+
+    Attributes:
+        log: journal, ledger and frame log. ingest: accepts whole frames. open_frames: accepts them camera by camera.
+        updates: gives frames to the worker. replays: of its last frames. points_sha256: of the initial cloud.
     """
 
     def __init__(
         self,
         definition: Definition,
-        folder: Path,
+        folder: SceneFolder,
         found: Recovered,
         server: ServerSettings,
         placement: Placement,
         hub: Hub,
     ) -> None:
         self.id, self.request, self.created = definition.id, definition.request, definition.created
-        self.rig = definition.request.rig.rig()
-        self.server = server
-        self.rules = definition.request.ingest
-        least = self.rules.minimum_cameras
-        self.minimum_cameras = -(-len(self.rig) // 2) if least is None else min(least, len(self.rig))
-        self.queue_limit = self.rules.queue_frames or server.queue_frames
+        self.rig = rig = definition.request.rig.rig()
+        asked = definition.request.ingest
+        least = asked.minimum_cameras
+        self.rules = IngestRules(
+            rig,
+            definition.request.frames_per_second,
+            queue_frames=asked.queue_frames or server.queue_frames,
+            when_full=asked.when_full,
+            minimum_cameras=-(-len(rig) // 2) if least is None else min(least, len(rig)),
+            part_seconds=asked.part_seconds,
+        )
         self.spec = SceneSpec(
-            server.engine, folder, self.rig, definition.settings, self.minimum_cameras, self.rules.keep_states
+            server.engine, folder, rig, definition.settings, self.rules.minimum_cameras, asked.keep_states
         )
-        self.ledger = found.ledger
-        self.held = Held(found.sizes)
-        self.damage = DamageLog(found.damage)
-        self._definition = definition
-        self.journal = Journal(self.spec.journal, found.good, self._all_facts, self._journal_renewed)
-        self.supervision = Supervision()
-        self.progress: ProgressModel | None = None
         self.points_sha256: str | None = None
-        self.gaussians: int | None = None
-        self.clock = WorkClock()
-        self.door = asyncio.Lock()
-        self.trouble = self._last_trouble()
-        """Why the scene is degraded: the last frame's, or that of the worker or the disk."""
-        self._at_work: int | None = None
-        self._ready = False
-        self._holding = 0
-        self._stopping = False
-        self._again: asyncio.TimerHandle | None = None
-        self._background = Background(self._failed)
-        self._placement = placement
+        self._definition = definition
+        self._server = server
         self._hub = hub
-        self._files = reports.ReportFiles(self.spec.states)
-        self.ingest = Ingest(self)
-        self._questions = Readers(self.spec, server, placement, lambda files: self.mending.noticed(files))
-        self.replays = Replays(self, placement)
-        self.mending = Mending(self.ledger, self.damage, self, found.remake)
-        self._worker: Process
-        self._start_worker()
-        if found.facts:
-            self.background(self._write(*found.facts))
-        scrubbed = Scrubbed(
-            definition, self.spec, self.ledger, self.journal, self.damage, self.mending.noticed, lambda: self.at_work
+        self._background = Background(self._failed)
+        self._damage = DamageLog(found.damage)
+        self.ledger = found.ledger
+        self.log = SceneLog(
+            found.ledger,
+            Journal(folder.journal, found.good, self._all_events, self._journal_renewed),
+            FrameLogIndex(folder.frames, found.sizes),
+            self._waits,
         )
-        self.background(Scrub(scrubbed, server.scrub_mb_per_second, server.scrub_pause_seconds).run())
+        self._readers = Readers(self.spec, server, placement, lambda files: self.updates.mending.noticed(files))
+        self._reports = FrameReports(self.ledger, folder.states, lambda files: self.updates.mending.noticed(files))
+        self.updates = Updates(
+            self.log,
+            self.spec,
+            self._damage,
+            self._readers,
+            self._reports,
+            self._background,
+            placement,
+            keep_frames=asked.keep_frames,
+            tell=self._tell,
+            close_due=lambda: self.open_frames.close_due(),
+            remake=found.remake,
+        )
+        self.ingest = Ingest(
+            self.log,
+            self.rules,
+            remaining=self.updates.clock.remaining,
+            accepted=self.updates.begin,
+            ended=lambda index: self._tell(FrameFinished(self.frames[index].report)),
+        )
+        self.open_frames = OpenFrames(self.ingest, self._background.run)
+        self.replays = Replays(self.spec, self.ledger, placement, self.updates.mending.noticed, self._background)
+        if found.events:
+            self._background.run(self.log.write(*found.events))
+        scrub = Scrub(
+            definition,
+            folder,
+            self.log,
+            self._damage,
+            noticed=self.updates.mending.noticed,
+            at_work=lambda: self.updates.at_work,
+            mb_per_second=server.scrub_mb_per_second,
+            pause_seconds=server.scrub_pause_seconds,
+        )
+        self._background.run(scrub.run())
 
-    def _tell(self, event: Event) -> None:
-        """Tells who listens to the scene (`server.stream.hub`); called at every change of its status or of a frame."""
-        if isinstance(event, FrameFinished):
-            metrics.finished(event.report)
-        self._hub.publish(self.id, event)
+    # Questions.
 
     @property
     def frames(self) -> FrameTable:
-        """All frames that are closed, by index."""
+        """All closed frames, by index."""
         return self.ledger.frames
 
     @property
@@ -142,297 +141,137 @@ class Scene:
 
     @property
     def next_frame(self) -> int:
-        """The index that is closed next."""
+        """Index of the frame that is accepted next."""
         return self.ledger.next_frame
 
     @property
-    def queued(self) -> int:
-        """Frames acknowledged and not finished."""
-        return self.ledger.unfinished
-
-    @property
     def error(self) -> str | None:
-        """Why the scene is failed or degraded."""
-        return self.ledger.fatal or self.trouble or self.mending.trouble
-
-    @property
-    def at_work(self) -> bool:
-        """Whether the worker has a frame."""
-        return self._at_work is not None and self._ready
+        """Sentence that says why the scene is failed or degraded, or None."""
+        return self.ledger.fatal or self.updates.trouble or self.updates.mending.trouble
 
     @property
     def state(self) -> SceneState:
-        """Where the scene is; see `SceneStatus`."""
-        return state_of(self)
+        """State of the scene; see `SceneStatus`."""
+        return state_of(self.ledger, at_work=self.updates.at_work, degraded=self.error is not None)
 
     def status(self) -> SceneStatus:
-        """The scene as it is now."""
-        return status_of(self)
+        """Describes the scene as it is now."""
+        ledger, updates = self.ledger, self.updates
+        return SceneStatus(
+            id=self.id,
+            name=self.request.name,
+            state=self.state,
+            error=self.error,
+            progress=updates.progress,
+            cameras=list(self.rig.names),
+            has_points=self.points_sha256 is not None,
+            next_frame=ledger.next_frame,
+            queued=ledger.unfinished,
+            queue_limit=self.rules.queue_frames,
+            committed=len(ledger.committed),
+            first_committed=ledger.committed[0] if ledger.committed else None,
+            last_committed=ledger.committed[-1] if ledger.committed else None,
+            gaussians=updates.gaussians,
+            paused=ledger.paused,
+            degraded=self.error is not None and ledger.fatal is None,
+            open_frames=sorted(ledger.open),
+            set_aside=ledger.counts[FrameState.SET_ASIDE],
+            missing=ledger.counts[FrameState.MISSING],
+            skipped=ledger.counts[FrameState.SKIPPED],
+            worker_deaths=updates.deaths.count,
+            frames_held=len(self.log.pictures),
+            frame_bytes=self.log.pictures.bytes,
+            states_deleted=ledger.states_deleted,
+            damage=self._damage.sentences,
+            created=self.created.isoformat(),
+            ingest=self.request.ingest,
+            settings=self.spec.settings.model_dump(mode="json"),
+            budget=ledger.budgets[-1][1],
+        )
 
     def camera(self, name: str) -> Camera:
-        """A camera of the rig by name."""
-        return camera_of(self, name)
+        """Returns a camera of the rig; see `camera_of`."""
+        return camera_of(self.rig, name)
 
     def committed_frame(self, index: int | None, field: str = "frame") -> int:
-        """The index, or the last one for None, checked to be committed."""
-        return committed_frame_of(self, index, field)
+        """Returns the index of a committed frame; see `committed_frame_of`."""
+        return committed_frame_of(self.ledger, self.state, index, field)
 
     async def report(self, index: int) -> FrameReportModel | None:
-        """What became of a frame, its numbers read from disk where they are not in memory; None: it is not known."""
-        return await report_of(self, self._files, index)
+        """Returns the report of a frame; see `FrameReports.of`."""
+        return await self._reports.of(index)
 
     async def ask(self, query: Query) -> Answer:
-        """The reader process's answer; see `Readers.ask`."""
+        """Returns a reader's answer; see `Readers.ask`."""
         with metrics.answering(query):
-            return await self._questions.ask(query)
+            return await self._readers.ask(query)
 
-    # The way of a frame.
+    def budget(self) -> SceneBudget:
+        """Describes the budget of frames that are not begun."""
+        since, asked = self.ledger.budgets[-1]
+        effective = effective_budget(self.spec.settings, asked)
+        return SceneBudget(scene=self.id, asked=asked, effective=effective, since=since)
 
-    def finished(self, report: FrameReportModel) -> None:
-        """A frame ended otherwise than by the worker."""
-        self._tell(FrameFinished(report))
+    # Changes.
 
-    def work(self) -> None:
-        """Gives the worker its next frame, if it can take one and one waits; called whenever that may have changed."""
-        self._tell(SceneChanged())
-        ledger = self.ledger
-        if not self._ready or self._at_work is not None or self._holding or self.mending.at_work is not None:
-            return
-        waiting = [] if ledger.paused or ledger.fatal is not None else ledger.waiting()
-        if not waiting:
-            self.mending.begin()
-            return
-        index = waiting[0]
-        entry = ledger.frames[index]
-        receipt = entry.receipt
-        assert receipt is not None
-        ledger.move(index, FrameState.UPDATING)
-        self._at_work = index
-        self.clock.begin(first=not ledger.committed)
-        self._worker.send(FrameReady(index, receipt.time, entry.files, receipt.identity, ledger.budget_of(index)))
-        self._tell(SceneChanged())
+    async def set_budget(self, budget: Budget) -> None:
+        """Sets the budget from the first frame on that is not begun; none begins while it is journalled.
 
-    def _from_worker(self, message: Any) -> None:
-        match message:
-            case Ready():
-                self.background(self._taken_up(message))
-            case Progressed():
-                self.progress = ProgressModel(
-                    stage=message.stage, done=message.done, total=message.total, detail=message.detail
-                )
-                self.clock.progress(message.stage, message.done, message.total)
-                self._tell(SceneChanged())
-            case Committed():
-                self.background(self._commit(message))
-            case SetAsideMessage():
-                fact = SetAside(
-                    index=message.index, reason=message.reason, dropped=message.dropped, fatal=message.fatal
-                )
-                self.background(self._set_aside(fact))
-            case Mended():
-                self.mending.mended(message)
-            case Stalled():
-                self.trouble = f"frame {message.index} waits for room on the disk: {message.reason}"
-                self.clock.stall(message.seconds)
-                self._tell(SceneChanged())
-            case Broken():
-                self.ledger.fatal = f"what is committed cannot be gone on from: {message.reason}"
-                log.error("scene %s: %s", self.id, self.ledger.fatal)
-                self._tell(SceneChanged())
+        Raises:
+            Problem: 409 for a failed scene, 507 when the disk is full.
+        """
 
-    async def _taken_up(self, ready: Ready) -> None:
-        """The worker has taken up what is committed: what it found decides which frames are still to be done."""
-        newest = self.committed[-1] if self.committed else -1
-        again = self.mending.frames | {index for index in ready.damaged if index < max(ready.indices, default=-1)}
-        facts = self.ledger.reconcile(ready.indices, ready.damaged, again)
-        for fault in ready.faults:
-            log.warning("scene %s: %s", self.id, fault)
-            self.damage.say(DamageKind.STATE, fault)
-        if facts:
-            await self._write(*facts)
-        if ready.indices and ready.report:
-            self._fill(ready.indices[-1], ready.report)
-            self._questions.refresh()
-            if ready.indices[-1] > newest:  # committed, and its worker was gone before it could say so
-                self._tell(FrameFinished(self.frames[ready.indices[-1]].report))
-        self.trouble = self._last_trouble()
-        self._ready = True
-        self.mending.taken_up(ready.damaged)
-        self.work()
+        async def change() -> None:
+            async with self.log.lock:
+                self.ingest.refuse_if_failed()
+                if self.ledger.budgets[-1][1] == budget:
+                    return
+                with self.updates.held():
+                    await self.log.append(BudgetChanged(index=self.ledger.begins_next(), budget=budget))
 
-    def _last_trouble(self) -> str | None:
-        """What was wrong with the newest frame that was tried."""
-        last = self.ledger.last_tried()
-        return None if last is None else reports.trouble(self.frames[last].report)
-
-    async def _commit(self, message: Committed) -> None:
-        self.supervision.committed()
-        self.clock.end(committed=True)
-        self._at_work, self.progress = None, None
-        self.ledger.move(message.index, FrameState.COMMITTED)
-        self._fill(message.index, message.report)
-        report = self.frames[message.index].report
-        self.trouble = reports.trouble(report)
-        self._questions.refresh((message.index, *message.deleted))
-        self._tell(FrameFinished(report))
-        self.work()
-        if message.deleted:
-            self.mending.retired(message.deleted)
-            deleted = StatesDeleted(frames=message.deleted)
-            self.ledger.apply(deleted)
-            self._tell(SceneChanged())
-            await self._write(deleted)
-        await self.retain()
-        await self.ingest.close_what_can_be()
-
-    async def _set_aside(self, fact: SetAside) -> None:
-        await self._write(fact)
-        self.ledger.apply(fact)
-        self.clock.end(committed=False)
-        self._at_work, self.progress = None, None
-        self.trouble = reports.trouble(self.frames[fact.index].report)
-        if fact.fatal:
-            async with self.door:  # from here on none is taken; the one that is just being taken waits like the others
-                pass
-            await self._fail_those_that_wait()
-        log.warning("scene %s: %s", self.id, self.trouble)
-        self._tell(FrameFinished(self.frames[fact.index].report))
-        self.work()
-        await self.ingest.close_what_can_be()
-
-    async def _fail_those_that_wait(self) -> None:
-        facts = self.ledger.hopeless()
-        if facts:
-            await self._write(*facts)
-        for fact in facts:
-            self.ledger.apply(fact)
-            self._tell(FrameFinished(self.frames[fact.index].report))
-
-    def _fill(self, index: int, committed: dict[str, Any]) -> None:
-        self.frames.set_numbers(index, committed)
-        report = self.frames[index].report
-        self.gaussians = report.gaussians
-
-    async def retain(self) -> None:
-        """Deletes pictures from the frame log by the scene's rule."""
-        needed = self.mending.frames
-        gone = [i for i in deletable(self.ledger, self.held, self.rules.keep_frames) if i not in needed]
-        if not gone:
-            return
-        names = [name for index in gone for name in self.frames[index].files]
-        self.held.discard(names)
-        fact = FramesDeleted(frames=tuple(gone))
-        self.ledger.apply(fact)
-        self._tell(SceneChanged())
-        await asyncio.to_thread(remove, self.spec.frames, names)
-        await self._write(fact)
-
-    async def _write(self, *facts: Fact) -> None:
-        """Appends facts that have happened and cannot be refused: again and again until there is room."""
-        while True:
-            try:
-                await self.journal.append(*facts)
-                return
-            except OSError as error:
-                if not no_room(error):
-                    raise
-                self.trouble = f"the journal waits for room on the disk: {message_of(error)}"
-                self._tell(SceneChanged())
-                await asyncio.sleep(AGAIN_S)
-
-    # What mending needs of it (`server.repair.mending.Hooks`), and the journal.
-
-    def to_worker(self, message: Any) -> bool:
-        """Posts a message; False where there is no worker that takes any."""
-        if self._ready:
-            self._worker.send(message)
-        return self._ready
-
-    def states_changed(self, frames: tuple[int, ...]) -> None:
-        """Files of states were written or lost."""
-        if frames:
-            self._questions.refresh(frames)
-        self.work()
-
-    def write_fact(self, fact: Fact) -> None:
-        """Journals a fact that was applied, in the background."""
-        self.background(self._write(fact))
-
-    def _all_facts(self) -> Iterator[Fact]:
-        """What the journal has to say; see `Journal`."""
-        return chain((Created(definition=self._definition.as_json()),), facts_of(self.ledger.copy()))
-
-    def _journal_renewed(self, fault: str) -> None:
-        self.damage.say(DamageKind.JOURNAL, f"{fault}; it was written anew from what the service knows")
-        self._tell(SceneChanged())
-
-    # The worker's life.
-
-    def _start_worker(self) -> None:
-        self.supervision.started()
-        self._worker = self._placement.start(worker.main, self.spec, self._from_worker, self._worker_ended)
-
-    def _worker_ended(self, reason: Ended) -> None:
-        self._ready, self.progress = False, None
-        self.clock.end(committed=False)
-        if self._stopping or self.ledger.fatal is not None:
-            return
-        metrics.RESTARTS.labels("worker").inc()
-        own, delay = self.supervision.died(reason.exit_code)
-        self.trouble = f"the worker is gone: {reason}; it is started again in {delay:g} s"
-        log.error("scene %s: %s", self.id, self.trouble)
-        self.background(self._after_death(str(reason), own, delay))
-
-    async def _after_death(self, reason: str, own: bool, delay: float) -> None:
-        index, self._at_work = self._at_work, None
-        if index is not None and self.frames[index].state == FrameState.UPDATING:
-            self.ledger.move(index, FrameState.QUEUED)
-            death = Died(index=index, reason=reason, own=own)
-            await self._write(death)
-            self.ledger.apply(death)
-            # It may have died between its commit and saying so: the next worker tells, and only then is it given up.
-            fact = given_up(self.frames[index], death)
-            if fact is not None and not await asyncio.to_thread(self._is_committed, index):
-                await self._set_aside(fact)
-        self._tell(SceneChanged())
-        if not self._stopping:
-            self._again = asyncio.get_running_loop().call_later(delay, self._start_worker)
-
-    def _is_committed(self, index: int) -> bool:
-        return bool(self._files.read(index))
-
-    @contextmanager
-    def no_frame_begins(self) -> Iterator[None]:
-        """The worker is given no frame inside; the one at work goes on."""
-        self._holding += 1
-        try:
-            yield
-        finally:
-            self._holding -= 1
-            self.work()
+        await uncancelled(change())
 
     async def pause(self, paused: bool) -> None:
-        """Reconstructs nothing more after the frame at work; or goes on."""
-        await self.ingest.pause(paused)
-        self.work()
+        """Begins no frame after the one at work, or goes on; holds over a restart."""
 
-    def background(self, coroutine: Coroutine[Any, Any, None]) -> None:
-        """In the background, in the order of the calls where they do not wait; the scene's end cancels it."""
-        self._background.run(coroutine)
+        async def change() -> None:
+            async with self.log.lock:
+                if self.ledger.paused != paused:
+                    await self.log.append(PauseChanged(paused=paused))
+
+        await uncancelled(change())
+        self.updates.begin()
+
+    async def stop(self) -> None:
+        """Ends the processes of the scene; its folder stays."""
+        self.open_frames.stop()
+        self.updates.stop()
+        self._background.cancel()
+        seconds = self._server.stop_seconds
+        await asyncio.gather(self.updates.stop_worker(seconds), self._readers.stop(seconds), self.replays.stop())
+        await self.log.journal.close()
+
+    # Events.
+
+    def _tell(self, event: Event) -> None:
+        """Publishes an event; to be called at every change of the scene's status or of a frame."""
+        if isinstance(event, FrameFinished):
+            metrics.finished(event.report)
+        self._hub.publish(self.id, event)
+
+    def _waits(self, sentence: str) -> None:
+        self.updates.trouble = sentence
+        self._tell(SceneChanged())
+
+    def _all_events(self) -> Iterator[JournalEvent]:
+        """Snapshot for the journal; see `Journal`."""
+        return chain((SceneCreated(definition=self._definition.as_json()),), events_of(self.ledger.copy()))
+
+    def _journal_renewed(self, fault: str) -> None:
+        self._damage.say(DamageKind.JOURNAL, f"{fault}; it was written anew from what the service knows")
+        self._tell(SceneChanged())
 
     def _failed(self, error: BaseException) -> None:
         self.ledger.fatal = f"the service failed: {type(error).__name__}: {message_of(error)}"
         log.error("scene %s", self.id, exc_info=error)
         self._tell(SceneChanged())
-
-    async def stop(self) -> None:
-        """Ends both processes; what is on disk stays."""
-        self._stopping = True
-        if self._again is not None:
-            self._again.cancel()
-        self.ingest.stop()
-        self.mending.stop()
-        self._background.cancel()
-        seconds = self.server.stop_seconds
-        await asyncio.gather(self._worker.stop(seconds), self._questions.stop(seconds), self.replays.stop())
-        await self.journal.close()

@@ -1,4 +1,4 @@
-"""All scenes of the service: made, found again at a start, deleted so that no power cut brings half of one back."""
+"""All scenes of the service: creates, recovers and deletes them, so that no power cut leaves half a scene."""
 
 from __future__ import annotations
 
@@ -18,17 +18,16 @@ from server.processes.placement import Placement
 from server.scene.scene import Scene
 from server.settings import ServerSettings
 from server.storage.definition import (
-    FRAMES_FOLDER,
-    JOURNAL_FILE,
     Definition,
     DefinitionError,
-    is_nothing,
+    never_acknowledged,
     read_definition,
     write_definition,
 )
 from server.storage.disk import FolderLock, full_disk, no_room
-from server.storage.events import Created
+from server.storage.events import SceneCreated
 from server.storage.journal import Journal
+from server.storage.layout import DataFolder, SceneFolder
 from server.storage.recovery import recover
 from server.stream.hub import Hub
 
@@ -37,15 +36,15 @@ __all__ = ["Scene", "Scenes"]
 log = logging.getLogger("scas4d.server")
 
 
-def hold(data: Path) -> FolderLock:
-    """The data folder, for this service alone; made where there is none.
+def lock_data(data: Path) -> FolderLock:
+    """Locks the data folder for this service; the folder is made when missing.
 
     Raises:
         RuntimeError: another service is at work in it.
     """
     data.mkdir(parents=True, exist_ok=True)
     try:
-        return FolderLock(data / "service.lock", wait=False)
+        return FolderLock(DataFolder(data).lock, wait=False)
     except BlockingIOError:
         raise RuntimeError(
             f"another service is at work in {data}; stop it, or give this one another folder: --data FOLDER"
@@ -56,7 +55,7 @@ class Scenes:
     """All scenes of the service, by id.
 
     Attributes:
-        unreadable: folders of the data folder that hold no scene that can be read, with the reason; left as they are.
+        unreadable: folders whose scene cannot be read, with the reason; they are left as they are.
     """
 
     def __init__(self, server: ServerSettings, placement: Placement, hub: Hub) -> None:
@@ -65,54 +64,53 @@ class Scenes:
         self.hub = hub
         self.by_id: dict[str, Scene] = {}
         self.unreadable: dict[str, str] = {}
-        self._folder = (server.data / "scenes").resolve()
-        self._deleted = (server.data / "deleted").resolve()
+        self._data = DataFolder(server.data.resolve())
         self._lock: FolderLock | None = None
         self._making = 0
         self._found: list[str] = []
-        """Folders found at the start. What comes after `by_id` and `unreadable` have it is recovered."""
+        """Folders found at the start; those in `by_id` or `unreadable` are recovered."""
         self._recovering: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
-        """Finds the scenes of the data folder; taking them up again goes on behind, a journal may be that of a day.
+        """Finds the scenes of the data folder; recovers them in the background, as a journal may be that of a day.
 
         Raises:
             RuntimeError: another service is at work in the data folder.
         """
-        for folder in (self._folder, self._deleted):
+        for folder in (self._data.scenes, self._data.deleted):
             folder.mkdir(parents=True, exist_ok=True)
-        self._lock = hold(self.server.data)
+        self._lock = lock_data(self.server.data)
         self._found = await asyncio.to_thread(self._folders)
         self._recovering = asyncio.create_task(self._recover())
 
     def _folders(self) -> list[str]:
-        """Of scenes; those that were never acknowledged are put with what is deleted."""
+        """Lists the folders of scenes; moves those that were never acknowledged to the deleted ones."""
         found = []
-        for path in sorted(path for path in self._folder.iterdir() if path.is_dir()):
-            if is_nothing(path):
-                path.rename(self._deleted / f"{path.name}-{secrets.token_hex(4)}")
+        for path in sorted(path for path in self._data.scenes.iterdir() if path.is_dir()):
+            if never_acknowledged(SceneFolder(path)):
+                path.rename(self._data.deleted / f"{path.name}-{secrets.token_hex(4)}")
             else:
                 found.append(path.name)
-        sync_folder(self._folder)
+        sync_folder(self._data.scenes)
         return found
 
     async def _recover(self) -> None:
-        """Takes up what was found, one scene after the other, and finishes deletions that were interrupted."""
-        graves = list(self._deleted.iterdir())
+        """Recovers the scenes that were found, one after the other, and finishes interrupted deletions."""
+        graves = list(self._data.deleted.iterdir())
         for name in self._found:
             try:
-                await self._restore(self._folder / name)
-            except Exception as error:  # a fault of one scene is none of the others
+                await self._restore(self._data.scene(name))
+            except Exception as error:  # a fault of one scene is no fault of the others
                 self.unreadable[name] = f"the service failed: {type(error).__name__}: {message_of(error)}"
-                log.exception("scene %s cannot be taken up", name)
+                log.exception("scene %s cannot be recovered", name)
         for path in graves:
             await asyncio.to_thread(shutil.rmtree, path, ignore_errors=True)
 
     def check_recovered(self, id: str | None = None) -> None:
-        """Returns where what was found at the start, or one scene of it, is taken up again.
+        """Checks that the scenes found at the start, or one of them, are recovered.
 
         Raises:
-            Problem: 503, with how many are.
+            Problem: 503, with the number of those that are.
         """
         missing = [name for name in self._found if name not in self.by_id and name not in self.unreadable]
         if id not in missing and (id is not None or not missing):
@@ -122,12 +120,12 @@ class Scenes:
             f"recovering {len(self._found) - len(missing)} of {counted(len(self._found), 'scene')}",
             field="id" if id is not None else None,
             value=id,
-            remedy="ask again: what was acknowledged is on disk, and is being read",
+            remedy="ask again: all acknowledged frames are on disk, and are being read",
             headers={"Retry-After": "1"},
             recovering=missing,
         )
 
-    async def _restore(self, folder: Path) -> None:
+    async def _restore(self, folder: SceneFolder) -> None:
         try:
             definition, damage = await asyncio.to_thread(read_definition, folder)
             if definition.id != folder.name:
@@ -137,17 +135,17 @@ class Scenes:
             found = await asyncio.to_thread(recover, folder, definition.id, definition.as_json())
             found.damage[:0] = [damage] if damage is not None else []
             scene = Scene(definition, folder, found, self.server, self.placement, self.hub)
-            scene.points_sha256 = await asyncio.to_thread(points_sha256, scene.spec.points)
+            scene.points_sha256 = await asyncio.to_thread(points_sha256, folder.points)
         except (DefinitionError, OSError) as error:
             self.unreadable[folder.name] = message_of(error)
-            log.error("folder %s holds no scene that can be read; it is left as it is: %s", folder, error)
+            log.error("folder %s holds no scene that can be read; it is left as it is: %s", folder.path, error)
             return
-        for said in found.damage:
-            log.warning("scene %s: %s", definition.id, said)
+        for sentence in found.damage:
+            log.warning("scene %s: %s", definition.id, sentence)
         self.by_id = dict(sorted([*self.by_id.items(), (scene.id, scene)], key=lambda item: item[1].created))
 
     async def create(self, request: SceneCreate, settings: Settings) -> Scene:
-        """A new scene with its processes started; it is on disk when this returns.
+        """Creates a scene and starts its processes; the scene is on disk when this returns.
 
         Raises:
             Problem: 429, as many scenes run as may; 503, those found at the start are still being recovered; 507, the
@@ -164,13 +162,13 @@ class Scenes:
                 headers={"Retry-After": "60"},
             )
         definition = Definition(secrets.token_hex(6), datetime.now(UTC), request, settings)
-        folder = self._folder / definition.id
+        folder = self._data.scene(definition.id)
         self._making += 1
         try:
             await self._write(folder, definition)
             found = await asyncio.to_thread(recover, folder, definition.id)
         except OSError as error:
-            await asyncio.to_thread(shutil.rmtree, folder, ignore_errors=True)
+            await asyncio.to_thread(shutil.rmtree, folder.path, ignore_errors=True)
             if no_room(error):
                 raise full_disk(error) from None
             raise
@@ -180,15 +178,15 @@ class Scenes:
         self.by_id[definition.id] = scene
         return scene
 
-    async def _write(self, folder: Path, definition: Definition) -> None:
-        """The folder, its journal, and last the definition, which makes it a scene."""
-        (folder / FRAMES_FOLDER).mkdir(parents=True)
-        journal = Journal(folder / JOURNAL_FILE)
+    async def _write(self, folder: SceneFolder, definition: Definition) -> None:
+        """Writes the folder, its journal, and last the definition, which makes it a scene."""
+        folder.frames.mkdir(parents=True)
+        journal = Journal(folder.journal)
         try:
-            await journal.append(Created(definition=definition.as_json()))
+            await journal.append(SceneCreated(definition=definition.as_json()))
         finally:
             await journal.close()
-        sync_folder(folder.parent)
+        sync_folder(folder.path.parent)
         await asyncio.to_thread(write_definition, folder, definition)
 
     def __getitem__(self, id: str) -> Scene:
@@ -202,19 +200,19 @@ class Scenes:
         return scene
 
     async def delete(self, id: str) -> None:
-        """Ends the scene's processes and removes its folder. From the rename on it is gone, whatever happens."""
+        """Ends the scene's processes and removes its folder. The scene is gone once the folder is renamed."""
         scene = self[id]
         self._found = [name for name in self._found if name != id]
         del self.by_id[id]
         self.hub.close(id, "the scene was deleted")
         await scene.stop()
-        await asyncio.to_thread(self._remove, scene.spec.folder)
+        await asyncio.to_thread(self._remove, scene.spec.folder.path)
 
     def _remove(self, folder: Path) -> None:
-        grave = self._deleted / f"{folder.name}-{secrets.token_hex(4)}"
+        grave = self._data.deleted / f"{folder.name}-{secrets.token_hex(4)}"
         folder.rename(grave)
-        sync_folder(self._deleted)
-        sync_folder(self._folder)
+        sync_folder(self._data.deleted)
+        sync_folder(self._data.scenes)
         shutil.rmtree(grave, ignore_errors=True)
 
     async def stop(self) -> None:
@@ -228,7 +226,7 @@ class Scenes:
 
 
 def points_sha256(path: Path) -> str | None:
-    """SHA-256 of the body that a scene's points came in, or None where it has none."""
+    """Returns the SHA-256 of the request body that a scene's points arrived in, or None where it has no points."""
     try:
         return bytes(read_npz(path, ("sha256",))["sha256"]).hex()
     except FileNotFoundError:

@@ -1,62 +1,156 @@
-"""Where a scene is, and what it says of itself."""
+"""Answers questions about a scene: its state, its budget, its cameras, its committed frames and their reports."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import asyncio
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
 
-from client.wire import FrameState, SceneState, SceneStatus
+from client.wire import Budget, EffectiveBudget, FrameReportModel, FrameState, SceneState
+from scas4d_core.cameras import Camera, Rig
+from scas4d_core.settings import Settings
+from scas4d_core.storage.history import History, HistoryError
+from server.problems import Problem
+from server.storage.ledger import Ledger
 
-if TYPE_CHECKING:
-    from server.scene.scene import Scene
 
-
-def state_of(scene: Scene) -> SceneState:
-    """Where the scene is; see `SceneStatus`."""
-    if scene.ledger.fatal is not None:
+def state_of(ledger: Ledger, *, at_work: bool, degraded: bool) -> SceneState:
+    """Returns the state of a scene; see `SceneStatus`."""
+    if ledger.fatal is not None:
         return SceneState.FAILED
-    if scene.at_work:
-        started = scene.committed or scene.ledger.states_deleted
-        return SceneState.UPDATING if started else SceneState.INITIALISING
-    if scene.ledger.paused:
+    if at_work:
+        return SceneState.UPDATING if ledger.committed or ledger.states_deleted else SceneState.INITIALISING
+    if ledger.paused:
         return SceneState.PAUSED
-    if scene.error is not None:
+    if degraded:
         return SceneState.DEGRADED
-    if not scene.ledger.frames and not scene.ledger.open:
+    if not ledger.frames and not ledger.open:
         return SceneState.AWAITING
     return SceneState.READY
 
 
-def status_of(scene: Scene) -> SceneStatus:
-    """The scene as it is now."""
-    ledger = scene.ledger
-    return SceneStatus(
-        id=scene.id,
-        name=scene.request.name,
-        state=scene.state,
-        error=scene.error,
-        progress=scene.progress,
-        cameras=list(scene.rig.names),
-        has_points=scene.points_sha256 is not None,
-        next_frame=ledger.next_frame,
-        queued=ledger.unfinished,
-        queue_limit=scene.queue_limit,
-        committed=len(ledger.committed),
-        first_committed=ledger.committed[0] if ledger.committed else None,
-        last_committed=ledger.committed[-1] if ledger.committed else None,
-        gaussians=scene.gaussians,
-        paused=ledger.paused,
-        degraded=scene.error is not None and ledger.fatal is None,
-        open_frames=sorted(ledger.open),
-        set_aside=ledger.counts[FrameState.SET_ASIDE],
-        missing=ledger.counts[FrameState.MISSING],
-        skipped=ledger.counts[FrameState.SKIPPED],
-        worker_deaths=scene.supervision.deaths,
-        frames_held=len(scene.held),
-        frame_bytes=scene.held.bytes,
-        states_deleted=ledger.states_deleted,
-        damage=scene.damage.sentences,
-        created=scene.created.isoformat(),
-        ingest=scene.rules,
-        settings=scene.spec.settings.model_dump(mode="json"),
-        budget=ledger.budgets[-1][1],
-    )
+def effective_budget(settings: Settings, asked: Budget) -> EffectiveBudget:
+    """Fills the open fields of a budget from the settings of the scene."""
+    fields = {name: getattr(settings.update, name) if value is None else value for name, value in asked}
+    return EffectiveBudget(**fields)
+
+
+def camera_of(rig: Rig, name: str) -> Camera:
+    """Returns a camera of the rig by name.
+
+    Raises:
+        Problem: 422, the rig has none of that name.
+    """
+    if name not in rig.names:
+        raise Problem(
+            422,
+            f"the rig has no camera {name!r}",
+            field="camera",
+            value=name,
+            remedy=f"name one of {', '.join(rig.names)}, or give the camera itself",
+        )
+    return rig[name]
+
+
+def committed_frame_of(ledger: Ledger, state: SceneState, index: int | None, field: str) -> int:
+    """Returns the index, or the last one for None, once it is checked that its state can be read.
+
+    Raises:
+        Problem: 404 or 409, it cannot; 503, it is being made again.
+    """
+    if not ledger.committed:
+        raise Problem(
+            409,
+            "no frame of this scene is committed yet",
+            field=field,
+            remedy="wait until `committed` in the scene's status is above 0",
+            state=state,
+        )
+    if index is None:
+        return ledger.committed[-1]
+    entry = ledger.frames.get(index)
+    if entry is not None and entry.unreadable:
+        raise Problem(
+            503,
+            f"the state of frame {index} was damaged on disk and is being made again",
+            field=field,
+            value=index,
+            remedy="ask again, or for another frame",
+            headers={"Retry-After": "2"},
+        )
+    other = f"ask for a committed frame, {ledger.committed[0]} to {ledger.committed[-1]}"
+    if entry is not None and entry.deleted and entry.error is not None:
+        raise Problem(404, entry.error, field=field, value=index, remedy=other)
+    if entry is None or entry.state != FrameState.COMMITTED or entry.deleted:
+        found = "not here" if entry is None else entry.state.value
+        if entry is not None and entry.deleted:
+            found = "deleted by the scene's retention"
+        raise Problem(
+            404,
+            f"frame {index} is {found}; only committed frames that are kept can be read",
+            field=field,
+            value=index,
+            remedy=other,
+        )
+    return index
+
+
+class FrameReports:
+    """Reports of a scene's frames; records of commits that are not in memory are read from disk.
+
+    Args:
+        ledger: of the scene. states: folder of its committed states.
+        damaged: called with files that could not be read, by name with the reason.
+    """
+
+    def __init__(self, ledger: Ledger, states: Path, damaged: Callable[[Mapping[str, str]], None]) -> None:
+        self._ledger = ledger
+        self._states = states
+        self._damaged = damaged
+        self._history: History | None = None
+        self._turn = threading.Lock()
+
+    async def of(self, index: int) -> FrameReportModel | None:
+        """Returns the report of a frame; None where the frame is not known."""
+        entry = self._ledger.frames.get(index)
+        if entry is None:
+            parts = self._ledger.open.get(index)
+            if parts is None:
+                return None
+            return FrameReportModel(
+                scene=self._ledger.scene,
+                index=index,
+                time=parts.time,
+                state=FrameState.OPEN,
+                received=parts.cameras,
+                held=True,
+            )
+        if entry.state != FrameState.COMMITTED or entry.deleted or entry.record is not None:
+            return entry.report
+        record = await asyncio.to_thread(self._read, index)
+        if damaged := await asyncio.to_thread(self._take_faults):
+            self._damaged(damaged)
+        self._ledger.frames.remember(index, record)
+        return entry.report_with(record)
+
+    async def is_committed(self, index: int) -> bool:
+        """Returns whether a readable state of the frame is on disk, whatever the ledger says."""
+        return bool(await asyncio.to_thread(self._read, index))
+
+    def _read(self, index: int) -> dict[str, Any]:
+        """Reads the record of a commit; empty where its state is deleted or damaged."""
+        with self._turn:
+            try:
+                if self._history is None:
+                    self._history = History.load(self._states, only=(index,))
+                else:
+                    self._history.refresh(only=(index,))
+                return self._history.report(index)
+            except HistoryError:
+                return {}
+
+    def _take_faults(self) -> dict[str, str]:
+        with self._turn:
+            return {} if self._history is None else self._history.take_faults()

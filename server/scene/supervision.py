@@ -1,25 +1,43 @@
-"""Deaths of a scene's worker: whose doing they were, when it is started again, and when a frame is given up."""
+"""Supervises a scene's worker: counts its deaths, times its frames; and keeps the scene's background tasks.
+
+A death is the worker's own doing or not; that decides when it is started again and when a frame is given up.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import signal
+import time
+from collections import deque
+from collections.abc import Callable, Coroutine
 from pathlib import Path
+from statistics import median
+from typing import Any
 
-from server.storage.events import Died, SetAside
+from server.storage.events import FrameSetAside, WorkerDied
 from server.storage.frame_table import FrameEntry
 
 OWN_SIGNALS = frozenset(
     {signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSYS, signal.SIGTRAP}
 )
 OWN_DEATHS = 2
-"""A frame at which the worker died so often by its own doing is set aside."""
+"""A frame is set aside after so many deaths of the worker by its own doing."""
 OTHER_DEATHS = 6
-"""And one at which it was killed so often from outside: something is wrong with it all the same."""
+"""A frame is set aside after so many deaths from outside, too: something is wrong with it all the same."""
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.5, 30.0
+
+UPDATES_KEPT = 8
+"""The prediction is the median of so many updates: a changed budget shows after a few frames."""
+FIRST_GUESS_S = 1.0
+"""Seconds of an update, before one has been timed."""
+SHORTEST_S = 0.1
+"""The shortest prediction in seconds."""
+OVERDUE = 0.25
+"""A frame that takes longer than predicted is predicted to take this share of its time so far again."""
 
 
 def oom_kills() -> int:
-    """How many processes the kernel has killed for want of memory in the control group of this one."""
+    """Returns how many processes of this control group the kernel has killed for want of memory."""
     try:
         for line in Path("/proc/self/cgroup").read_text().splitlines():
             number, _, path = line.partition("::")
@@ -32,39 +50,39 @@ def oom_kills() -> int:
     return 0
 
 
-class Supervision:
+class WorkerDeaths:
     """Counts the deaths of one scene's worker."""
 
     def __init__(self) -> None:
-        self.deaths = 0
+        self.count = 0
         self._in_a_row = 0
         self._oom_kills = oom_kills()
 
     def started(self) -> None:
-        """The worker is started."""
+        """Notes that the worker is started."""
         self._oom_kills = oom_kills()
 
     def committed(self) -> None:
-        """It works."""
+        """Notes that the worker works: it has committed a frame."""
         self._in_a_row = 0
 
     def died(self, exit_code: int | None) -> tuple[bool, float]:
-        """The worker is gone.
+        """Notes that the worker is gone.
 
         Returns:
-            Whether it died through its own doing: it exited, by a signal that only a fault of its own sends, or it was
-            killed for want of memory. And the seconds to wait before it is started again.
+            True where it died by its own doing (it exited, or by a signal that only a fault of its own sends, or it was
+            killed for want of memory); and the seconds to wait before it is started again.
         """
         own = exit_code is not None and (exit_code > 0 or -exit_code in OWN_SIGNALS)
         own = own or oom_kills() > self._oom_kills
         delay = min(LONGEST_DELAY_S, FIRST_DELAY_S * 2**self._in_a_row)
-        self.deaths += 1
+        self.count += 1
         self._in_a_row += 1
         return own, delay
 
 
-def given_up(entry: FrameEntry, death: Died) -> SetAside | None:
-    """That the frame is set aside for this death, counted already; or None: it is tried again."""
+def given_up(entry: FrameEntry, death: WorkerDied) -> FrameSetAside | None:
+    """Returns the event that sets the frame aside for this death, which is counted already; None: it is tried again."""
     own, other = entry.note.own_deaths, entry.note.other_deaths
     if own >= OWN_DEATHS:
         reason = f"the worker died {own} times while it reconstructed this frame: {death.reason}"
@@ -72,4 +90,102 @@ def given_up(entry: FrameEntry, death: Died) -> SetAside | None:
         reason = f"the worker was killed {other} times while it reconstructed this frame: {death.reason}"
     else:
         return None
-    return SetAside(index=death.index, reason=reason)
+    return FrameSetAside(index=death.index, reason=reason)
+
+
+class WorkClock:
+    """Predicts the end of the frame at work, from the frames before it and from its progress.
+
+    Frame 0 is not counted as an update: it takes minutes where an update takes a second.
+
+    Args:
+        now: seconds of a clock that never goes back.
+
+    Example:
+        >>> seconds = iter([0.0, 2.0, 2.0, 2.5])
+        >>> clock = WorkClock(lambda: next(seconds))
+        >>> clock.begin(first=False)
+        >>> clock.end(committed=True)
+        >>> clock.begin(first=False)
+        >>> clock.remaining()
+        1.5
+    """
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        self._now = now
+        self._updates: deque[float] = deque(maxlen=UPDATES_KEPT)
+        self._began: float | None = None
+        self._first = False
+        self._stage = ""
+        self._stage_began = 0.0
+        self._done = 0.0
+        self._stalled_until: float | None = None
+
+    @property
+    def update_seconds(self) -> float:
+        """Predicted seconds of an update."""
+        return median(self._updates) if self._updates else FIRST_GUESS_S
+
+    def begin(self, *, first: bool) -> None:
+        """Notes that the worker has a frame; ``first``: there is no committed state before it."""
+        self._began, self._first, self._stalled_until = self._now(), first, None
+        self._stage, self._done = "", 0.0
+
+    def progress(self, stage: str, done: int, total: int) -> None:
+        """Notes how far frame 0 is in one of its stages."""
+        if stage != self._stage:
+            self._stage, self._stage_began = stage, self._now()
+        self._done = done / total if total > 0 else 0.0
+
+    def stall(self, seconds: float) -> None:
+        """Notes that the frame at work waits for room on the disk and is tried again after so long."""
+        self._stalled_until = self._now() + seconds
+
+    def end(self, *, committed: bool) -> None:
+        """Notes that the worker has no frame; one that was not committed, or stalled, is not counted as an update."""
+        if committed and self._began is not None and not self._first and self._stalled_until is None:
+            self._updates.append(self._now() - self._began)
+        self._began = self._stalled_until = None
+
+    def remaining(self) -> float:
+        """Returns the seconds until the frame at work ends; an update where there is none."""
+        if self._began is None:
+            return max(SHORTEST_S, self.update_seconds)
+        now = self._now()
+        if self._stalled_until is not None:
+            return max(0.0, self._stalled_until - now) + self.update_seconds
+        elapsed = now - self._began
+        if self._first:
+            in_stage = now - self._stage_began
+            if 0 < self._done < 1:
+                return max(SHORTEST_S, in_stage * (1 - self._done) / self._done)
+            return max(SHORTEST_S, OVERDUE * elapsed)  # between two stages nothing better is known
+        return max(SHORTEST_S, self.update_seconds - elapsed, OVERDUE * (elapsed - self.update_seconds))
+
+
+class Background:
+    """Keeps the background tasks of a scene until they are done; the scene's end cancels them.
+
+    Args:
+        failed: called with the error that a task ended with.
+    """
+
+    def __init__(self, failed: Callable[[BaseException], None]) -> None:
+        self._failed = failed
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def run(self, coroutine: Coroutine[Any, Any, None]) -> None:
+        """Begins a task; tasks run in the order of the calls where they do not wait."""
+        task = asyncio.get_running_loop().create_task(coroutine)
+        self._tasks.add(task)
+        task.add_done_callback(self._done)
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self._failed(error)
+
+    def cancel(self) -> None:
+        """Cancels all tasks."""
+        for task in tuple(self._tasks):
+            task.cancel()

@@ -1,4 +1,4 @@
-"""Accuracy against time, from the reports of a scene's newest frames and from its replays. No disk, no processes."""
+"""Accuracy against time, computed from the reports of a scene's newest frames and from its replays."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from client.wire import CurveMean, FrameReportModel, FrameState, PointKind, TimeModel, TradeoffPoint
 
 NEWEST = 64
-"""Frames that are looked at."""
+"""Frames whose reports are used: the newest."""
 LADDER = (10, 25, 50, 100, 200, 300, 500)
 """Iterations that are extrapolated where they were not measured."""
 NEAR = 0.1
@@ -19,7 +19,7 @@ NEAR = 0.1
 
 
 def telling(reports: Iterable[FrameReportModel], first: int) -> list[FrameReportModel]:
-    """Updates that tell what their iterations cost and bring: committed, not frame 0, in one go, and met."""
+    """Selects the updates that measure their iterations: committed whole at the first attempt, and not frame 0."""
     return [
         report
         for report in reports
@@ -33,13 +33,13 @@ def telling(reports: Iterable[FrameReportModel], first: int) -> list[FrameReport
 
 
 def writing(reports: Iterable[FrameReportModel]) -> float:
-    """Milliseconds that writing a commit takes, the median; 0 where it is not known."""
+    """Returns the median milliseconds of writing a commit; 0 where it is not known."""
     known = [report.write_seconds for report in reports if report.write_seconds is not None]
     return 1000 * median(known) if known else 0.0
 
 
 def measured(reports: Sequence[FrameReportModel]) -> list[TradeoffPoint]:
-    """A point for each number of iterations that frames ran, to two digits, and threads."""
+    """Makes a point for each number of iterations that frames ran, to two digits, and of threads."""
     write = writing(reports)
     points = []
     for (iterations, threads), group in _groups(reports, lambda report: (_rounded(report.iterations), report.threads)):
@@ -59,7 +59,7 @@ def measured(reports: Sequence[FrameReportModel]) -> list[TradeoffPoint]:
 
 
 def curve(reports: Sequence[FrameReportModel]) -> list[CurveMean]:
-    """How far updates were on their way, mean over those that had as many iterations."""
+    """Averages the curves of updates that had the same number of iterations."""
     steps = [
         (_rounded(report.iterations), _rounded(point.iterations), point)
         for report in reports
@@ -79,7 +79,7 @@ def curve(reports: Sequence[FrameReportModel]) -> list[CurveMean]:
 
 
 def time_model(reports: Sequence[FrameReportModel]) -> TimeModel | None:
-    """Time linear in the iterations: their slope from within the updates, the rest is fixed."""
+    """Fits a time linear in the iterations: the slope from within the updates, the rest is fixed."""
     slopes = []
     for report in reports:
         if len(report.curve) > 1:
@@ -93,7 +93,7 @@ def time_model(reports: Sequence[FrameReportModel]) -> TimeModel | None:
 
 
 def extrapolated(model: TimeModel | None, known: Sequence[TradeoffPoint], threads: int | None) -> list[TradeoffPoint]:
-    """What was not measured on as many threads, by the model: its time, and nothing about its accuracy."""
+    """Makes points for iterations not measured on as many threads: the model's time, and no accuracy."""
     if model is None:
         return []
     there = [point.iterations for point in known if point.threads == threads]
@@ -120,7 +120,7 @@ def _groups(items: Sequence[Any], key: Any) -> list[tuple[Any, list[Any]]]:
 
 
 def _rounded(iterations: int | None) -> int:
-    """To two significant digits: a budget of milliseconds gives a frame 97 and the next 98."""
+    """Rounds to two significant digits: a budget of milliseconds gives a frame 97 iterations and the next 98."""
     if not iterations:
         return 0
     return round(iterations, min(0, 1 - floor(log10(iterations))))

@@ -1,11 +1,10 @@
-"""What a scene is: rig, settings, how it takes frames. Written once, before the scene is acknowledged."""
+"""Definition of a scene: rig, settings, ingest rules. Written once, before the scene is acknowledged."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 from blake3 import blake3
@@ -14,16 +13,15 @@ from client.wire import SceneCreate
 from scas4d_core.error_text import message_of
 from scas4d_core.settings import Settings
 from scas4d_core.storage.npz import written_whole
-from server.storage.events import Created, Fact
+from server.storage.events import JournalEvent, SceneCreated
 from server.storage.journal import replay
+from server.storage.layout import SceneFolder
 
 FORMAT = 1
-SCENE_FILE, JOURNAL_FILE, FRAMES_FOLDER = "scene.json", "journal.log", "frames"
-STATES_FOLDER, POINTS_FILE = "states", "points.npz"
 
 
 class DefinitionError(ValueError):
-    """A folder without a definition that can be read: says why."""
+    """A folder has no definition that can be read: the message says why."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ class Definition:
     settings: Settings
 
     def as_json(self) -> dict[str, Any]:
-        """For `scene.json` and the journal."""
+        """Returns the content of `scene.json`, and of the journal's first event."""
         return {
             "format": FORMAT,
             "id": self.id,
@@ -47,10 +45,10 @@ class Definition:
 
     @classmethod
     def of_json(cls, data: Any) -> Definition:
-        """The same back.
+        """Reads the definition from what `as_json` made.
 
         Raises:
-            DefinitionError: it is of another format, or not what this version takes.
+            DefinitionError: it is of another format, or this version does not accept it.
         """
         try:
             if data["format"] != FORMAT:
@@ -65,60 +63,63 @@ class Definition:
             raise DefinitionError(f"the definition cannot be read: {message_of(error)}") from None
 
 
-def write_definition(folder: Path, definition: Definition) -> None:
-    """Writes `scene.json`: from here on the scene exists."""
+def write_definition(folder: SceneFolder, definition: Definition) -> None:
+    """Writes `scene.json`: the scene exists from here on."""
     text = json.dumps(definition.as_json(), indent=1)
-    path = folder / SCENE_FILE
+    path = folder.definition
     with written_whole(path, path.with_suffix(".part")) as file:
         file.write(json.dumps({"blake3": _digest(text), "scene": json.loads(text)}, indent=1).encode())
 
 
-def read_definition(folder: Path) -> tuple[Definition, str | None]:
-    """The definition in a scene's folder, from `scene.json` or else from the journal; and what was damaged, or None.
+def read_definition(folder: SceneFolder) -> tuple[Definition, str | None]:
+    """Reads the definition from `scene.json` or else from the journal.
+
+    Returns:
+        The definition, and a sentence about damage that was found, or None.
 
     Raises:
         DefinitionError: it is in neither of them.
     """
-    found, said = _checked(folder)
+    found, fault = _checked(folder)
     if isinstance(found, Definition):
         return found, None
-    created: list[Created] = []
-    replay(folder / JOURNAL_FILE, lambda fact: created.append(fact) if isinstance(fact, Created) else None)
+    created: list[SceneCreated] = []
+    replay(folder.journal, lambda event: created.append(event) if isinstance(event, SceneCreated) else None)
     if created:
-        return Definition.of_json(created[0].definition), f"{said}; taken from the journal"
-    raise DefinitionError(f"{said}, and the journal does not have it either")
+        return Definition.of_json(created[0].definition), f"{fault}; taken from the journal"
+    raise DefinitionError(f"{fault}, and the journal does not have it either")
 
 
-def check_definition(folder: Path) -> str | None:
-    """What is wrong with `scene.json`, None: nothing."""
+def check_definition(folder: SceneFolder) -> str | None:
+    """Checks `scene.json`; returns its fault, or None."""
     return _checked(folder)[1]
 
 
-def _checked(folder: Path) -> tuple[Definition | None, str | None]:
-    """The definition in `scene.json`, or what is wrong with that."""
+def _checked(folder: SceneFolder) -> tuple[Definition | None, str | None]:
+    """Reads `scene.json`: the definition, or its fault."""
     try:
-        data = json.loads((folder / SCENE_FILE).read_bytes())
+        data = json.loads(folder.definition.read_bytes())
         if _digest(json.dumps(data["scene"], indent=1)) != data["blake3"]:
             raise DefinitionError("it fails its checksum")
         return Definition.of_json(data["scene"]), None
     except FileNotFoundError:
-        return None, f"{SCENE_FILE} is gone"
+        return None, f"{folder.definition.name} is gone"
     except (OSError, KeyError, TypeError, ValueError) as error:
-        return None, f"{SCENE_FILE} is damaged ({message_of(error)})"
+        return None, f"{folder.definition.name} is damaged ({message_of(error)})"
 
 
-def is_nothing(folder: Path) -> bool:
-    """Whether a folder without `scene.json` is of a scene that was never acknowledged.
+def never_acknowledged(folder: SceneFolder) -> bool:
+    """True for a folder without `scene.json` whose scene was never acknowledged.
 
-    Then it has no frame, no state, no points, and no fact but that of its making.
+    Such a folder has no frame, no state, no points, and no event but that of its creation.
     """
-    if (folder / SCENE_FILE).exists() or (folder / POINTS_FILE).exists():
+    if folder.definition.exists() or folder.points.exists():
         return False
-    if any(any((folder / inside).glob("*")) for inside in (FRAMES_FOLDER, STATES_FOLDER)):
+    if any(any(inside.glob("*")) for inside in (folder.frames, folder.states)):
         return False
-    facts: list[Fact] = []
-    replay(folder / JOURNAL_FILE, facts.append)
-    return len(facts) < 2
+    events: list[JournalEvent] = []
+    replay(folder.journal, events.append)
+    return len(events) < 2
 
 
 def _digest(text: str) -> str:

@@ -1,4 +1,4 @@
-"""What the disk can say: that it is full, and that somebody else is at work in a folder."""
+"""Full disks, and locks of folders."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from scas4d_core.error_text import message_of
 from server.problems import Problem
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""Errors that go away once there is room."""
+"""Errors of a full disk: they go away once there is room."""
 
 
 def no_room(error: BaseException | None) -> bool:
-    """Whether an error says that the disk is full, or came up while such a one was handled (as zipfile's do)."""
+    """True for an error of a full disk, and for one raised while such an error was handled (as zipfile does)."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in NO_ROOM:
             return True
@@ -24,7 +24,7 @@ def no_room(error: BaseException | None) -> bool:
 
 
 def full_disk(error: Exception) -> Problem:
-    """The answer where there is no room."""
+    """Makes the answer, 507, for a full disk."""
     return Problem(
         507,
         f"the disk has no room: {message_of(error)}",
@@ -34,11 +34,11 @@ def full_disk(error: Exception) -> Problem:
 
 
 class FolderLock:
-    """Held by one process at a time; the kernel lets it go when that ends, however it ends.
+    """Lock of a folder, held by one process at a time; the kernel releases it when the process ends.
 
     Args:
-        path: of the lock's file, made where there is none.
-        wait: until it is free; otherwise BlockingIOError where another holds it.
+        path: of the lock's file; made when missing.
+        wait: until it is free; otherwise BlockingIOError where another process holds it.
     """
 
     def __init__(self, path: Path, *, wait: bool) -> None:
@@ -50,10 +50,10 @@ class FolderLock:
             raise
 
     def write(self, text: str) -> None:
-        """Puts something in the file for people, such as who holds it."""
+        """Writes a note for people into the file, such as the holder's process id."""
         os.ftruncate(self._file, 0)
         os.pwrite(self._file, text.encode(), 0)
 
     def release(self) -> None:
-        """Lets it go."""
+        """Releases the lock."""
         os.close(self._file)

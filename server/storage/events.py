@@ -1,7 +1,11 @@
-"""What the journal of a scene says: small facts, for ever. Everything known of a frame follows from them in order."""
+"""Events of a scene's journal: the only record of its frames, from which the ledger is folded in order.
+
+The tag of each event, `fact`, and its fields are written in `journal.log` and stay as they are.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -12,18 +16,18 @@ Hashes = dict[str, dict[FileKind, str]]
 """BLAKE3 of each file, by camera and kind."""
 
 
-class _Fact(BaseModel):
+class _Event(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
-class Created(_Fact):
-    """The scene's definition, once more: `scene.json` may be damaged."""
+class SceneCreated(_Event):
+    """The scene was created; holds its definition again, because `scene.json` may be damaged."""
 
     fact: Literal["created"] = "created"
     definition: dict[str, Any]
 
 
-class Taken(_Fact):
+class FrameAccepted(_Event):
     """A whole frame was acknowledged: its pictures lie in `files` of the frame log, which are all on disk."""
 
     fact: Literal["taken"] = "taken"
@@ -32,11 +36,11 @@ class Taken(_Fact):
     identity: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     files: tuple[str, ...]
     closed_by: Literal["whole", "complete", "request", "deadline", "found"] = "whole"
-    """`found`: not told by the journal, which is damaged, but whole in the frame log at a start."""
+    """`found`: the journal had lost the frame, and a start found its whole record in the frame log."""
 
 
-class PartTaken(_Fact):
-    """One camera's files of a frame that is open were acknowledged. `time` is None where the camera gave none."""
+class PartAccepted(_Event):
+    """One camera's files of an open frame were acknowledged. `time` is None where the camera gave none."""
 
     fact: Literal["part"] = "part"
     index: int
@@ -46,7 +50,7 @@ class PartTaken(_Fact):
     hashes: dict[FileKind, str]
 
 
-class Missing(_Fact):
+class FrameMissing(_Event):
     """A frame was declared missing."""
 
     fact: Literal["missing"] = "missing"
@@ -54,15 +58,15 @@ class Missing(_Fact):
     reason: str
 
 
-class Skipped(_Fact):
-    """Frames were skipped because frame `by` came and the queue was full."""
+class FramesSkipped(_Event):
+    """Frames were skipped because frame `by` arrived while the queue was full."""
 
     fact: Literal["skipped"] = "skipped"
     frames: tuple[int, ...]
     by: int
 
 
-class SetAside(_Fact):
+class FrameSetAside(_Event):
     """A frame could not be reconstructed. `fatal`: the scene cannot go on without it."""
 
     fact: Literal["set_aside"] = "set_aside"
@@ -72,8 +76,8 @@ class SetAside(_Fact):
     fatal: bool = False
 
 
-class Died(_Fact):
-    """The worker died at a frame; `own`: through its own doing, not by a signal from outside."""
+class WorkerDied(_Event):
+    """The worker died at a frame; `own`: by a fault of its own, not by a signal from outside."""
 
     fact: Literal["died"] = "died"
     index: int
@@ -81,14 +85,14 @@ class Died(_Fact):
     own: bool
 
 
-class FramesDeleted(_Fact):
-    """Retention deleted the pictures of frames."""
+class PicturesDeleted(_Event):
+    """Retention deleted the pictures of frames from the frame log."""
 
     fact: Literal["frames_deleted"] = "frames_deleted"
     frames: tuple[int, ...]
 
 
-class StatesDeleted(_Fact):
+class StatesDeleted(_Event):
     """Retention deleted committed states, or they were found damaged or gone (`reason`)."""
 
     fact: Literal["states_deleted"] = "states_deleted"
@@ -96,7 +100,7 @@ class StatesDeleted(_Fact):
     reason: str = "retention"
 
 
-class StateFound(_Fact):
+class StateFound(_Event):
     """A committed state was found whose acknowledgement the journal has lost; `time` is that of the state."""
 
     fact: Literal["state_found"] = "state_found"
@@ -104,44 +108,66 @@ class StateFound(_Fact):
     time: float | None
 
 
-class Paused(_Fact):
-    """The scene was paused, or told to go on."""
+class PauseChanged(_Event):
+    """The scene was paused or resumed."""
 
     fact: Literal["paused"] = "paused"
     paused: bool
 
 
-class Budgeted(_Fact):
-    """Another budget holds from frame `index` on: a frame that is done again gets the one that held for it."""
+class BudgetChanged(_Event):
+    """Another budget holds from frame `index` on; a frame that is updated again gets the budget that held for it."""
 
     fact: Literal["budget"] = "budget"
     index: int
     budget: Budget
 
 
-Fact = Annotated[
-    Created
-    | Taken
-    | PartTaken
-    | Missing
-    | Skipped
-    | SetAside
-    | Died
-    | FramesDeleted
+@dataclass
+class OpenFrame:
+    """A frame whose cameras send one by one: its `PartAccepted` events, gathered."""
+
+    index: int
+    time: float | None = None
+    hashes: Hashes = field(default_factory=dict)
+    files: list[str] = field(default_factory=list)
+
+    @property
+    def cameras(self) -> list[str]:
+        """Cameras whose picture has arrived, sorted."""
+        return sorted(camera for camera, kinds in self.hashes.items() if FileKind.IMAGE in kinds)
+
+    def add(self, part: PartAccepted) -> None:
+        """Adds a camera, or another file of a camera."""
+        self.time = part.time if self.time is None else self.time
+        self.hashes.setdefault(part.camera, {}).update(part.hashes)
+        if part.file not in self.files:
+            self.files.append(part.file)
+
+
+JournalEvent = Annotated[
+    SceneCreated
+    | FrameAccepted
+    | PartAccepted
+    | FrameMissing
+    | FramesSkipped
+    | FrameSetAside
+    | WorkerDied
+    | PicturesDeleted
     | StatesDeleted
     | StateFound
-    | Paused
-    | Budgeted,
+    | PauseChanged
+    | BudgetChanged,
     Field(discriminator="fact"),
 ]
-_adapter: TypeAdapter[Fact] = TypeAdapter(Fact)
+_adapter: TypeAdapter[JournalEvent] = TypeAdapter(JournalEvent)
 
 
-parse_fact = _adapter.validate_json
-"""A fact from a record's head; raises `ValidationError`."""
+parse_event = _adapter.validate_json
+"""Reads an event from a record's head; raises `ValidationError`."""
 
 
-def no_fact(error: ValidationError) -> str:
-    """Why a head is no fact."""
+def why_no_event(error: ValidationError) -> str:
+    """Names the field of a record's head that makes it no event, and the fault."""
     first = error.errors()[0]
-    return f"{'.'.join(map(str, first['loc'])) or 'fact'}: {first['msg']}"
+    return f"{'.'.join(map(str, first['loc'])) or 'event'}: {first['msg']}"

@@ -1,7 +1,7 @@
-"""The frame log of a scene: the pictures as they came, one record a file, written while they are received.
+"""Frame log of a scene: the pictures as they were sent, one record a file, written while they are received.
 
-A file gets its final name at once and is debris until the journal names it; so no frame's bytes are copied or renamed,
-a cut can damage one record only, and retention deletes files.
+A file gets its final name at once and is debris until the journal names it: no frame's bytes are copied or renamed, a
+cut can damage one record only, and retention deletes files.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import fcntl
 import os
 import re
 import secrets
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,14 +29,14 @@ BLOCK = 4096
 
 
 class FrameDamage(ValueError):
-    """A record of the frame log that cannot be used: says which and why."""
+    """A record of the frame log cannot be used: the message names it and the reason."""
 
 
 @dataclass(frozen=True, eq=False)
-class Pictures:
+class StoredPictures:
     """The encoded files of a record, by camera (views, not copies), and the BLAKE3 of each.
 
-    `time` and `part` are what its upload said: seconds, where they were known; whether it holds one camera only.
+    `time` in seconds, None where the upload did not know it; `part`: the record holds one camera only.
     """
 
     index: int
@@ -47,14 +48,14 @@ class Pictures:
 
 
 class Upload:
-    """One record on its way to disk, its bytes written as they come. `write` and the others block: for a thread.
+    """Writes one record while its bytes arrive. All methods block: call them in a thread.
 
-    Past the page cache where the file system can (O_DIRECT): through it a frame costs ten times the processor time.
-    Such writes are of whole blocks, from memory that begins at a page; what is over waits for the next.
+    Writes bypass the page cache where the file system can (O_DIRECT): through it a frame costs ten times the processor
+    time. Such writes are of whole blocks, from memory that begins at a page; the remainder waits for the next write.
 
     Args:
         folder: of the frame log.
-        head: says which files follow, and their sizes.
+        head: names the files that follow, and their sizes.
         seconds: time of the frame; None where it is not known yet.
     """
 
@@ -63,21 +64,21 @@ class Upload:
         self._folder = folder
         self._file: int | None = None
         files = [file.model_dump(mode="json") for file in head.files]
-        said = {"time": seconds, "part": head.part, "files": files}
+        fields = {"time": seconds, "part": head.part, "files": files}
         length = sum(file.size for file in head.files)
-        self._opening = opening(Kind.PICTURES, head.index, said, length, BY_FILE)
+        self._opening = opening(Kind.PICTURES, head.index, fields, length, BY_FILE)
         self._over = self._opening
         self.begin = len(self._opening)
-        """Where in the file the pictures begin."""
+        """Offset in the file at which the pictures begin."""
         self.size = self.begin + length + CHECKSUM
         """Bytes of the whole record."""
 
     def write(self, block: memoryview, lead: int) -> None:
-        """Writes what comes next of the files.
+        """Writes the next bytes of the files.
 
         Args:
-            block: memory that begins at a page; the bytes are those from `lead` on, and before them is room for what
-                is left of those before.
+            block: memory that begins at a page; the bytes are those from `lead` on, and before them is room for the
+                remainder of the write before.
             lead: their place in the file, modulo `BLOCK`.
         """
         if self._file is None:
@@ -89,10 +90,10 @@ class Upload:
         self._over = bytes(block[whole:])
 
     def finish(self, digests: Iterable[bytes]) -> None:
-        """The record, whose files have these BLAKE3s, is on disk when this returns.
+        """Ends and syncs the record, whose files have these BLAKE3s: it is on disk when this returns.
 
         Raises:
-            OSError: it is not; `abort` removes what is there.
+            OSError: it is not on disk; `abort` removes the file.
         """
         if self._file is None:
             self._open()
@@ -137,11 +138,11 @@ class Upload:
                 self._direct(False)
 
 
-def read_pictures(folder: Path, name: str) -> Pictures:
-    """The files of a record, checked.
+def read_pictures(folder: Path, name: str) -> StoredPictures:
+    """Reads the files of a record and checks them.
 
     Raises:
-        FrameDamage: it is gone, cut, or not what was written.
+        FrameDamage: the record is gone, cut, or not as it was written.
     """
     if not FILE.fullmatch(name):
         raise FrameDamage(f"{name!r} is no name of a record")
@@ -160,16 +161,16 @@ def read_pictures(folder: Path, name: str) -> Pictures:
             kind, camera = FileKind(file["kind"]), file["camera"]
             (images if kind == FileKind.IMAGE else masks)[camera] = piece
             hashes.setdefault(camera, {})[kind] = digest.hex()
-        return Pictures(found.index, found.head["time"], bool(found.head["part"]), images, masks, hashes)
+        return StoredPictures(found.index, found.head["time"], bool(found.head["part"]), images, masks, hashes)
     except (KeyError, TypeError, ValueError) as error:
         raise FrameDamage(f"{name}: its head is not one of pictures ({error!r})") from None
 
 
 def checked(folder: Path, name: str) -> Iterator[int]:
-    """Reads a record again and yields how many bytes, piece by piece; at its end all of it has been compared.
+    """Reads a record again; yields the number of bytes of each piece. At its end all of it has been checked.
 
     Raises:
-        FrameDamage: it is gone, cut, or not what was written.
+        FrameDamage: the record is gone, cut, or not as it was written.
     """
     try:
         with (folder / name).open("rb") as file:
@@ -181,22 +182,67 @@ def checked(folder: Path, name: str) -> Iterator[int]:
 
 
 def stored(folder: Path) -> dict[str, int]:
-    """Bytes of every record's file, by name."""
+    """Lists the records of the frame log: bytes by name."""
     return {entry.name: entry.stat().st_size for entry in os.scandir(folder) if FILE.fullmatch(entry.name)}
 
 
 def remove(folder: Path, names: Iterable[str]) -> None:
-    """Deletes records; gone for good when this returns."""
+    """Deletes records; they are gone for good when this returns."""
     for name in names:
         (folder / name).unlink(missing_ok=True)
     sync_folder(folder)
 
 
 def frame_of(name: str) -> int:
-    """The frame that a record's file is of."""
+    """Index of the frame that a record belongs to, from its name."""
     return int(name.partition("-")[0])
 
 
 def holds(folder: Path, index: int) -> bool:
-    """Whether there is a record of the frame."""
+    """True where the frame log has a record of the frame."""
     return any(folder.glob(f"{index:010d}-*.frame"))
+
+
+class FrameLogIndex:
+    """Index of a scene's frame log in memory: bytes of each record by name, and their sums.
+
+    Args:
+        folder: of the frame log. sizes: bytes of the records in it, by name.
+    """
+
+    def __init__(self, folder: Path, sizes: Mapping[str, int]) -> None:
+        self.folder = folder
+        self._sizes: dict[str, int] = {}
+        self._records: Counter[int] = Counter()
+        self.bytes = 0
+        for name, size in sizes.items():
+            self.add(name, size)
+
+    @property
+    def frames(self) -> list[int]:
+        """Indices of frames with records, rising."""
+        return sorted(self._records)
+
+    def __len__(self) -> int:
+        """Number of frames with records."""
+        return len(self._records)
+
+    def add(self, name: str, size: int) -> None:
+        """Adds a record that is on disk."""
+        self._sizes[name] = size
+        self._records[frame_of(name)] += 1
+        self.bytes += size
+
+    def discard(self, names: Iterable[str]) -> None:
+        """Removes records from the index; their files are deleted by `remove`."""
+        for name in names:
+            if (size := self._sizes.pop(name, None)) is not None:
+                index = frame_of(name)
+                self._records[index] -= 1
+                if not self._records[index]:
+                    del self._records[index]
+                self.bytes -= size
+
+    def size(self, names: Iterable[str]) -> int:
+        """Sums the bytes of records."""
+        return sum(self._sizes.get(name, 0) for name in names)

@@ -1,7 +1,7 @@
-"""What is known of each frame of a scene, in columns: a day at 30 a second is 2.6 million frames. No disk, no clock.
+"""Frames of one scene in columns: a day at 30 frames a second is 2.6 million frames. No disk, no clock.
 
-46 bytes a frame for ever; what only some frames have (a reason, records in the frame log, deaths of the worker) lies in
-dictionaries beside, and the numbers of a commit stay with the newest few: those of older ones are read from disk.
+A frame takes 46 bytes for ever. Properties of few frames (an error, records in the frame log, deaths of the worker) lie
+in dictionaries. Records of commits stay in memory for the newest frames; those of older ones are read from disk.
 """
 
 from __future__ import annotations
@@ -12,40 +12,55 @@ from bisect import bisect_left
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from client.wire import FINISHED, FrameReceipt, FrameReportModel, FrameState
-from server.scene import reports
+from server.storage.events import OpenFrame
 
-if TYPE_CHECKING:
-    from server.storage.ledger import OpenFrame
-
+RECORDS_KEPT = 512
+"""Records of so many newest commits stay in memory."""
 LOST = "the journal's record of this frame is damaged, and so it is not known what was sent"
-
 STATES = tuple(FrameState)
 CODES = {state: code for code, state in enumerate(STATES)}
 TIME, RECEIPT, DELETED, UNREADABLE = 1, 2, 4, 8
-"""Flags: it has a time; it was acknowledged, and has an identity; its committed state is gone; it is damaged, and is
-being made again."""
-IDENTITY = 32
-"""Bytes."""
+"""Flags of a frame: it has a time; it was acknowledged and has an identity; its committed state is gone; its state is
+damaged and is being made again."""
+IDENTITY = 32  # bytes
 FEW = 32
-"""States so few are taken out of the list one by one."""
+"""Up to so many states are removed from the list of committed ones one by one."""
+
+WIRE_NAMES = {"used": "used_cameras", "dropped": "dropped_cameras", "attempts": "tries", "held": "held_gaussians"}
+"""Fields of a commit's record with another name on the wire; all others have the same (a test checks that)."""
+NOT_SENT = frozenset({"index", "time", "publish_seconds", "resumed"})
+"""Fields of a commit's record that are not sent: the table has the first two, the third is added to ``seconds``."""
+
+
+def committed_fields(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of the report on the wire from the record of a commit (`scas4d_core.frame_report.FrameReport.record`)."""
+    sent = {WIRE_NAMES.get(name, name): value for name, value in record.items() if name not in NOT_SENT}
+    found = {name: sent[name] for name in FrameReportModel.model_fields if sent.get(name) is not None}
+    seconds = {name: float(value) for name, value in found.get("seconds", {}).items()}
+    if "report" in seconds:  # the report before this one was published after its commit
+        seconds["report"] += record.get("publish_seconds") or 0.0
+    seconds.setdefault("total", sum(seconds.values()))
+    found["seconds"] = seconds
+    found["loss"] = [value for value in found.get("loss", []) if value is not None]
+    return found
 
 
 @dataclass(slots=True)
 class Note:
-    """What most frames do not have."""
+    """Properties that few frames have."""
 
     error: str | None = None
     dropped: dict[str, str] = field(default_factory=dict)
     own_deaths: int = 0
     other_deaths: int = 0
     parts: OpenFrame | None = None
-    """What it was closed from, while its pictures are held."""
+    """The parts that the frame was closed from, while its pictures are held."""
 
 
 class FrameTable:
@@ -66,7 +81,7 @@ class FrameTable:
         self._skipped_by = array("i")
         self._files: dict[int, tuple[str, ...]] = {}
         self._notes: dict[int, Note] = {}
-        self._numbers: OrderedDict[int, Mapping[str, Any]] = OrderedDict()
+        self._records: OrderedDict[int, Mapping[str, Any]] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._states)
@@ -84,7 +99,7 @@ class FrameTable:
         return FrameEntry(self, index) if index in self else None
 
     def grow(self, count: int) -> None:
-        """Has `count` frames; nothing is known of the new ones."""
+        """Grows to `count` frames; nothing is known of the new ones."""
         new = count - len(self)
         if new > 0:
             self._states.extend(bytes([CODES[FrameState.SET_ASIDE]]) * new)
@@ -95,7 +110,7 @@ class FrameTable:
             self.counts[FrameState.SET_ASIDE] += new
 
     def held(self) -> Iterator[FrameEntry]:
-        """Frames that have records in the frame log."""
+        """Yields the frames that have records in the frame log, rising."""
         return (FrameEntry(self, index) for index in sorted(self._files))
 
     def states(self) -> NDArray[np.uint8]:
@@ -103,22 +118,20 @@ class FrameTable:
         return np.frombuffer(bytes(self._states), np.uint8)
 
     def flagged(self, flag: int) -> NDArray[np.bool_]:
-        """[N] whether frames have a flag; a copy."""
+        """[N] true for frames with the flag; a copy."""
         found: NDArray[np.bool_] = (np.frombuffer(bytes(self._flags), np.uint8) & flag) != 0
         return found
 
     def copy(self) -> FrameTable:
-        """All of it but the numbers of commits, for who goes through it elsewhere."""
+        """Copies the table without records of commits, for a thread to read."""
         new = FrameTable(self.scene)
         for name in ("_states", "_flags", "_times", "_identities", "_skipped_by", "_files", "counts", "committed"):
             setattr(new, name, copy.copy(getattr(self, name)))
         new._notes = copy.deepcopy(self._notes)
         return new
 
-    # Changes; `server.storage.ledger` makes them.
-
     def take(self, index: int, time: float, identity: str, files: tuple[str, ...], parts: OpenFrame | None) -> None:
-        """The frame was acknowledged and is queued."""
+        """Queues an acknowledged frame."""
         self._times[index] = time
         self._flags[index] |= TIME | RECEIPT
         self._identities[IDENTITY * index : IDENTITY * (index + 1)] = bytes.fromhex(identity)
@@ -130,7 +143,7 @@ class FrameTable:
         self.move(index, FrameState.QUEUED)
 
     def move(self, index: int, state: FrameState) -> None:
-        """The frame is in another state."""
+        """Puts the frame in another state."""
         before = STATES[self._states[index]]
         self.counts[before] -= 1
         self.counts[state] += 1
@@ -139,7 +152,7 @@ class FrameTable:
             self._list(index, state == FrameState.COMMITTED and not self._flags[index] & (DELETED | UNREADABLE))
 
     def found(self, index: int, time: float | None) -> None:
-        """Its committed state is there, and nothing else is known of it."""
+        """Notes a committed state of which nothing else is known."""
         if time is not None:
             self._times[index] = time
             self._flags[index] |= TIME
@@ -148,17 +161,17 @@ class FrameTable:
         self.move(index, FrameState.COMMITTED)
 
     def set_unreadable(self, index: int, unreadable: bool) -> None:
-        """Its committed state is damaged and is being made again; or that is over."""
+        """Marks a committed state that is damaged and being made again, or clears the mark."""
         self._flags[index] = self._flags[index] | UNREADABLE if unreadable else self._flags[index] & ~UNREADABLE
         self.move(index, STATES[self._states[index]])
 
     def skip(self, index: int, by: int) -> None:
-        """The frame was skipped for another one."""
+        """Marks the frame as skipped for frame `by`."""
         self._skipped_by[index] = by
         self.move(index, FrameState.SKIPPED)
 
     def delete_states(self, indices: Sequence[int]) -> int:
-        """Committed states are gone; answers of how many that was not known."""
+        """Marks committed states as gone; returns how many were not marked before."""
         new = 0
         for index in indices:
             new += not self._flags[index] & DELETED
@@ -171,7 +184,7 @@ class FrameTable:
         return new
 
     def restore_state(self, index: int) -> bool:
-        """The state of a frame that is not committed now may be made again; answers whether it was gone."""
+        """Clears the marks of a frame that will be updated again; returns whether its state was gone."""
         gone = bool(self._flags[index] & DELETED)
         self._flags[index] &= ~(DELETED | UNREADABLE)
         if index in self._notes:
@@ -179,7 +192,7 @@ class FrameTable:
         return gone
 
     def commit_up_to(self, last: int) -> None:
-        """All frames up to `last` that are queued or at work are committed: many at once, after a start."""
+        """Commits all queued and updating frames up to `last`: many at once, after a start."""
         states = np.frombuffer(self._states, np.uint8)
         for state in (FrameState.QUEUED, FrameState.UPDATING):
             found = np.flatnonzero(states[: last + 1] == CODES[state])
@@ -190,7 +203,7 @@ class FrameTable:
         self._list_all()
 
     def set_files(self, index: int, files: tuple[str, ...]) -> None:
-        """Its records in the frame log; with the last one goes what it was closed from."""
+        """Sets the frame's records in the frame log; without any, its parts are forgotten too."""
         if files:
             self._files[index] = files
             return
@@ -201,28 +214,28 @@ class FrameTable:
                 del self._notes[index]
 
     def note(self, index: int) -> Note:
-        """To be written to."""
+        """Returns the frame's note, to be changed."""
         return self._notes.setdefault(index, Note())
 
-    def set_numbers(self, index: int, committed: Mapping[str, Any]) -> None:
-        """What was committed with the frame, as `History.report` gives it."""
-        self._numbers[index] = committed
-        self._numbers.move_to_end(index)
-        while len(self._numbers) > reports.KEPT:
-            self._numbers.popitem(last=False)
+    def set_record(self, index: int, record: Mapping[str, Any]) -> None:
+        """Keeps the record of a commit (`History.report`)."""
+        self._records[index] = record
+        self._records.move_to_end(index)
+        while len(self._records) > RECORDS_KEPT:
+            self._records.popitem(last=False)
 
-    def remember(self, index: int, committed: Mapping[str, Any]) -> None:
-        """The same of a frame that is not new, where there is room: the newest stay."""
-        if committed and index not in self._numbers and len(self._numbers) < reports.KEPT:
-            self._numbers[index] = committed
-            self._numbers.move_to_end(index, last=False)
+    def remember(self, index: int, record: Mapping[str, Any]) -> None:
+        """Keeps the record of an older commit where there is room: the newest stay."""
+        if record and index not in self._records and len(self._records) < RECORDS_KEPT:
+            self._records[index] = record
+            self._records.move_to_end(index, last=False)
 
-    def amend(self, index: int, committed: Mapping[str, Any]) -> None:
-        """The same of a frame whose state is another one now."""
-        if index in self._numbers:
-            self._numbers[index] = committed
+    def amend(self, index: int, record: Mapping[str, Any]) -> None:
+        """Replaces the record of a commit whose state was made again."""
+        if index in self._records:
+            self._records[index] = record
         else:
-            self.remember(index, committed)
+            self.remember(index, record)
 
     def _list_all(self) -> None:
         readable = (self.states() == CODES[FrameState.COMMITTED]) & ~self.flagged(DELETED | UNREADABLE)
@@ -238,7 +251,7 @@ class FrameTable:
 
 
 class FrameEntry:
-    """What the service knows of a frame that is closed: a look into the table, made when it is asked for."""
+    """One closed frame: a view into the table."""
 
     __slots__ = ("_table", "index")
 
@@ -248,7 +261,7 @@ class FrameEntry:
 
     @property
     def state(self) -> FrameState:
-        """Where it is."""
+        """State of the frame."""
         return STATES[self._table._states[self.index]]
 
     @property
@@ -273,14 +286,14 @@ class FrameEntry:
 
     @property
     def identity(self) -> str | None:
-        """As in its receipt."""
+        """Identity as in the receipt; None where the frame never came or its receipt is lost."""
         if not self._table._flags[self.index] & RECEIPT:
             return None
         return self._table._identities[IDENTITY * self.index : IDENTITY * (self.index + 1)].hex()
 
     @property
     def receipt(self) -> FrameReceipt | None:
-        """What its sender was answered; None where it never came, or where that is lost."""
+        """Receipt that its sender got; None where the frame never came, or the receipt is lost."""
         identity, time = self.identity, self.time
         if identity is None or time is None:
             return None
@@ -293,17 +306,17 @@ class FrameEntry:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Its records in the frame log; none once they are deleted."""
+        """Names of its records in the frame log; none once they are deleted."""
         return self._table._files.get(self.index, ())
 
     @property
     def note(self) -> Note:
-        """What most frames do not have; a change of it may be lost."""
+        """Rare properties, to be read only: changes may be lost."""
         return self._table._notes.get(self.index) or Note()
 
     @property
     def error(self) -> str | None:
-        """Why it was set aside or skipped, or is missing."""
+        """Reason why it was set aside or skipped, or is missing."""
         if (error := self.note.error) is not None:
             return error
         if self.state == FrameState.SKIPPED:
@@ -311,20 +324,19 @@ class FrameEntry:
         return LOST if self.state == FrameState.SET_ASIDE else None
 
     @property
-    def numbers(self) -> Mapping[str, Any] | None:
-        """What was committed with it, where that is in memory."""
-        return self._table._numbers.get(self.index)
-
-    @property
-    def measured(self) -> bool:
-        """Whether the numbers of its commit are in memory."""
-        return self.index in self._table._numbers
+    def record(self) -> Mapping[str, Any] | None:
+        """Record of its commit, where that is in memory."""
+        return self._table._records.get(self.index)
 
     @property
     def report(self) -> FrameReportModel:
-        """All of it on the wire, with the numbers of its commit where they are in memory."""
+        """Report on the wire, with the record of its commit where that is in memory."""
+        return self.report_with(self.record)
+
+    def report_with(self, record: Mapping[str, Any] | None) -> FrameReportModel:
+        """Report on the wire, with the record of its commit; None: of a frame that is not committed, or not read."""
         note = self.note
-        report = FrameReportModel(
+        return FrameReportModel(
             scene=self._table.scene,
             index=self.index,
             time=self.time,
@@ -334,8 +346,5 @@ class FrameEntry:
             attempts=note.own_deaths + note.other_deaths,
             held=bool(self.files),
             deleted=self.deleted,
-            dropped_cameras=dict(note.dropped),
+            **({"dropped_cameras": dict(note.dropped)} if record is None else committed_fields(record)),
         )
-        if self.measured:
-            reports.fill(report, self._table._numbers[self.index])
-        return report

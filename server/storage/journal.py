@@ -1,8 +1,8 @@
-"""The journal of a scene: one append-only file of facts. A fact is acknowledged when it is on disk.
+"""Journal of a scene: one append-only file of events. An event is acknowledged when it is on disk.
 
-A file that is deleted, or that another takes the place of, while the service runs would take facts that nobody finds
-again: each write looks whether the file still has its name. Then, and where a scrub finds it damaged, the journal is
-written anew from what the service knows (`snapshot`), beside its place, and renamed.
+A file that is deleted or replaced while the service runs would receive events that nobody finds again: each write
+checks that the file still has its name. If it has not, or if a scrub finds it damaged, the journal is written anew from
+the ledger (`snapshot`), beside its place, and renamed.
 """
 
 from __future__ import annotations
@@ -19,39 +19,39 @@ from pydantic import ValidationError
 from scas4d_core.storage.npz import sync_folder, written_whole
 from server.problems import Problem
 from server.storage.disk import no_room
-from server.storage.events import Created, Died, Fact, no_fact, parse_fact
+from server.storage.events import JournalEvent, SceneCreated, WorkerDied, parse_event, why_no_event
 from server.storage.record_log import Damage, Kind, encoded, streamed
 
 PIECE = 1 << 16
 """Bytes that are compared at a time."""
 TOGETHER = 1000
-"""Facts that are encoded at a time where a whole journal is written."""
+"""Events that are encoded at a time where a whole journal is written."""
 
-Snapshot = Callable[[], Iterator[Fact]]
-"""Taken at once, on the event loop; its facts may be told in another thread."""
+Snapshot = Callable[[], Iterator[JournalEvent]]
+"""Called on the event loop; the events may be read in another thread."""
 
 
 @dataclass(frozen=True)
-class JournalRead:
-    """What a journal holds: its facts in order, the bytes that are whole, and a sentence for each damage."""
+class JournalContent:
+    """Content of a journal: its events in order, the bytes that are whole, and a sentence for each damage."""
 
-    facts: list[Fact]
+    events: list[JournalEvent]
     good: int
     damage: list[str]
 
 
-def read_journal(path: Path) -> JournalRead:
-    """All of a journal that is not large; see `replay`."""
-    facts: list[Fact] = []
-    told = replay(path, facts.append)
-    return JournalRead(facts, told.good, told.damage)
+def read_journal(path: Path) -> JournalContent:
+    """Reads a whole journal that is not large; see `replay`."""
+    events: list[JournalEvent] = []
+    reading = replay(path, events.append)
+    return JournalContent(events, reading.good, reading.damage)
 
 
 @dataclass(frozen=True)
-class Replayed:
-    """How a journal was read: the bytes that are whole, and a sentence for each damage.
+class JournalReading:
+    """Result of reading a journal: the bytes that are whole, and a sentence for each damage.
 
-    `broken`: more than a torn tail is damaged; what it said may be lost. `begun`: its first fact is `Created`.
+    `broken`: more than a torn tail is damaged; events may be lost. `begun`: its first event is `SceneCreated`.
     """
 
     good: int
@@ -60,18 +60,18 @@ class Replayed:
     begun: bool = False
 
 
-def replay(path: Path, take: Callable[[Fact], object]) -> Replayed:
-    """Tells `take` every fact that is whole, in order, reading piece by piece; never raises for what the file holds.
+def replay(path: Path, take: Callable[[JournalEvent], object]) -> JournalReading:
+    """Calls `take` with every whole event, in order, reading piece by piece; never raises for the file's content.
 
-    A torn tail is what an append leaves that was cut short: it was never acknowledged, and it is dropped.
+    An append that was cut short leaves a torn tail: it was never acknowledged, and it is dropped.
     """
-    said: list[str] = []
+    damage: list[str] = []
     broken = False
     begun: bool | None = None
     try:
         opened = path.open("rb")
     except FileNotFoundError:
-        return Replayed(0, said)
+        return JournalReading(0, damage)
     with opened as file:
         good = os.fstat(file.fileno()).st_size
         for found in streamed(file):
@@ -79,39 +79,39 @@ def replay(path: Path, take: Callable[[Fact], object]) -> Replayed:
                 if found.torn:
                     good = found.start
                 broken |= not found.torn
-                said.append(f"{path.name}: bytes {found.start} to {found.end} dropped: {found.reason}")
+                damage.append(f"{path.name}: bytes {found.start} to {found.end} dropped: {found.reason}")
                 continue
             try:
-                fact = parse_fact(found.text)
+                event = parse_event(found.text)
             except ValidationError as error:
-                fault = no_fact(error)
+                fault = why_no_event(error)
                 broken = True
-                said.append(f"{path.name}: a record of kind {found.kind}, frame {found.frame}, is no fact: {fault}")
+                damage.append(f"{path.name}: a record of kind {found.kind}, frame {found.frame}, is no event: {fault}")
                 continue
-            begun = isinstance(fact, Created) if begun is None else begun
-            take(fact)
-    return Replayed(good, said, broken, bool(begun))
+            begun = isinstance(event, SceneCreated) if begun is None else begun
+            take(event)
+    return JournalReading(good, damage, broken, bool(begun))
 
 
-def bytes_of(facts: Iterable[Fact]) -> bytes:
-    """Facts as records, one after the other."""
-    return b"".join(encoded(Kind.FACT, _index(fact), fact.model_dump(mode="json")) for fact in facts)
+def bytes_of(events: Iterable[JournalEvent]) -> bytes:
+    """Encodes events as records, one after the other."""
+    return b"".join(encoded(Kind.EVENT, _index(event), event.model_dump(mode="json")) for event in events)
 
 
-def write_journal(path: Path, facts: Iterator[Fact]) -> int:
-    """A journal that is whole at `path`, in place of what is there; blocking.
+def write_journal(path: Path, events: Iterator[JournalEvent]) -> int:
+    """Writes a whole journal at `path`, in place of the file there; blocking.
 
     Returns:
-        Its bytes.
+        Its size in bytes.
 
     Raises:
-        OSError: it could not be written; what was there is there.
+        OSError: it could not be written; the file that was there stays.
     """
     beside = path.with_name(f".{path.name}.part")
     size, batch = 0, []
     with written_whole(path, beside) as file:
-        for fact in facts:
-            batch.append(fact)
+        for event in events:
+            batch.append(event)
             if len(batch) == TOGETHER:
                 size += file.write(bytes_of(batch))
                 batch = []
@@ -120,7 +120,7 @@ def write_journal(path: Path, facts: Iterator[Fact]) -> int:
 
 
 class _Beginning:
-    """So many bytes of a file."""
+    """The first bytes of a file, as a file."""
 
     def __init__(self, file: BinaryIO, left: int) -> None:
         self._file = file
@@ -133,10 +133,10 @@ class _Beginning:
 
 
 def checked_journal(path: Path, good: int) -> Iterator[int]:
-    """Reads the first bytes of a journal again and yields how many, piece by piece.
+    """Reads the first bytes of a journal again; yields the number of bytes of each piece.
 
     Raises:
-        FileNotFoundError: it is gone. ValueError: not all of them are whole records.
+        FileNotFoundError: the journal is gone. ValueError: not all of the bytes are whole records.
     """
     read = since = 0
     with path.open("rb") as file:
@@ -154,13 +154,13 @@ def checked_journal(path: Path, good: int) -> Iterator[int]:
 
 
 class Journal:
-    """Appends facts. Those that come while one write is under way share the next one.
+    """Appends events. Those that arrive while one write is under way share the next one.
 
     Args:
-        path: of the file; made where there is none.
-        good: bytes of it that are whole; what follows is cut off.
-        snapshot: all facts that are known now, which the journal is written anew from; None: it never is.
-        renewed: told of the fault each time that it was.
+        path: of the file; made when missing.
+        good: bytes of it that are whole; the rest is cut off.
+        snapshot: returns all events that are known now, to write the journal anew; None: it is never written anew.
+        renewed: called with the fault each time that it was written anew.
     """
 
     def __init__(
@@ -179,44 +179,44 @@ class Journal:
         os.ftruncate(self._file, good)
         os.fsync(self._file)
         sync_folder(path.parent)
-        self._waiting: list[tuple[Sequence[Fact], asyncio.Future[None]]] = []
-        self._last: list[Fact] = []
-        """Facts that were written last: whoever appended them may not have taken them in yet."""
+        self._waiting: list[tuple[Sequence[JournalEvent], asyncio.Future[None]]] = []
+        self._last: list[JournalEvent] = []
+        """Events that were written last: the ledger may not have applied them yet."""
         self._fault: str | None = None
         self._flushing: asyncio.Task[None] | None = None
 
     @property
     def place(self) -> tuple[int, int]:
-        """Which file it is written to, and the bytes of it that are whole: whether it was written anew meanwhile."""
+        """Inode of the file, which changes when it is written anew, and the bytes of it that are whole."""
         return os.fstat(self._file).st_ino, self._good
 
-    async def append(self, *facts: Fact) -> None:
-        """Returns when the facts are on disk, all or none of them.
+    async def append(self, *events: JournalEvent) -> None:
+        """Returns when the events are on disk, all of them.
 
         Raises:
-            OSError: they are not; the file is as it was.
+            OSError: none of them is on disk; the file is as it was.
             Problem: 503, the journal is closed.
         """
         if self._closed:
             raise Problem(503, "the scene has ended", remedy="ask again: a scene that was deleted is not found then")
         done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._waiting.append((facts, done))
+        self._waiting.append((events, done))
         self._begin()
         await asyncio.shield(done)
 
     def renew(self, fault: str) -> None:
-        """It was found damaged: it is written anew, in turn with what is appended. `fault`: a sentence."""
+        """Writes the journal anew because it was found damaged, in turn with appends. `fault`: a sentence."""
         if not self._closed and self._snapshot is not None:
             self._fault = fault
             self._begin()
 
     def look(self) -> None:
-        """Writes it anew where its file has lost its name; while nothing is being written."""
+        """Writes the journal anew where its file has lost its name; does nothing during a write."""
         if self._flushing is None and not self._closed and (fault := self.misplaced()) is not None:
             self.renew(fault)
 
     def misplaced(self) -> str | None:
-        """Whether the file that is written to still has its name and its bytes; a sentence where not."""
+        """Checks that the open file still has its name and its bytes; returns the fault, or None."""
         try:
             there, own = os.stat(self.path), os.fstat(self._file)
         except FileNotFoundError:
@@ -235,17 +235,17 @@ class Journal:
         try:
             while self._waiting or self._fault is not None:
                 batch, self._waiting = self._waiting, []
-                facts = [fact for some, _ in batch for fact in some]
+                events = [event for some, _ in batch for event in some]
                 fault: Exception | None = None
                 try:
                     if self._fault is None:
-                        self._fault = await asyncio.to_thread(self._write, facts)
+                        self._fault = await asyncio.to_thread(self._write, events)
                     if self._fault is not None:
-                        await self._renew_or_append(facts)
-                except Exception as error:  # whatever it is, those who wait are told
+                        await self._renew_or_append(events)
+                except Exception as error:  # of any kind: the callers that wait must get it
                     fault = error
                 else:
-                    self._last = facts or self._last
+                    self._last = events or self._last
                 for _, done in batch:
                     if done.done():
                         continue
@@ -253,18 +253,18 @@ class Journal:
                         done.set_result(None)
                     else:
                         done.set_exception(fault)
-                        done.exception()  # whoever asked may have gone: not a fault of the event loop
+                        done.exception()  # the caller may be gone: not a fault of the event loop
                 if fault is not None and not batch and not self._waiting:
-                    break  # the next fact tries again
+                    break  # the next event tries again
         finally:
             self._flushing = None
 
-    def _write(self, facts: Sequence[Fact]) -> str | None:
-        """Appends; answers what is wrong with the file's place, and then the facts are not where they should be."""
+    def _write(self, events: Sequence[JournalEvent]) -> str | None:
+        """Appends; returns a fault where the file has lost its name: then the events are not in the journal."""
         watched = self._snapshot is not None
         if watched and (fault := self.misplaced()) is not None:
             return fault
-        data = bytes_of(facts)
+        data = bytes_of(events)
         view = memoryview(data)
         try:
             while view:
@@ -276,51 +276,51 @@ class Journal:
         self._good += len(data)
         return self.misplaced() if watched else None
 
-    async def _renew_or_append(self, facts: Sequence[Fact]) -> None:
-        """Writes it anew; where there is no room for that and the file is in its place, what comes goes behind.
+    async def _renew_or_append(self, events: Sequence[JournalEvent]) -> None:
+        """Writes the journal anew; where there is no room for that and the file has its name, appends to it.
 
-        A damaged record costs what it said, a refused frame costs the frame; the next scrub finds the damage again.
+        A damaged record costs its event, a refused frame costs the frame; the next scrub finds the damage again.
         """
         try:
-            await self._renew(facts)
+            await self._renew(events)
         except OSError as error:
             if not no_room(error) or self.misplaced() is not None:
                 raise
             self._fault = None
-            if facts and (fault := await asyncio.to_thread(self._write, facts)) is not None:
+            if events and (fault := await asyncio.to_thread(self._write, events)) is not None:
                 self._fault = fault
                 raise
 
-    async def _renew(self, facts: Sequence[Fact]) -> None:
-        """Writes it anew: what the snapshot tells, and behind it what that may lack."""
+    async def _renew(self, events: Sequence[JournalEvent]) -> None:
+        """Writes the journal anew: the snapshot, and behind it the events that the snapshot may lack."""
         assert self._snapshot is not None
         assert self._fault is not None
-        told = self._snapshot()
-        # Facts may be told twice, but for a death, which would be counted twice: whoever appended it takes it in after.
-        last = [fact for fact in self._last if not isinstance(fact, Died)]
-        self._good = await asyncio.to_thread(self._replace, told, [*last, *facts])
+        snapshot = self._snapshot()
+        # Events may come twice, except a death, which would be counted twice: its caller applies it afterwards.
+        last = [event for event in self._last if not isinstance(event, WorkerDied)]
+        self._good = await asyncio.to_thread(self._replace, snapshot, [*last, *events])
         fault, self._fault = self._fault, None
         self._renewed(fault)
 
-    def _replace(self, told: Iterator[Fact], behind: Sequence[Fact]) -> int:
-        def all_facts() -> Iterator[Fact]:
-            yield from told
+    def _replace(self, snapshot: Iterator[JournalEvent], behind: Sequence[JournalEvent]) -> int:
+        def all_events() -> Iterator[JournalEvent]:
+            yield from snapshot
             yield from behind
 
-        size = write_journal(self.path, all_facts())
+        size = write_journal(self.path, all_events())
         file = os.open(self.path, os.O_RDWR | os.O_CLOEXEC)
         os.close(self._file)
         self._file = file
         return size
 
     async def close(self) -> None:
-        """Waits for what is being written; nothing is written after that, its number may be another file's by then."""
+        """Waits for the write under way; nothing is written later: the descriptor may be another file's by then."""
         self._closed = True
         while self._flushing is not None:
             await asyncio.wait([self._flushing])
         os.close(self._file)
 
 
-def _index(fact: Fact) -> int:
-    frames: Sequence[int] = getattr(fact, "frames", ())
-    return int(getattr(fact, "index", frames[0] if frames else 0))
+def _index(event: JournalEvent) -> int:
+    frames: Sequence[int] = getattr(event, "frames", ())
+    return int(getattr(event, "index", frames[0] if frames else 0))

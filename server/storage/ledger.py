@@ -1,40 +1,46 @@
-"""What is known of the frames of a scene: the fold of its journal's facts. No disk, no processes, no clock.
+"""Ledger of a scene's frames, folded from the events of its journal; and the log that journals what changes it.
 
-The running scene and the one that is found again after a restart go through the same `apply`.
+The running scene and the one that is found again after a restart go through the same `Ledger.apply`.
 """
 
 from __future__ import annotations
 
+import asyncio
 import copy
 import json
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 from blake3 import blake3
 
-from client.wire import Budget, FileKind, FrameState
+from client.wire import Budget, FrameState, Retention
+from scas4d_core.error_text import message_of
+from scas4d_core.storage.history import NEWEST_KEPT
+from server.storage.disk import full_disk, no_room
 from server.storage.events import (
-    Budgeted,
-    Died,
-    Fact,
-    FramesDeleted,
+    BudgetChanged,
+    FrameAccepted,
+    FrameMissing,
+    FrameSetAside,
+    FramesSkipped,
     Hashes,
-    Missing,
-    PartTaken,
-    Paused,
-    SetAside,
-    Skipped,
+    JournalEvent,
+    OpenFrame,
+    PartAccepted,
+    PauseChanged,
+    PicturesDeleted,
     StateFound,
     StatesDeleted,
-    Taken,
+    WorkerDied,
 )
-from server.storage.frame_table import CODES, DELETED, FEW, LOST, RECEIPT, FrameTable
+from server.storage.frame_store import FrameLogIndex, remove
+from server.storage.frame_table import CODES, DELETED, FEW, RECEIPT, FrameTable
+from server.storage.journal import Journal
 
-__all__ = ["LOST", "Ledger", "OpenFrame", "frame_identity"]
-
+AGAIN_S = 1.0
+"""An event that the disk has no room for is written again after so long."""
 RETENTION = "retention"
-"""Why states are deleted, where nothing is wrong with them."""
+"""Reason of `StatesDeleted` for states with which nothing is wrong."""
 HOPELESS = "the scene has failed at a frame before"
 
 
@@ -44,34 +50,12 @@ def frame_identity(hashes: Hashes, time: float) -> str:
     return blake3(json.dumps([parts, time]).encode()).hexdigest()
 
 
-@dataclass
-class OpenFrame:
-    """A frame whose cameras send one by one."""
-
-    index: int
-    time: float | None = None
-    hashes: Hashes = field(default_factory=dict)
-    files: list[str] = field(default_factory=list)
-
-    @property
-    def cameras(self) -> list[str]:
-        """Whose picture is here."""
-        return sorted(camera for camera, kinds in self.hashes.items() if FileKind.IMAGE in kinds)
-
-    def add(self, part: PartTaken) -> None:
-        """One more camera, or one more file of a camera."""
-        self.time = part.time if self.time is None else self.time
-        self.hashes.setdefault(part.camera, {}).update(part.hashes)
-        if part.file not in self.files:
-            self.files.append(part.file)
-
-
 class Ledger:
-    """Frames of one scene by index.
+    """Frames of one scene by index. No disk, no processes, no clock.
 
     Attributes:
-        frames: every index below `next_frame`. open: frames that cameras send one by one. fatal: why the scene cannot
-            go on, or None. budgets: the first frame that each holds for, rising.
+        frames: every index below `next_frame`. open: frames that cameras send one by one. fatal: reason why the scene
+            cannot go on, or None. budgets: the first frame that each holds for, rising.
     """
 
     def __init__(self, scene: str) -> None:
@@ -90,12 +74,12 @@ class Ledger:
 
     @property
     def counts(self) -> Mapping[FrameState, int]:
-        """How many frames are in each state."""
+        """Number of frames in each state."""
         return self.frames.counts
 
     @property
     def next_frame(self) -> int:
-        """The index that is closed next."""
+        """Index of the frame that is accepted next."""
         return len(self.frames)
 
     @property
@@ -103,80 +87,82 @@ class Ledger:
         """Frames acknowledged and not finished."""
         return self.counts[FrameState.QUEUED] + self.counts[FrameState.UPDATING]
 
-    def apply(self, fact: Fact) -> None:
-        """Takes one fact in. Facts may come twice, and those before them may be lost."""
-        match fact:
-            case Taken():
-                parts = self.open.pop(fact.index, None)
-                self._have(fact.index)
-                self.frames.take(fact.index, fact.time, fact.identity, fact.files, parts)
-            case PartTaken() if fact.index >= self.next_frame:
-                self.open.setdefault(fact.index, OpenFrame(fact.index)).add(fact)
-            case Missing():
-                self._have(fact.index)
-                self.frames.note(fact.index).error = fact.reason
-                self.move(fact.index, FrameState.MISSING)
-            case Skipped():
-                for index in fact.frames:
+    def apply(self, event: JournalEvent) -> None:
+        """Applies one event. Events may come twice, and those before them may be lost."""
+        match event:
+            case FrameAccepted():
+                parts = self.open.pop(event.index, None)
+                self._have(event.index)
+                self.frames.take(event.index, event.time, event.identity, event.files, parts)
+            case PartAccepted() if event.index >= self.next_frame:
+                self.open.setdefault(event.index, OpenFrame(event.index)).add(event)
+            case FrameMissing():
+                self._have(event.index)
+                self.frames.note(event.index).error = event.reason
+                self.move(event.index, FrameState.MISSING)
+            case FramesSkipped():
+                for index in event.frames:
                     self._have(index)
-                    self.frames.skip(index, fact.by)
-            case SetAside():
-                self._have(fact.index)
-                note = self.frames.note(fact.index)
-                note.error, note.dropped = fact.reason, dict(fact.dropped)
-                self.fatal = fact.reason if fact.fatal else self.fatal
-                self.move(fact.index, FrameState.SET_ASIDE)
-            case Died():
-                self._have(fact.index)
-                note = self.frames.note(fact.index)
-                note.own_deaths += fact.own
-                note.other_deaths += not fact.own
-            case FramesDeleted():
-                for index in fact.frames:
+                    self.frames.skip(index, event.by)
+            case FrameSetAside():
+                self._have(event.index)
+                note = self.frames.note(event.index)
+                note.error, note.dropped = event.reason, dict(event.dropped)
+                self.fatal = event.reason if event.fatal else self.fatal
+                self.move(event.index, FrameState.SET_ASIDE)
+            case WorkerDied():
+                self._have(event.index)
+                note = self.frames.note(event.index)
+                note.own_deaths += event.own
+                note.other_deaths += not event.own
+            case PicturesDeleted():
+                for index in event.frames:
                     self._have(index)
                     self.frames.set_files(index, ())
             case StatesDeleted():
-                self._have(max(fact.frames, default=-1))
-                self.states_deleted += self.frames.delete_states(fact.frames)
-                if fact.reason != RETENTION and len(fact.frames) < FEW:
-                    for index in fact.frames:
-                        self.frames.note(index).error = fact.reason
+                self._have(max(event.frames, default=-1))
+                self.states_deleted += self.frames.delete_states(event.frames)
+                if event.reason != RETENTION and len(event.frames) < FEW:
+                    for index in event.frames:
+                        self.frames.note(index).error = event.reason
             case StateFound():
-                self._have(fact.index)
-                self.frames.found(fact.index, fact.time)
-            case Paused():
-                self.paused = fact.paused
-            case Budgeted():
-                self.budgets = [one for one in self.budgets if one[0] < fact.index] or [(0, Budget())]
-                self.budgets.append((fact.index, fact.budget))
+                self._have(event.index)
+                self.frames.found(event.index, event.time)
+            case PauseChanged():
+                self.paused = event.paused
+            case BudgetChanged():
+                self.budgets = [one for one in self.budgets if one[0] < event.index] or [(0, Budget())]
+                self.budgets.append((event.index, event.budget))
             case _:  # created: the scene's own; a part of a frame that is closed
                 pass
 
     def budget_of(self, index: int) -> Budget:
-        """The budget that holds for a frame."""
+        """Returns the budget that holds for a frame."""
         return next(budget for first, budget in reversed(self.budgets) if first <= index)
 
     def begins_next(self) -> int:
-        """The first frame that is not begun: what changes now holds from there on."""
+        """Returns the first frame that is not begun: a new budget holds from there on."""
         return next(iter(self.waiting()), self.next_frame)
 
     def move(self, index: int, state: FrameState) -> None:
-        """A frame is in another state."""
+        """Puts a frame in another state."""
         self.frames.move(index, state)
 
-    def reconcile(self, indices: Sequence[int], damaged: Mapping[int, str], remake: Collection[int] = ()) -> list[Fact]:
-        """Brings the frames in line with the committed states that are there, and tells what the journal lacks.
+    def reconcile(
+        self, indices: Sequence[int], damaged: Mapping[int, str], remake: Collection[int] = ()
+    ) -> list[JournalEvent]:
+        """Brings the frames in line with the committed states that exist, and returns what the journal lacks.
 
         Args:
             indices: of the states that can be read, rising. damaged: states that cannot, with the reason.
-            remake: of those that are damaged or gone, states that will be made again: nothing is told of them.
+            remake: of those that are damaged or gone, states that will be made again: no event is made of them.
 
         Returns:
-            Facts, already applied, that have to be appended: states that are gone, frames that have to be done again
+            Events, already applied, that have to be appended: states that are gone, frames that have to be done again
             and cannot.
         """
         last = indices[-1] if indices else -1
-        facts: list[Fact] = []
+        events: list[JournalEvent] = []
         if last >= self.next_frame:  # the journal is damaged
             self._have(last)
         frames, count = self.frames, self.next_frame
@@ -187,10 +173,12 @@ class Ledger:
             frames.move(int(index), FrameState.QUEUED)
             self.states_deleted -= frames.restore_state(int(index))
             if not frames[int(index)].files:
-                facts.append(SetAside(index=int(index), reason="its state is damaged, and its pictures are deleted"))
+                events.append(
+                    FrameSetAside(index=int(index), reason="its state is damaged, and its pictures are deleted")
+                )
         frames.commit_up_to(last)
         lost = readable & (codes == CODES[FrameState.SET_ASIDE]) & ~frames.flagged(RECEIPT)
-        for index in np.flatnonzero(lost):  # its fact is lost, its state is not
+        for index in np.flatnonzero(lost):  # its event is lost, its state is not
             frames.note(int(index)).error = None
             frames.move(int(index), FrameState.COMMITTED)
         unreadable = (frames.states() == CODES[FrameState.COMMITTED]) & ~frames.flagged(DELETED) & ~readable
@@ -199,14 +187,14 @@ class Ledger:
             if again < count and unreadable[again]:
                 frames.set_unreadable(again, True)
         if gone:
-            said = "; ".join(damaged[index] for index in gone if index in damaged)
-            facts.append(StatesDeleted(frames=gone, reason=said or "found gone"))
-        for fact in facts:
-            self.apply(fact)
-        return facts
+            reasons = "; ".join(damaged[index] for index in gone if index in damaged)
+            events.append(StatesDeleted(frames=gone, reason=reasons or "found gone"))
+        for event in events:
+            self.apply(event)
+        return events
 
     def copy(self) -> Ledger:
-        """As it is now, for who goes through it elsewhere; without the numbers of commits."""
+        """Copies the ledger without records of commits, for a thread to read."""
         new = Ledger(self.scene)
         new.frames, new.open = self.frames.copy(), copy.deepcopy(self.open)
         new.paused, new.fatal, new.states_deleted = self.paused, self.fatal, self.states_deleted
@@ -214,8 +202,8 @@ class Ledger:
         return new
 
     def waiting(self) -> list[int]:
-        """Frames that are queued and not at work, rising. Only the newest can be."""
-        found: list[int] = []
+        """Lists queued frames that the worker does not have, rising."""
+        found: list[int] = []  # scans backwards: queued frames are always the newest
         for index in range(self.next_frame - 1, -1, -1):
             if len(found) == self.counts[FrameState.QUEUED]:
                 break
@@ -223,20 +211,20 @@ class Ledger:
                 found.append(index)
         return found[::-1]
 
-    def hopeless(self) -> list[SetAside]:
-        """Nothing will become of frames that wait behind a first one that failed: as facts, not applied."""
+    def hopeless(self) -> list[FrameSetAside]:
+        """Returns events, not applied, that set aside the frames waiting behind a failed first one."""
         if self.fatal is None:
             return []
-        return [SetAside(index=index, reason=f"{HOPELESS}: {self.fatal}") for index in self.waiting()]
+        return [FrameSetAside(index=index, reason=f"{HOPELESS}: {self.fatal}") for index in self.waiting()]
 
     def last_tried(self) -> int | None:
-        """The newest frame that the worker has finished, well or not."""
+        """Returns the newest frame that the worker has finished, committed or set aside."""
         states = self.frames.states()
         tried = np.flatnonzero((states == CODES[FrameState.COMMITTED]) | (states == CODES[FrameState.SET_ASIDE]))
         return int(tried[-1]) if len(tried) else None
 
     def last_time(self) -> float | None:
-        """Seconds of the newest closed frame that has a time."""
+        """Returns the seconds of the newest closed frame that has a time."""
         for index in range(self.next_frame - 1, -1, -1):
             time = self.frames[index].time
             if time is not None:
@@ -244,8 +232,84 @@ class Ledger:
         return None
 
     def _have(self, index: int) -> None:
-        """The frame is there; indices that nothing is known of up to it are set aside as lost."""
+        """Grows to the frame; unknown indices up to it are set aside as lost."""
         if index >= self.next_frame:
             for new in [new for new in self.open if new <= index]:
                 del self.open[new]
             self.frames.grow(index + 1)
+
+
+class SceneLog:
+    """Journal, ledger and frame log of one scene: an acknowledged change is journalled before the ledger has it.
+
+    Args:
+        ledger, journal, pictures: of the scene.
+        waits: called with a sentence each time that a journal write waits for room on the disk.
+
+    Attributes:
+        lock: held while the next frame is decided.
+    """
+
+    def __init__(self, ledger: Ledger, journal: Journal, pictures: FrameLogIndex, waits: Callable[[str], None]) -> None:
+        self.ledger = ledger
+        self.journal = journal
+        self.pictures = pictures
+        self.lock = asyncio.Lock()
+        self._waits = waits
+
+    async def append(self, *events: JournalEvent) -> None:
+        """Journals events and then applies them.
+
+        Raises:
+            Problem: 507, the disk is full; nothing has changed.
+        """
+        try:
+            await self.journal.append(*events)
+        except OSError as error:
+            if not no_room(error):
+                raise
+            raise full_disk(error) from None
+        for event in events:
+            self.ledger.apply(event)
+
+    async def write(self, *events: JournalEvent) -> None:
+        """Journals events that cannot be refused, again and again until there is room; the caller applies them."""
+        while True:
+            try:
+                await self.journal.append(*events)
+                return
+            except OSError as error:
+                if not no_room(error):
+                    raise
+                self._waits(f"the journal waits for room on the disk: {message_of(error)}")
+                await asyncio.sleep(AGAIN_S)
+
+    async def delete_pictures(self, names: Collection[str]) -> None:
+        """Deletes records of the frame log."""
+        self.pictures.discard(names)
+        await asyncio.to_thread(remove, self.pictures.folder, names)
+
+    def deletable(self, rule: Retention) -> list[int]:
+        """Lists the frames whose pictures the rule deletes now, rising.
+
+        Pictures are kept of frames that are not finished, and of those newer than the commit that an interrupted scene
+        may have to go back to: they would be needed again.
+        """
+        ledger, pictures = self.ledger, self.pictures
+        if len(ledger.committed) < NEWEST_KEPT or (rule.last is None and rule.bytes is None):
+            return []
+        last_safe = ledger.committed[-NEWEST_KEPT]
+        frames = [index for index in pictures.frames if index in ledger.frames]
+        gone: list[int] = []
+        total = pictures.bytes
+        for place, index in enumerate(frames):
+            entry = ledger.frames[index]
+            surplus = rule.last is not None and len(frames) - place > rule.last
+            excess = rule.bytes is not None and total > rule.bytes
+            if index > last_safe or not (surplus or excess):
+                break
+            if not entry.finished:
+                continue
+            total -= pictures.size(entry.files)
+            gone.append(index)
+        return gone

@@ -1,4 +1,4 @@
-"""Records on disk: checksummed, appended, found again after a cut at any byte and flipped bits.
+"""Records on disk: checksummed, appended, and found again after a cut at any byte or flipped bits.
 
 A record is a header, a head (JSON) and a body (raw bytes), and a checksum behind them:
 
@@ -8,7 +8,7 @@ A record is a header, a head (JSON) and a body (raw bytes), and a checksum behin
     1      kind, `Kind`
     2      nought
     4      length of the head
-    8      index of the frame that it is about
+    8      index of the frame that it belongs to
     8      length of the body
     4      CRC-32 of the 28 bytes before and of the head
     …      head, UTF-8 JSON
@@ -16,10 +16,10 @@ A record is a header, a head (JSON) and a body (raw bytes), and a checksum behin
     16     BLAKE3, cut to 128 bits; version 1: of all before, version 2: of header and head and then of the BLAKE3
            (32 bytes) of each file
 
-All numbers are unsigned little-endian. The CRC makes a header that is found in the middle of damage worth believing, so
-that a reader can look for the next record; the BLAKE3 says that the record is what was written. The body may be written
-before its checksum is known: a frame goes to disk while it is received. Of version 2 the head has `files`, whose `size`
-says where in the body each is: the BLAKE3 of a file is the frame's identity too, and so no byte is hashed twice.
+All numbers are unsigned little-endian. A header inside damage can be believed if its CRC agrees, so that a reader can
+look for the next record; the BLAKE3 proves that the record is as it was written. The body may be written before its
+checksum is known: a frame goes to disk while it is received. The head of version 2 has `files`, whose `size` gives the
+place of each in the body: the BLAKE3 of a file is used for the frame's identity too, and so no byte is hashed twice.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ MAX_HEAD = 1 << 22
 
 
 class Kind(IntEnum):
-    """What a record holds."""
+    """Kinds of record."""
 
-    FACT = 1
-    """What became of a frame or of the scene; all in the head."""
+    EVENT = 1
+    """An event of a frame or of the scene; all in the head."""
     PICTURES = 2
     """The encoded files of a frame, or of one camera of it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """One record as read; views into what was read. `files` and `digests`, the BLAKE3 of each, only of version 2."""
+    """One record as read; views into the bytes read. `files` and `digests`, the BLAKE3 of each, only of version 2."""
 
     kind: int
     index: int
@@ -66,7 +66,7 @@ class Record:
 
 
 class Head(NamedTuple):
-    """A record of which only the head matters: its JSON, not parsed, and the bytes of the whole record."""
+    """Head of a record without a body: its JSON, not parsed, and the size of the whole record in bytes."""
 
     kind: int
     frame: int
@@ -76,7 +76,7 @@ class Head(NamedTuple):
 
 @dataclass(frozen=True)
 class Damage:
-    """Bytes [start, end) that hold no whole record, and why.
+    """Bytes [start, end) that hold no whole record, and the reason.
 
     `index` and `kind` are those of the record that was there, where its header can still be believed.
     """
@@ -87,18 +87,18 @@ class Damage:
     index: int | None = None
     kind: int | None = None
     torn: bool = False
-    """It reaches the end of the log: an append that was cut short looks like this."""
+    """The damage reaches the end of the log, as after an append that was cut short."""
 
 
 def opening(kind: int, index: int, head: Any, body_length: int, version: int = WHOLE) -> bytes:
-    """Header and head of a record; the body and its checksum follow."""
+    """Encodes header and head of a record; the body and its checksum follow."""
     text = json.dumps(head, separators=(",", ":"), allow_nan=False).encode()
     header = HEADER.pack(MAGIC, version, kind, 0, len(text), index, body_length)
     return header + CRC.pack(zlib.crc32(text, zlib.crc32(header))) + text
 
 
 def checksum(*pieces: bytes | bytearray | memoryview) -> bytes:
-    """Of consecutive pieces: all of a record, or its opening and the BLAKE3 of each of its files."""
+    """Hashes consecutive pieces: all of a record, or its opening and the BLAKE3 of each of its files."""
     digest = blake3()
     for piece in pieces:
         digest.update(piece)
@@ -106,16 +106,17 @@ def checksum(*pieces: bytes | bytearray | memoryview) -> bytes:
 
 
 def encoded(kind: int, index: int, head: Any, body: bytes = b"") -> bytes:
-    """A whole record of version 1."""
+    """Encodes a whole record of version 1."""
     start = opening(kind, index, head, len(body))
     return start + body + checksum(start, body)
 
 
 def read_at(data: memoryview, at: int) -> tuple[Record | Damage, int]:
-    """What begins at a byte, and where it ends.
+    """Reads the record that begins at a byte.
 
     Returns:
-        The record, or the damage; where its header cannot be believed the damage ends at the next one that can.
+        The record, or the damage, and its end; where the header cannot be believed, the damage ends at the next that
+        can.
     """
     header = data[at : at + HEADER.size]
     if len(header) < HEADER.size or header[:4] != MAGIC:
@@ -146,10 +147,10 @@ def read_at(data: memoryview, at: int) -> tuple[Record | Damage, int]:
 
 
 def _files(head: Any, body: memoryview) -> tuple[memoryview, ...]:
-    """The pieces of a body.
+    """Splits a body into its files.
 
     Raises:
-        KeyError, TypeError, ValueError: the head does not say where they are.
+        KeyError, TypeError, ValueError: the head does not give their sizes.
     """
     files, at = [], 0
     for file in head["files"]:
@@ -161,7 +162,7 @@ def _files(head: Any, body: memoryview) -> tuple[memoryview, ...]:
 
 
 def records(data: bytes | memoryview) -> Iterator[Record | Damage]:
-    """All that a log holds, in order: every whole record, and what lies between them."""
+    """Yields every whole record of a log, and the damage between them, in order."""
     view = memoryview(data)
     at = 0
     while at < len(view):
@@ -172,18 +173,18 @@ def records(data: bytes | memoryview) -> Iterator[Record | Damage]:
 PIECE = 1 << 22
 """Bytes that are read at a time."""
 ENOUGH = 2 * (MAX_HEAD + PREFIX + CHECKSUM)
-"""So much of a log behind a place tells whether a record without a body, as facts are, is whole there."""
+"""So many bytes of a log are enough to tell whether a record without a body, such as an event, is whole."""
 
 
 class Readable(Protocol):
-    """What is read piece by piece."""
+    """A file that is read piece by piece."""
 
     def read(self, size: int, /) -> bytes:
-        """At most so many bytes; none at the end."""
+        """Reads at most so many bytes; none at the end."""
 
 
 def streamed(file: Readable) -> Iterator[Head | Damage]:
-    """Heads of a log of small records, in order, and what lies between them; the log need not fit in memory."""
+    """Yields the heads of a log of small records, and the damage between them; the log need not fit in memory."""
     data, start, at, ended = b"", 0, 0, False
     while True:
         head = _whole(data, at)
@@ -205,7 +206,7 @@ def streamed(file: Readable) -> Iterator[Head | Damage]:
 
 
 def _whole(data: bytes, at: int) -> Head | None:
-    """The record that begins at a byte, if it is whole, of version 1, and nothing is wrong with it."""
+    """Returns the record that begins at a byte, if it is whole and of version 1."""
     if len(data) - at < PREFIX:
         return None
     magic, version, kind, nought, head_length, index, body_length = HEADER.unpack_from(data, at)
@@ -222,7 +223,7 @@ def _whole(data: bytes, at: int) -> Head | None:
 
 
 def _damage(data: bytes, at: int) -> tuple[Damage | None, int]:
-    """Why there is no such record at a byte, and where to go on; None where there is nothing at all."""
+    """Returns why no such record begins at a byte, and where to go on; None at the end of the data."""
     if at == len(data):
         return None, at
     found, after = read_at(memoryview(data), at)
@@ -230,7 +231,7 @@ def _damage(data: bytes, at: int) -> tuple[Damage | None, int]:
 
 
 def _skip(data: memoryview, at: int, reason: str) -> tuple[Damage, int]:
-    """Damage up to the next header that can be believed, or to the end."""
+    """Returns the damage up to the next header that can be believed, or to the end."""
     text = data.obj if isinstance(data.obj, bytes) and len(data.obj) == len(data) else bytes(data)
     following = at
     while (following := text.find(MAGIC, following + 1)) >= 0:
@@ -252,10 +253,10 @@ COMPARED = 1 << 20
 
 
 def streamed_record(file: Readable) -> Iterator[int]:
-    """Reads a file that is one record, and yields how many bytes, piece by piece; it need not fit in memory.
+    """Reads a file that is one record; yields the number of bytes of each piece. It need not fit in memory.
 
     Raises:
-        ValueError: it is not whole.
+        ValueError: the record is not whole.
     """
     header = file.read(PREFIX)
     if len(header) < PREFIX or header[:4] != MAGIC:
@@ -267,7 +268,7 @@ def streamed_record(file: Readable) -> Iterator[int]:
     if CRC.unpack_from(header, HEADER.size)[0] != zlib.crc32(head, zlib.crc32(header[: HEADER.size])):
         raise ValueError("the header or head fails its checksum")
     try:
-        sizes = [body_length] if version == WHOLE else [int(said["size"]) for said in json.loads(head)["files"]]
+        sizes = [body_length] if version == WHOLE else [int(entry["size"]) for entry in json.loads(head)["files"]]
     except (KeyError, TypeError) as error:  # whole, but written by something else
         raise ValueError(f"the head is not one of a record ({error!r})") from None
     whole = blake3(header + head)

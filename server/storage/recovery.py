@@ -1,4 +1,4 @@
-"""A scene found on disk: its journal, its frame log and its states brought together, and what does not fit said."""
+"""Recovers a scene from its folder: brings journal, frame log and states together, and names what does not fit."""
 
 from __future__ import annotations
 
@@ -12,30 +12,38 @@ from typing import Any
 from client.wire import FileKind, FrameState
 from scas4d_core.storage.frame_files import FrameFiles
 from scas4d_core.storage.history import History, HistoryError
-from server.storage.definition import FRAMES_FOLDER, JOURNAL_FILE
 from server.storage.disk import no_room
-from server.storage.events import Created, Fact, Hashes, PartTaken, SetAside, StateFound, Taken
-from server.storage.frame_store import FrameDamage, Pictures, frame_of, read_pictures, remove, stored
+from server.storage.events import (
+    FrameAccepted,
+    FrameSetAside,
+    Hashes,
+    JournalEvent,
+    PartAccepted,
+    SceneCreated,
+    StateFound,
+)
+from server.storage.frame_store import FrameDamage, StoredPictures, frame_of, read_pictures, remove, stored
 from server.storage.journal import replay, write_journal
+from server.storage.layout import SceneFolder
 from server.storage.ledger import Ledger, frame_identity
-from server.storage.snapshot import facts_of
+from server.storage.snapshot import events_of
 
 NO_STATE = "the journal was lost, and there is no committed state of this frame"
 
 
 @dataclass(frozen=True)
 class Recovered:
-    """A scene as its folder tells it.
+    """A scene as found in its folder.
 
     Attributes:
-        good: bytes of the journal that are whole. facts: those that the journal lacks, applied already.
-        sizes: bytes of each record of the frame log. damage: what was dropped, a sentence each.
+        good: bytes of the journal that are whole. events: those that the journal lacks, applied already.
+        sizes: bytes of each record of the frame log. damage: a sentence for each thing that was dropped.
         remake: frames whose states are damaged or gone, with the reason, and whose pictures are held.
     """
 
     ledger: Ledger
     good: int
-    facts: list[Fact]
+    events: list[JournalEvent]
     sizes: dict[str, int]
     damage: list[str]
     remake: dict[int, str] = field(default_factory=dict)
@@ -43,7 +51,7 @@ class Recovered:
 
 @dataclass(frozen=True)
 class _States:
-    """Committed states: the times of those that can be read, why others cannot, and the newest one's report."""
+    """Committed states: times of those that can be read, faults of the others, and the newest one's report."""
 
     times: dict[int, float] = field(default_factory=dict)
     damaged: dict[int, str] = field(default_factory=dict)
@@ -58,34 +66,34 @@ class _States:
         return max(self.times, default=-1)
 
 
-def recover(folder: Path, scene: str, definition: Mapping[str, Any] | None = None) -> Recovered:
+def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | None = None) -> Recovered:
     """Reads a scene's folder and removes what interrupted uploads left. Blocking.
 
-    A journal that is damaged, or gone, loses what it said and nothing else: committed states and whole records of
-    pictures are found again, nothing is removed, and a new journal is written with what is known.
+    A journal that is damaged or gone loses its own content and nothing else: committed states and whole records of
+    pictures are found again, nothing is removed, and a new journal is written with all that is known.
 
     Args:
-        folder: of the scene. scene: its id. definition: as in `Created`; without it no journal is written anew.
+        folder: of the scene. scene: its id. definition: as in `SceneCreated`; without it no new journal is written.
     """
-    frames = folder / FRAMES_FOLDER
+    frames, journal = folder.frames, folder.journal
     frames.mkdir(exist_ok=True)
     ledger = Ledger(scene)
-    told = replay(folder / JOURNAL_FILE, ledger.apply)
-    damage = list(told.damage)
-    if not told.begun:  # a scene is made with its journal, which begins with that
-        damage.append(f"{JOURNAL_FILE} {'lacks its beginning' if (folder / JOURNAL_FILE).exists() else 'is gone'}")
-    broken = told.broken or not told.begun
+    reading = replay(journal, ledger.apply)
+    damage = list(reading.damage)
+    if not reading.begun:  # a scene is made with its journal, which begins with that
+        damage.append(f"{journal.name} {'lacks its beginning' if journal.exists() else 'is gone'}")
+    broken = reading.broken or not reading.begun
     sizes = stored(frames)
     in_states: list[str] = []
-    states = _states(folder / "states", in_states)
-    facts: list[Fact] = []
+    states = _states(folder.states, in_states)
+    events: list[JournalEvent] = []
     if broken:
-        facts.extend(_found_states(states, ledger))
+        events.extend(_found_states(states, ledger))
     if damage:
-        facts.extend(_found(frames, sorted(_unnamed(ledger, sizes)), ledger, states, broken))
-    if found := sorted({fact.index for fact in facts if isinstance(fact, Taken | PartTaken)}):
-        said = ", ".join(map(str, found))
-        damage.append(f"the journal does not name the records of frames {said} any more; taken as they were found")
+        events.extend(_found(frames, sorted(_unnamed(ledger, sizes)), ledger, states, broken))
+    if found := sorted({event.index for event in events if isinstance(event, FrameAccepted | PartAccepted)}):
+        listed = ", ".join(map(str, found))
+        damage.append(f"the journal does not name the records of frames {listed} any more; used as they were found")
     damage += in_states
     debris = _unnamed(ledger, sizes)
     if broken and debris:
@@ -95,12 +103,12 @@ def recover(folder: Path, scene: str, definition: Mapping[str, Any] | None = Non
     sizes = {name: size for name, size in sizes.items() if name not in debris}
     remake = _remade(ledger, states, broken, _deletes_states(definition or {}))
     damage.extend(f"frame {index}: {reason}" for index, reason in remake.items() if index not in states.damaged)
-    facts += ledger.reconcile(states.indices, states.damaged, remake)
+    events += ledger.reconcile(states.indices, states.damaged, remake)
     if states.newest:
-        ledger.frames.set_numbers(states.last, states.newest)
-    for fact in ledger.hopeless():  # its scene failed, and the service ended before it could say so of this one
-        ledger.apply(fact)
-        facts.append(fact)
+        ledger.frames.set_record(states.last, states.newest)
+    for event in ledger.hopeless():  # its scene failed, and the service ended before it could say so of this one
+        ledger.apply(event)
+        events.append(event)
     for entry in list(ledger.frames.held()):
         lost = [name for name in entry.files if name not in sizes]
         if lost:
@@ -109,39 +117,39 @@ def recover(folder: Path, scene: str, definition: Mapping[str, Any] | None = Non
                 damage.append(f"frame {entry.index}: its record is gone from the frame log: {', '.join(lost)}")
         if entry.state == FrameState.QUEUED and (reason := _unusable(frames, entry.files, lost)):
             damage.append(f"frame {entry.index}: {reason}")
-            gone = SetAside(index=entry.index, reason=reason)
+            gone = FrameSetAside(index=entry.index, reason=reason)
             ledger.apply(gone)
-            facts.append(gone)
-    good = told.good
+            events.append(gone)
+    good = reading.good
     if broken and definition is not None:
         try:
-            known = Created(definition=dict(definition))
-            good = write_journal(folder / JOURNAL_FILE, iter((known, *facts_of(ledger))))
-            facts = []
-            damage.append(f"{JOURNAL_FILE} was written anew from what is known")
+            known = SceneCreated(definition=dict(definition))
+            good = write_journal(journal, iter((known, *events_of(ledger))))
+            events = []
+            damage.append(f"{journal.name} was written anew from what is known")
         except OSError as error:
             if not no_room(error):
                 raise
-    return Recovered(ledger, good, facts, sizes, damage, remake)
+    return Recovered(ledger, good, events, sizes, damage, remake)
 
 
 def _unnamed(ledger: Ledger, sizes: dict[str, int]) -> set[str]:
-    """Records that no fact names."""
+    """Returns the records that no event names."""
     named = {name for entry in ledger.frames.held() for name in entry.files}
     named |= {name for frame in ledger.open.values() for name in frame.files}
     return set(sizes) - named
 
 
 def _deletes_states(definition: Mapping[str, Any]) -> bool:
-    """Whether the scene has a rule by which old states go."""
+    """True for a scene with a rule that deletes old states."""
     rule = definition.get("request", {}).get("ingest", {}).get("keep_states") or {}
     return any(value is not None for value in rule.values())
 
 
 def _remade(ledger: Ledger, states: _States, broken: bool, deletes: bool) -> dict[int, str]:
-    """Frames that were committed, whose states cannot be read, and whose pictures are held: they can be made again.
+    """Finds frames whose committed states cannot be read and can be made again, because their pictures are held.
 
-    Where facts are lost, a frame without a state may never have been committed. Where old states are deleted by a rule,
+    Where events are lost, a frame without a state may never have been committed. Where a rule deletes old states,
     those before the oldest (but the first, which stays) are not missed: the journal may not have heard of it.
     """
     oldest = min(sorted(states.times)[1:], default=0) if deletes else 0
@@ -157,19 +165,19 @@ def _remade(ledger: Ledger, states: _States, broken: bool, deletes: bool) -> dic
 
 
 def _found_states(states: _States, ledger: Ledger) -> Iterator[StateFound]:
-    """Committed states of frames whose facts the damaged journal has lost, applied."""
+    """Yields committed states whose events the damaged journal has lost, as events, applied."""
     for index, time in states.times.items():
         entry = ledger.frames.get(index)
         if entry is None or (entry.receipt is None and entry.time is None):
-            fact = StateFound(index=index, time=time)
-            ledger.apply(fact)
-            yield fact
+            event = StateFound(index=index, time=time)
+            ledger.apply(event)
+            yield event
 
 
-def _found(folder: Path, names: list[str], ledger: Ledger, states: _States, broken: bool) -> Iterator[Fact]:
-    """Whole records of frames whose facts the damaged journal has lost, applied.
+def _found(folder: Path, names: list[str], ledger: Ledger, states: _States, broken: bool) -> Iterator[JournalEvent]:
+    """Yields whole records of frames whose events the damaged journal has lost, as events, applied.
 
-    Only where one record can be meant: two whole ones of a frame would leave open which was acknowledged.
+    Only one whole record of a frame is accepted: of two it is not known which was acknowledged.
     """
     by_frame: defaultdict[int, list[str]] = defaultdict(list)
     for name in names:
@@ -180,35 +188,35 @@ def _found(folder: Path, names: list[str], ledger: Ledger, states: _States, brok
         known = entry is not None and not (without and entry.state in (FrameState.SET_ASIDE, FrameState.COMMITTED))
         if known or (entry is None and index != ledger.next_frame and not broken):
             continue
-        for fact in _facts_of(folder, index, records, ledger, states):
-            ledger.apply(fact)
-            yield fact
+        for event in _events_of(folder, index, records, ledger, states):
+            ledger.apply(event)
+            yield event
 
 
-def _facts_of(folder: Path, index: int, names: list[str], ledger: Ledger, states: _States) -> list[Fact]:
-    """What the records of one frame tell."""
-    pictures: dict[str, Pictures] = {}
+def _events_of(folder: Path, index: int, names: list[str], ledger: Ledger, states: _States) -> list[JournalEvent]:
+    """Makes the events of one frame from its records."""
+    pictures: dict[str, StoredPictures] = {}
     for name in names:
         with contextlib.suppress(FrameDamage):
             pictures[name] = read_pictures(folder, name)
     whole = [name for name, found in pictures.items() if not found.part]
     parts = {name: found for name, found in pictures.items() if found.part}
     if len(names) == len(whole) == 1:
-        taken = _whole(index, whole[0], pictures[whole[0]], ledger)
+        accepted = _whole(index, whole[0], pictures[whole[0]], ledger)
     elif index < ledger.next_frame:
-        taken = _closed(index, parts, states.times.get(index))
+        accepted = _closed(index, parts, states.times.get(index))
     else:
         found = [_part(index, name, pictures) for name, pictures in parts.items()]
-        return [fact for fact in found if fact is not None]
-    if taken is None:
+        return [event for event in found if event is not None]
+    if accepted is None:
         return []
     if index < states.last and index not in states.times and index not in states.damaged:
-        return [taken, SetAside(index=index, reason=NO_STATE)]
-    return [taken]
+        return [accepted, FrameSetAside(index=index, reason=NO_STATE)]
+    return [accepted]
 
 
 def _unusable(folder: Path, files: tuple[str, ...], lost: list[str]) -> str | None:
-    """Why a frame that waits cannot be reconstructed. Of several records, one a camera, the worker leaves those out."""
+    """Says why a queued frame cannot be reconstructed, or None. The worker drops damaged ones of several records."""
     if lost:
         return f"its record is gone from the frame log: {', '.join(lost)}"
     if len(files) == 1:
@@ -219,7 +227,7 @@ def _unusable(folder: Path, files: tuple[str, ...], lost: list[str]) -> str | No
     return None
 
 
-def _whole(index: int, name: str, pictures: Pictures, ledger: Ledger) -> Taken | None:
+def _whole(index: int, name: str, pictures: StoredPictures, ledger: Ledger) -> FrameAccepted | None:
     before = max(
         (time for i in range(min(index, ledger.next_frame)) if (time := ledger.frames[i].time) is not None),
         default=None,
@@ -227,11 +235,11 @@ def _whole(index: int, name: str, pictures: Pictures, ledger: Ledger) -> Taken |
     if pictures.time is None or (before is not None and pictures.time <= before):
         return None
     identity = frame_identity(pictures.hashes, pictures.time)
-    return Taken(index=index, time=pictures.time, identity=identity, files=(name,), closed_by="found")
+    return FrameAccepted(index=index, time=pictures.time, identity=identity, files=(name,), closed_by="found")
 
 
-def _closed(index: int, parts: Mapping[str, Pictures], time: float | None) -> Taken | None:
-    """A committed frame that its cameras sent one by one."""
+def _closed(index: int, parts: Mapping[str, StoredPictures], time: float | None) -> FrameAccepted | None:
+    """Makes the event of a committed frame that its cameras sent one by one."""
     hashes: Hashes = {}
     for pictures in parts.values():
         for camera, kinds in pictures.hashes.items():
@@ -240,18 +248,18 @@ def _closed(index: int, parts: Mapping[str, Pictures], time: float | None) -> Ta
     if time is None or not hashes:
         return None
     files = tuple(sorted(parts))
-    return Taken(index=index, time=time, identity=frame_identity(hashes, time), files=files, closed_by="found")
+    return FrameAccepted(index=index, time=time, identity=frame_identity(hashes, time), files=files, closed_by="found")
 
 
-def _part(index: int, name: str, pictures: Pictures) -> PartTaken | None:
+def _part(index: int, name: str, pictures: StoredPictures) -> PartAccepted | None:
     if len(pictures.hashes) != 1:
         return None
     ((camera, kinds),) = pictures.hashes.items()
-    return PartTaken(index=index, time=pictures.time, camera=camera, file=name, hashes=kinds)
+    return PartAccepted(index=index, time=pictures.time, camera=camera, file=name, hashes=kinds)
 
 
 def _states(folder: Path, damage: list[str]) -> _States:
-    """Committed states of the folder."""
+    """Reads the committed states of the folder; what is wrong with them is added to `damage`."""
     try:
         history = History.load(folder)
     except HistoryError as error:
@@ -261,7 +269,7 @@ def _states(folder: Path, damage: list[str]) -> _States:
     damage.extend(f"frame {index}: its state is damaged: {reason}" for index, reason in history.damaged.items())
     report: dict[str, Any] = {}
     if history.indices:
-        with contextlib.suppress(HistoryError):  # the worker takes the state up, or says what is wrong with it
+        with contextlib.suppress(HistoryError):  # the worker loads the state, or says why it cannot
             report = history.report(history.indices[-1])
     times = dict(zip(history.indices, history.times.tolist(), strict=True))
     return _States(times, dict(history.damaged), report)

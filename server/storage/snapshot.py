@@ -1,4 +1,4 @@
-"""The facts that a ledger follows from: a journal that was damaged or deleted is written anew with them."""
+"""Makes events from a ledger: a damaged or deleted journal is written anew with them."""
 
 from __future__ import annotations
 
@@ -6,33 +6,35 @@ from collections.abc import Iterator
 
 from client.wire import Budget, FrameState
 from server.storage.events import (
-    Budgeted,
-    Died,
-    Fact,
-    FramesDeleted,
-    Missing,
-    PartTaken,
-    Paused,
-    SetAside,
-    Skipped,
+    BudgetChanged,
+    FrameAccepted,
+    FrameMissing,
+    FrameSetAside,
+    FramesSkipped,
+    JournalEvent,
+    OpenFrame,
+    PartAccepted,
+    PauseChanged,
+    PicturesDeleted,
     StateFound,
     StatesDeleted,
-    Taken,
+    WorkerDied,
 )
 from server.storage.frame_table import FrameEntry
-from server.storage.ledger import RETENTION, Ledger, OpenFrame
+from server.storage.ledger import RETENTION, Ledger
 
 TOGETHER = 10_000
-"""Frames that one fact names at most: the head of a record is bounded."""
+"""An event names at most so many frames: the head of a record is bounded."""
 OWN_ERROR = (FrameState.SET_ASIDE, FrameState.MISSING)
-"""What is noted of such a frame is why it is in that state; of another one, why its state is gone."""
+"""The error noted of a frame in such a state explains the state; of another frame, why its committed state is gone."""
 BEFORE = "before the journal was written anew"
 
 
-def facts_of(ledger: Ledger) -> Iterator[Fact]:
-    """Facts in an order that gives an equal ledger, but for what the states on disk say (`Ledger.reconcile`).
+def events_of(ledger: Ledger) -> Iterator[JournalEvent]:
+    """Yields events in an order that gives an equal ledger, but for the states on disk (`Ledger.reconcile`).
 
-    A frame that is committed or at work is queued in it. How a frame was closed and why the worker died are not kept.
+    A frame that is committed or at work is queued in it. The ways that frames were closed, and the reasons of deaths,
+    are not kept.
     """
     bare: list[int] = []
     deleted: list[int] = []
@@ -50,41 +52,41 @@ def facts_of(ledger: Ledger) -> Iterator[Fact]:
     for first in range(0, len(deleted), TOGETHER):
         yield StatesDeleted(frames=tuple(deleted[first : first + TOGETHER]), reason=RETENTION)
     for first in range(0, len(bare), TOGETHER):
-        yield FramesDeleted(frames=tuple(bare[first : first + TOGETHER]))
+        yield PicturesDeleted(frames=tuple(bare[first : first + TOGETHER]))
     for frame in ledger.open.values():
         yield from _parts(frame)
     for first, budget in ledger.budgets:
         if (first, budget) != (0, Budget()):
-            yield Budgeted(index=first, budget=budget)
+            yield BudgetChanged(index=first, budget=budget)
     if ledger.paused:
-        yield Paused(paused=True)
+        yield PauseChanged(paused=True)
 
 
-def _of_frame(entry: FrameEntry, fatal: str | None) -> Iterator[Fact]:
+def _of_frame(entry: FrameEntry, fatal: str | None) -> Iterator[JournalEvent]:
     index, note, receipt = entry.index, entry.note, entry.receipt
     if receipt is not None:
         if note.parts is not None:
             yield from _parts(note.parts)
-        yield Taken(index=index, time=receipt.time, identity=receipt.identity, files=entry.files)
+        yield FrameAccepted(index=index, time=receipt.time, identity=receipt.identity, files=entry.files)
     elif entry.state == FrameState.COMMITTED or entry.time is not None:
         yield StateFound(index=index, time=entry.time)
     for own in [True] * note.own_deaths + [False] * note.other_deaths:
-        yield Died(index=index, reason=BEFORE, own=own)
+        yield WorkerDied(index=index, reason=BEFORE, own=own)
     match entry.state:
         case FrameState.SET_ASIDE if note.error is not None:
-            yield SetAside(index=index, reason=note.error, dropped=note.dropped, fatal=note.error == fatal)
+            yield FrameSetAside(index=index, reason=note.error, dropped=note.dropped, fatal=note.error == fatal)
         case FrameState.MISSING:
-            yield Missing(index=index, reason=note.error or "")
+            yield FrameMissing(index=index, reason=note.error or "")
         case FrameState.SKIPPED:
-            yield Skipped(frames=(index,), by=entry.skipped_by)
+            yield FramesSkipped(frames=(index,), by=entry.skipped_by)
         case _:
             pass
 
 
-def _parts(frame: OpenFrame) -> Iterator[PartTaken]:
-    """A fact a file; a camera may have sent several, and which was in which is not kept."""
+def _parts(frame: OpenFrame) -> Iterator[PartAccepted]:
+    """Yields an event a file; a camera may have sent several, and their order is not kept."""
     cameras = list(frame.hashes)
     for place, file in enumerate(frame.files):
         camera = cameras[min(place, len(cameras) - 1)]
         hashes = frame.hashes[camera] if place < len(cameras) else {}
-        yield PartTaken(index=frame.index, time=frame.time, camera=camera, file=file, hashes=hashes)
+        yield PartAccepted(index=frame.index, time=frame.time, camera=camera, file=file, hashes=hashes)

@@ -23,6 +23,7 @@ from scas4d_core.storage.history import NEWEST_KEPT
 from scas4d_core.storage.npz import read_npz
 from server.storage.frame_store import FrameDamage, read_pictures
 from server.storage.journal import read_journal
+from server.storage.layout import DataFolder
 from studies.service.process import Service, StudyError
 from studies.service.study import AGAIN_S, Sender, Study, digests
 
@@ -73,7 +74,7 @@ def undisturbed(study: Study) -> tuple[dict[int, str], Pictures]:
             sender.send(index)
         service.finish(scene, len(study.frames))
         views = {index: _view(service, study, scene, index).content for index in range(len(study.frames))}
-        return digests(service.data / "scenes" / scene / "states"), views
+        return digests(DataFolder(service.data).scene(scene).states), views
     finally:
         service.stop()
 
@@ -104,7 +105,7 @@ def flips(study: Study, count: int, seed: int, told: Callable[[str], None]) -> F
                 one.faults.append(str(error))
             found.faults += [f"{said}: {fault}" for fault in one.faults]
         found.faults += sender.check()
-        states = digests(service.data / "scenes" / scene / "states")
+        states = digests(DataFolder(service.data).scene(scene).states)
         others = found.remade | found.lost | found.unreported
         wrong = [index for index in expected if index not in others and states.get(index) != expected[index]]
         if wrong:
@@ -121,7 +122,7 @@ class _Flip:
         self, study: Study, service: Service, scene: str, kind: str, frames: int, random_: random.Random
     ) -> None:
         self.study, self.service, self.scene, self.kind = study, service, scene, kind
-        self.folder = service.data / "scenes" / scene
+        self.folder = DataFolder(service.data).scene(scene)
         self.frames = frames
         self.index, self.file = self._choose(random_)
         self.whole = self.file.read_bytes()
@@ -131,7 +132,7 @@ class _Flip:
 
     def _choose(self, random_: random.Random) -> tuple[int, Path]:
         """A file of the kind, and the frame that it is of."""
-        newest, states = self.frames - 1, self.folder / "states"
+        newest, states = self.frames - 1, self.folder.states
         match self.kind:
             case "state":
                 index = random_.choice([newest, newest - 1, 0, random_.randrange(1, newest - 1)])
@@ -142,9 +143,9 @@ class _Flip:
             case "fixed":
                 return newest, states / random_.choice(["fixed.npz", "fixed.copy.npz", "first.copy.npz"])
             case "journal":
-                return newest, self.folder / "journal.log"
+                return newest, self.folder.journal
             case _:
-                return newest, random_.choice(sorted((self.folder / "frames").glob("*.frame")))
+                return newest, random_.choice(sorted(self.folder.frames.glob("*.frame")))
 
     def run(self, down: bool, found: Flips, views: Pictures) -> str:
         """Flips it, asks for everything, and puts it right where the service has not."""

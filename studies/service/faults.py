@@ -18,12 +18,12 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from client.wire import FrameState
-from server.storage.events import Taken
+from server.storage.events import FrameAccepted
 from server.storage.journal import read_journal
+from server.storage.layout import DataFolder, SceneFolder
 from studies.service import damage
 from studies.service.outcome import Outcome, Told
 from studies.service.process import PATIENCE_S, Service, StudyError
@@ -70,7 +70,7 @@ def kills(study: Study, expected: Mapping[int, str], update_s: float, count: int
         service.kill()
         service.start()  # and once more: all is found again
         service.finish(scene, len(study.frames))
-        faults = sender.check() + compare(digests(service.data / "scenes" / scene / "states"), expected)
+        faults = sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
         lost = len(study.frames) - len(sender.receipts)
         found = (
             f"{done['worker']} of the worker, {done['service']} of the service; {lost} acknowledged frames lost, "
@@ -124,7 +124,7 @@ def damaged_log(study: Study, expected: Mapping[int, str], cuts: int, flips: int
         victim = study.service("damaged")
         shutil.rmtree(victim.data)
         shutil.copytree(service.data, victim.data)
-        folder = victim.data / "scenes" / scene
+        folder = DataFolder(victim.data).scene(scene)
         said, hit = _damage(folder, kind, random_, half)
         victim.start()
         try:
@@ -132,7 +132,7 @@ def damaged_log(study: Study, expected: Mapping[int, str], cuts: int, flips: int
             status = victim.finish(scene, len(study.frames) if hit is None else 0)
             told(f"{said}: {'; '.join(status.damage) or 'nothing to say'}")
             wrong = _check_damaged(victim, scene, sender, hit)
-            wrong += compare(digests(folder / "states"), expected, range(hit, len(study.frames)) if hit else ())
+            wrong += compare(digests(folder.states), expected, range(hit, len(study.frames)) if hit else ())
             if hit is not None:
                 report = victim.frame(scene, hit)
                 dropped += 1
@@ -150,13 +150,13 @@ def damaged_log(study: Study, expected: Mapping[int, str], cuts: int, flips: int
     return Outcome(f"{cuts} cuts and {flips} flipped bytes of journal and frame log", bar, found, faults)
 
 
-def _damage(folder: Path, kind: str, random_: random.Random, half: int) -> tuple[str, int | None]:
+def _damage(folder: SceneFolder, kind: str, random_: random.Random, half: int) -> tuple[str, int | None]:
     """Damages the journal or the record of a frame that waits; says how, and which frame is hit."""
-    journal = folder / "journal.log"
-    taken = {fact.index: fact for fact in read_journal(journal).facts if isinstance(fact, Taken)}
+    journal = folder.journal
+    taken = {event.index: event for event in read_journal(journal).events if isinstance(event, FrameAccepted)}
     waiting = [index for index in taken if index >= half]
     hit = random_.choice([None, random_.choice(waiting)])
-    file = journal if hit is None else folder / "frames" / taken[hit].files[0]
+    file = journal if hit is None else folder.frames / taken[hit].files[0]
     at = random_.randrange(1, file.stat().st_size)
     with file.open("r+b") as opened:
         if kind == "cut":
@@ -215,7 +215,7 @@ def full_disk(study: Study, expected: Mapping[int, str], told: Told) -> Outcome:
         for index in range(half + 1, len(study.frames)):
             sender.send(index)
         service.finish(scene, len(study.frames))
-        faults += sender.check() + compare(digests(service.data / "scenes" / scene / "states"), expected)
+        faults += sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
     finally:
         service.stop()
     bar = "starts, loses nothing acknowledged before the damage, says what it dropped"

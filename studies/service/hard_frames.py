@@ -26,6 +26,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import psnr
 from scas4d_core.query.committed import CommittedScene
 from scas4d_core.storage.history import History
+from server.storage.layout import DataFolder
 from studies.hard_frames.footage import Filmed, MadeUp
 from studies.hard_frames.frames import FrameCase, Pictures, Sent, Step, good, named, teleported, violations
 from studies.hard_frames.study import AT, sound
@@ -196,7 +197,7 @@ def _push(service: Service, footage: MadeUp | Filmed, sent: Sequence[Sent], told
         if report.state != FrameState.COMMITTED or report.attempts:
             faults.append(f"frame {index} is {report.state} after {report.attempts} deaths: {report.error}")
     told(f"scene {scene}: {status.next_frame} frames, {len(faults)} faults")
-    history = History.load(service.data / "scenes" / scene / "states")
+    history = History.load(DataFolder(service.data).scene(scene).states)
     return Pushed(
         CommittedScene(history, footage.rig.world_frame(footage.settings.scene.metres_per_unit)), len(sent)
     ), faults

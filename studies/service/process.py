@@ -17,6 +17,7 @@ import httpx
 
 from client.wire import FRAME_MEDIA_TYPE, FrameReportModel, RigModel, SceneStatus, frame_chunks
 from scas4d_core.cameras import Rig
+from server.storage.layout import DataFolder
 
 START_S, PATIENCE_S = 120.0, 900.0
 EVERY_S = 0.05
@@ -85,7 +86,7 @@ class Service:
     def worker_pid(self, scene: str) -> int | None:
         """Of the worker of a scene, or None while there is none."""
         try:
-            pid = int((self.data / "scenes" / scene / "worker.lock").read_text())
+            pid = int(DataFolder(self.data).scene(scene).worker_lock.read_text())
             os.kill(pid, 0)
         except (OSError, ValueError):
             return None

@@ -16,6 +16,7 @@ from client.wire import FrameState
 from scas4d_core.captures import Capture
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.storage.history import History
+from server.storage.layout import DataFolder
 from studies.service.process import PATIENCE_S, Service, StudyError
 
 AGAIN_S = 0.05
@@ -154,6 +155,6 @@ def undisturbed(study: Study) -> tuple[dict[int, str], float]:
         seconds = (time.monotonic() - began) / max(1, len(study.frames) - 1)
         if faults := sender.check():
             raise StudyError(f"the undisturbed run: {'; '.join(faults)}")
-        return digests(service.data / "scenes" / scene / "states"), seconds
+        return digests(DataFolder(service.data).scene(scene).states), seconds
     finally:
         service.stop()

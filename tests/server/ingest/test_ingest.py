@@ -14,6 +14,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from client.wire import FRAME_MEDIA_TYPE, RigModel, frame_chunks
+from server.ingest import acknowledge
 from server.ingest.pictures import largest_frame
 
 FRAMED = {"Content-Type": FRAME_MEDIA_TYPE}
@@ -90,7 +91,7 @@ def test_a_refused_upload_leaves_no_file(http, make, service):
     id = make()
     problem(put(http, id, 0, {"c0": picture(), "c1": picture()[:-9]}), 422)
     problem(put(http, id, 4), 409)
-    folder = service.app.state.scenes[id].spec.frames
+    folder = service.app.state.scenes[id].spec.folder.frames
     assert list(folder.iterdir()) == []
 
 
@@ -272,7 +273,7 @@ def test_retention_deletes_pictures_and_states_and_says_so(http, make, service):
     reports = [http.get(f"/v1/scenes/{id}/frames/{index}").json() for index in range(7)]
     assert [report["held"] for report in reports] == [False] * 4 + [True] * 3
     assert [report["deleted"] for report in reports] == [False, True, True, True, True, False, False]
-    assert len(list(service.app.state.scenes[id].spec.frames.iterdir())) == 3
+    assert len(list(service.app.state.scenes[id].spec.folder.frames.iterdir())) == 3
     # What a frame was is known for ever.
     assert put(http, id, 1).json() == receipts[1]
     assert problem(put(http, id, 1, pictures(9)), 409)["identity"] == receipts[1]["identity"]
@@ -333,16 +334,17 @@ def test_a_full_queue_says_over_a_websocket_when_to_come_again(http, make, servi
     assert full["retry_after"] == int(by_http.headers["Retry-After"]) >= 1
 
 
-def test_a_scene_has_only_so_many_sending_websockets(http, make, service):
+def test_a_scene_has_only_so_many_sending_websockets(http, make, service, monkeypatch):
     id = make()
     address = f"{service.url.replace('http', 'ws')}/v1/scenes/{id}/ingest"
-    most = service.app.state.settings.max_ingest_sockets
+    most = 3
+    monkeypatch.setattr(acknowledge, "MOST_SOCKETS", most)
     with contextlib.ExitStack() as stack:
         sockets = [stack.enter_context(connect(address)) for _ in range(most)]
         with pytest.raises(InvalidStatus) as refused:
             connect(address)
         document = json.loads(refused.value.response.body)
-        assert (document["status"], document["field"]) == (429, "SCAS4D_MAX_INGEST_SOCKETS")
+        assert (document["status"], document["field"]) == (429, "id")
         assert refused.value.response.headers["Retry-After"]
         sockets[0].close()
         stack.enter_context(retried(lambda: connect(address), InvalidStatus))  # there is room again
@@ -412,7 +414,7 @@ def test_a_sender_that_goes_away_loses_nothing_that_it_sent_whole(http, make, se
         assert json.loads(socket.recv())["status"] == 202
     wait_for(lambda: status(http, id)["next_frame"] >= 1)
     scene = service.app.state.scenes[id]
-    wait_for(lambda: len(list(scene.spec.frames.iterdir())) == status(http, id)["next_frame"])
+    wait_for(lambda: len(list(scene.spec.folder.frames.iterdir())) == status(http, id)["next_frame"])
     assert put(http, id, status(http, id)["next_frame"]).status_code == 202
 
 

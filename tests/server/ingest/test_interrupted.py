@@ -1,4 +1,4 @@
-"""What is cut short in the middle: senders that go, requests that are cancelled, facts that race, folders half lost."""
+"""Interruptions: senders that leave, cancelled requests, events that race, folders half lost."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from test_restart import create, serving
 from test_restart import put as put_form
 
 from client.wire import FRAME_MEDIA_TYPE
-from server.ingest import receive as door
-from server.ingest import upload
+from server.ingest import camera_files, receive
 from server.scene import scene
-from server.storage.events import SetAside, Taken
+from server.storage.events import FrameAccepted, FrameSetAside
 from server.storage.journal import Journal
+from server.storage.layout import SceneFolder
 from server.storage.recovery import recover
 
 
 def test_a_refused_sender_that_goes_in_the_middle_leaves_the_frame_free(http, make, service, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(upload, "BATCH", 1)  # file by file: the first is refused while the third is on its way
+    monkeypatch.setattr(receive, "BATCH", 1)  # file by file: the first is refused while the third is on its way
     id = make(3)
     body = framed(0, {"c0": picture()[:-9], "c1": picture(), "c2": picture() + bytes(500_000)})
     head = f"PUT /v1/scenes/{id}/frames/0 HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: {FRAME_MEDIA_TYPE}\r\n"
@@ -36,11 +36,11 @@ def test_a_refused_sender_that_goes_in_the_middle_leaves_the_frame_free(http, ma
 
 
 def on_the_loop(scene, coroutine):
-    return asyncio.run_coroutine_threadsafe(coroutine, scene._worker._loop)
+    return asyncio.run_coroutine_threadsafe(coroutine, scene.updates._worker._loop)
 
 
 @pytest.mark.parametrize("part", [False, True])
-def test_a_request_cancelled_while_its_fact_is_written_keeps_its_pictures(http, make, service, monkeypatch, part):  # noqa: F811
+def test_a_request_cancelled_while_its_event_is_written_keeps_its_pictures(http, make, service, monkeypatch, part):  # noqa: F811
     id = make(1)
     http.post(f"/v1/scenes/{id}/pause")
     scene = service.app.state.scenes[id]
@@ -54,18 +54,21 @@ def test_a_request_cancelled_while_its_fact_is_written_keeps_its_pictures(http, 
         yield framed(0, {"c0": picture()}, part=part)
 
     monkeypatch.setattr(Journal, "_write", slow)
-    take = door.take_camera(scene, 0, "c0", body(), None) if part else door.take_framed(scene, 0, body(), None)
+    if part:
+        take = camera_files.receive_camera(scene.open_frames, 0, "c0", body(), None)
+    else:
+        take = receive.receive_frame(scene.ingest, 0, body(), None)
     request = on_the_loop(scene, take)
     time.sleep(0.25)
     request.cancel()
     wait_for(lambda: scene.next_frame == 1)
     time.sleep(0.2)
-    assert len(list(scene.spec.frames.iterdir())) == 1
+    assert len(list(scene.spec.folder.frames.iterdir())) == 1
     http.post(f"/v1/scenes/{id}/resume")
     assert finished(http, id, 0)["state"] == "committed"
 
 
-def test_a_frame_taken_while_the_first_one_fails_does_not_wait_for_ever(http, make, service, monkeypatch):  # noqa: F811
+def test_a_frame_accepted_while_the_first_one_fails_does_not_wait_for_ever(http, make, service, monkeypatch):  # noqa: F811
     id = make(queue_frames=9)
     scene = service.app.state.scenes[id]
     real = Journal._write
@@ -75,14 +78,14 @@ def test_a_frame_taken_while_the_first_one_fails_does_not_wait_for_ever(http, ma
         real(self, data)
 
     async def race():
-        fact = SetAside(index=0, reason="told to", fatal=True)
-        setting = asyncio.ensure_future(scene._set_aside(fact))
+        event = FrameSetAside(index=0, reason="told to", fatal=True)
+        setting = asyncio.ensure_future(scene.updates._set_aside(event))
         await asyncio.sleep(0.1)
 
         async def body():
             yield framed(1)
 
-        await asyncio.gather(setting, door.take_framed(scene, 1, body(), None))
+        await asyncio.gather(setting, receive.receive_frame(scene.ingest, 1, body(), None))
 
     http.post(f"/v1/scenes/{id}/pause")
     put(http, id, 0)
@@ -96,16 +99,16 @@ def test_a_scene_that_failed_is_found_with_nothing_waiting(tmp_path):
     async def write():
         journal = Journal(tmp_path / "journal.log")
         taken = [
-            Taken(index=index, time=index / 10, identity="ab" * 32, files=(f"{index:010d}-{0:012x}.frame",))
+            FrameAccepted(index=index, time=index / 10, identity="ab" * 32, files=(f"{index:010d}-{0:012x}.frame",))
             for index in (0, 1)
         ]
-        await journal.append(taken[0], SetAside(index=0, reason="told to", fatal=True), taken[1])
+        await journal.append(taken[0], FrameSetAside(index=0, reason="told to", fatal=True), taken[1])
         await journal.close()
 
     asyncio.run(write())
-    found = recover(tmp_path, "s")
+    found = recover(SceneFolder(tmp_path), "s")
     assert found.ledger.waiting() == []
-    assert [(fact.index, fact.fact) for fact in found.facts] == [(1, "set_aside")]
+    assert [(event.index, event.fact) for event in found.events] == [(1, "set_aside")]
     assert "told to" in found.ledger.frames[1].report.error
 
 

@@ -39,7 +39,7 @@ def two_frames(impatient):
         for index in range(2):
             sdk.put_frame(id, index, pictures())
         sdk.wait(id, 1)
-        yield id, impatient.app.state.scenes[id]._questions, http
+        yield id, impatient.app.state.scenes[id]._readers, http
         sdk.delete_scene(id)
 
 
@@ -156,7 +156,7 @@ def test_deleting_a_scene_answers_whoever_waits(service):
         id = sdk.create_scene(make_rig()).id
         sdk.put_frame(id, 0, pictures())
         sdk.wait(id, 0)
-        readers = service.app.state.scenes[id]._questions
+        readers = service.app.state.scenes[id]._readers
         hanging = in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}"))
         until(lambda: readers.bulk._at_work is not None)
         processes = [readers.views.process._process, readers.bulk.process._process]
@@ -280,7 +280,7 @@ def test_only_what_stays_may_be_kept_by_a_browser(still):
 
 def test_a_state_that_went_missing_is_answered_from_a_copy_or_asked_for_later(scene, impatient):
     id, _, http = scene
-    states = impatient.app.state.scenes[id].spec.states
+    states = impatient.app.state.scenes[id].spec.folder.states
     (states / "frame_000000.npz").unlink()
     assert http.get(f"/v1/scenes/{id}/render?frame=0").status_code == 200
     (states / "frame_000001.npz").unlink()

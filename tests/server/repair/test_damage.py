@@ -14,7 +14,7 @@ from test_restart import create, put, settled
 
 from client.sdk import Client
 from scas4d_core.captures import open_capture
-from server.repair.damage import KEPT, DamageKind, DamageLog
+from server.repair.mending import SENTENCES_KEPT, DamageKind, DamageLog
 from studies.service import faults
 from studies.service import study as of
 
@@ -307,9 +307,9 @@ def test_sentences_are_bounded_and_counted():
     assert log.sentences == ["a", "b b.npz"]
     log.say(DamageKind.STATE, "b /tmp/x/b.npz")
     assert log.sentences == ["a", "b b.npz (2 times)"]
-    for number in range(KEPT):
+    for number in range(SENTENCES_KEPT):
         log.say(DamageKind.FRAME, f"{number}")
-    assert len(log.sentences) == KEPT + 1
+    assert len(log.sentences) == SENTENCES_KEPT + 1
     assert log.sentences[0].startswith("2 more")
 
 

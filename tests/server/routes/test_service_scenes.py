@@ -39,10 +39,10 @@ def test_a_scene_is_created_listed_and_deleted(http, service):
     url = created.headers["Location"]
     assert status["id"] in [scene["id"] for scene in http.get("/v1/scenes").json()["scenes"]]
     scene = service.app.state.scenes[status["id"]]
-    processes = [scene._worker._process, scene._questions.views.process._process]
+    processes = [scene.updates._worker._process, scene._readers.views.process._process]
     assert http.delete(url).status_code == 204
     problem(http.get(url), 404)
-    assert not scene.spec.folder.exists()
+    assert not scene.spec.folder.path.exists()
     for process in processes:
         with pytest.raises(ValueError, match="closed"):
             process.is_alive()
@@ -173,7 +173,7 @@ def test_a_reader_that_dies_is_replaced(sdk, scene, service):
     sdk.put_frame(scene, 0, pictures())
     sdk.wait(scene, 0)
     sdk.render(scene, "c0")
-    service.app.state.scenes[scene]._questions.views.process._process.kill()
+    service.app.state.scenes[scene]._readers.views.process._process.kill()
     time.sleep(0.2)
     assert sdk.render(scene, "c0").shape == (HEIGHT, WIDTH, 3)
 

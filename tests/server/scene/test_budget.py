@@ -14,7 +14,7 @@ from running import Running, fake_settings, make_rig, pictures, problem
 
 from client.sdk import Client
 from client.wire import Budget
-from server.storage.events import Budgeted, Taken
+from server.storage.events import BudgetChanged, FrameAccepted
 from server.storage.ledger import Ledger
 
 
@@ -131,11 +131,11 @@ def test_a_scene_that_failed_takes_none(http, sdk):
     sdk.delete_scene(id)
 
 
-def test_later_facts_win_and_each_frame_finds_its_own():
+def test_later_events_win_and_each_frame_finds_its_own():
     ledger = Ledger("s")
     for index in range(6):
-        ledger.apply(Taken(index=index, time=float(index), identity="0" * 64, files=("f",)))
+        ledger.apply(FrameAccepted(index=index, time=float(index), identity="0" * 64, files=("f",)))
     for index, count in ((2, 20), (4, 40), (3, 30)):  # frames were taken back in between
-        ledger.apply(Budgeted(index=index, budget=Budget(iterations=count)))
+        ledger.apply(BudgetChanged(index=index, budget=Budget(iterations=count)))
     assert [ledger.budget_of(index).iterations for index in range(6)] == [None, None, 20, 30, 30, 30]
     assert ledger.begins_next() == 0

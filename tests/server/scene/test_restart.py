@@ -17,7 +17,7 @@ from client.sdk import Client
 from client.wire import RigModel
 from scas4d_core.captures import InitialPoints
 from server.storage import recovery
-from server.storage.ledger import LOST
+from server.storage.frame_table import LOST
 
 
 @contextlib.contextmanager
@@ -145,7 +145,7 @@ def test_a_damaged_definition_comes_back_from_the_journal_and_without_it_is_left
     assert file.read_text() == "{"  # whoever knows more may still repair it
 
 
-def test_a_lost_journal_costs_the_facts_and_no_state(tmp_path):
+def test_a_lost_journal_costs_the_events_and_no_state(tmp_path):
     with serving(tmp_path) as (http, sdk):
         id = create(http, keep_frames={"last": 0})
         for index in range(4):

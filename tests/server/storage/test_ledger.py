@@ -1,15 +1,26 @@
-"""What is known of frames: the fold of facts, in little memory, brought in line with the states that are there."""
+"""The ledger: folded from events, in little memory, and brought in line with the committed states."""
 
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import fields
 
 import pytest
 
-from client.wire import FrameState
-from server.scene import reports
-from server.storage.events import Died, FramesDeleted, Missing, PartTaken, SetAside, Skipped, StatesDeleted, Taken
-from server.storage.frame_table import LOST, FrameTable
+from client.wire import CameraFitModel, CurvePointModel, FrameReportModel, FrameState
+from scas4d_core.frame_report import CurvePoint, FrameReport
+from scas4d_core.update.result import CameraFit
+from server.storage.events import (
+    FrameAccepted,
+    FrameMissing,
+    FrameSetAside,
+    FramesSkipped,
+    PartAccepted,
+    PicturesDeleted,
+    StatesDeleted,
+    WorkerDied,
+)
+from server.storage.frame_table import LOST, NOT_SENT, RECORDS_KEPT, WIRE_NAMES, FrameTable
 from server.storage.ledger import Ledger
 
 REPORT = {"iterations": 100, "psnr": 31.5, "gaussians": 2, "seconds": {"update": 0.5}, "dropped": {"c1": "dark"}}
@@ -20,23 +31,27 @@ def identity(index):
 
 
 def taken(index, **more):
-    return Taken(
+    return FrameAccepted(
         index=index, time=index / 10, identity=identity(index), files=(f"{index:010d}-{0:012x}.frame",), **more
     )
 
 
-def ledger_of(*facts):
+def ledger_of(*events):
     ledger = Ledger("abc")
-    for fact in facts:
-        ledger.apply(fact)
+    for event in events:
+        ledger.apply(event)
     return ledger
 
 
-def test_an_entry_says_what_the_facts_said():
-    facts = [taken(0), Missing(index=1, reason="cable"), taken(2), Skipped(frames=(2,), by=3), taken(3)]
-    facts += [Died(index=3, reason="x", own=True), Died(index=3, reason="x", own=False)]
-    facts += [SetAside(index=3, reason="two deaths", dropped={"c0": "torn"}), taken(4), FramesDeleted(frames=(0, 4))]
-    ledger = ledger_of(*facts)
+def test_an_entry_says_what_the_events_said():
+    events = [taken(0), FrameMissing(index=1, reason="cable"), taken(2), FramesSkipped(frames=(2,), by=3), taken(3)]
+    events += [WorkerDied(index=3, reason="x", own=True), WorkerDied(index=3, reason="x", own=False)]
+    events += [
+        FrameSetAside(index=3, reason="two deaths", dropped={"c0": "torn"}),
+        taken(4),
+        PicturesDeleted(frames=(0, 4)),
+    ]
+    ledger = ledger_of(*events)
     reports_ = [ledger.frames[index].report for index in range(5)]
     states = [FrameState.QUEUED, FrameState.MISSING, FrameState.SKIPPED, FrameState.SET_ASIDE, FrameState.QUEUED]
     assert [report.state for report in reports_] == states
@@ -56,8 +71,8 @@ def test_an_entry_says_what_the_facts_said():
         ledger.frames[5]
 
 
-def test_what_is_lost_before_a_fact_is_set_aside():
-    ledger = ledger_of(PartTaken(index=1, time=None, camera="c0", file="f", hashes={}), taken(2))
+def test_what_is_lost_before_an_event_is_set_aside():
+    ledger = ledger_of(PartAccepted(index=1, time=None, camera="c0", file="f", hashes={}), taken(2))
     assert ledger.next_frame == 3
     assert [ledger.frames[index].error for index in range(3)] == [LOST, LOST, None]
     assert ledger.open == {}
@@ -67,21 +82,21 @@ def test_what_is_lost_before_a_fact_is_set_aside():
 
 
 def test_states_that_are_there_commit_and_those_that_are_gone_are_told():
-    ledger = ledger_of(*map(taken, range(6)), StatesDeleted(frames=(1,)), FramesDeleted(frames=(0, 1, 2)))
-    facts = ledger.reconcile([0, 2, 4], {3: "torn"})
+    ledger = ledger_of(*map(taken, range(6)), StatesDeleted(frames=(1,)), PicturesDeleted(frames=(0, 1, 2)))
+    events = ledger.reconcile([0, 2, 4], {3: "torn"})
     assert list(ledger.committed) == [0, 2, 4]
-    assert facts == [StatesDeleted(frames=(3,), reason="torn")]
+    assert events == [StatesDeleted(frames=(3,), reason="torn")]
     assert (ledger.states_deleted, ledger.waiting()) == (2, [5])
     assert ledger.frames[3].deleted
     # The newest state turns out damaged: what comes after the one before is done again where its pictures are held.
     assert ledger.reconcile([0, 2], {4: "torn"}) == []
     assert (list(ledger.committed), ledger.waiting()) == ([0, 2], [3, 4, 5])
     gone = "its state is damaged, and its pictures are deleted"
-    assert ledger.reconcile([0], {}) == [SetAside(index=1, reason=gone), SetAside(index=2, reason=gone)]
+    assert ledger.reconcile([0], {}) == [FrameSetAside(index=1, reason=gone), FrameSetAside(index=2, reason=gone)]
     assert ledger.frames[2].state == FrameState.SET_ASIDE
 
 
-def test_a_state_whose_fact_is_lost_is_committed():
+def test_a_state_whose_event_is_lost_is_committed():
     ledger = ledger_of(taken(0), taken(2))
     assert ledger.reconcile([0, 1, 2], {}) == []
     assert list(ledger.committed) == [0, 1, 2]
@@ -107,15 +122,34 @@ def test_many_states_deleted_at_once_are_those_deleted_one_by_one():
 
 def test_the_numbers_of_the_newest_commits_are_in_memory():
     table = FrameTable("abc")
-    table.grow(reports.KEPT + 1)
-    for index in range(reports.KEPT + 1):
+    table.grow(RECORDS_KEPT + 1)
+    for index in range(RECORDS_KEPT + 1):
         table.take(index, index / 10, identity(index), (), None)
         table.move(index, FrameState.COMMITTED)
-        table.set_numbers(index, REPORT)
-    assert (table[0].measured, table[1].measured) == (False, True)
-    report = table[reports.KEPT].report
+        table.set_record(index, REPORT)
+    assert (table[0].record is None, table[1].record is None) == (True, False)
+    report = table[RECORDS_KEPT].report
     assert (report.psnr, report.iterations, report.dropped_cameras) == (31.5, 100, {"c1": "dark"})
     assert report.seconds == {"update": 0.5, "total": 0.5}
+
+
+def test_every_field_of_a_commit_reaches_the_wire_or_is_named_as_left_out():
+    own = {"scene", "state", "error", "identity", "deleted", "received"}  # the service knows these itself
+    noted = {
+        "budget",
+        "write_seconds",
+        "publish_seconds",
+        "threads",
+        "remade",
+        "resumed",
+    }  # the worker adds them to the record
+    committed = {field.name for field in fields(FrameReport)} | noted
+    sent = {WIRE_NAMES.get(name, name) for name in committed - NOT_SENT}
+    assert sent <= set(FrameReportModel.model_fields) - own
+    assert committed >= NOT_SENT
+    assert set(WIRE_NAMES) <= committed
+    for core, wire in ((CameraFit, CameraFitModel), (CurvePoint, CurvePointModel)):
+        assert {field.name for field in fields(core)} == set(wire.model_fields)
 
 
 def test_a_day_of_frames_fits_in_memory():
@@ -126,7 +160,7 @@ def test_a_day_of_frames_fits_in_memory():
         ledger.apply(taken(index))
         ledger.move(index - 1, FrameState.COMMITTED)
         if index > 40:
-            ledger.apply(FramesDeleted(frames=(index - 40,)))
+            ledger.apply(PicturesDeleted(frames=(index - 40,)))
             ledger.apply(StatesDeleted(frames=(index - 40,)))
     used, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()

@@ -13,13 +13,13 @@ from blake3 import blake3
 from client.wire import FrameFile, FrameHead
 from server.problems import Problem
 from server.storage import record_log
-from server.storage.events import Missing, Paused, Taken
+from server.storage.events import FrameAccepted, FrameMissing, PauseChanged
 from server.storage.frame_store import FrameDamage, Upload, read_pictures, stored
 from server.storage.journal import Journal, read_journal
 from server.storage.record_log import Damage, Kind, Record, encoded, records
 
 PARTS = [
-    encoded(Kind.FACT, index, {"fact": "missing", "index": index, "reason": "é" * index}, b"S4DR" * index)
+    encoded(Kind.EVENT, index, {"fact": "missing", "index": index, "reason": "é" * index}, b"S4DR" * index)
     for index in range(4)
 ]
 LOG = b"".join(PARTS)
@@ -84,16 +84,16 @@ def test_a_length_that_was_made_up_reads_no_further_than_the_file():
 
 
 FACTS = [
-    Taken(index=0, time=0.5, identity="ab" * 32, files=("f",)),
-    Paused(paused=True),
-    Missing(index=1, reason="lost"),
+    FrameAccepted(index=0, time=0.5, identity="ab" * 32, files=("f",)),
+    PauseChanged(paused=True),
+    FrameMissing(index=1, reason="lost"),
 ]
 
 
-def write_journal(path, *facts, good=0):
+def write_journal(path, *events, good=0):
     async def write():
         journal = Journal(path, good)
-        await asyncio.gather(*(journal.append(fact) for fact in facts))
+        await asyncio.gather(*(journal.append(event) for event in events))
         await journal.close()
 
     asyncio.run(write())
@@ -103,9 +103,9 @@ def test_a_journal_comes_back_and_goes_on(tmp_path):
     path = tmp_path / "journal.log"
     write_journal(path, *FACTS)
     read = read_journal(path)
-    assert (read.facts, read.good, read.damage) == (FACTS, path.stat().st_size, [])
+    assert (read.events, read.good, read.damage) == (FACTS, path.stat().st_size, [])
     write_journal(path, FACTS[1], good=read.good)
-    assert read_journal(path).facts == [*FACTS, FACTS[1]]
+    assert read_journal(path).events == [*FACTS, FACTS[1]]
 
 
 def test_a_journal_cut_at_every_byte_starts_and_says_what_it_dropped(tmp_path):
@@ -116,12 +116,12 @@ def test_a_journal_cut_at_every_byte_starts_and_says_what_it_dropped(tmp_path):
     for length in range(len(data)):
         path.write_bytes(data[:length])
         read = read_journal(path)
-        assert read.facts == FACTS[: len(read.facts)]
+        assert read.events == FACTS[: len(read.events)]
         assert bool(read.damage) == (read.good != length)
-        ends.append(len(read.facts))
-        write_journal(path, Missing(index=9, reason=""), good=read.good)
+        ends.append(len(read.events))
+        write_journal(path, FrameMissing(index=9, reason=""), good=read.good)
         again = read_journal(path)
-        assert again.facts == [*FACTS[: len(read.facts)], Missing(index=9, reason="")]
+        assert again.events == [*FACTS[: len(read.events)], FrameMissing(index=9, reason="")]
         assert again.damage == []
     assert sorted(set(ends)) == [0, 1, 2]
 
@@ -129,11 +129,11 @@ def test_a_journal_cut_at_every_byte_starts_and_says_what_it_dropped(tmp_path):
 def test_a_log_that_is_read_piece_by_piece_says_the_same(monkeypatch):
     """Wherever a piece ends: of a log that is whole, cut, damaged by flipped bits, or has rubbish in it."""
     rng = np.random.default_rng(0)
-    facts = [
-        encoded(Kind.FACT, index, {"fact": "missing", "index": index, "reason": "é" * index}) for index in range(9)
+    events = [
+        encoded(Kind.EVENT, index, {"fact": "missing", "index": index, "reason": "é" * index}) for index in range(9)
     ]
-    log = b"".join(facts)
-    logs = [log, log[:-1], log[: len(log) // 2], b"", b"S4DR", facts[0] + b"S4DR" * 40 + facts[1], bytes(300) + log]
+    log = b"".join(events)
+    logs = [log, log[:-1], log[: len(log) // 2], b"", b"S4DR", events[0] + b"S4DR" * 40 + events[1], bytes(300) + log]
     for at in rng.integers(0, len(log), 40):
         damaged = bytearray(log)
         damaged[at] ^= 1 << int(rng.integers(8))
@@ -169,7 +169,7 @@ def test_a_full_disk_leaves_the_journal_whole(tmp_path, monkeypatch):
 
     asyncio.run(write())
     read = read_journal(path)
-    assert (read.facts, read.damage) == ([FACTS[0], FACTS[2]], [])
+    assert (read.events, read.damage) == ([FACTS[0], FACTS[2]], [])
 
 
 def upload(folder, data=b"picture"):

@@ -14,24 +14,24 @@ from test_ledger import identity
 
 from client.wire import Budget, FileKind, FrameState
 from server.storage.events import (
-    Budgeted,
-    Created,
-    Died,
-    FramesDeleted,
-    Missing,
-    PartTaken,
-    Paused,
-    SetAside,
-    Skipped,
+    BudgetChanged,
+    FrameAccepted,
+    FrameMissing,
+    FrameSetAside,
+    FramesSkipped,
+    PartAccepted,
+    PauseChanged,
+    PicturesDeleted,
+    SceneCreated,
     StateFound,
     StatesDeleted,
-    Taken,
+    WorkerDied,
 )
 from server.storage.journal import Journal, read_journal, replay
 from server.storage.ledger import Ledger
-from server.storage.snapshot import facts_of
+from server.storage.snapshot import events_of
 
-MADE = Created(definition={"id": "abc"})
+MADE = SceneCreated(definition={"id": "abc"})
 
 
 def state_of(ledger):
@@ -48,60 +48,60 @@ def state_of(ledger):
     return frames, opened, ledger.paused, ledger.fatal, ledger.states_deleted, ledger.budgets, dict(ledger.counts)
 
 
-def fold(facts):
+def fold(events):
     ledger = Ledger("abc")
-    for fact in facts:
-        ledger.apply(fact)
+    for event in events:
+        ledger.apply(event)
     return ledger
 
 
 @st.composite
 def lives(draw):
     """Facts in an order that a scene may write them in, and the states that it has committed."""
-    facts, committed, held = [], [], []
+    events, committed, held = [], [], []
     for index in range(draw(st.integers(0, 8))):
         how = draw(st.sampled_from(["whole", "parts", "missing", "lost", "found"]))
         if how == "missing":
-            facts.append(Missing(index=index, reason=draw(st.sampled_from(["cable", ""]))))
+            events.append(FrameMissing(index=index, reason=draw(st.sampled_from(["cable", ""]))))
             continue
         if how == "lost":
             continue
         if how == "found":
-            facts.append(StateFound(index=index, time=draw(st.sampled_from([None, index / 10]))))
+            events.append(StateFound(index=index, time=draw(st.sampled_from([None, index / 10]))))
             committed.append(index)
             continue
         files = (f"{index:010d}-{0:012x}.frame",)
         if how == "parts":
-            facts += parts(index, draw(st.integers(1, 3)))
-            files = tuple(fact.file for fact in facts if isinstance(fact, PartTaken) and fact.index == index)
-        facts.append(Taken(index=index, time=index / 10, identity=identity(index), files=files))
+            events += parts(index, draw(st.integers(1, 3)))
+            files = tuple(event.file for event in events if isinstance(event, PartAccepted) and event.index == index)
+        events.append(FrameAccepted(index=index, time=index / 10, identity=identity(index), files=files))
         for own in draw(st.lists(st.booleans(), max_size=2)):
-            facts.append(Died(index=index, reason="x", own=own))
+            events.append(WorkerDied(index=index, reason="x", own=own))
         end = draw(st.sampled_from(["committed", "set aside", "skipped", "waits"]))
         if end == "set aside":
-            facts.append(SetAside(index=index, reason=f"fault {index}", dropped={"c0": "dark"}))
+            events.append(FrameSetAside(index=index, reason=f"fault {index}", dropped={"c0": "dark"}))
         elif end == "skipped":
-            facts.append(Skipped(frames=(index,), by=index + 1))
+            events.append(FramesSkipped(frames=(index,), by=index + 1))
         elif end == "committed":
             committed.append(index)
         if end != "waits" and draw(st.booleans()):
             held.append(index)
     if held:
-        facts.append(FramesDeleted(frames=tuple(held)))
+        events.append(PicturesDeleted(frames=tuple(held)))
     if gone := [index for index in committed if draw(st.booleans())]:
-        facts.append(StatesDeleted(frames=tuple(gone), reason=draw(st.sampled_from(["retention", "damaged"]))))
+        events.append(StatesDeleted(frames=tuple(gone), reason=draw(st.sampled_from(["retention", "damaged"]))))
     if draw(st.booleans()):
-        facts.append(Paused(paused=True))
+        events.append(PauseChanged(paused=True))
     for index in draw(st.lists(st.integers(0, 9), max_size=2, unique=True)):
-        facts.append(Budgeted(index=index, budget=Budget(iterations=10 + index)))
+        events.append(BudgetChanged(index=index, budget=Budget(iterations=10 + index)))
     if draw(st.booleans()):
-        facts += parts(20, draw(st.integers(1, 3)))
-    return facts, committed
+        events += parts(20, draw(st.integers(1, 3)))
+    return events, committed
 
 
 def parts(index, count):
     return [
-        PartTaken(
+        PartAccepted(
             index=index, time=index / 10, camera=f"c{k}", file=f"{index:010d}-{k:012x}.frame",
             hashes={FileKind.IMAGE: identity(k)},
         )
@@ -111,10 +111,10 @@ def parts(index, count):
 
 @settings(max_examples=300, deadline=None)
 @given(lives())
-def test_the_facts_of_a_ledger_give_an_equal_one(life):
-    facts, _ = life
-    ledger = fold(facts)
-    again = fold(facts_of(ledger.copy()))
+def test_the_events_of_a_ledger_give_an_equal_one(life):
+    events, _ = life
+    ledger = fold(events)
+    again = fold(events_of(ledger.copy()))
     count = len(again.frames)
     assert count == len(ledger.frames)
     found, expected = state_of(again), state_of(ledger)
@@ -124,11 +124,11 @@ def test_the_facts_of_a_ledger_give_an_equal_one(life):
 @settings(max_examples=200, deadline=None)
 @given(lives())
 def test_and_the_states_on_disk_bring_both_to_the_same(life):
-    facts, committed = life
-    ledger = fold(facts)
+    events, committed = life
+    ledger = fold(events)
     kept = [index for index in committed if not ledger.frames[index].deleted]
     ledger.reconcile(kept, {})
-    again = fold(facts_of(ledger.copy()))
+    again = fold(events_of(ledger.copy()))
     again.reconcile(kept, {})
     assert state_of(again)[0] == state_of(ledger)[0]
     assert list(again.committed) == list(ledger.committed)
@@ -136,11 +136,14 @@ def test_and_the_states_on_disk_bring_both_to_the_same(life):
 
 def test_a_fatal_frame_stays_fatal():
     ledger = fold(
-        [Taken(index=0, time=0.0, identity=identity(0), files=("a",)), SetAside(index=0, reason="x", fatal=True)]
+        [
+            FrameAccepted(index=0, time=0.0, identity=identity(0), files=("a",)),
+            FrameSetAside(index=0, reason="x", fatal=True),
+        ]
     )
-    assert fold(facts_of(ledger)).fatal == "x"
+    assert fold(events_of(ledger)).fatal == "x"
     ledger.fatal = "the service failed: only in memory"
-    assert fold(facts_of(ledger)).fatal is None
+    assert fold(events_of(ledger)).fatal is None
 
 
 def journalled(path, lose):
@@ -148,16 +151,16 @@ def journalled(path, lose):
     ledger, said = Ledger("abc"), []
 
     def snapshot():
-        return iter([MADE, *facts_of(ledger.copy())])
+        return iter([MADE, *events_of(ledger.copy())])
 
     async def live():
         journal = Journal(path, 0, snapshot, said.append)
         await journal.append(MADE)
         for index in range(6):
-            fact = Taken(index=index, time=index / 10, identity=identity(index), files=(f"{index}",))
-            await journal.append(fact)
-            ledger.apply(fact)
-            death = Died(index=index, reason="x", own=False)
+            event = FrameAccepted(index=index, time=index / 10, identity=identity(index), files=(f"{index}",))
+            await journal.append(event)
+            ledger.apply(event)
+            death = WorkerDied(index=index, reason="x", own=False)
             ledger.apply(death)
             await journal.append(death)
             if index == 3:
@@ -189,8 +192,8 @@ def test_a_journal_that_is_deleted_replaced_or_damaged_is_written_anew(tmp_path)
         assert len(said) == 1, name
         read = read_journal(path)
         assert read.damage == []
-        assert read.facts[0] == MADE
-        assert state_of(fold(read.facts)) == state_of(ledger), name
+        assert read.events[0] == MADE
+        assert state_of(fold(read.events)) == state_of(ledger), name
         assert ledger.counts[FrameState.QUEUED] == 6
         assert sorted(file.name for file in path.parent.iterdir()) == ["journal.log"]
 
@@ -211,19 +214,19 @@ def test_every_flipped_byte_of_a_journal_and_a_cut_beginning_are_damage(tmp_path
         path.write_bytes(flipped)
         assert read_journal(path).damage, at
     second = content.index(b"S4DR", 4)
-    assert replay(path, lambda fact: None).begun
+    assert replay(path, lambda event: None).begun
     for rest in (b"", content[second:]):
         path.write_bytes(rest)
-        assert not replay(path, lambda fact: None).begun
+        assert not replay(path, lambda event: None).begun
     path.unlink()
-    assert not replay(path, lambda fact: None).begun
+    assert not replay(path, lambda event: None).begun
 
 
 def no_space(*_):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def test_a_fact_that_comes_while_a_renewal_fails_is_not_forgotten(tmp_path, monkeypatch):
+def test_an_event_that_comes_while_a_renewal_fails_is_not_forgotten(tmp_path, monkeypatch):
     async def job():
         journal = Journal(tmp_path / "journal.log", 0, lambda: iter(()))
         began, go = asyncio.Event(), threading.Event()
@@ -237,15 +240,15 @@ def test_a_fact_that_comes_while_a_renewal_fails_is_not_forgotten(tmp_path, monk
         monkeypatch.setattr(journal, "_replace", slow)
         journal.renew("it is damaged")
         await began.wait()
-        appended = asyncio.create_task(journal.append(Missing(index=0, reason="r")))
+        appended = asyncio.create_task(journal.append(FrameMissing(index=0, reason="r")))
         await asyncio.sleep(0)
         go.set()
-        # There is no room for a journal anew, and the file is in its place: the fact goes behind what is there.
+        # There is no room for a journal anew, and the file is in its place: the event goes behind what is there.
         await asyncio.wait_for(appended, 10)
         await journal.close()
 
     asyncio.run(job())
-    assert [fact.index for fact in read_journal(tmp_path / "journal.log").facts] == [0]
+    assert [event.index for event in read_journal(tmp_path / "journal.log").events] == [0]
 
 
 def test_whoever_waits_for_a_renewal_that_breaks_is_told(tmp_path, monkeypatch):
@@ -253,12 +256,12 @@ def test_whoever_waits_for_a_renewal_that_breaks_is_told(tmp_path, monkeypatch):
         journal = Journal(tmp_path / "journal.log", 0, lambda: iter(()))
 
         def broken(*_):
-            raise ValueError("a fact that cannot be written")
+            raise ValueError("an event that cannot be written")
 
         monkeypatch.setattr(journal, "_replace", broken)
         (tmp_path / "journal.log").unlink()
         with pytest.raises(ValueError, match="cannot be written"):
-            await asyncio.wait_for(journal.append(Missing(index=0, reason="r")), 10)
+            await asyncio.wait_for(journal.append(FrameMissing(index=0, reason="r")), 10)
         await journal.close()
 
     asyncio.run(job())

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from running import HEIGHT, WIDTH, picture
 
-from server.ingest.image_structure import StructureError, walk
+from server.ingest.pictures import StructureError, image_header
 
 FILES = {
     "png": picture(40),
@@ -19,7 +19,7 @@ FILES = {
 
 @pytest.mark.parametrize("name", FILES)
 def test_a_whole_file_tells_its_size(name):
-    header = walk(FILES[name])
+    header = image_header(FILES[name])
     assert (header.width, header.height) == (WIDTH, HEIGHT)
 
 
@@ -28,7 +28,7 @@ def test_every_cut_is_found(name):
     data = FILES[name]
     for length in range(len(data)):
         with pytest.raises(StructureError):
-            walk(data[:length])
+            image_header(data[:length])
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -41,7 +41,7 @@ def test_damage_raises_nothing_else(name):
         for at in rng.integers(0, len(data), 3):
             damaged[at] = rng.integers(256)
         try:
-            walk(bytes(damaged))
+            image_header(bytes(damaged))
         except StructureError:
             refused += 1
     # Checksums find every change of a PNG; the others only what breaks their segments.
@@ -49,4 +49,4 @@ def test_damage_raises_nothing_else(name):
 
 
 def test_what_follows_the_end_is_let_be():
-    assert walk(FILES["jpeg"] + b"\0\0") == walk(FILES["jpeg"])
+    assert image_header(FILES["jpeg"] + b"\0\0") == image_header(FILES["jpeg"])

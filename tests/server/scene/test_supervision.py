@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from server.scene.work_clock import FIRST_GUESS_S, OVERDUE, SHORTEST_S, UPDATES_KEPT, WorkClock
+from server.scene.supervision import FIRST_GUESS_S, OVERDUE, SHORTEST_S, UPDATES_KEPT, WorkClock
 
 
 class Hand:

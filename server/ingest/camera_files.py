@@ -1,0 +1,178 @@
+"""Receives frames that do not come as one S4DF: multipart forms, and pictures sent camera by camera."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import AsyncIterator, Sequence
+
+from fastapi import Request
+from starlette.datastructures import UploadFile
+
+from client.wire import FileKind, FrameFile, FrameHead, FrameReceipt, PartReceipt
+from scas4d_core.cameras import Camera, Rig
+from server.ingest.acknowledge import Ingest
+from server.ingest.open_frames import OpenFrames
+from server.ingest.pictures import MASK, check_files, check_size
+from server.ingest.receive import Receiving, accepted_or_removed, check_index, drain, read_framed, receiving_of
+from server.problems import Problem, counted
+from server.storage.disk import full_disk, no_room
+
+
+async def receive_form(ingest: Ingest, index: int, request: Request) -> FrameReceipt:
+    """Receives a whole frame as multipart/form-data, which is easy to send and slow to read."""
+    # A picture sent as a plain field (no file name) would be read as text: such fields are kept short.
+    async with request.form(max_files=2 * len(ingest.rules.rig) + 8, max_fields=8, max_part_size=4096) as form:
+        given: dict[str, UploadFile] = {}
+        time: float | None = None
+        for name, value in form.multi_items():
+            if name == "time" and isinstance(value, str):
+                time = _seconds(value)
+            elif isinstance(value, UploadFile):
+                if name in given:
+                    raise Problem(
+                        422,
+                        f"{name!r} is here twice",
+                        field=name,
+                        value=value.filename,
+                        remedy="send one file a camera",
+                    )
+                given[name] = value
+            else:
+                raise Problem(
+                    422, f"{name!r} is no file", field=name, value=value, remedy="send it with a file name in its part"
+                )
+        # Names that no camera can have are refused here, as the model of a file would not take them.
+        for name in given:
+            _check_camera(ingest.rules.rig, name.removeprefix(MASK), name)
+        head = _head(index, time, [_file(name, upload.size or 0) for name, upload in given.items()], part=False)
+        check_files(ingest.rules.rig, head.files, whole=True)
+        keep = ingest.expects(head)
+        if keep:
+            ingest.coming(index)
+        try:
+            receiving = receiving_of(ingest, head, ingest.time_of(index, time), keep=keep)
+            await _feed(receiving, [await upload.read() for upload in given.values()])
+            return await accepted_or_removed(receiving, lambda received: ingest.accept(head, received))
+        finally:
+            if keep:
+                ingest.came(index)
+
+
+async def receive_camera(
+    frames: OpenFrames, index: int | None, camera: str | None, body: AsyncIterator[bytes], length: int | None
+) -> PartReceipt:
+    """Receives one camera's picture and mask as S4DF; `index` and `camera` as the address gives them, if it does."""
+    ingest = frames.ingest
+    names: list[str] = []
+
+    def begin(head: FrameHead) -> Receiving:
+        check_index(head, index)
+        check_files(ingest.rules.rig, head.files, whole=False)
+        names.append(_one_camera(head, camera))
+        frames.expects(head, names[0])
+        keep = head.index >= ingest.ledger.next_frame
+        return receiving_of(ingest, head.model_copy(update={"part": True}), head.time, keep=keep)
+
+    try:
+        head, receiving = await read_framed(body, begin, length)
+        return await accepted_or_removed(receiving, lambda received: frames.accept(head, names[0], received))
+    finally:
+        await drain(body)
+
+
+async def receive_file(
+    frames: OpenFrames,
+    index: int,
+    camera: str,
+    kind: FileKind,
+    time: float | None,
+    body: AsyncIterator[bytes],
+    length: int | None,
+) -> PartReceipt:
+    """Receives one camera's picture or mask, the plain file."""
+    ingest = frames.ingest
+    _check_camera(ingest.rules.rig, camera, "c")
+    data = await _read(ingest.rules.rig[camera], camera, body, length)
+    head = _head(index, time, [FrameFile(camera=camera, kind=kind, size=len(data))], part=True)
+    frames.expects(head, camera)
+    receiving = receiving_of(ingest, head, time, keep=index >= ingest.ledger.next_frame)
+    await _feed(receiving, [data])
+    return await accepted_or_removed(receiving, lambda received: frames.accept(head, camera, received))
+
+
+async def _read(camera: Camera, field: str, body: AsyncIterator[bytes], length: int | None) -> bytearray:
+    """Reads a file of a camera; refuses it as soon as it is larger than the camera's pictures can be."""
+    data = bytearray()
+    try:
+        check_size(camera, field, length or 0)
+        async for chunk in body:
+            check_size(camera, field, len(data) + len(chunk))
+            data += chunk
+        return data
+    finally:
+        await drain(body)
+
+
+def _check_camera(rig: Rig, camera: str, field: str) -> None:
+    """Refuses a camera that the rig does not have."""
+    if camera not in rig.names:
+        raise Problem(
+            422,
+            f"the rig has no camera {camera!r}",
+            field=field,
+            value=camera,
+            remedy=f"the cameras are {', '.join(rig.names)}",
+        )
+
+
+def _head(index: int, time: float | None, files: Sequence[FrameFile], *, part: bool) -> FrameHead:
+    if not files:
+        raise Problem(
+            422,
+            "no picture is here",
+            field="body",
+            value="nothing",
+            remedy="send one file a camera, named like the camera",
+        )
+    return FrameHead(index=index, time=time, files=list(files), part=part)
+
+
+def _file(field: str, size: int) -> FrameFile:
+    kind = FileKind.MASK if field.startswith(MASK) else FileKind.IMAGE
+    return FrameFile(camera=field.removeprefix(MASK), kind=kind, size=size)
+
+
+async def _feed(receiving: Receiving, files: Sequence[bytes | bytearray]) -> None:
+    try:
+        for data in files:
+            await receiving.take(memoryview(data))
+    except BaseException as error:
+        await receiving.abort()
+        if no_room(error) and isinstance(error, OSError):
+            raise full_disk(error) from None
+        raise
+
+
+def _one_camera(head: FrameHead, camera: str | None) -> str:
+    names = sorted({file.camera for file in head.files})
+    if len(names) != 1 or camera not in (None, names[0]):
+        raise Problem(
+            422,
+            f"the files are of {counted(len(names), 'camera')}: {', '.join(names)}",
+            field="head.files",
+            value=", ".join(names),
+            remedy="send the files of one camera" + ("" if camera is None else f", {camera!r}, as the address says"),
+        )
+    return names[0]
+
+
+def _seconds(value: str) -> float:
+    try:
+        seconds = float(value)
+    except ValueError:
+        seconds = math.nan
+    if not math.isfinite(seconds):
+        raise Problem(
+            422, "time is no finite number", field="time", value=value, remedy="give seconds, as 1.25, or leave it out"
+        )
+    return seconds
