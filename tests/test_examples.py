@@ -20,7 +20,7 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "scas4d_core.captures.frame": ("Frame", "InitialPoints"),
     "scas4d_core.captures.ground_truth": ("GroundTruth",),
     "scas4d_core.captures.images": ("decode_image", "decode_mask", "decode_labels", "resize_area", "picture_size"),
-    "scas4d_core.error_text": ("message_of", "without_paths"),
+    "scas4d_core.errors": ("message_of", "without_paths"),
     "scas4d_core.first_frame.initial_points": ("initial_points",),
     "scas4d_core.first_frame.static_scene": ("fit_static_scene",),
     "scas4d_core.gaussians": ("Gaussians", "moving_extent", "quaternions_to_matrices"),

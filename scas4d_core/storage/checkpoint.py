@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.captures.frame import Frame
-from scas4d_core.error_text import message_of
+from scas4d_core.errors import message_of
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import Outcome
 from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
-from scas4d_core.error_text import message_of
+from scas4d_core.errors import message_of
 from server.problems import Problem
 from server.processes.engine import load_engine
 from server.processes.messages import Stop

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.wire import parts_model
-from scas4d_core.error_text import message_of
+from scas4d_core.errors import message_of
 from scas4d_core.storage.frame_files import frame_file
 from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFrameError
 from server.processes import encode, track_answers

@@ -10,7 +10,7 @@ from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
-from scas4d_core.error_text import message_of
+from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History
 from server.processes.decoding import decode, read
 from server.processes.engine import load_engine

@@ -14,7 +14,7 @@ from typing import Any
 
 from client.wire import Budget
 from scas4d_core.captures import Frame, InitialPoints
-from scas4d_core.error_text import message_of
+from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.storage.npz import read_npz
 from server.processes.decoding import decode, read

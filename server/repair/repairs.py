@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from scas4d_core.captures import Frame
-from scas4d_core.error_text import message_of
+from scas4d_core.errors import message_of
 from scas4d_core.storage.frame_files import (
     FIRST_COPY,
     FIXED_COPY,

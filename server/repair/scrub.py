@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 from client.wire import FrameState
-from scas4d_core.error_text import message_of
+from scas4d_core.errors import message_of
 from scas4d_core.storage.frame_files import (
     FIRST_COPY,
     FIXED_COPY,

@@ -9,7 +9,7 @@ from itertools import chain
 
 from client.wire import Budget, FrameReportModel, FrameState, SceneBudget, SceneState, SceneStatus
 from scas4d_core.cameras import Camera
-from scas4d_core.error_text import message_of
+from scas4d_core.errors import message_of
 from server.health import metrics
 from server.ingest.acknowledge import Ingest, IngestRules, uncancelled
 from server.ingest.open_frames import OpenFrames

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from client.wire import SceneCreate
-from scas4d_core.error_text import message_of
+from scas4d_core.errors import message_of
 from scas4d_core.settings import Settings
 from scas4d_core.storage.npz import read_npz, sync_folder
 from server.problems import Problem, counted

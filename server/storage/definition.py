@@ -10,7 +10,7 @@ from typing import Any
 from blake3 import blake3
 
 from client.wire import SceneCreate
-from scas4d_core.error_text import message_of
+from scas4d_core.errors import message_of
 from scas4d_core.settings import Settings
 from scas4d_core.storage.npz import written_whole
 from server.storage.events import JournalEvent, SceneCreated

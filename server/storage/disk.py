@@ -7,7 +7,7 @@ import fcntl
 import os
 from pathlib import Path
 
-from scas4d_core.error_text import message_of
+from scas4d_core.errors import message_of
 from server.problems import Problem
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_history import filled, same, state
 
-from scas4d_core.error_text import message_of, without_paths
+from scas4d_core.errors import message_of, without_paths
 from scas4d_core.storage.checkpoint import Checkpoints
 from scas4d_core.storage.frame_files import FIRST_COPY, FIXED_COPY, FIXED_FILE, DamagedFrameError
 from scas4d_core.storage.history import History, HistoryError
