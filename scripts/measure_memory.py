@@ -13,6 +13,7 @@ import json
 
 import numpy as np
 
+from client.cli.evaluate import peak_megabytes
 from client.wire import RigModel
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import Frame, InitialPoints
@@ -20,7 +21,6 @@ from scas4d_core.presets import preset
 from scas4d_core.settings import Settings
 from server.health.estimate import estimate
 from server.settings import ServerSettings
-from studies.quality.quality import peak_megabytes
 
 
 def ring(count: int, size: int) -> Rig:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from client import rig
-from client.cli.overrides import overrides
+from client.cli.changes import parse_changes
 from client.cli.progress import Bars, console
 from client.importers.open_source import open_source
 from client.importers.source import Source
@@ -90,7 +90,7 @@ def push(
     ] = None,
 ) -> None:
     """Sends a capture to a running service as its rig would, and waits for the last frame."""
-    settings = overrides(changes or [])
+    settings = parse_changes(changes)
     source = _opened(capture, calibration, pictures, capture_fps, masks, encoding)
     with Client(url, token=token, outage=0) as client:
         client.live()  # a wrong address is said at once, an outage later is waited for

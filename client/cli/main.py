@@ -5,15 +5,15 @@ from __future__ import annotations
 import os
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from pydantic import ValidationError
 
 from client import __version__
 from client.cli import commands, extras
-from client.cli.overrides import overrides, refusal
+from client.cli.changes import parse_changes
 from client.cli.progress import console
 from client.errors import ServiceError, ServiceUnreachable
 from client.importers.open_source import open_prepared
@@ -66,7 +66,7 @@ def demo(
     """Starts a service, streams the sample capture through it, and leaves renders beside the truth."""
     from client.cli import demo as main_job
 
-    opened, settings = open_prepared(capture), overrides(changes or [])
+    opened, settings = open_prepared(capture), parse_changes(changes)
     stays = sys.stdout.isatty() if stay is None else stay
     data, log = out / "data", out / "service.log"
     with main_job.running_service(data, log, port) as url:
@@ -96,7 +96,7 @@ def reconstruct(
     """Reconstructs a capture in this process, without a service: pictures, states, and a .ply of the last frame."""
     from client.cli.reconstruct import reconstruct as run
 
-    given = [*(changes or []), *([f"device={device}"] if device else [])]
+    given = parse_changes([*(changes or []), *([f"device={device}"] if device else [])])
     run(capture, out, frames=frames, preset=preset, changes=given)
 
 
@@ -110,13 +110,10 @@ def evaluate(
     again: Annotated[bool, typer.Option("--again", help="Measure anew what is there already.")] = False,
 ) -> None:
     """Prints a capture's scores on its test cameras and ground truth; reconstructs it unless `out` has them already."""
-    if open_prepared(capture).full_test_rig is None:
-        raise CaptureError(
-            f"{capture}: no test cameras (test_meta.json) to measure on; `scas4d reconstruct` needs none"
-        )
-    from studies.commands import quality  # a checkout has it; the wheel does not
+    from client.cli.evaluate import evaluate as run
 
-    quality([capture], out=out, frames=frames, preset=[preset], changes=changes, again=again)
+    open_prepared(capture)  # says which command prepares a capture that is not
+    run(capture, out, frames=frames, preset_name=preset, changes=parse_changes(changes), again=again)
 
 
 def _version(wanted: bool) -> None:
@@ -132,24 +129,27 @@ def options(version: Annotated[bool, typer.Option("--version", callback=_version
 
 def main() -> None:
     """The entry point."""
-    run(app)
+    run(app, "scas4d", extras.remedy)
 
 
-def run(commands: typer.Typer) -> None:
-    """Runs a command line: errors that a user can mend are one line, not a traceback."""
+def run(commands: typer.Typer, name: str, remedy: Callable[[ModuleNotFoundError], str | None]) -> None:
+    """Runs a command line: an error that a user can mend becomes one line, not a traceback.
+
+    Args:
+        commands: the command line. name: the command as a user writes it.
+        remedy: says what to install for a missing module; None where that would not help.
+    """
     try:
-        commands()
+        commands(prog_name=name)
     except ModuleNotFoundError as error:
-        remedy = extras.remedy(error)
-        if remedy is None:
+        install = remedy(error)
+        if install is None:
             raise
-        raise SystemExit(f"scas4d: {remedy}") from None
-    except ValidationError as error:
-        raise SystemExit(f"scas4d: {refusal(error)}") from None
+        raise SystemExit(f"{name}: {install}") from None
     except ServiceUnreachable as error:
-        raise SystemExit(f"scas4d: {error}; start one with: scas4d serve") from None
+        raise SystemExit(f"{name}: {error}; start one with: scas4d serve") from None
     except (ServiceError, CaptureError, ImageError, RuntimeError, ValueError, OSError) as error:
-        raise SystemExit(f"scas4d: {error}") from None
+        raise SystemExit(f"{name}: {error}") from None
 
 
 if __name__ == "__main__":

@@ -16,6 +16,12 @@ DIFFERENCE_GAIN = 4
 Picture = NDArray[np.uint8]
 
 
+def eight_bit(colour: NDArray[np.floating]) -> Picture:
+    """Colour in 0…1, [H, W, 3], rounded to 0…255; what lies outside is clipped."""
+    rounded: Picture = np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8)
+    return rounded
+
+
 def comparison(truth: Picture, render: Picture) -> Picture:
     """Truth | render | difference, [H, 3 W, 3]."""
     difference = np.abs(truth.astype(np.int16) - render.astype(np.int16)) * DIFFERENCE_GAIN

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from client.cli.scores import Row
 from scas4d_core.captures import Capture, open_capture
 from scas4d_core.metrics import psnr as image_psnr
 from scas4d_core.presets import preset
@@ -23,7 +24,6 @@ from scas4d_core.settings import Settings
 from studies.effort.sequences import Shown, as_it_is, back_and_forth, repeated, slowed
 from studies.frontier.timing import started
 from studies.machine import core_version, machine
-from studies.quality.store import Row
 
 Report = Callable[[str], None]
 

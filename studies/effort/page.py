@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from client.cli.scores import Row
 from studies.effort.effort import SEEDS, TOLERANCE
 from studies.effort.report import BAR
-from studies.quality.store import Row
 
 KEPT = 0.95
 """Share of the frames that have to keep a budget."""

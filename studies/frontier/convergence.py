@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from client.cli.evaluate import Report
+from client.cli.scores import Row
 from scas4d_core import metrics
 from scas4d_core.captures import Capture, open_capture
 from scas4d_core.gaussians import Gaussians
@@ -21,8 +23,6 @@ from scas4d_core.warm_up import warm_up_elsewhere
 from studies.frontier.frontier import Variant
 from studies.frontier.timing import started
 from studies.machine import core_version
-from studies.quality.quality import Report
-from studies.quality.store import Row
 
 CHECKPOINTS = (0, 1, 2, 4, 7, 10, 15, 20, 25, 30, 40, 50, 60, 70, 80, 90, 100, 125, 150, 175, 200, 225, 250, 275)
 """Iterations after which the state is looked at, as far as an update has them; its end is looked at in any case."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from math import log2
 from pathlib import Path
 
+from client.cli.scores import Store
 from studies.effort.page import effort_text
 from studies.frontier import plots
 from studies.frontier.convergence import read_convergence
@@ -23,7 +24,6 @@ from studies.frontier.tradeoff import (
     undominated,
 )
 from studies.machine import in_words
-from studies.quality.store import Store
 
 PREVIEW_LOSS_DB = 4.0
 """A preview may lose so much against the default."""
@@ -31,7 +31,7 @@ LIVE_GAIN_DB = 1.0
 """A live show goes on to a slower setting while it gains this much for each doubling of the time."""
 ARCHIVE_GAIN_DB = 0.1
 """An archive takes the fastest setting within this of the best."""
-BARS = ("scas4d 10", "scas4d 25", "scas4d 50", "scas4d 100", "dynamic3dgs 100", "dynamic3dgs 200")
+STAGE_ROWS = ("scas4d 10", "scas4d 25", "scas4d 50", "scas4d 100", "dynamic3dgs 100", "dynamic3dgs 200")
 """Labels of the settings whose stages are drawn."""
 AXIS_WORDS: Mapping[str, str] = {
     "adaptive": "Other presets",
@@ -162,7 +162,7 @@ def _draw(
     if whole is not None:
         plots.draw_drift(points, whole, folder / "drift.png")
         drawn.append("drift.png")
-    bars = [p for label in BARS for p in means if p.variant.label == label and not p.variant.whole]
+    bars = [p for label in STAGE_ROWS for p in means if p.variant.label == label and not p.variant.whole]
     plots.draw_stages(bars, words, folder / "stages.png")
     return [*drawn, "stages.png"]
 

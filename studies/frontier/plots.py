@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from client.cli.scores import Row
 from scas4d_core.update.result import REPORT
 from studies.frontier.frontier import DEFAULT, METHODS
 from studies.frontier.tradeoff import Point, curve, of_axis, spread, undominated
-from studies.quality.store import Row
 
 OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#CC79A7", "#F0E442", "#000000")
 COLOURS = dict(zip(METHODS, OKABE_ITO, strict=False))

@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
+from client.cli.evaluate import Report
+from client.cli.scores import Row
 from scas4d_core.captures import Capture, open_capture
 from scas4d_core.settings import Settings
 from scas4d_core.warm_up import warm_up_elsewhere
 from studies.frontier.frontier import Variant
 from studies.machine import core_version, machine
-from studies.quality.quality import Report
 from studies.quality.runs import completed
-from studies.quality.store import Row
 
 ROUNDS = 5
 """That are counted."""

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from client.cli.scores import Row, Store
 from studies.frontier.frontier import AXES, DEFAULT, METHODS, Variant, row_of, variants
 from studies.frontier.timing import read_times, time_of
-from studies.quality.store import Row, Store
 
 SCORES = (
     "psnr",

@@ -44,22 +44,22 @@ SETTINGS = Settings(
 PIXEL_M = 0.023
 """Metres that a pixel sees at the middle of the scene: what the pictures can tell."""
 RESTING_M = 4 * PIXEL_M
-"""Bar: root mean square of how far Gaussians that rest, but may move, are from where they were, in any row: an update
-finds where a ball of ten pixels is with some error, and a few in a row may err to the same side."""
+"""Target: root mean square of how far Gaussians that rest, but may move, are from where they were, in any row: an
+update finds where a ball of ten pixels is with some error, and a few in a row may err to the same side."""
 RESTING_MEAN_M = PIXEL_M
-"""Bar: the mean of that over a run."""
+"""Target: the mean of that over a run."""
 RETURN_M = PIXEL_M
-"""Bar: the same of those that move, when they are back where they began."""
+"""Target: the same of those that move, when they are back where they began."""
 TREND = 1.5
-"""Bar: times as far as in the first half that what rests may be from where it was in the second half, on average."""
+"""Target: times as far as in the first half that what rests may be from where it was in the second half, on average."""
 UNIT = 1e-5
-"""Bar: how far from 1 the norm of a rotation may be."""
+"""Target: how far from 1 the norm of a rotation may be."""
 GROWTH = 10.5
-"""Bar: times longer or shorter than in frame 0 that an axis may be; ``attempts.SHRUNK`` holds them, less rounding."""
+"""Target: times longer or shorter than in frame 0 that an axis may be; ``attempts.SHRUNK`` holds them."""
 HALF = 10
 """Rows that a half needs for that."""
 MEMORY = 1.1
-"""Bar: times the memory of the first tenth that the last tenth may take."""
+"""Target: times the memory of the first tenth that the last tenth may take."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import psnr
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.storage.history import History
-from studies.hard_frames.footage import Filmed, MadeUp
+from studies.hard_frames.footage import Footage
 from studies.hard_frames.frames import FrameCase, Pictures, Sent, Step, named, violations
 
 AT = 5
@@ -46,7 +46,7 @@ class FrameStudy:
         folder: for committed states; what is there goes.
     """
 
-    def __init__(self, footage: MadeUp | Filmed, folder: Path) -> None:
+    def __init__(self, footage: Footage, folder: Path) -> None:
         self.footage, self.folder = footage, folder
         self.cases = named(footage)
         shutil.rmtree(folder, ignore_errors=True)
@@ -108,7 +108,10 @@ class FrameStudy:
 
 
 def study(
-    footage: MadeUp | Filmed, folder: Path, names: Sequence[str] = (), told: Callable[[str], None] = print
+    footage: Footage,
+    folder: Path,
+    names: Sequence[str] = (),
+    told: Callable[[str], None] = print,
 ) -> list[Line]:
     """All cases whose name holds one of ``names``, or all, in all sizes; tells each as it is done."""
     of, lines = FrameStudy(footage, folder), []

@@ -22,6 +22,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
+from client.cli.evaluate import peak_megabytes
+from client.cli.scores import Row
 from scas4d_core.cameras import Camera, rig_inside
 from scas4d_core.captures import open_capture
 from scas4d_core.gaussians import Gaussians
@@ -33,9 +35,7 @@ from scas4d_core.settings import Settings
 from studies.kernels.pairs import MicroKernel, blended_pairs
 from studies.machine import core_version, in_words, machine
 from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
-from studies.quality.quality import peak_megabytes
-from studies.quality.store import Row
-from studies.quality.targets import BARS, KERNELS
+from studies.quality.targets import KERNELS, TARGETS
 
 Report = Callable[[str], None]
 
@@ -204,12 +204,12 @@ def spread(values: Any) -> dict[str, float]:
 
 def table(row: Row) -> str:
     """The figures as one Markdown table."""
-    bars = {bar.metric: bar for bar in BARS if bar.run == KERNELS}
+    targets = {target.metric: target for target in TARGETS if target.run == KERNELS}
 
     def line(what: str, of: dict[str, float], unit: str, metric: str | None = None, digits: int = 2) -> str:
         must, word = "", ""
         if metric is not None:
-            threshold, sense = bars[metric].threshold, bars[metric].sense
+            threshold, sense = targets[metric].threshold, targets[metric].sense
             assert threshold is not None
             reached = of["median"] < threshold or (sense == "≤" and of["median"] == threshold)
             must, word = f"{sense} {threshold:g} {unit}", "reached" if reached else "**missed**"

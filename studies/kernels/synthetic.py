@@ -1,4 +1,4 @@
-"""A scene made up for comparisons: a coloured ball over a floor, seen by six cameras around it."""
+"""Synthetic scene for comparisons: a coloured ball over a floor, seen by six cameras around it."""
 
 from __future__ import annotations
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from client.cli.scores import Store
 from studies.frontier.frontier import UPDATES, Variant
 from studies.frontier.tradeoff import read_points
 from studies.machine import in_words
@@ -16,11 +17,10 @@ from studies.paper.paper import (
     Experiment,
     Measured,
     Outcome,
+    compare,
     iteration_ratio,
-    judge,
     measured,
 )
-from studies.quality.store import Store
 
 DIGITS: Mapping[str, int] = {"psnr": 2, "ssim": 3, "mte_2d_oracle": 2, "parts_ari": 3}
 """By score."""
@@ -33,13 +33,13 @@ def write_paper_page(
 
     Args:
         out: folder of the frontier. captures: names. page: Markdown file. updates: that the rows cover.
-        quality: folder of the study of the bars, for captures that the frontier has no rows of.
+        quality: folder of the study of quality, for captures that the frontier has no rows of.
     """
     ours = measured(out, captures, updates, quality)
     points = read_points(out, captures, updates)
     ratio = iteration_ratio(points)
     there = [name for name in captures if any(point.capture == name for point in points)]
-    outcomes = {experiment.title: judge(experiment, ours) for experiment in EXPERIMENTS}
+    outcomes = {experiment.title: compare(experiment, ours) for experiment in EXPERIMENTS}
     sections = "\n\n".join(
         section(experiment, outcomes[experiment.title], ours, captures, ratio) for experiment in EXPERIMENTS
     )

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from client.cli.scores import Store
 from studies.frontier.frontier import AXES, DEFAULT, Variant
 from studies.frontier.tradeoff import Point, read_points
 from studies.paper import figures
 from studies.paper.figures import Figures
 from studies.quality.runs import measured_runs
-from studies.quality.store import Store
 
 FACTOR = 2.0
 """Between two differences that agree in size."""
@@ -211,7 +211,7 @@ class Outcome:
 
 
 def measured(out: Path, captures: Sequence[str], updates: int, quality: Path | None = None) -> Measured:
-    """Our figures: rows of the frontier and, for captures that it has none of, rows of the bars over shared updates."""
+    """Our figures: rows of the frontier; for captures without any, rows of the study of quality over shared updates."""
     found: dict[tuple[Variant, str], dict[str, float]] = {}
     for point in read_points(out, captures, updates):
         for score in SMALL:
@@ -232,7 +232,7 @@ def measured(out: Path, captures: Sequence[str], updates: int, quality: Path | N
     return found
 
 
-def judge(experiment: Experiment, ours: Measured) -> list[Outcome]:
+def compare(experiment: Experiment, ours: Measured) -> list[Outcome]:
     """Each claim of an experiment against what was measured."""
     return [_outcome(experiment, claim, ours) for claim in experiment.claims]
 

@@ -20,15 +20,15 @@ from typing import Any
 
 import numpy as np
 
+from client.cli.scores import Row, Store, digest
 from scas4d_core.captures import open_capture
 from scas4d_core.metrics import psnr
 from studies.machine import core_version, machine
-from studies.quality.job import settings_of
-from studies.quality.store import Row, Store, digest
+from studies.quality.settings import settings_of
 
 Report = Callable[[str], None]
 
-TARGETS: Mapping[str, Mapping[str, str]] = {
+PROCESSORS: Mapping[str, Mapping[str, str]] = {
     "this processor": {},
     "AVX2 and FMA": {
         "NUMBA_CPU_NAME": "x86-64-v3",
@@ -64,13 +64,13 @@ def run(
     """
     store, rows = Store(out), []
     for capture in captures:
-        for target, seed in [*((name, 0) for name in TARGETS), *(("this processor", k) for k in range(1, seeds))]:
+        for target, seed in [*((name, 0) for name in PROCESSORS), *(("this processor", k) for k in range(1, seeds))]:
             key = f"{capture.resolve().name}-{target.replace(' ', '-')}-s{seed}-{digest(frames, list(changes))}"
             row = store.row(key)
             if row is None or row["core"] != core_version():
                 report(key)
                 row = {"key": key, "capture": capture.resolve().name, "target": target, "seed": seed}
-                row |= _apart(capture, TARGETS[target], frames, seed, changes)
+                row |= _apart(capture, PROCESSORS[target], frames, seed, changes)
                 store.put(row)
             rows.append(row)
     text = table(rows)
@@ -88,13 +88,13 @@ def same_bits(rows: Sequence[Row], capture: str) -> bool:
 def table(rows: Sequence[Row]) -> str:
     """A line a capture: decibels by target, whether the bits are the same, and the spread over seeds."""
     lines = [
-        f"| capture | {' | '.join(TARGETS)} | states | seeds: spread (standard deviation) |",
-        "|---" * (len(TARGETS) + 3) + "|",
+        f"| capture | {' | '.join(PROCESSORS)} | states | seeds: spread (standard deviation) |",
+        "|---" * (len(PROCESSORS) + 3) + "|",
     ]
     for name in dict.fromkeys(row["capture"] for row in rows):
         own = [row for row in rows if row["capture"] == name]
         by_target = {row["target"]: row for row in own if row["seed"] == 0}
-        means = [f"{statistics.fmean(by_target[target]['psnr']):.2f} dB" for target in TARGETS]
+        means = [f"{statistics.fmean(by_target[target]['psnr']):.2f} dB" for target in PROCESSORS]
         by_seed = [statistics.fmean(row["psnr"]) for row in own if row["target"] == "this processor"]
         spread = f"{max(by_seed) - min(by_seed):.2f} dB"
         if len(by_seed) > 1:
@@ -112,7 +112,7 @@ def measure(capture: Path, frames: int, seed: int, changes: Sequence[str]) -> Ro
     opened = open_capture(capture)
     if opened.test_rig is None:
         raise ValueError(f"{capture} has no test cameras, so there is nothing to measure on")
-    settings = settings_of("scas4d", overrides=changes)
+    settings = settings_of("scas4d", changes=changes)
     settings = settings.model_copy(update={"update": settings.update.model_copy(update={"seed": seed})})
     scene = Reconstruction.start(opened.rig, opened.frame(0), settings, points=opened.points)
     row: Row = {"psnr": [], "states": [], "core": core_version(), "machine": machine()}

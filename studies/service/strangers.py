@@ -170,7 +170,7 @@ def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token
             )
     finally:
         service.stop()
-    return judge(attack, without, attacked, closed, left, token=token)
+    return compare(attack, without, attacked, closed, left, token=token)
 
 
 def _start(port: int, path: str, attack: Attack) -> subprocess.Popen[bytes]:
@@ -179,7 +179,7 @@ def _start(port: int, path: str, attack: Attack) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-m", "studies.service.attack", *options], stdout=subprocess.PIPE)
 
 
-def judge(attack: Attack, without: Side, attacked: Side, closed: float, left: int, *, token: bool) -> Outcome:
+def compare(attack: Attack, without: Side, attacked: Side, closed: float, left: int, *, token: bool) -> Outcome:
     """The row of the table.
 
     Args:

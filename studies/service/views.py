@@ -29,7 +29,7 @@ from studies.machine import in_words, machine
 from studies.service.process import Service, StudyError
 from studies.service.study import encoded_frames
 
-BAR_RATE, BAR_LATENCY, BAR_SLOWER = 5.0, 2.0, 0.25
+TARGET_RATE, TARGET_LATENCY, TARGET_SLOWER = 5.0, 2.0, 0.25
 IDLE_S = 6.0
 """Of views while nothing is updated, a turn."""
 WARM_UP = 3
@@ -227,11 +227,11 @@ def table(rows: Sequence[Measured]) -> str:
     ]
     text = "\n".join([*head, *map(line, rows)])
     for row in rows:
-        if row.rate == BAR_RATE:
-            reached = row.latency <= BAR_LATENCY and row.slower <= BAR_SLOWER and row.refused == 0
+        if row.rate == TARGET_RATE:
+            reached = row.latency <= TARGET_LATENCY and row.slower <= TARGET_SLOWER and row.refused == 0
             text += (
-                f"\n\nBar at {BAR_RATE:g} a second: median at most {BAR_LATENCY:g} times the idle one, updates at most "
-                f"{100 * BAR_SLOWER:.0f} % slower: {'reached' if reached else '**missed**'} "
+                f"\n\nTarget at {TARGET_RATE:g} a second: median at most {TARGET_LATENCY:g} times the idle one, "
+                f"updates at most {100 * TARGET_SLOWER:.0f} % slower: {'reached' if reached else '**missed**'} "
                 f"({row.latency:.2f} times, {100 * row.slower:+.0f} %)."
             )
     return text

@@ -50,7 +50,7 @@ def test_presets_are_what_they_are_called() -> None:
 
 
 def test_an_unknown_preset_names_those_there_are() -> None:
-    with pytest.raises(ValueError, match=r"'fast' is unknown; choose one of .*scas4d"):
+    with pytest.raises(ValueError, match=r"preset='fast': there is no preset of this name; give one of .*scas4d"):
         preset("fast")
 
 
