@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from client.cli.extras import CUDA, SERVER
+from client.cli.extras import CUDA, SERVER, remedy
 
 FAKES = str(Path(__file__).parents[1] / "helpers")
 ALONE = f"""
@@ -51,7 +51,6 @@ def refused(*arguments, **more):
         ("demo --capture TINY --out OUT", "server"),
         ("reconstruct TINY --out OUT", "server"),
         ("evaluate TINY --out OUT", "server"),
-        ("reconstruct TINY --out OUT --device cuda", "cuda"),
     ],
 )
 def test_the_client_alone_names_what_to_install(capture_folder, tmp_path, command, extra):
@@ -59,6 +58,15 @@ def test_the_client_alone_names_what_to_install(capture_folder, tmp_path, comman
     words = command.replace("TINY", str(capture_folder)).replace("OUT", str(tmp_path / "out")).split()
     said = refused(*words, before=[tmp_path])
     assert f"pip install -e '.[{extra}]'" in said
+
+
+@pytest.mark.parametrize("package", CUDA)
+def test_a_missing_package_for_the_gpu_names_its_extra(package):
+    said = remedy(ModuleNotFoundError(f"No module named {package!r}", name=f"{package}.cuda"))
+    assert said is not None
+    assert package in said
+    assert "pip install -e '.[cuda]'" in said
+    assert remedy(ModuleNotFoundError("No module named 'other'", name="other")) is None
 
 
 def test_the_client_alone_still_helps(tmp_path):
@@ -87,7 +95,7 @@ def test_evaluate_asks_for_test_cameras(capture_folder, tmp_path):
         ("update.iterations=x", "setting update.iterations='x': "),
         (
             "update.iteration=4",
-            "setting update.iteration=4: there is no setting of this name; did you mean update.iterations?",
+            "there is no setting of this name; did you mean update.iterations?",
         ),
     ],
 )
