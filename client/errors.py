@@ -1,4 +1,4 @@
-"""What can go wrong between a client and the service, as exceptions.
+"""Exceptions of the client: refusals of the service by kind, and a service that does not answer.
 
 ::
 
@@ -55,7 +55,7 @@ class NotFound(ServiceError):
 
 
 class Conflict(ServiceError):
-    """What is there already does not allow it."""
+    """The scene's present state does not allow it."""
 
 
 class FrameGap(Conflict):

@@ -145,7 +145,7 @@ class Retries:
 
 
 def seconds_asked(header: str) -> float | None:
-    """What a Retry-After asks for, a number or a date; None where it says nothing that can be read."""
+    """Seconds that a Retry-After header asks for, a number or a date; None where it cannot be read."""
     if header.strip().isdigit():
         return float(header)
     try:

@@ -59,7 +59,7 @@ def _sends_async(build: Callable[P, Call[T]]) -> Callable[Concatenate[AsyncClien
 
 
 class _Settings:
-    """What both clients keep."""
+    """Address, token and patience of both clients."""
 
     def __init__(self, url: str, token: str | None, patience: float, outage: float, on_retry: Told | None) -> None:
         if not url.startswith(("http://", "https://")):

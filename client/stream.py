@@ -127,7 +127,7 @@ Event = SceneMessage | FrameMessage | ViewEvent | TracksEvent | PartsEvent
 
 @dataclass(frozen=True)
 class Wish:
-    """What to subscribe to; made by the functions below."""
+    """A topic and its request, to subscribe to; made by the functions below."""
 
     topic: Topic
     request: Model
@@ -139,7 +139,7 @@ def scene_changes() -> Wish:
 
 
 def finished_frames() -> Wish:
-    """What became of each frame, with its metrics."""
+    """Subscribes to the report of each finished frame, with its metrics."""
     return Wish(Topic.FRAMES, NoRequest())
 
 
@@ -192,7 +192,7 @@ def _wire(camera: Camera | str) -> CameraModel | str:
 
 
 class _Session:
-    """What both streams know without a connection: the subscriptions, how to say them, how to read what comes."""
+    """Subscriptions of a stream, the messages that ask for them, and the events read from the answers."""
 
     def __init__(self, url: str, scene: str, token: str | None, outage: float) -> None:
         self.scene = scene
@@ -229,7 +229,7 @@ class _Session:
         return Unsubscribe(id=id).model_dump_json()
 
     def read(self, data: str | bytes) -> Event | Gone | None:
-        """What a message means to the caller; None where it means nothing.
+        """The event of a message; None for a message that is none to the caller.
 
         Raises:
             ServiceError: the service refused what was asked for.

@@ -9,7 +9,7 @@ from client.wire import Budget, ReplayRequest, SceneBudget, TradeoffModel
 
 
 def budget(id: str) -> Call[SceneBudget]:
-    """What the updates of a scene may cost."""
+    """Reads the budget of a scene's updates."""
     return Call("GET", path(id, "budget"), reads(SceneBudget))
 
 
@@ -35,7 +35,7 @@ def set_budget(
 
 
 def tradeoff(id: str) -> Call[TradeoffModel]:
-    """What accuracy costs in time, for this scene on its machine."""
+    """Reads the measured points of accuracy against time, for this scene on its machine."""
     return Call("GET", path(id, "tradeoff"), reads(TradeoffModel))
 
 

@@ -73,12 +73,12 @@ def _framed(
 
 
 def frame(id: str, index: int) -> Call[FrameReportModel]:
-    """What became of a frame."""
+    """Reads the report of a frame."""
     return Call("GET", path(id, "frames", index), reads(FrameReportModel))
 
 
 def frames(id: str, first: int = 0, limit: int = 500) -> Call[FrameList]:
-    """What became of many frames, from `first` on; `next` of the answer says where to go on."""
+    """Reads the reports of many frames, from `first` on; `next` of the answer is the index to go on with."""
     arguments = {"params": {"first": first, "limit": limit}}
     return Call("GET", path(id, "frames"), reads(FrameList), arguments=arguments)
 

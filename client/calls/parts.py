@@ -1,4 +1,4 @@
-"""What moves together."""
+"""Parts: groups of Gaussians that move together."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ PUSH_OUTAGE_S = 600.0
 
 
 class PicturesFrom(StrEnum):
-    """Where the pictures of a capture are."""
+    """The kind of files that hold a capture's pictures."""
 
     IMAGES = "images"
     VIDEOS = "videos"
@@ -29,14 +29,14 @@ class PicturesFrom(StrEnum):
 
 
 class Encoding(StrEnum):
-    """How pictures are encoded anew."""
+    """The format of pictures that are encoded anew."""
 
     JPEG = "jpeg"
     PNG = "png"
 
 
 class WhenFull(StrEnum):
-    """What happens to a frame when the queue is full."""
+    """The service's answer to a frame when the queue is full."""
 
     REFUSE = "refuse"
     SKIP = "skip"
@@ -218,7 +218,7 @@ def import_(
 
 
 def frame_line(report: FrameReportModel, missed: int = 0) -> str:
-    """What became of a frame, for a person."""
+    """A finished frame's report as one line."""
     parts = [f"frame {report.index}: {report.state}"]
     if report.psnr is not None:
         parts.append(f"{report.psnr:.1f} dB")

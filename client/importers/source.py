@@ -48,7 +48,7 @@ class Source(Protocol):
 
     @property
     def remarks(self) -> Sequence[str]:
-        """What a person should know about how it was read."""
+        """Remarks on the reading, for a person."""
 
     def time(self, index: int) -> float:
         """Seconds of a frame, rising."""
@@ -98,7 +98,7 @@ class Pictures(Protocol):
 
     @property
     def remarks(self) -> Sequence[str]:
-        """What a person should know about how they were read."""
+        """Remarks on the reading, for a person."""
 
     def time(self, index: int) -> float | None:
         """Seconds, where the pictures say."""
@@ -155,7 +155,7 @@ class ImportedSource:
         return Rig(tuple(undistorter.camera for undistorter in self._undistorters.values()))
 
     def undistorter(self, camera: str) -> Undistorter:
-        """What undoes a camera's lens."""
+        """The undistorter of a camera's lens."""
         return self._undistorters[camera]
 
     def time(self, index: int) -> float:

@@ -1,4 +1,4 @@
-"""When a rig takes its frames, and what of it is lost: the clock of the rig simulator."""
+"""Pace of the rig simulator: frame rate, jitter and losses."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Pace:
-    """How a rig behaves.
+    """Frame rate, jitter and losses of a simulated rig; the same seed gives the same.
 
     Attributes:
         fps: frames a second; None sends as fast as the service takes them.
@@ -31,7 +31,7 @@ class Pace:
             raise ValueError(f"drop {self.drop!r} must be a share from 0 to below 1")
 
     def loses(self, index: int, camera: str = "") -> bool:
-        """Is this frame (or this camera's picture of it) lost? The same answer every time."""
+        """True where this frame (or this camera's picture of it) is lost; the same answer every time."""
         return index > 0 and random.Random(f"{self.seed} {index} {camera} lost").random() < self.drop
 
     def late(self, index: int, camera: str = "") -> float:

@@ -1,4 +1,4 @@
-"""How the rig simulator's frames leave: as requests or over WebSockets, whole or each camera for itself, in time."""
+"""Sends the rig simulator's frames in time: as requests or over WebSockets, whole or camera by camera."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class Sequence:
         return FOREVER if self.loop else self._last + 1
 
     def place(self, index: int) -> int:
-        """Which frame of the capture is frame `index` of the scene."""
+        """The frame of the capture that is frame `index` of the scene."""
         if index <= self._last:
             return self.start + index
         if self._last == 0:

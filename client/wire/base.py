@@ -1,4 +1,4 @@
-"""What the models on the wire are made of."""
+"""Base class and field types of the models on the wire."""
 
 from __future__ import annotations
 

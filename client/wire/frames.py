@@ -32,7 +32,7 @@ class PartReceipt(Model):
 
 
 class FrameState(StrEnum):
-    """Where a frame is. The last four are for ever."""
+    """State of a frame. The last four are final."""
 
     OPEN = "open"
     QUEUED = "queued"
@@ -54,7 +54,7 @@ class MissingRequest(Model):
 
 
 class CameraFitModel(Model):
-    """How well one camera's picture was met, when it was last rendered: a bumped or changed camera shows."""
+    """Fit of one camera's picture when it was last rendered: a bumped or changed camera shows."""
 
     psnr: float | None = Field(description="dB.")
     colour_shift: tuple[float, float, float] | None = Field(
@@ -68,7 +68,7 @@ class CameraFitModel(Model):
 
 
 class CurvePointModel(Model):
-    """How far an update was."""
+    """One point of an update's progress."""
 
     iterations: int
     milliseconds: float = Field(description="Since the update began, after decoding.")
@@ -76,7 +76,7 @@ class CurvePointModel(Model):
 
 
 class FrameReportModel(Model):
-    """What became of a frame."""
+    """Report of one frame: its state, times, errors and metrics."""
 
     scene: str
     index: int

@@ -37,7 +37,7 @@ class FramingError(ValueError):
 
 
 class FileKind(StrEnum):
-    """What a file is."""
+    """Kind of a file: image or mask."""
 
     IMAGE = "image"
     MASK = "mask"
@@ -52,7 +52,7 @@ class FrameFile(Model):
 
 
 class FrameHead(Model):
-    """What a frame consists of."""
+    """Head of a framed body: the frame's index, time and files."""
 
     index: int = Field(ge=0, le=MAX_INDEX)
     time: FiniteFloat | None = Field(default=None, description="Seconds; by the scene's frame rate where not given.")

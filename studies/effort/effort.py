@@ -41,7 +41,7 @@ COUNTED_FROM = 2
 
 @dataclass
 class Kept:
-    """How one budget was kept: seconds of each counted frame, its iterations, and the seconds of one."""
+    """Measured frames under one budget: seconds and iterations of each, and the seconds of one iteration."""
 
     milliseconds: float
     seconds: list[float] = field(default_factory=list)

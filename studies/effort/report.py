@@ -1,4 +1,4 @@
-"""What an update spends on its own report: the share of its stage, and the check that the stage leaves nothing out.
+"""Cost of an update's own report: the share of its stage, and the check that the stage leaves nothing out.
 
 The stage ``report`` has the stage timers themselves, losses that nothing but the curve asks for, the cameras' colour
 shifts, and assembling and writing the record; publishing it, as a worker does, is timed here and belongs to it. What is

@@ -1,4 +1,4 @@
-"""How an update converges: the test cameras' PSNR of the state after some of its iterations.
+"""Convergence of an update: the test cameras' PSNR of the state after some of its iterations.
 
 Rates fall and layers begin by shares of an update's iterations, so the curve of a long update does not run through the
 ends of shorter ones. The test cameras are rendered beside the update and never reach it.
@@ -92,7 +92,7 @@ def measure_convergence(
 
 
 def read_convergence(out: Path, capture: str) -> Row | None:
-    """What ``measure_convergence`` left for a capture; None where it was not measured."""
+    """Reads the measurements of ``measure_convergence`` for a capture; None where there are none."""
     path = out / "convergence" / f"{capture}.json"
     if not path.exists():
         return None

@@ -136,7 +136,7 @@ def equal_table(compared: Sequence[EqualSeconds]) -> str:
 
 
 def equal_words(compared: Sequence[EqualSeconds]) -> str:
-    """How often ``scas4d`` is ahead, and by how much at least."""
+    """Says in how many comparisons ``scas4d`` is ahead, and by how much at least."""
     leads = [one.lead for one in compared if one.lead is not None]
     missing = len(compared) - len(leads)
     if not leads:
@@ -312,7 +312,7 @@ def _over(points: Sequence[Point], axis: str, captures: Sequence[str]) -> str:
 
 
 def _spreads(points: Sequence[Point], captures: Sequence[str]) -> str:
-    """What chance does: the standard deviation over the seeds of the updates."""
+    """The effect of chance: the standard deviation over the seeds of the updates."""
     told = []
     for method in METHODS:
         by_capture = {name: spread(points, method, name) for name in captures}

@@ -264,7 +264,7 @@ def draw_drift(points: Sequence[Point], capture: str, file: Path) -> None:
 
 
 def draw_stages(points: Sequence[Point], title: str, file: Path) -> None:
-    """Where the time of a frame goes, a bar a setting.
+    """Draws the time of a frame by stage, a bar a setting.
 
     Args:
         points: in the order of the bars, the first on top.

@@ -112,7 +112,7 @@ def measure_times(
 
 
 def read_times(out: Path, capture: str) -> Row | None:
-    """What ``measure_times`` left for a capture; None where it was not measured."""
+    """Reads the times of ``measure_times`` for a capture; None where there are none."""
     path = out / "timing" / f"{capture}.json"
     if not path.exists():
         return None

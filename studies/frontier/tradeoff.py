@@ -139,12 +139,12 @@ class EqualSeconds:
 
     @property
     def lead(self) -> float | None:
-        """How far ``scas4d`` is ahead, in dB."""
+        """The lead of ``scas4d`` in dB."""
         return None if self.psnr is None else self.psnr - self.baseline_psnr
 
 
 def equal_seconds(points: Sequence[Point], captures: Sequence[str]) -> list[EqualSeconds]:
-    """Who is ahead at equal seconds, at every budget of ``BUDGETS`` that was measured."""
+    """Compares the methods at equal seconds, at every budget of ``BUDGETS`` that was measured."""
     own, other = METHODS
     found = []
     for capture in captures:

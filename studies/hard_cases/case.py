@@ -1,4 +1,4 @@
-"""What a hard case is, and the laws that all of them share."""
+"""Hard cases as values, and the laws that all of them share."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CPU, TORCH, CUDA = "cpu", "torch float32", "cuda"
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What one backend made of a case.
+    """Result of one backend on a case.
 
     Attributes:
         values, gradients: arrays by name.
@@ -37,7 +37,7 @@ class Problem(Protocol):
         """Compute it; None where the backend has no such computation."""
 
     def violations(self, outcomes: Mapping[str, Outcome]) -> list[str]:
-        """What does not hold, in words."""
+        """Laws that do not hold, in words."""
 
 
 def _nothing_more(problem: Any, outcomes: Mapping[str, Outcome]) -> list[str]:

@@ -163,7 +163,7 @@ def sources() -> str:
 
 
 def known(store: Path) -> dict[str, list[str]] | None:
-    """What ``study`` has found for these sources; None where it has not been run to its end."""
+    """Results of ``study`` for these sources; None where it has not been run to its end."""
     file = store / f"mutations-{sources()}.json"
     results: dict[str, list[str]] = json.loads(file.read_text()) if file.exists() else {}
     found = {guard.name: results[guard.name] for guard in mutants() if guard.name in results}

@@ -119,7 +119,7 @@ def _tiny(value: float) -> Callable[[int, Array], None]:
 
 
 def denormal(array: NDArray[Any]) -> int:
-    """How many numbers are neither 0 nor normal in float32."""
+    """Count of numbers that are neither 0 nor normal in float32."""
     return int(np.count_nonzero((array != 0) & (np.abs(array) < np.finfo(np.float32).tiny)))
 
 

@@ -1,4 +1,4 @@
-"""What the checks cost: share of an update, by its stage timers, the bar against it."""
+"""Cost of the checks: share of an update by its stage timers, against the target."""
 
 from __future__ import annotations
 

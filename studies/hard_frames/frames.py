@@ -39,7 +39,7 @@ class Footage(Protocol):
         """The training pictures."""
 
     def truth(self, index: int) -> Pictures:
-        """What the held-out cameras see."""
+        """True pictures of the held-out cameras."""
 
     def jumped(self, index: int, sizes: float) -> tuple[Frame, Pictures] | None:
         """The same with the object moved by so many times its own size; None where that cannot be had."""
@@ -63,7 +63,7 @@ class Sent:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What came of one.
+    """Outcome of one frame.
 
     Attributes:
         sent: what was sent. report: of the frame. kept: whether the state is that before, bit by bit. sound: whether
@@ -102,7 +102,7 @@ class FrameCase:
 
 
 def violations(case: FrameCase, steps: Sequence[Step], size: Any) -> list[str]:
-    """What does not hold, a sentence each."""
+    """Laws that do not hold, a sentence each."""
     found = [f"frame {step.report.index}: not finite, or a rotation is no unit" for step in steps if not step.sound]
     faulty = [step for step in steps if not step.sent.good]
     found += case.holds(faulty, size)

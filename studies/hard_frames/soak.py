@@ -123,7 +123,7 @@ class Soak:
         return [Row(**row) for row in told if row["frame"] <= self.done]
 
     def frame(self, index: int) -> Frame:
-        """What the cameras see."""
+        """Pictures of all cameras."""
         shown = photograph(true_state(self.first, index), self._rig)
         return Frame(index, index / RATE, shown.images, shown.masks)
 
@@ -171,7 +171,7 @@ class Soak:
 
 
 def violations(rows: Sequence[Row]) -> list[str]:
-    """What does not hold, a sentence each."""
+    """Targets that are missed, a sentence each."""
     found = []
     for row in rows:
         at = f"frame {row.frame}: "

@@ -150,7 +150,7 @@ def _decibels(values: Sequence[float]) -> str:
 
 
 def _said(step: Step) -> str:
-    """What a report says, in one line."""
+    """A frame's report in one line."""
     report = step.report
     words = [] if report.degraded is None else [report.degraded]
     if report.dropped:
@@ -166,7 +166,7 @@ def _same(before: Gaussians, after: Gaussians) -> bool:
 
 
 def sound(state: Gaussians) -> bool:
-    """Whether a state is finite and its rotations are units."""
+    """True where a state is finite and its rotations are units."""
     finite = all(bool(np.isfinite(array).all()) for array in state.arrays().values())
     norms = np.linalg.norm(state.rotations.astype(np.float64), axis=1)
     return finite and bool(np.abs(norms - 1).max() <= UNIT)

@@ -55,7 +55,7 @@ full size however small a gradient is. One unit in the last place moves the CPU'
 
 @dataclass(frozen=True)
 class Stage:
-    """How far apart the two are in one stage.
+    """Difference of the two devices in one stage.
 
     Attributes:
         name: of the stage.
@@ -72,7 +72,7 @@ class Stage:
 
     @property
     def agrees(self) -> bool:
-        """Whether every array is within the stage's tolerance; NaN is not."""
+        """True where every array is within the stage's tolerance; NaN is not."""
         return all(difference <= TOLERANCES[self.name] for difference in self.differences.values())
 
 

@@ -141,7 +141,7 @@ def summary(outcomes: Sequence[Outcome], by_title: Mapping[str, Sequence[Outcome
 
 
 def _commands(captures: Sequence[str], there: Sequence[str], page: Path) -> str:
-    """What measures the rows and writes the page."""
+    """The commands that measure the rows and write the page."""
     command = "scripts/bench paper " + " ".join(f"CAPTURES/{name}" for name in there)
     more = " ".join(f"CAPTURES/{name}" for name in captures if name not in there)
     if not more:
@@ -150,7 +150,7 @@ def _commands(captures: Sequence[str], there: Sequence[str], page: Path) -> str:
 
 
 def _elsewhere(captures: Sequence[str], there: Sequence[str]) -> str:
-    """Where the figures of captures come from that the study has no rows of."""
+    """The source of figures for captures that the study has no rows of."""
     others = [name for name in captures if name not in there]
     if not others:
         return ""

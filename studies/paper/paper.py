@@ -193,7 +193,7 @@ AgreementWord = Literal["sign and size", "sign", "no", "not measured"]
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a claim came out.
+    """A claim of the paper beside our figures.
 
     Attributes:
         paper: the paper's mean gain over the captures that both have; None where it prints none.

@@ -80,7 +80,7 @@ def run(
 
 
 def same_bits(rows: Sequence[Row], capture: str) -> bool:
-    """Whether the states of a capture are the same on all targets that were measured."""
+    """True where the states of a capture are the same on all processors that were measured."""
     own = [row for row in rows if row["capture"] == capture and row["seed"] == 0]
     return len({json.dumps(row["states"]) for row in own}) == 1
 

@@ -53,7 +53,7 @@ class Run:
     frames: int | None = None
 
     def settings(self, capture: str) -> Settings:
-        """What is run on a capture, complete."""
+        """Complete settings of the run on a capture."""
         return settings_of(self.preset, self.iterations, changes=[*CAPTURE_CHANGES.get(capture, ()), *self.changes])
 
     def job(self, folder: Path, frames: int | None = None) -> Job:

@@ -144,7 +144,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Figure:
-    """What a target is about on one capture: the value, the two it is the difference of, and the updates covered."""
+    """A target's figure on one capture: the value, the two it is the difference of, and the updates covered."""
 
     value: float
     parts: tuple[float, float] | None
@@ -164,7 +164,7 @@ def compare(rows: Rows, targets: Sequence[Target] = TARGETS) -> list[Verdict]:
 
 
 def figure_of(target: Target, capture: str, rows: Rows) -> Figure | None:
-    """What the rows of a capture say; None where one that is needed is missing or lacks the value."""
+    """The figure of a capture; None where a row that is needed is missing or lacks the value."""
     needed = [rows.get((run, capture)) for run in (target.run, *target.over)]
     there = [row for row in needed if row is not None]
     if len(there) < len(needed):
@@ -198,7 +198,7 @@ def target_table(verdicts: Sequence[Verdict]) -> str:
 
 
 def count_words(verdicts: Sequence[Verdict]) -> str:
-    """How many targets are reached, missed, and not measured."""
+    """Counts the targets that are reached, missed, and not measured."""
     compared = [verdict for verdict in verdicts if verdict.target.threshold is not None]
     reached, missed = (sum(verdict.reached is answer for verdict in compared) for answer in (True, False))
     return f"{reached} reached, {missed} missed, {len(compared) - reached - missed} not measured, of {len(compared)}"
@@ -215,7 +215,7 @@ def read_study(folder: Path) -> dict[tuple[str, str], Row]:
 
 
 def left_out(folder: Path, rows: Rows) -> int:
-    """How many finished rows in the folder of a study belong to no run as it is set today, or are not its longest."""
+    """Counts finished rows that belong to no run as it is set today, or are not its longest."""
     used = {row.get("key") for row in rows.values()}
     return sum("error" not in row and row["key"] not in used for row in Store(folder).rows())
 
@@ -281,7 +281,7 @@ def _value(row: Row, metric: str, updates: int) -> float | None:
 
 
 def _updates(metric: str, rows: Sequence[Row], shared: int) -> str:
-    """Which updates a figure covers; those of each row where their values are not taken over the shared ones."""
+    """The updates that a figure covers; those of each row where values are not taken over the shared ones."""
     if metric == "psnr_first":
         return "frame 0"
     if "capture_frames" not in rows[0]:

@@ -1,4 +1,4 @@
-"""What single flipped bits cost, wherever they are: each is noticed or harmless, and no picture is wrong.
+"""Single flipped bits, wherever they are: each must be noticed or harmless, and no picture wrong.
 
 One scene, frame after frame. Before each frame one bit of one file is flipped, under the service as it runs, or while
 it is down; then views are asked for, the next frame is sent, and all is compared with a run that nothing disturbed.
@@ -42,7 +42,7 @@ Pictures = dict[int, bytes]
 
 @dataclass
 class Flips:
-    """What came of the flipped bits.
+    """Outcome of the flipped bits.
 
     Attributes:
         counts: noticed or harmless, by kind. remade, lost: frames whose state is another one, or gone.
@@ -58,7 +58,7 @@ class Flips:
 
 
 def frames_for(count: int) -> int:
-    """How many frames a study of so many flips sends."""
+    """Number of frames that a study of so many flips sends."""
     return BEFORE + count
 
 
@@ -179,7 +179,7 @@ class _Flip:
         return outcome
 
     def _harmless(self) -> bool:
-        """Whether everything that can be read of the file is what was written."""
+        """True where everything that can be read of the file is what was written."""
         try:
             if self.kind == "frame":
                 return bool(read_pictures(self.file.parent, self.file.name).images)
@@ -222,7 +222,7 @@ class _Flip:
             self.faults.append("an answer names a path of the server")
 
     def _put_right(self, flipped: bytes) -> None:
-        """What the service could not mend is whole again, so that the next bit is the only one."""
+        """Restores what the service could not mend, so that the next bit is the only one."""
         try:
             with self.file.open("r+b") as opened:
                 opened.seek(self.at)

@@ -1,5 +1,4 @@
-"""What kills, cuts, flipped bits and a full disk cost: nothing acknowledged, and not a bit of the states. And what
-strangers without a token cost (`studies.service.strangers`).
+"""Kills, cuts, flipped bits, a full disk and strangers: none may cost an acknowledged frame or a bit of the states.
 
 Each scenario runs the whole service as a process of its own. The undisturbed run comes first; the others are compared
 with it, state by state and bit by bit.

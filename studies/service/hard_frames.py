@@ -77,7 +77,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Part:
-    """What is sent for one case, from which index of the scene on."""
+    """Frames sent for one case, from an index of the scene on."""
 
     case: FrameCase
     size: Any

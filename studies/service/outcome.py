@@ -19,7 +19,7 @@ class Outcome:
 
     @property
     def reached(self) -> bool:
-        """Whether nothing went wrong."""
+        """True where nothing went wrong."""
         return not self.faults
 
 

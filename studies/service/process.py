@@ -111,7 +111,7 @@ class Service:
         return SceneStatus.model_validate_json(self.http.get(f"/v1/scenes/{scene}").content)
 
     def frame(self, scene: str, index: int) -> FrameReportModel:
-        """What became of a frame."""
+        """The report of a frame."""
         return FrameReportModel.model_validate_json(self.http.get(f"/v1/scenes/{scene}/frames/{index}").content)
 
     def finish(self, scene: str, frames: int) -> SceneStatus:

@@ -1,4 +1,4 @@
-"""What strangers without a token cost: `/health/live`, memory and updates with an attack and without, in turns.
+"""Cost of strangers without a token: `/health/live`, memory and updates with an attack and without, in turns.
 
 The attack is `studies.service.attack`, in a process of its own; a service runs with a token and one without. The scene
 goes on updating all the time, in the turns with the attack until its last connection is closed.
@@ -36,7 +36,7 @@ WARM_UP = 3
 
 @dataclass(frozen=True)
 class Attack:
-    """How much at once: bytes of one endless header, half-sent headers, hanging uploads."""
+    """Size of an attack: bytes of one endless header, half-sent headers, hanging uploads."""
 
     header: int = 300_000_000
     halves: int = 300

@@ -1,4 +1,4 @@
-"""What a study of the service sends, to which service, and what it compares: the frames, their sender, the states."""
+"""Frames of a study of the service, their sender, and the states that are compared."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Files = tuple[dict[str, bytes], dict[str, bytes]]
 
 @dataclass(frozen=True)
 class Study:
-    """What is sent, and where to.
+    """Frames to be sent, and the service that takes them.
 
     Attributes:
         folder: for data folders and logs. frames: encoded pictures and masks of each. settings: of the scene.

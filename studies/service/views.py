@@ -1,4 +1,4 @@
-"""What live views cost an update, and an update the views: a scene under an open-loop load of renders.
+"""Live views beside updates, each slowed by the other: a scene under an open-loop load of renders.
 
 A service runs in a process of its own. For each rate: views while nothing is updated, updates while nobody looks, and
 both together, in turns, because a machine's speed drifts. Arrivals are at fixed times whatever came of the requests

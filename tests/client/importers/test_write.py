@@ -55,8 +55,8 @@ def test_what_was_imported_is_a_capture(distorted, tmp_path):
 
 def test_a_cloud_of_unknown_foreground_comes_along(tmp_path):
     pytest.importorskip("pycolmap")
+    from rigs import colmap_model as model
     from rigs import write_pictures
-    from test_colmap import model
 
     model(lenses("PINHOLE"), tmp_path / "in/sparse/0", "PINHOLE", True)
     write_pictures(tmp_path / "in/images")

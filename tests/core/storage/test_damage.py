@@ -7,7 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
-from test_history import filled, same, state
+from histories import filled, same, state
 
 from scas4d_core.storage.checkpoint import Checkpoints
 from scas4d_core.storage.error_text import told, without_paths
