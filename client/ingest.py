@@ -75,7 +75,7 @@ class IngestSocket:
     def _send(self, chunks: list[bytes]) -> FrameReceipt | PartReceipt:
         call: Call[Any] = Call("PUT", self._address, lambda response: None)
         client = self._client
-        retries = Retries(call, client.url, busy=client.patience, outage=client.outage, told=client.on_retry)
+        retries = Retries(call, client.url, busy=client.patience, outage=client.outage, on_retry=client.on_retry)
         while True:
             wait: float | None
             try:

@@ -59,18 +59,20 @@ class Retry:
     detail: str
 
 
-Told = Callable[[Retry], None]
+OnRetry = Callable[[Retry], None]
 
 
 class Retries:
     """Of one call: says after how many seconds it may be sent again, or raises."""
 
-    def __init__(self, call: Call[Any], url: str, *, busy: float, outage: float, told: Told | None = None) -> None:
+    def __init__(
+        self, call: Call[Any], url: str, *, busy: float, outage: float, on_retry: OnRetry | None = None
+    ) -> None:
         self.call = call
         self._url = url
         self._busy_left = busy
         self._outage = outage
-        self._told = told
+        self._on_retry = on_retry
         self._failed_at: float | None = None
         self._failures = 0
         self._lost = False
@@ -139,8 +141,8 @@ class Retries:
         return self._tell(Retry("outage", min(wait, left), detail))
 
     def _tell(self, retry: Retry) -> float:
-        if self._told is not None:
-            self._told(retry)
+        if self._on_retry is not None:
+            self._on_retry(retry)
         return retry.seconds
 
 

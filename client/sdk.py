@@ -18,7 +18,7 @@ import httpx
 from client import calls
 from client.calls import Call
 from client.errors import ServiceError
-from client.retries import BUSY_S, OUTAGE_S, Retries, Told
+from client.retries import BUSY_S, OUTAGE_S, OnRetry, Retries
 from client.wire import FINISHED, FrameReportModel, SceneState, SceneStatus
 
 __all__ = ["DEFAULT_URL", "AsyncClient", "Client", "ServiceError"]
@@ -61,7 +61,7 @@ def _sends_async(build: Callable[P, Call[T]]) -> Callable[Concatenate[AsyncClien
 class _Settings:
     """Address, token and patience of both clients."""
 
-    def __init__(self, url: str, token: str | None, patience: float, outage: float, on_retry: Told | None) -> None:
+    def __init__(self, url: str, token: str | None, patience: float, outage: float, on_retry: OnRetry | None) -> None:
         if not url.startswith(("http://", "https://")):
             raise ValueError(f"url {url!r} is no address of a service; write http://{url.partition('://')[2] or url}")
         self.url = url.rstrip("/")
@@ -75,7 +75,7 @@ class _Settings:
         return {"base_url": self.url, "timeout": httpx.Timeout(TIMEOUT_S, connect=10.0), "headers": headers}
 
     def _retries(self, call: Call[Any]) -> Retries:
-        return Retries(call, self.url, busy=self.patience, outage=self.outage, told=self.on_retry)
+        return Retries(call, self.url, busy=self.patience, outage=self.outage, on_retry=self.on_retry)
 
 
 class Client(_Settings):
@@ -101,7 +101,7 @@ class Client(_Settings):
         token: str | None = None,
         patience: float = BUSY_S,
         outage: float = OUTAGE_S,
-        on_retry: Told | None = None,
+        on_retry: OnRetry | None = None,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
         super().__init__(url, token, patience, outage, on_retry)
@@ -201,7 +201,7 @@ class AsyncClient(_Settings):
         token: str | None = None,
         patience: float = BUSY_S,
         outage: float = OUTAGE_S,
-        on_retry: Told | None = None,
+        on_retry: OnRetry | None = None,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         super().__init__(url, token, patience, outage, on_retry)

@@ -20,7 +20,6 @@ LONG = {
     "scas4d_core/storage/history.py": "to be shortened",
     "scas4d_core/torch_backend/update.py": "the twin of the whole update, read beside it",
     "server/scene/scene.py": "to be shortened",
-    "client/stream.py": "to be shortened",
 }
 """Longer files, each with its reason. Kernels are exempt: one flat function is one file."""
 

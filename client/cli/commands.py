@@ -108,8 +108,8 @@ def push(
             preset=preset,
             settings=settings,
             ingest=IngestSettings(when_full=when_full.value),
-            told=bars,
-            said=lambda sentence: console.print(sentence, style="yellow", highlight=False),
+            on_progress=bars,
+            on_message=lambda sentence: console.print(sentence, style="yellow", highlight=False),
         )
         status = client.scene(delivery.scene)
     console.print(delivery.lateness.summary(fps), highlight=False, soft_wrap=True)
@@ -213,7 +213,7 @@ def import_(
 
     source = _opened(capture, calibration, pictures, capture_fps, masks, encoding)
     with Bars() as bars:
-        write_dynamic3dgs(source, out, frames=frames, test=test or (), told=bars)
+        write_dynamic3dgs(source, out, frames=frames, test=test or (), on_progress=bars)
     console.print(f"{out}: {len(source.rig)} cameras; try: scas4d push {out}", highlight=False, soft_wrap=True)
 
 

@@ -107,7 +107,9 @@ def run(capture: Capture, url: str, out: Path, *, frames: int | None, preset: st
             if earlier.name == name:  # each would be one of the few that the service takes
                 client.delete_scene(earlier.id)
         with Bars() as bars:
-            delivery = rig.push(capture, client, name=name, frames=frames, preset=preset, settings=settings, told=bars)
+            delivery = rig.push(
+                capture, client, name=name, frames=frames, preset=preset, settings=settings, on_progress=bars
+            )
         status = client.scene(delivery.scene)
         if status.last_committed is None:
             raise RuntimeError(f"no frame was committed: {status.error}")

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from client.importers.calibration import Calibration, View, calibration
+from client.importers.calibration import CalibratedImage, Calibration, calibration
 from client.importers.lens import MODELS, LensCamera, lens_camera
 from scas4d_core.captures import CaptureError, InitialPoints
 
@@ -78,7 +78,9 @@ def read_colmap(folder: Path) -> Calibration:
     points = None
     if files["points3D"].is_file():
         points = _cloud(list(_binary_points(files["points3D"]) if binary else _text_points(files["points3D"])))
-    views = [View(PurePosixPath(image.name.replace("\\", "/")), _lens(files, cameras, image)) for image in images]
+    views = [
+        CalibratedImage(PurePosixPath(image.name.replace("\\", "/")), _lens(files, cameras, image)) for image in images
+    ]
     return calibration(folder, views, points=points)
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from client.importers.calibration import Calibration, View, calibration
+from client.importers.calibration import CalibratedImage, Calibration, calibration
 from client.importers.lens import MODELS, lens_camera
 from scas4d_core.captures import CaptureError
 from scas4d_core.captures.files import read_json
@@ -54,7 +54,7 @@ def read_transforms(path: Path) -> Calibration:
     return calibration(path, views, fps=fps)
 
 
-def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: Float, scale: float) -> View:
+def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: Float, scale: float) -> CalibratedImage:
     file = frame.get("file_path")
     if not isinstance(file, str) or not PurePosixPath(file).name:
         raise CaptureError(f"{where} has no file_path")
@@ -82,7 +82,7 @@ def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: F
     camera = lens_camera(file, model, parameters, pose, size, source=where)
     path = PurePosixPath(file)
     time = _number(where, frame, "time") if frame.get("time") is not None else None
-    return View(path, camera, time)
+    return CalibratedImage(path, camera, time)
 
 
 def _model_unsaid(given: Mapping[str, Any]) -> str:

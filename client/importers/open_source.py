@@ -9,7 +9,7 @@ from client.importers.calibration import Calibration
 from client.importers.colmap import is_model, read_colmap
 from client.importers.nerfstudio import FILE, read_transforms
 from client.importers.pictures import PictureFiles, folders_of, named_files
-from client.importers.source import CaptureSource, Encoding, ImportedSource, Pictures, Source
+from client.importers.source import CaptureSource, Encoding, ImportedSource, PictureReader, Source
 from client.importers.videos import Videos, find_videos
 from scas4d_core.captures import Capture, CaptureError, open_capture
 from scas4d_core.captures.dynamic3dgs import TRAIN_META
@@ -102,7 +102,7 @@ def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
     )
 
 
-def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | None) -> Pictures:
+def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | None) -> PictureReader:
     images, videos = folder / "images", folder / "videos"
     has_images = images.is_dir() and any(path.is_dir() for path in images.iterdir())
     if wanted == "named" or (wanted is None and min(len(views) for views in calibration.views.values()) > 1):

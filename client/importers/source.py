@@ -85,7 +85,7 @@ class CaptureSource:
         return self._capture.encoded_mask(index, camera)
 
 
-class Pictures(Protocol):
+class PictureReader(Protocol):
     """The pictures of the cameras as they took them: files or videos."""
 
     @property
@@ -132,7 +132,7 @@ class ImportedSource:
         self,
         name: str,
         calibration: Calibration,
-        pictures: Pictures,
+        pictures: PictureReader,
         *,
         masks: tuple[Mapping[str, Path], ...] = (),
         fps: float | None = None,

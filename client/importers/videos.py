@@ -99,7 +99,7 @@ class Video:
         if frame.rotation:
             raise CaptureError(
                 f"{self.path}: its metadata turns the picture by {frame.rotation}°, and whether the calibration was of "
-                "turned pictures cannot be told; store the pixels as calibrated and drop the rotation"
+                "turned pictures cannot be recognized; store the pixels as calibrated and drop the rotation"
             )
         picture: Picture = frame.to_ndarray(format="rgb24")
         return picture

@@ -15,7 +15,7 @@ from client.importers.source import Source
 from scas4d_core.cameras import Camera
 from scas4d_core.captures import CaptureError
 
-Told = Callable[[str, int, int], None]
+OnProgress = Callable[[str, int, int], None]
 
 
 def write_dynamic3dgs(
@@ -24,7 +24,7 @@ def write_dynamic3dgs(
     *,
     frames: int | None = None,
     test: Collection[str] = (),
-    told: Told | None = None,
+    on_progress: OnProgress | None = None,
 ) -> None:
     """Writes a capture: pictures under `ims/`, masks under `seg/`, cameras in `train_meta.json` and `test_meta.json`.
 
@@ -35,7 +35,7 @@ def write_dynamic3dgs(
         out: folder, new or empty.
         frames: how many; all where None.
         test: cameras to hold out, for measuring.
-        told: hears ("frames", done, total).
+        on_progress: hears ("frames", done, total).
 
     Raises:
         CaptureError: the folder is not empty, cameras differ in size, or a test camera is unknown or the last.
@@ -66,8 +66,8 @@ def write_dynamic3dgs(
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
         for index in range(count):
             list(pool.map(write, [index] * len(cameras), source.rig.names))
-            if told is not None:
-                told("frames", index + 1, count)
+            if on_progress is not None:
+                on_progress("frames", index + 1, count)
     points = source.points
     if points is not None:
         foreground = () if points.foreground is None else (points.foreground[:, None],)

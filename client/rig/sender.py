@@ -13,7 +13,7 @@ from client.rig.pace import Pace
 from client.rig.sequence import Files, Sequence
 from client.sdk import Client
 
-Said = Callable[[str], None]
+OnMessage = Callable[[str], None]
 
 
 class Requests:
@@ -74,7 +74,7 @@ class Sender:
         sequence: Sequence,
         pace: Pace,
         delivery: Delivery,
-        said: Said,
+        on_message: OnMessage,
         per_camera: bool,
     ) -> None:
         self._client = client
@@ -82,7 +82,7 @@ class Sender:
         self._sequence = sequence
         self._pace = pace
         self._delivery = delivery
-        self._said = said
+        self._on_message = on_message
         names = sequence.source.rig.names
         self._cameras = ThreadPoolExecutor(max_workers=len(names), thread_name_prefix="camera") if per_camera else None
         self.start_clock()
@@ -104,7 +104,7 @@ class Sender:
             except FrameGap as gap:
                 if gap.expected == index:
                     raise
-                self._said(f"the service expects frame {gap.expected} next, not {index}: going on there")
+                self._on_message(f"the service expects frame {gap.expected} next, not {index}: going on there")
                 index = gap.expected
                 continue
             if due is not None:
@@ -137,7 +137,7 @@ class Sender:
         if len(sending) < len(files.images):
             self._client.close_frame(id, index)
             lost = ", ".join(name for name in files.images if name not in sending)
-            self._said(f"frame {index}: the rig lost the pictures of {lost}; closed without them")
+            self._on_message(f"frame {index}: the rig lost the pictures of {lost}; closed without them")
 
     def _send_camera(self, index: int, name: str, files: Files) -> None:
         time.sleep(self._pace.late(index, name))
@@ -146,7 +146,7 @@ class Sender:
     def _lose(self, index: int) -> None:
         self._client.declare_missing(self._delivery.scene, index, reason="lost by the rig simulator")
         self._delivery.lost.append(index)
-        self._said(f"frame {index}: lost by the rig, declared missing")
+        self._on_message(f"frame {index}: lost by the rig, declared missing")
 
     def close(self) -> None:
         """Ends its threads."""

@@ -111,7 +111,7 @@ class FrameReportModel(Model):
     exposure: float | None = Field(default=None, description="Times brighter than the light that the colours are in.")
     held_gaussians: int | None = Field(default=None, description="That stayed as they were before, one by one.")
     guards: dict[str, int] = Field(default_factory=dict, description="How often each guard acted.")
-    budget: Budget | None = Field(default=None, description="What the update was told; nulls: as the scene was made.")
+    budget: Budget | None = Field(default=None, description="Budget of the update; nulls: as the scene was made.")
     iterations: int | None = None
     planned: list[tuple[int, int]] = Field(
         default_factory=list, description="(iteration, iterations in all) whenever that was planned otherwise."

@@ -133,8 +133,8 @@ def measure_adaptive(
         answer = {"sequence": what, **turns.row()}
         answers.append(answer)
         difference = answer["psnr"][name] - answer["psnr"]["scas4d"]
-        told = "" if answer["time_repeats"] is None else f", repeats {100 * answer['time_repeats']:.0f} %"
-        report(f"    {capture.name}, {what}: {100 * answer['time']:.0f} % of the time{told}, {difference:+.2f} dB")
+        ratio = "" if answer["time_repeats"] is None else f", repeats {100 * answer['time_repeats']:.0f} %"
+        report(f"    {capture.name}, {what}: {100 * answer['time']:.0f} % of the time{ratio}, {difference:+.2f} dB")
     return leave(out, f"{capture.name}-{name}", capture, {"name": name, "sequences": answers})
 
 

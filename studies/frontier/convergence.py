@@ -30,7 +30,7 @@ WATCHED = (("scas4d", 25), ("scas4d", 100), ("scas4d", 300), ("dynamic3dgs", 100
 """Preset and iterations."""
 
 Look = Callable[[int, Any, Any, Any, Any], None]
-"""Told the iterations done, means, factors, opacities and features."""
+"""Called with the iterations done, means, factors, opacities and features."""
 
 
 class WatchedPictures:

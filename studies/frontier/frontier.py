@@ -183,7 +183,7 @@ def row_of(rows: Iterable[Row], variant: Variant, capture: str, updates: int) ->
             continue
         given = row["given"]
         frames = row["capture_frames"] if variant.whole else min(updates + 1, row["capture_frames"])
-        told = completed(row["settings"], settings)
-        if given == {"frames": frames, "masks": True, "points": True} and told == settings:
+        filled = completed(row["settings"], settings)
+        if given == {"frames": frames, "masks": True, "points": True} and filled == settings:
             return row
     return None

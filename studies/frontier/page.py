@@ -313,15 +313,15 @@ def _over(points: Sequence[Point], axis: str, captures: Sequence[str]) -> str:
 
 def _spreads(points: Sequence[Point], captures: Sequence[str]) -> str:
     """The effect of chance: the standard deviation over the seeds of the updates."""
-    told = []
+    spreads = []
     for method in METHODS:
         by_capture = {name: spread(points, method, name) for name in captures}
         found = {name: value for name, value in by_capture.items() if value is not None}
         if found:
             count = max(seeds for _, seeds in found.values())
             words = ", ".join(f"{name} {deviation:.2f}" for name, (deviation, _) in found.items())
-            told.append(f"`{method}` {words} ({count} seeds)")
-    return f"Standard deviation of PSNR over seeds of the updates, dB: {'; '.join(told)}." if told else ""
+            spreads.append(f"`{method}` {words} ({count} seeds)")
+    return f"Standard deviation of PSNR over seeds of the updates, dB: {'; '.join(spreads)}." if spreads else ""
 
 
 def _provenance(out: Path, captures: Sequence[str]) -> str:

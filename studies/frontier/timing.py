@@ -34,7 +34,7 @@ MANY_ITERATIONS = 500
 
 
 @dataclass
-class Timed:
+class TimedVariant:
     """One setting under way: its reconstruction, and what each counted update took."""
 
     variant: Variant
@@ -84,7 +84,7 @@ def measure_times(
     turns = min(rounds + 1, capture.frame_count - 1)
     if turns < 2:
         raise ValueError(f"{folder} has {capture.frame_count} frame(s); timing needs at least 3")
-    timed = [Timed(variant, started(capture, variant.settings, out)) for variant in _distinct(variants)]
+    timed = [TimedVariant(variant, started(capture, variant.settings, out)) for variant in _distinct(variants)]
     ratios: list[list[float]] = [[] for _ in timed]
     for turn in range(turns):
         taken: dict[int, float] = {}
@@ -185,7 +185,7 @@ def started(capture: Capture, settings: Settings, out: Path, states: Path | None
     return reconstruction
 
 
-def _answer(one: Timed, ratios: Sequence[float]) -> Row:
+def _answer(one: TimedVariant, ratios: Sequence[float]) -> Row:
     names = dict.fromkeys(name for stages in one.stages for name in stages)
     return {
         "label": one.variant.label,

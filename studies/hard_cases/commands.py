@@ -46,7 +46,7 @@ def stability(
     from studies.hard_cases import mutate as mutations
     from studies.hard_cases import run
 
-    lines = run.run(cases, slow=not fast, told=typer.echo)
+    lines = run.run(cases, slow=not fast, echo=typer.echo)
     failing = mutations.study(store, typer.echo) if mutate else mutations.known(store)
     if out is not None:
         if cases or fast:
@@ -67,7 +67,7 @@ def _frame_studies(
     if soak is not None:
         from studies.hard_frames.soak import Soak, table, violations
 
-        rows = Soak(store / "soak").run(soak, told=lambda row: typer.echo(str(row)))
+        rows = Soak(store / "soak").run(soak, echo=lambda row: typer.echo(str(row)))
         typer.echo(table(rows))
         _end(violations(rows))
         return

@@ -170,7 +170,7 @@ def known(store: Path) -> dict[str, list[str]] | None:
     return found if len(found) == len(list(mutants())) else None
 
 
-def study(store: Path, told: Callable[[str], None] = print) -> dict[str, list[str]]:
+def study(store: Path, echo: Callable[[str], None] = print) -> dict[str, list[str]]:
     """Takes every guard away in turn; the failing cases by guard.
 
     Args:
@@ -193,5 +193,5 @@ def study(store: Path, told: Callable[[str], None] = print) -> dict[str, list[st
             results[guard.name] = failing_without(guard, sections_of(guard))
             file.write_text(json.dumps(results, indent=1))
         cases = results[guard.name]
-        told(f"without {guard.name}: {', '.join(cases) if cases else 'NOTHING fails'}")
+        echo(f"without {guard.name}: {', '.join(cases) if cases else 'NOTHING fails'}")
     return {name: cases for name, cases in results.items() if name != CONTROL}

@@ -28,11 +28,11 @@ CASES = tuple(case for _, cases in SECTIONS for case in cases)
 
 BEGIN, END = "<!-- scripts/bench stability: begin -->", "<!-- scripts/bench stability: end -->"
 
-Told = Callable[[str], None]
+Echo = Callable[[str], None]
 
 
 @dataclass
-class Line:
+class CaseResult:
     """A case in one size: what ran, what acted on the CPU, and what does not hold."""
 
     case: str
@@ -69,9 +69,9 @@ def selected(names: Sequence[str] | None, slow: bool) -> list[HardCase]:
     return [case for case in CASES if slow or not case.slow]
 
 
-def run_case(case: HardCase, size: Any, on: Iterable[str]) -> Line:
+def run_case(case: HardCase, size: Any, on: Iterable[str]) -> CaseResult:
     """One case in one size; what raises does not hold."""
-    line = Line(case.name, str(size))
+    line = CaseResult(case.name, str(size))
     started = time.perf_counter()
     try:
         with np.errstate(all="ignore"):
@@ -87,7 +87,7 @@ def run_case(case: HardCase, size: Any, on: Iterable[str]) -> Line:
     return line
 
 
-def run(names: Sequence[str] | None = None, *, slow: bool = True, told: Told = print) -> list[Line]:
+def run(names: Sequence[str] | None = None, *, slow: bool = True, echo: Echo = print) -> list[CaseResult]:
     """All sizes of the selected cases; tells each as it is done."""
     on = backends()
     lines = []
@@ -95,11 +95,11 @@ def run(names: Sequence[str] | None = None, *, slow: bool = True, told: Told = p
         for size in case.sizes:
             line = run_case(case, size, on)
             lines.append(line)
-            told(f"{'holds' if not line.violations else 'FAILS'}  {case.name}, {line.size}  {in_words(line.guards)}")
+            echo(f"{'holds' if not line.violations else 'FAILS'}  {case.name}, {line.size}  {in_words(line.guards)}")
             for violation in line.violations:
-                told(f"       {violation}")
+                echo(f"       {violation}")
     failed = sum(bool(line.violations) for line in lines)
-    told(f"{len({line.case for line in lines})} cases, {len(lines)} with sizes, {failed} do not hold")
+    echo(f"{len({line.case for line in lines})} cases, {len(lines)} with sizes, {failed} do not hold")
     return lines
 
 
@@ -108,9 +108,9 @@ def in_words(guards: dict[str, int]) -> str:
     return ", ".join(f"{name} {count:,}" for name, count in sorted(guards.items(), key=lambda item: -item[1]))
 
 
-def catalogue_table(lines: Sequence[Line]) -> str:
+def catalogue_table(lines: Sequence[CaseResult]) -> str:
     """One row a case: what is hard, where it is from, its sizes, what acted, and whether it holds."""
-    by_case: dict[str, list[Line]] = {}
+    by_case: dict[str, list[CaseResult]] = {}
     for line in lines:
         by_case.setdefault(line.case, []).append(line)
     text = []
@@ -148,7 +148,7 @@ def guards_table(guards: Iterable[Guard], failing: dict[str, list[str]] | None =
     return "\n".join(lines)
 
 
-def page(lines: Sequence[Line], failing: dict[str, list[str]] | None, on: str, date: str) -> str:
+def page(lines: Sequence[CaseResult], failing: dict[str, list[str]] | None, on: str, date: str) -> str:
     """The generated part of docs/stability.md."""
     count, failed = len({line.case for line in lines}), sum(bool(line.violations) for line in lines)
     observed = "\n".join(f"- `{name}`: {words}" for name, words in OBSERVED.items())

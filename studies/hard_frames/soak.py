@@ -119,15 +119,15 @@ class Soak:
     def rows(self) -> list[Row]:
         """Those up to where the scene is."""
         file = self.folder / "rows.jsonl"
-        told = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
-        return [Row(**row) for row in told if row["frame"] <= self.done]
+        rows = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+        return [Row(**row) for row in rows if row["frame"] <= self.done]
 
     def frame(self, index: int) -> Frame:
         """Pictures of all cameras."""
         shown = photograph(true_state(self.first, index), self._rig)
         return Frame(index, index / RATE, shown.images, shown.masks)
 
-    def run(self, frames: int, every: int = 100, told: Callable[[Row], None] = lambda row: None) -> list[Row]:
+    def run(self, frames: int, every: int = 100, echo: Callable[[Row], None] = lambda row: None) -> list[Row]:
         """Go on until so many frames after the first are done, a row every so many of them; all rows."""
         rows, began, degraded, since = self.rows, 0.0, 0, 0
         while self.done < frames:
@@ -139,7 +139,7 @@ class Soak:
                 rows.append(self._measured(began / since, report.psnr, degraded))
                 with (self.folder / "rows.jsonl").open("a") as file:
                     file.write(json.dumps(asdict(rows[-1])) + "\n")
-                told(rows[-1])
+                echo(rows[-1])
                 self.scene.history.retain(last=2)
                 began, degraded, since = 0.0, 0, 0
         return rows

@@ -14,9 +14,9 @@ from studies.paper.paper import (
     EXPERIMENTS,
     FACTOR,
     SMALL,
+    ClaimResult,
     Experiment,
     Measured,
-    Outcome,
     compare,
     iteration_ratio,
     measured,
@@ -79,7 +79,11 @@ does not agree with one that is not. Where the paper shows a picture only, its c
 
 
 def section(
-    experiment: Experiment, outcomes: Sequence[Outcome], ours: Measured, captures: Sequence[str], ratio: float | None
+    experiment: Experiment,
+    outcomes: Sequence[ClaimResult],
+    ours: Measured,
+    captures: Sequence[str],
+    ratio: float | None,
 ) -> str:
     """An experiment as Markdown: table, outcome, note."""
     names = [name for name in SCENES if name in captures]
@@ -93,19 +97,19 @@ def section(
         mean = _mean([own[name] for name in shared])
         paper = _mean([side.paper[name] for name in shared]) if side.paper else None
         lines.append("| " + " | ".join([side.name, *cells, _cell(mean, paper, digits)]) + " |")
-    told = "\n".join(f"- {sentence(outcome, digits, unit)}" for outcome in outcomes)
+    sentences = "\n".join(f"- {sentence(outcome, digits, unit)}" for outcome in outcomes)
     note = experiment.note.format(ratio="–" if ratio is None else f"{ratio:.2f} times that")
     parts = [
         f"## {experiment.title}",
         f"Paper: {experiment.source}." + (f" In{unit}." if unit else ""),
         "\n".join(lines),
-        told,
+        sentences,
         note,
     ]
     return "\n\n".join(part for part in parts if part)
 
 
-def sentence(outcome: Outcome, digits: int, unit: str) -> str:
+def sentence(outcome: ClaimResult, digits: int, unit: str) -> str:
     """A claim and how it came out."""
     what = f"{outcome.claim.what[0].upper()}{outcome.claim.what[1:]} ({outcome.claim.first} – {outcome.claim.second})"
     if outcome.own is None:
@@ -118,13 +122,13 @@ def sentence(outcome: Outcome, digits: int, unit: str) -> str:
     return f"{what}: {figures}; {_word(outcome)}, on {outcome.same_sign} of {len(outcome.captures)} captures alone."
 
 
-def summary(outcomes: Sequence[Outcome], by_title: Mapping[str, Sequence[Outcome]]) -> str:
+def summary(outcomes: Sequence[ClaimResult], by_title: Mapping[str, Sequence[ClaimResult]]) -> str:
     """Counts, and a line for each claim that does not agree."""
-    told = [outcome for outcome in outcomes if outcome.agrees != "not measured"]
-    counts = {word: sum(o.agrees == word for o in told) for word in ("sign and size", "sign", "no")}
+    known = [outcome for outcome in outcomes if outcome.agrees != "not measured"]
+    counts = {word: sum(o.agrees == word for o in known) for word in ("sign and size", "sign", "no")}
     lines = [
         f"Of {len(outcomes)} comparisons {counts['sign and size']} agree in sign and size, {counts['sign']} in sign, "
-        f"{counts['no']} do not, and {len(outcomes) - len(told)} are not measured.",
+        f"{counts['no']} do not, and {len(outcomes) - len(known)} are not measured.",
         "",
         "| experiment | comparison | here | paper | agrees in |",
         "|---|---|---|---|---|",
@@ -163,7 +167,7 @@ def needed() -> list[Variant]:
     return list(dict.fromkeys(side.variant for experiment in EXPERIMENTS for side in experiment.sides))
 
 
-def _word(outcome: Outcome) -> str:
+def _word(outcome: ClaimResult) -> str:
     if outcome.agrees == "no":
         return "does not agree"
     return f"agrees in {outcome.agrees}"

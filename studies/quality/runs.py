@@ -155,8 +155,8 @@ def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
             for row in rows:
                 given = row["given"]
                 withheld = (given["masks"], given["points"])
-                told = completed(row["settings"], settings)
-                same = all(told.get(group) == settings[group] for group in groups)
+                filled = completed(row["settings"], settings)
+                same = all(filled.get(group) == settings[group] for group in groups)
                 if row["capture"] != capture or not same or withheld != (run.masks, run.points):
                     continue
                 best = found.get((name, capture))

@@ -63,7 +63,7 @@ def faults(
     )
     parts = part or of_faults.PARTS
     outcomes = of_faults.run(
-        study, moments=kills, cuts=cuts, flips=flips, bits=bits, seed=seed, turns=turns, parts=parts, told=typer.echo
+        study, moments=kills, cuts=cuts, flips=flips, bits=bits, seed=seed, turns=turns, parts=parts, echo=typer.echo
     )
     text = table(outcomes)
     typer.echo(text)
@@ -128,7 +128,7 @@ def views(
         width=width,
         settings=parse_changes(changes),
         environment={} if engine is None else {"SCAS4D_ENGINE": engine},
-        told=typer.echo,
+        echo=typer.echo,
     )
     text = of_views.page(rows, capture.name, width, updates, turns)
     typer.echo(text)

@@ -24,7 +24,7 @@ from scas4d_core.storage.npz import read_npz
 from server.storage.frame_store import FrameDamage, read_pictures
 from server.storage.journal import read_journal
 from studies.service.process import Service, StudyError
-from studies.service.study import AGAIN_S, Sender, Study, digests
+from studies.service.study import AGAIN_S, FrameSender, Study, digests
 
 KINDS = ("state", "checkpoint", "fixed", "journal", "frame")
 BEFORE = 6
@@ -68,7 +68,7 @@ def undisturbed(study: Study) -> tuple[dict[int, str], Pictures]:
     service.start()
     try:
         scene = study.create(service)
-        sender = Sender(study, service, scene)
+        sender = FrameSender(study, service, scene)
         for index in range(len(study.frames)):
             sender.send(index)
         service.finish(scene, len(study.frames))
@@ -78,7 +78,7 @@ def undisturbed(study: Study) -> tuple[dict[int, str], Pictures]:
         service.stop()
 
 
-def flips(study: Study, count: int, seed: int, told: Callable[[str], None]) -> Flips:
+def flips(study: Study, count: int, seed: int, echo: Callable[[str], None]) -> Flips:
     """Flips `count` bits, as many of each kind, half of them while the service is down."""
     random_ = random.Random(seed)
     expected, views = undisturbed(study)
@@ -87,7 +87,7 @@ def flips(study: Study, count: int, seed: int, told: Callable[[str], None]) -> F
     found = Flips()
     try:
         scene = study.create(service, keep_frames={"last": KEPT})
-        sender = Sender(study, service, scene)
+        sender = FrameSender(study, service, scene)
         for index in range(BEFORE):
             sender.send(index)
         service.finish(scene, BEFORE)
@@ -99,7 +99,7 @@ def flips(study: Study, count: int, seed: int, told: Callable[[str], None]) -> F
                 outcome = one.run(down, found, views)
                 sender.send(BEFORE + number)
                 service.finish(scene, BEFORE + number + 1)
-                told(f"{said}: {outcome}")
+                echo(f"{said}: {outcome}")
             except StudyError as error:
                 one.faults.append(str(error))
             found.faults += [f"{said}: {fault}" for fault in one.faults]

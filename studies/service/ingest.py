@@ -31,7 +31,7 @@ UNANSWERED = 2
 
 
 @dataclass(frozen=True)
-class Measured:
+class IngestTimes:
     """Megabytes a second of plain writes, over HTTP and over a WebSocket, one number a round."""
 
     plain: list[float]
@@ -73,7 +73,7 @@ def noise_rig(cameras: int, side: int = 1024) -> Rig:
     return Rig(tuple(found))
 
 
-def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds: int, senders: int) -> Measured:
+def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds: int, senders: int) -> IngestTimes:
     """Sends `frames` frames a round and writes the same bytes plainly, in turns."""
     rig = noise_rig(cameras)
     pictures = [jpeg(size_bytes, seed) for seed in range(cameras)]
@@ -102,7 +102,7 @@ def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds:
                 first += frames if way else 0
                 if number:  # the first round warms caches, connections and the pool of threads
                     found[way].append(megabytes / took)
-        return Measured(*found)
+        return IngestTimes(*found)
     finally:
         service.stop()
         shutil.rmtree(plain_folder, ignore_errors=True)
@@ -188,7 +188,7 @@ def _socket(service: Service, scene: str, records: Sequence[dict[str, bytes]], f
     return took
 
 
-def page(measured: Measured, *, frames: int, cameras: int, size_bytes: int, senders: int) -> str:
+def page(measured: IngestTimes, *, frames: int, cameras: int, size_bytes: int, senders: int) -> str:
     """As Markdown."""
     shares = [f"{100 * measured.share(took):.0f} %" for took in (measured.ingest, measured.socket)]
     rows = "\n".join(

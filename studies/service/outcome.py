@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-Told = Callable[[str], None]
+Echo = Callable[[str], None]
 
 
 @dataclass
-class Outcome:
+class ScenarioResult:
     """A fault, the bar, and what was found; with `faults` the bar is missed."""
 
     name: str
@@ -23,7 +23,7 @@ class Outcome:
         return not self.faults
 
 
-def table(outcomes: Sequence[Outcome]) -> str:
+def table(outcomes: Sequence[ScenarioResult]) -> str:
     """As Markdown."""
     rows = ["| fault | bar | found | |", "|---|---|---|---|"]
     for outcome in outcomes:

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from client.wire import FrameState
-from studies.service.outcome import Outcome, Told
+from studies.service.outcome import Echo, ScenarioResult
 from studies.service.process import Service, StudyError
 from studies.service.study import Study
 
@@ -44,7 +44,7 @@ class Attack:
 
 
 @dataclass
-class Side:
+class AttackTimes:
     """All turns without the attack, or with it.
 
     Attributes:
@@ -65,7 +65,7 @@ class Side:
 class Watch:
     """Asks `/health/live` and reads the service's memory, from a thread, while the block runs."""
 
-    def __init__(self, service: Service, side: Side) -> None:
+    def __init__(self, service: Service, side: AttackTimes) -> None:
         self._service, self._side = service, side
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -136,7 +136,7 @@ class Updates:
         return f"/v1/scenes/{self.scene}/frames/{self._next + AT_ONCE}"
 
 
-def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token: bool, told: Told) -> Outcome:
+def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token: bool, echo: Echo) -> ScenarioResult:
     """The attack on one service.
 
     Args:
@@ -147,7 +147,7 @@ def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token
     name = "strangers-token" if token else "strangers"
     service = Study(study.folder, study.capture, study.frames, study.settings, environment).service(name)
     service.start()
-    without, attacked = Side(), Side()
+    without, attacked = AttackTimes(), AttackTimes()
     closed, left = 0.0, 0
     try:
         updates = Updates(study, service)
@@ -164,7 +164,7 @@ def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token
                     attacked.updates += updates.run(AT_ONCE)
             ended = json.loads(attacker.communicate()[0])
             closed, left = max(closed, ended["seconds"]), left + int(ended["open"])
-            told(
+            echo(
                 f"turn {turn + 1}: all closed after {ended['seconds']:.1f} s, {ended['open']} left; "
                 f"{ended['sent'] / 1e6:.1f} MB of header sent; /health/live p99 {attacked.p(99):.1f} ms"
             )
@@ -179,7 +179,9 @@ def _start(port: int, path: str, attack: Attack) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-m", "studies.service.attack", *options], stdout=subprocess.PIPE)
 
 
-def compare(attack: Attack, without: Side, attacked: Side, closed: float, left: int, *, token: bool) -> Outcome:
+def compare(
+    attack: Attack, without: AttackTimes, attacked: AttackTimes, closed: float, left: int, *, token: bool
+) -> ScenarioResult:
     """The row of the table.
 
     Args:
@@ -205,7 +207,7 @@ def compare(attack: Attack, without: Side, attacked: Side, closed: float, left: 
         f"{without.memory:.0f} → {attacked.memory:.0f} MB; all closed after {closed:.0f} s; an update "
         f"{statistics.median(without.updates):.3f} → {statistics.median(attacked.updates):.3f} s ({slower:.2f} times)"
     )
-    return Outcome(
+    return ScenarioResult(
         f"strangers, {'a token' if token else 'no token'}: an endless header of {attack.header / 1e6:.0f} MB, "
         f"{attack.halves} half-sent headers, {attack.uploads} hanging uploads at once",
         f"/health/live answers, p99 + {P99_MS:.0f} ms; memory + {MEMORY_MB:.0f} MB; closed within {CLOSED_S:.0f} s; "

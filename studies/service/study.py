@@ -97,7 +97,7 @@ def compare(found: Mapping[int, str], expected: Mapping[int, str], but: Sequence
     return faults + ([f"states {others} are not bit-identical"] if others else [])
 
 
-class Sender:
+class FrameSender:
     """Sends frames as a rig would that never gives up, and keeps what was acknowledged."""
 
     def __init__(self, study: Study, service: Service, scene: str) -> None:
@@ -144,7 +144,7 @@ def undisturbed(study: Study) -> tuple[dict[int, str], float]:
     service.start()
     try:
         scene = study.create(service)
-        sender = Sender(study, service, scene)
+        sender = FrameSender(study, service, scene)
         sender.send(0)
         service.finish(scene, 1)
         began = time.monotonic()

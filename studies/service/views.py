@@ -35,11 +35,11 @@ IDLE_S = 6.0
 WARM_UP = 3
 """Updates before anything is measured: the first ones compile or load kernels and start cold."""
 
-Told = Callable[[str], None]
+Echo = Callable[[str], None]
 
 
 @dataclass
-class Measured:
+class ViewTimes:
     """One rate.
 
     Attributes:
@@ -66,7 +66,7 @@ class Measured:
 
 
 class Load:
-    """Views at a rate, from a thread, until told to stop."""
+    """Views at a rate, from a thread, until it is stopped."""
 
     def __init__(self, url: str, cameras: Sequence[str], rate: float, width: int) -> None:
         self.latencies: list[float] = []
@@ -109,7 +109,7 @@ class Load:
         self.latencies.append(1000 * (time.perf_counter() - due))
 
 
-class Sender:
+class CaptureSender:
     """Frames of a capture that are sent to a scene, some at a time."""
 
     def __init__(self, service: Service, scene: str, capture: Capture, count: int) -> None:
@@ -143,8 +143,8 @@ def measure(
     width: int,
     settings: Mapping[str, Any],
     environment: Mapping[str, str],
-    told: Told,
-) -> list[Measured]:
+    echo: Echo,
+) -> list[ViewTimes]:
     """Runs the study.
 
     Args:
@@ -162,15 +162,15 @@ def measure(
         scene = service.create(capture.rig, settings, ingest={"queue_frames": updates + 1})
         if capture.points is not None:
             put_points(service, scene, capture)
-        frames = Sender(service, scene, capture, many)
-        told("frame 0 …")
+        frames = CaptureSender(service, scene, capture, many)
+        echo("frame 0 …")
         frames.update(1)
         frames.update(WARM_UP)
         url = f"http://127.0.0.1:{service.port}/v1/scenes/{scene}/"
         names = capture.rig.names
         with Load(url, names, 2.0, width):  # connections, the reader's kernels
             time.sleep(3.0)
-        found = [Measured(rate) for rate in rates]
+        found = [ViewTimes(rate) for rate in rates]
         for _ in range(turns):
             for row in found:
                 with Load(url, names, row.rate, width) as load:
@@ -182,7 +182,7 @@ def measure(
                     row.together += frames.update(updates)
                 row.loaded += load.latencies
                 row.refused += load.refused
-                told(line(row))
+                echo(line(row))
         return found
     finally:
         with contextlib.suppress(Exception):
@@ -204,7 +204,7 @@ def put_points(service: Service, scene: str, capture: Capture) -> None:
         raise StudyError(answer.text)
 
 
-def line(row: Measured) -> str:
+def line(row: ViewTimes) -> str:
     """One row of the table."""
     cells = [
         f"{row.rate:g}",
@@ -218,7 +218,7 @@ def line(row: Measured) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def table(rows: Sequence[Measured]) -> str:
+def table(rows: Sequence[ViewTimes]) -> str:
     """As Markdown, with the bar."""
     head = [
         "| views a second | idle, ms (95 %) | during updates, ms (95 %) | ratio | update alone, s | under views, s | "
@@ -237,7 +237,7 @@ def table(rows: Sequence[Measured]) -> str:
     return text
 
 
-def page(rows: Sequence[Measured], capture: str, width: int, updates: int, turns: int) -> str:
+def page(rows: Sequence[ViewTimes], capture: str, width: int, updates: int, turns: int) -> str:
     """The table with what it was measured on."""
     day = datetime.now(UTC).date().isoformat()
     return (

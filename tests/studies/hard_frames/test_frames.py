@@ -10,7 +10,7 @@ import pytest
 from studies.hard_frames import frames
 from studies.hard_frames.footage import SyntheticFootage
 from studies.hard_frames.frames import Footage, FrameCase, Sent
-from studies.hard_frames.study import FrameStudy, Line, table
+from studies.hard_frames.study import FrameCaseResult, FrameStudy, table
 
 FOOTAGE = SyntheticFootage()
 CASES = [(case, size) for case in frames.named(FOOTAGE) for size in case.sizes]
@@ -59,5 +59,5 @@ def test_what_a_footage_cannot_show_is_left_out(study: FrameStudy) -> None:
 
 
 def test_the_table_says_what_does_not_hold() -> None:
-    line = Line(frames.CASES[0], 3, ["held"], [-1.0, 0.2], ["it is black"])
+    line = FrameCaseResult(frames.CASES[0], 3, ["held"], [-1.0, 0.2], ["it is black"])
     assert "**no**: it is black" in table([line])

@@ -15,8 +15,8 @@ from studies.paper.paper import (
     BASE_2000,
     EXPERIMENTS,
     Claim,
+    ClaimSetting,
     Experiment,
-    Side,
     compare,
     iteration_ratio,
     measured,
@@ -28,8 +28,8 @@ from studies.quality.runs import RUNS
 def gain(own: dict, paper: dict, expected=None):
     """The outcome of one comparison: figures of (first, second) by capture."""
     sides = (
-        Side("a", DEFAULT, {name: pair[0] for name, pair in paper.items()}),
-        Side("b", BASE_100, {name: pair[1] for name, pair in paper.items()}),
+        ClaimSetting("a", DEFAULT, {name: pair[0] for name, pair in paper.items()}),
+        ClaimSetting("b", BASE_100, {name: pair[1] for name, pair in paper.items()}),
     )
     experiment = Experiment("made", "nowhere", "psnr", "dB", sides, (Claim("better", "a", "b", expected),))
     ours = {

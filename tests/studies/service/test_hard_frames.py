@@ -11,7 +11,7 @@ CASES = ("all black", "swapped", "drop out", "jumps")
 
 
 def test_cases_through_the_service(tmp_path: Path) -> None:
-    lines, faults = stability.study(SyntheticFootage(), tmp_path / "study", CASES, told=lambda said: None)
+    lines, faults = stability.study(SyntheticFootage(), tmp_path / "study", CASES, echo=lambda said: None)
     assert faults == []
     assert len(lines) == 8
     assert [(line.case.name, line.size, line.violations) for line in lines if line.violations] == []
