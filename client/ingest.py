@@ -31,6 +31,13 @@ class IngestSocket:
     Args:
         client: whose service, token, patience and `on_retry` are used.
         scene: id.
+
+    >>> n = client.scene(open_scene).next_frame
+    >>> with IngestSocket(client, open_scene) as socket:
+    ...     whole = socket.put_frame(n, pictures)
+    ...     parts = [socket.put_camera(n + 1, camera, pictures[camera]) for camera in ("c0", "c1")]
+    >>> whole.index == n, [part.absent for part in parts]
+    (True, [['c1'], []])
     """
 
     def __init__(self, client: Client, scene: str) -> None:

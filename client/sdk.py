@@ -92,6 +92,15 @@ class Client(_Settings):
     Raises:
         ServiceError: the service refused; see `client.errors` for the kinds.
         ServiceUnreachable: nobody answered.
+
+    >>> with Client(url, patience=60) as client:
+    ...     new = client.create_scene(rig)
+    ...     receipt = client.put_frame(new.id, 0, pictures)
+    ...     report = client.wait(new.id, 0)
+    ...     picture = client.render(new.id, "c0")
+    ...     client.delete_scene(new.id)
+    >>> report.state, picture.shape
+    (<FrameState.COMMITTED: 'committed'>, (16, 24, 3))
     """
 
     def __init__(
@@ -114,11 +123,19 @@ class Client(_Settings):
         self.close()
 
     def close(self) -> None:
-        """Closes its connections."""
+        """Closes its connections.
+
+        >>> client = Client(url)
+        >>> client.close()
+        """
         self._http.close()
 
     def send(self, call: Call[T]) -> T:
-        """Any call, with its retries."""
+        """Sends any call, with its retries.
+
+        >>> client.send(calls.scene(scene)).id == scene
+        True
+        """
         retries = self._retries(call)
         while True:
             wait: float | None
@@ -169,6 +186,9 @@ class Client(_Settings):
 
         Raises:
             TimeoutError: neither within `seconds`.
+
+        >>> [status.committed for status in client.watch(scene, 1)]
+        [3]
         """
         until = time.monotonic() + seconds
         while True:
@@ -185,6 +205,9 @@ class Client(_Settings):
 
         Raises:
             TimeoutError: none of these within `seconds`.
+
+        >>> client.wait(scene, 1).psnr
+        31.5
         """
         for _ in self.watch(id, index, seconds=seconds, every=every):
             pass
@@ -192,7 +215,15 @@ class Client(_Settings):
 
 
 class AsyncClient(_Settings):
-    """As `Client`, for asyncio."""
+    """The service at `url` for asyncio: arguments and errors as of `Client`, whose every method it has.
+
+    >>> async def committed():
+    ...     async with AsyncClient(url) as client:
+    ...         status, report = await asyncio.gather(client.scene(scene), client.wait(scene, 1))
+    ...         return status.committed, report.index
+    >>> asyncio.run(committed())
+    (3, 1)
+    """
 
     def __init__(
         self,

@@ -84,6 +84,14 @@ class Stream:
     Raises:
         ServiceError: the service refused; `NotFound` where there is no such scene.
         ServiceUnreachable: nobody answered.
+
+    >>> with Stream(url, scene) as stream:
+    ...     stream.subscribe("live", view("c0"), tag=1)
+    ...     event = stream.receive(timeout=20)
+    ...     stream.update("live", frame=0, tag=2)
+    ...     stream.unsubscribe("live")
+    >>> event.id, event.tag, event.frame, event.picture().shape
+    ('live', 1, 2, (16, 24, 3))
     """
 
     def __init__(self, url: str, scene: str, *, token: str | None = None, outage: float = OUTAGE_S) -> None:
@@ -172,7 +180,15 @@ class Stream:
 
 
 class AsyncStream:
-    """The same for asyncio: `async with`, `async for`."""
+    """The same for asyncio: `async with`, `async for`.
+
+    >>> async def newest():
+    ...     async with AsyncStream(url, scene) as stream:
+    ...         await stream.subscribe("what moves", parts(2))
+    ...         return await stream.receive()
+    >>> asyncio.run(newest()).model().count
+    2
+    """
 
     def __init__(self, url: str, scene: str, *, token: str | None = None, outage: float = OUTAGE_S) -> None:
         self._session = StreamSession(url, scene, token, outage)

@@ -111,12 +111,26 @@ class SubscriptionRequest:
 
 
 def scene_changes() -> SubscriptionRequest:
-    """State, progress and queue at every change."""
+    """State, progress and queue at every change.
+
+    >>> with Stream(url, scene) as stream:
+    ...     stream.subscribe("scene", scene_changes())
+    ...     event = stream.receive(timeout=20)
+    >>> event.status.committed
+    3
+    """
     return SubscriptionRequest(Topic.SCENE, NoRequest())
 
 
 def finished_frames() -> SubscriptionRequest:
-    """Subscribes to the report of each finished frame, with its metrics."""
+    """Subscribes to the report of each finished frame, with its metrics.
+
+    >>> with Stream(url, scene) as stream:
+    ...     stream.subscribe("done", finished_frames())
+    ...     event = stream.receive(timeout=20)
+    >>> event.report.index
+    2
+    """
     return SubscriptionRequest(Topic.FRAMES, NoRequest())
 
 
@@ -129,7 +143,14 @@ def view(
     background: tuple[float, float, float] | None = None,
     parts: int | None = None,
 ) -> SubscriptionRequest:
-    """A view of every new frame, or of a chosen one; `Stream.update` moves the camera. As `client.calls.render`."""
+    """A view of every new frame, or of a chosen one; `Stream.update` moves the camera. As `client.calls.render`.
+
+    >>> with Stream(url, scene) as stream:
+    ...     stream.subscribe("live", view(rig.cameras[0], format="png"))
+    ...     event = stream.receive(timeout=20)
+    >>> event.frame, event.picture().shape
+    (2, (16, 24, 3))
+    """
     request = {"camera": wire_camera(camera), "frame": frame, "kinds": [kind], "format": format}
     return SubscriptionRequest(
         Topic.RENDER, RenderRequest.model_validate({**request, "background": background, "parts": parts})
@@ -147,7 +168,14 @@ def tracks(
     project: Sequence[Camera | str] = (),
     format: str = "json",
 ) -> SubscriptionRequest:
-    """Trajectories so far, then those of each new frame. As `client.calls.tracks`."""
+    """Trajectories so far, then those of each new frame. As `client.calls.tracks`.
+
+    >>> with Stream(url, scene) as stream:
+    ...     stream.subscribe("two", tracks(ids=[0, 1]))
+    ...     event = stream.receive(timeout=20)
+    >>> event.first, event.frame, event.model().ids
+    (0, 2, [0, 1])
+    """
     request = {
         "ids": None if ids is None else [int(id) for id in ids],
         "pixels": None if pixels is None else np.asarray(pixels, dtype=np.float64).tolist(),
@@ -162,7 +190,14 @@ def tracks(
 
 
 def parts(count: int | None = None, *, every: int = 1) -> SubscriptionRequest:
-    """Labels of all Gaussians, found anew when `every` more frames are there."""
+    """Labels of all Gaussians, found anew when `every` more frames are there.
+
+    >>> with Stream(url, scene) as stream:
+    ...     stream.subscribe("labels", parts(2))
+    ...     event = stream.receive(timeout=20)
+    >>> event.model().count
+    2
+    """
     return SubscriptionRequest(Topic.PARTS, PartsSubscription(count=count, every=every))
 
 

@@ -18,7 +18,6 @@ from client.wire import RigModel
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import Frame, InitialPoints
 from scas4d_core.presets import preset
-from scas4d_core.settings import Settings
 from server.health.estimate import estimate
 from server.settings import ServerSettings
 
@@ -57,12 +56,10 @@ def main() -> None:
     parser.add_argument("--scale", type=float, default=1.0)
     parser.add_argument("--masks", action="store_true")
     given = parser.parse_args()
-    base = preset("scas4d").model_dump()
-    base["static"] |= {"iterations": 8, "max_gaussians": given.gaussians, "initial_share": 1.0, "densify_from": 1000}
-    base["static"] |= {"min_views": 0, "prune_opacity": 0.0}
-    base["update"] |= {"iterations": 4}
-    base["scene"] |= {"image_scale": given.scale}
-    settings = Settings.model_validate(base)
+    static = {"iterations": 8, "max_gaussians": given.gaussians, "initial_share": 1.0, "densify_from": 1000}
+    static |= {"min_views": 0, "prune_opacity": 0.0}
+    changes = {"static": static, "update": {"iterations": 4}, "scene": {"image_scale": given.scale}}
+    settings = preset("scas4d", changes)
     rig = ring(given.cameras, given.size)
     normals = np.random.default_rng(0).normal(size=(given.gaussians, 3))
     points = 0.4 * normals / np.linalg.norm(normals, axis=1, keepdims=True)

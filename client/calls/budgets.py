@@ -9,7 +9,11 @@ from client.wire import Budget, ReplayRequest, SceneBudget, TradeoffModel
 
 
 def budget(id: str) -> Call[SceneBudget]:
-    """Reads the budget of a scene's updates."""
+    """Reads the budget of a scene's updates.
+
+    >>> client.budget(scene).effective.iterations
+    100
+    """
     return Call("GET", path(id, "budget"), reads(SceneBudget))
 
 
@@ -29,13 +33,23 @@ def set_budget(
         budget_ms: milliseconds a frame, decoding and commit included; then as many iterations as fit.
         stop_gain: ten iterations that lower the error by less than this share end the update.
         still: a frame needs no iteration where the one before shows it with at most 1 + this times the usual error.
+
+    >>> found = client.set_budget(scene, iterations=50)
+    >>> found.effective.iterations, found.since
+    (50, 3)
+    >>> client.set_budget(scene).effective.iterations  # as the scene was made
+    100
     """
     request = Budget(iterations=iterations, budget_ms=budget_ms, stop_gain=stop_gain, still=still)
     return Call("PUT", path(id, "budget"), reads(SceneBudget), arguments=body(request))
 
 
 def tradeoff(id: str) -> Call[TradeoffModel]:
-    """Reads the measured points of accuracy against time, for this scene on its machine."""
+    """Reads the measured points of accuracy against time, for this scene on its machine.
+
+    >>> "measured" in [point.kind for point in client.tradeoff(scene).points]
+    True
+    """
     return Call("GET", path(id, "tradeoff"), reads(TradeoffModel))
 
 
@@ -48,11 +62,20 @@ def replay(id: str, iterations: Sequence[int] = (25, 50, 200), frames: int = 4) 
         id: of the scene.
         iterations: a frame, each a replay; the scene's own number is always measured too.
         frames: that are replayed; their pictures must still be held.
+
+    >>> client.replay(scene, [50], frames=1).replay.state
+    <ReplayState.RUNNING: 'running'>
+    >>> client.end_replay(scene).scene == scene
+    True
     """
     request = ReplayRequest(iterations=list(iterations), frames=frames)
     return Call("POST", path(id, "tradeoff"), reads(TradeoffModel), repeatable=False, arguments=body(request))
 
 
 def end_replay(id: str) -> Call[TradeoffModel]:
-    """Ends the replay that is running, if one is; what it has measured stays."""
+    """Ends the replay that is running, if one is; what it has measured stays.
+
+    >>> client.end_replay(scene).scene == scene
+    True
+    """
     return Call("DELETE", path(id, "tradeoff"), reads(TradeoffModel))

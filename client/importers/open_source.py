@@ -41,6 +41,10 @@ def open_source(
     Raises:
         CaptureError: no known layout, or a fault in one of the files; the message says what is missing.
         MissingExtra: a lens or a video needs a package of the extra `importers`.
+
+    >>> source = open_source(folder)
+    >>> source.rig.names, source.frame_count
+    (('0', '1'), 4)
     """
     folder = Path(folder)
     if not folder.is_dir():

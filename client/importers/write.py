@@ -39,6 +39,11 @@ def write_dynamic3dgs(
 
     Raises:
         CaptureError: the folder is not empty, cameras differ in size, or a test camera is unknown or the last.
+
+    >>> from client.importers.open_source import open_source
+    >>> write_dynamic3dgs(open_source(folder), out, frames=2, test=["1"])
+    >>> sorted(path.name for path in out.iterdir())
+    ['ims', 'init_pt_cld.npz', 'seg', 'test_meta.json', 'train_meta.json']
     """
     cameras = source.rig.cameras
     if out.exists() and any(out.iterdir()):

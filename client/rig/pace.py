@@ -15,6 +15,12 @@ class Pace:
         jitter: seconds that a frame is late at most, evenly distributed: cables, encoders, switches.
         drop: share of frames that the rig loses, 0…1. Frame 0 is never lost.
         seed: of what is random here.
+
+    >>> pace = Pace(fps=30, drop=0.5)
+    >>> [pace.loses(index) for index in range(4)] == [pace.loses(index) for index in range(4)]
+    True
+    >>> pace.loses(0)
+    False
     """
 
     fps: float | None = None

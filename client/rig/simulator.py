@@ -66,6 +66,12 @@ def push(
     Raises:
         ServiceError, ServiceUnreachable: as by the client.
         RuntimeError: the scene failed, or has other cameras than the capture.
+
+    >>> from client.importers.open_source import open_source
+    >>> delivery = push(open_source(folder), client, frames=2)
+    >>> delivery.status.committed
+    2
+    >>> client.delete_scene(delivery.scene)
     """
     source = CaptureSource(source) if isinstance(source, Capture) else source
     on_progress = on_progress or (lambda stage, done, total: None)
