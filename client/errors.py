@@ -39,19 +39,19 @@ class ServiceError(RuntimeError):
 
 
 class InvalidRequest(ServiceError):
-    """A field that cannot be."""
+    """A field has a value that it cannot have."""
 
 
 class TooLarge(ServiceError):
-    """More than the service takes at once."""
+    """The request is larger than the service takes."""
 
 
 class NotAuthorized(ServiceError):
-    """No token, or not one that the service knows."""
+    """The token is missing, or the service does not know it."""
 
 
 class NotFound(ServiceError):
-    """No such scene, frame or camera."""
+    """There is no such scene, frame or camera."""
 
 
 class Conflict(ServiceError):

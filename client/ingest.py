@@ -121,7 +121,7 @@ class IngestSocket:
 
 
 def _as_response(answer: IngestAnswer) -> httpx.Response:
-    """The answer as the HTTP door would have given it, so that the same rules hold."""
+    """The answer as it would have come over HTTP, so that the same retries apply."""
     problem = {} if answer.problem is None else answer.problem.model_dump(mode="json", exclude_none=True)
     headers = {} if answer.retry_after is None else {"Retry-After": str(answer.retry_after)}
     return httpx.Response(answer.status, headers=headers, json=problem)

@@ -1,4 +1,4 @@
-"""When a call is sent again, and how long that goes on.
+"""Retries of calls: which answers are retried, after how long, and until when.
 
 Sent again is what does the same when it is done twice: reading, and every frame, which the service knows by its
 content.
@@ -46,7 +46,7 @@ OUTAGE_S = 20.0
 
 @dataclass(frozen=True)
 class Retry:
-    """Why a call waits before it is sent again.
+    """A wait before a call is sent again, with its reason.
 
     Attributes:
         reason: "busy": the service is there and has no room; "outage": it does not answer.
@@ -63,7 +63,7 @@ OnRetry = Callable[[Retry], None]
 
 
 class Retries:
-    """Of one call: says after how many seconds it may be sent again, or raises."""
+    """Retries of one call: computes the seconds until it may be sent again, or raises."""
 
     def __init__(
         self, call: Call[Any], url: str, *, busy: float, outage: float, on_retry: OnRetry | None = None

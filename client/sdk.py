@@ -249,7 +249,7 @@ class AsyncClient(_Settings):
         await self._http.aclose()
 
     async def send(self, call: Call[T]) -> T:
-        """Any call, with its retries."""
+        """As `Client.send`."""
         retries = self._retries(call)
         while True:
             wait: float | None

@@ -180,7 +180,7 @@ class Stream:
 
 
 class AsyncStream:
-    """The same for asyncio: `async with`, `async for`.
+    """A scene's stream for asyncio: use it in an `async with`, iterate with `async for`.
 
     >>> async def newest():
     ...     async with AsyncStream(url, scene) as stream:

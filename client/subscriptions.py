@@ -48,7 +48,7 @@ RETRIED_STATUSES = (429, 502, 503, 504)
 
 @dataclass(frozen=True)
 class Bulk:
-    """Bytes that came for a subscription.
+    """A binary message of a subscription.
 
     Attributes:
         id: the subscription's. tag: of the request that this answers. missed: what it took the place of, unsent.
@@ -64,17 +64,17 @@ class Bulk:
     body: bytes
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The body of an npz; nothing is unpickled."""
+        """Reads the body as the arrays of an npz; nothing is unpickled."""
         with np.load(io.BytesIO(self.body), allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
 
 
 @dataclass(frozen=True)
 class ViewEvent(Bulk):
-    """A view."""
+    """A rendered view."""
 
     def picture(self) -> NDArray[Any]:
-        """[H, W, 3] uint8 for colour, else [H, W]."""
+        """Decodes the picture: [H, W, 3] uint8 for colour, else [H, W]."""
         with Image.open(io.BytesIO(self.body)) as picture:
             return np.array(picture)
 
@@ -92,7 +92,7 @@ class TracksEvent(Bulk):
 
 @dataclass(frozen=True)
 class PartsEvent(Bulk):
-    """Labels."""
+    """Part labels of all Gaussians."""
 
     def model(self) -> PartsModel:
         """Of a request for JSON."""
@@ -111,7 +111,7 @@ class SubscriptionRequest:
 
 
 def scene_changes() -> SubscriptionRequest:
-    """State, progress and queue at every change.
+    """Subscribes to the scene's state, progress and queue at every change.
 
     >>> with Stream(url, scene) as stream:
     ...     stream.subscribe("scene", scene_changes())
@@ -143,7 +143,7 @@ def view(
     background: tuple[float, float, float] | None = None,
     parts: int | None = None,
 ) -> SubscriptionRequest:
-    """A view of every new frame, or of a chosen one; `Stream.update` moves the camera. As `client.calls.render`.
+    """Subscribes to a view of every new frame, or of a chosen one. Arguments as of `client.calls.render`.
 
     >>> with Stream(url, scene) as stream:
     ...     stream.subscribe("live", view(rig.cameras[0], format="png"))
@@ -168,7 +168,7 @@ def tracks(
     project: Sequence[Camera | str] = (),
     format: str = "json",
 ) -> SubscriptionRequest:
-    """Trajectories so far, then those of each new frame. As `client.calls.tracks`.
+    """Subscribes to trajectories so far, then of each new frame. Arguments as of `client.calls.tracks`.
 
     >>> with Stream(url, scene) as stream:
     ...     stream.subscribe("two", tracks(ids=[0, 1]))
@@ -190,7 +190,7 @@ def tracks(
 
 
 def parts(count: int | None = None, *, every: int = 1) -> SubscriptionRequest:
-    """Labels of all Gaussians, found anew when `every` more frames are there.
+    """Subscribes to part labels of all Gaussians, found anew after every `every` frames.
 
     >>> with Stream(url, scene) as stream:
     ...     stream.subscribe("labels", parts(2))

@@ -1,4 +1,4 @@
-"""Budgets: what an update may cost, and what it brings."""
+"""Calls on budgets of updates, and on the measured accuracy against time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def set_budget(
     stop_gain: float | None = None,
     still: float | None = None,
 ) -> Call[SceneBudget]:
-    """Another budget, from the first frame on that is not begun. What is None is as the scene was made.
+    """Sets another budget, from the first frame that is not begun. A limit that is None is as the scene was made.
 
     Args:
         id: of the scene.

@@ -1,4 +1,4 @@
-"""Frames: sent whole or camera by camera, closed, declared missing, and what became of them."""
+"""Calls on frames: send whole or camera by camera, close, declare missing, read reports and exports."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def put_camera(
 
 
 def close_frame(id: str, index: int) -> Call[FrameReceipt]:
-    """Closes a frame whose cameras send one by one: it goes without those that are not in.
+    """Closes a frame whose cameras send one by one: it is reconstructed without those that are absent.
 
     >>> n = client.scene(open_scene).next_frame
     >>> client.put_camera(open_scene, n, "c0", pictures["c0"]).absent
@@ -120,7 +120,7 @@ def frames(id: str, first: int = 0, limit: int = 500) -> Call[FrameList]:
 
 
 def ply(id: str, index: int) -> Call[bytes]:
-    """A committed frame as a 3DGS .ply.
+    """Reads a committed frame as a 3DGS .ply.
 
     >>> client.ply(scene, 1)[:3]
     b'ply'

@@ -1,4 +1,4 @@
-"""Scenes: create, look at, pause, resume, delete; the cloud that frame 0 starts from."""
+"""Calls on scenes: create, read, pause, resume, delete; the initial points of frame 0."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def create_scene(
     frames_per_second: float = 30.0,
     ingest: IngestSettings | None = None,
 ) -> Call[SceneStatus]:
-    """A new scene. Never sent twice: that would make two.
+    """Creates a scene. The request is never sent twice: that would make two.
 
     Args:
         rig: its cameras, at the size of the pictures that will be sent.
@@ -52,7 +52,7 @@ def create_scene(
 
 
 def estimate(rig: Rig, *, preset: str = "scas4d", settings: Mapping[str, Any] | None = None) -> Call[SceneEstimate]:
-    """Memory and disk that a scene would take; arguments as `create_scene`, and nothing is created.
+    """Estimates the memory and disk that a scene would take; arguments as `create_scene`, and nothing is created.
 
     >>> found = client.estimate(rig)
     >>> found.memory_mb < found.limit_mb
@@ -63,7 +63,7 @@ def estimate(rig: Rig, *, preset: str = "scas4d", settings: Mapping[str, Any] | 
 
 
 def scenes() -> Call[list[SceneStatus]]:
-    """All scenes, oldest first.
+    """Reads the status of all scenes, oldest first.
 
     >>> scene in [status.id for status in client.scenes()]
     True
@@ -72,7 +72,7 @@ def scenes() -> Call[list[SceneStatus]]:
 
 
 def scene(id: str) -> Call[SceneStatus]:
-    """A scene's state, progress and queue.
+    """Reads a scene's state, progress and queue.
 
     >>> client.scene(scene).committed
     3
@@ -81,7 +81,7 @@ def scene(id: str) -> Call[SceneStatus]:
 
 
 def rig(id: str) -> Call[Rig]:
-    """A scene's cameras.
+    """Reads a scene's cameras.
 
     >>> client.rig(scene).names
     ('c0', 'c1')
@@ -90,7 +90,7 @@ def rig(id: str) -> Call[Rig]:
 
 
 def pause(id: str) -> Call[SceneStatus]:
-    """Lets the scene rest after the frame at work: it takes frames, and reconstructs none.
+    """Pauses a scene after the frame at work: it takes frames, and reconstructs none.
 
     >>> client.pause(scene).paused
     True
@@ -101,7 +101,7 @@ def pause(id: str) -> Call[SceneStatus]:
 
 
 def resume(id: str) -> Call[SceneStatus]:
-    """Lets a paused scene go on.
+    """Resumes a paused scene.
 
     >>> client.resume(scene).paused
     False
@@ -121,7 +121,7 @@ def delete_scene(id: str) -> Call[None]:
 
 
 def put_points(id: str, points: InitialPoints) -> Call[PointsReceipt]:
-    """The cloud that frame 0 starts from; before frame 0.
+    """Sends the initial points of frame 0; to be sent before it.
 
     >>> from scas4d_core.captures import InitialPoints
     >>> new = client.create_scene(rig)

@@ -1,4 +1,4 @@
-"""Trajectories of ids, of pixels, of points."""
+"""Calls on trajectories of ids, of pixels, of points."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def tracks(
     frames: tuple[int, int] | None = None,
     project: Sequence[Camera | str] = (),
 ) -> Call[TracksModel]:
-    """Trajectories of exactly one of `ids`, `pixels` and `points`.
+    """Reads the trajectories of exactly one of `ids`, `pixels` and `points`.
 
     Args:
         id: of the scene.
@@ -57,7 +57,7 @@ def tracks_arrays(
     frames: tuple[int, int] | None = None,
     project: Sequence[Camera | str] = (),
 ) -> Call[dict[str, NDArray[Any]]]:
-    """The same as the arrays of an npz: for many.
+    """Reads trajectories as the arrays of an npz: for many. Arguments as of `tracks`.
 
     >>> client.tracks_arrays(scene, ids=[0, 1], project=["c0"])["tracks_world"].shape
     (3, 2, 3)

@@ -14,7 +14,7 @@ CUDA = ("torch", "gsplat")
 
 
 def need_server() -> None:
-    """For commands that start other processes: these would fail where nobody looks.
+    """Checks that the service is installed, for commands that start it in another process.
 
     Raises:
         ModuleNotFoundError: something of the extra `server` is not installed.

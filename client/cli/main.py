@@ -24,10 +24,13 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, help="Online 4D re
 commands.register(app)
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture.")]
-Preset = Annotated[str, typer.Option(help="Named settings: scas4d, adaptive or dynamic3dgs.")]
-Changes = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="As update.iterations=200.")]
-Frames = Annotated[int | None, typer.Option(min=1, help="Only so many frames.")]
-Out = Annotated[Path, typer.Option(help="Where pictures go.")]
+Preset = Annotated[str, typer.Option(help="Preset of settings: scas4d, adaptive or dynamic3dgs.")]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NAME=VALUE", help="Change a setting, as update.iterations=200. May be repeated."),
+]
+Frames = Annotated[int | None, typer.Option(min=1, help="Take only so many frames.")]
+Out = Annotated[Path, typer.Option(help="Folder for the results.")]
 
 
 @app.command()
@@ -41,7 +44,7 @@ def serve(
         Path | None, typer.Option(help="TOML file of settings; docs/operations.md lists them. The environment wins.")
     ] = None,
 ) -> None:
-    """Starts the service. What is not given here is read from the environment (SCAS4D_...), then from the file."""
+    """Starts the service. Settings not given here are read from the environment (SCAS4D_...), then from the file."""
     if config is not None:
         os.environ["SCAS4D_CONFIG"] = str(config)
     from server.serve import serve as run
@@ -90,7 +93,7 @@ def reconstruct(
     out: Out = Path("out/reconstruct"),
     frames: Frames = None,
     preset: Preset = "scas4d",
-    device: Annotated[str | None, typer.Option(help="cpu or cuda.")] = None,
+    device: Annotated[str | None, typer.Option(help="Device of the updates: cpu or cuda.")] = None,
     changes: Changes = None,
 ) -> None:
     """Reconstructs a capture in this process, without a service: pictures, states, and a .ply of the last frame."""
@@ -107,7 +110,9 @@ def evaluate(
     frames: Frames = None,
     preset: Preset = "scas4d",
     changes: Changes = None,
-    again: Annotated[bool, typer.Option("--again", help="Measure anew what is there already.")] = False,
+    again: Annotated[
+        bool, typer.Option("--again", help="Measure anew, even where the folder holds the scores.")
+    ] = False,
 ) -> None:
     """Prints a capture's scores on its test cameras and ground truth; reconstructs it unless `out` has them already."""
     from client.cli.evaluate import evaluate as run

@@ -1,4 +1,4 @@
-"""Renders beside the truth. Numpy and Pillow only."""
+"""Comparison pictures: renders beside the truth. Numpy and Pillow only."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def brightness(depth: NDArray[np.floating]) -> Picture:
 
 
 def save(path: Path, picture: Picture) -> Path:
-    """As PNG; folders are made."""
+    """Saves a picture as PNG; folders are made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(picture).save(path)
     return path

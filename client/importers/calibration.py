@@ -19,7 +19,7 @@ STILL_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class CalibratedImage:
-    """One picture that a calibration speaks of.
+    """One picture that a calibration names, with its camera.
 
     Attributes:
         path: as the file names it.
@@ -65,7 +65,7 @@ def natural(text: str) -> list[tuple[int, int, str]]:
 def calibration(
     source: Path, views: Sequence[CalibratedImage], *, points: InitialPoints | None = None, fps: float | None = None
 ) -> Calibration:
-    """Views to cameras. A camera is called like the folder of its pictures or, where all lie in one, like its picture.
+    """Groups pictures by camera. A camera is named by its pictures' folder or, where all lie in one, by its picture.
 
     Raises:
         CaptureError: no views, a camera that moves, or a name that cannot be.

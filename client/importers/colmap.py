@@ -55,7 +55,7 @@ class _Image:
 
 
 def is_model(folder: Path) -> bool:
-    """Do the files of a model lie in the folder?"""
+    """True where the files of a model lie in the folder."""
     return any((folder / f"cameras{end}").is_file() for end in (".bin", ".txt"))
 
 

@@ -24,16 +24,16 @@ class Requests:
         self._scene = scene
 
     def frame(self, index: int, files: Files) -> None:
-        """A whole frame."""
+        """Sends a whole frame."""
         self._client.put_frame(self._scene, index, files.images, files.masks, time=files.time)
 
     def camera(self, index: int, name: str, files: Files) -> None:
-        """One camera's pictures."""
+        """Sends one camera's pictures."""
         mask = files.masks.get(name)
         self._client.put_camera(self._scene, index, name, files.images[name], mask, time=files.time)
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Does nothing: no connection is kept."""
 
 
 class Sockets:
@@ -45,11 +45,11 @@ class Sockets:
         self._sockets: dict[str, IngestSocket] = {}
 
     def frame(self, index: int, files: Files) -> None:
-        """A whole frame."""
+        """Sends a whole frame."""
         self._of("").put_frame(index, files.images, files.masks, time=files.time)
 
     def camera(self, index: int, name: str, files: Files) -> None:
-        """One camera's pictures, over its own socket."""
+        """Sends one camera's pictures over its own socket."""
         self._of(name).put_camera(index, name, files.images[name], files.masks.get(name), time=files.time)
 
     def close(self) -> None:
@@ -88,7 +88,7 @@ class Sender:
         self.start_clock()
 
     def start_clock(self) -> None:
-        """The next frame is due now; the rate is counted from here."""
+        """Starts the clock: the next frame is due now."""
         self._began = time.monotonic()
         self._sent = 0
         self._delivery.lateness.began = self._began

@@ -56,7 +56,7 @@ class Sequence:
         return self.time(self._last) + (index - self._last) / self.source.fps
 
     def files(self, index: int) -> Files:
-        """The files of a frame; those of the next are made meanwhile."""
+        """Returns the files of a frame; those of the next are made meanwhile."""
         future = self._ahead[1] if self._ahead and self._ahead[0] == index else self._reader.submit(self._files, index)
         found = future.result()
         if index + 1 < len(self):

@@ -1,4 +1,4 @@
-"""Frames on the wire: what was taken, and what became of it."""
+"""Frames on the wire: receipts and reports."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ MOST_BUDGETS = 8
 
 
 class PointKind(StrEnum):
-    """Origin of a point: reports or a replay."""
+    """Origin of a point: measured, extrapolated or replayed."""
 
     MEASURED = "measured"
     REPLAYED = "replayed"
@@ -23,7 +23,7 @@ class PointKind(StrEnum):
 
 
 class TradeoffPoint(Model):
-    """Seconds and PSNR of a frame with so many iterations."""
+    """Milliseconds, error and PSNR of a frame with so many iterations."""
 
     kind: PointKind = Field(
         description="measured: frames that the scene committed. replayed: frames of the scene, updated again in the "
@@ -32,8 +32,8 @@ class TradeoffPoint(Model):
     iterations: int = Field(description="A frame. Measured: what frames ran, to two significant digits.")
     milliseconds: float = Field(description="A frame from decoding to the end of the commit; the median.")
     error: float | None = Field(
-        description="Mean image loss of the witnesses, at most four training views, for what was committed; null where "
-        "not measured. What is extrapolated has none."
+        description="Mean image loss of the probe views, at most four training views, of the committed state; null "
+        "where not measured. What is extrapolated has none."
     )
     psnr: float | None = Field(description="dB, of training views as they were last rendered; null as `error`.")
     frames: int = Field(description="That went into it; 0 for what is extrapolated.")

@@ -10,7 +10,7 @@ import numpy as np
 
 from client.cli.scores import Row
 from studies.effort.effort import SEEDS, TOLERANCE
-from studies.effort.report import BAR
+from studies.effort.report import TARGET
 
 KEPT = 0.95
 """Share of the frames that have to keep a budget."""
@@ -90,7 +90,7 @@ def _adaptive(rows: Sequence[Row]) -> list[str]:
     lines += [
         "",
         f"Mean: {100 * np.mean(times):.0f} % of the time, {np.mean(losses):+.2f} dB; "
-        f"repeats {100 * np.mean(repeats):.0f} %. The bar, at most {100 * TIME:.0f} % of the time at {LOSS_DB:g} dB, "
+        f"repeats {100 * np.mean(repeats):.0f} %. The target, at most {100 * TIME:.0f} % of time at {LOSS_DB:g} dB, "
         f"and {100 * REPEATS:.0f} % for repeats, is "
         f"{'reached on every capture' if ok else '**missed** on some captures'}.",
         "",
@@ -110,13 +110,13 @@ def _report(rows: Sequence[Row]) -> list[str]:
         "|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        verdict = "reached" if row["share"] <= BAR else "**missed**"
+        verdict = "reached" if row["share"] <= TARGET else "**missed**"
         low, high = row["ratio_quartiles"]
         lines.append(
             f"| {row['capture']} | {row['updates']} | {row['milliseconds']:.1f} | {100 * row['share']:.2f} % "
             f"| {100 * row['share_worst']:.2f} % | {row['ratio']:.3f} ({low:.3f} to {high:.3f}) | {verdict} |"
         )
-    return [*lines, "", f"The bar: at most {100 * BAR:.0f} % of an update.", ""]
+    return [*lines, "", f"The target: at most {100 * TARGET:.0f} % of an update.", ""]
 
 
 def _gain(one: Row) -> float:

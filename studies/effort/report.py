@@ -24,7 +24,7 @@ from scas4d_core.update.result import REPORT
 from studies.effort.effort import COUNTED_FROM, Report, changed, leave
 from studies.frontier.timing import started
 
-BAR = 0.02
+TARGET = 0.02
 """Share of an update that its report may cost."""
 
 
@@ -73,10 +73,10 @@ def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report
         "ratio": float(np.median(ratios)),
         "ratio_quartiles": np.percentile(ratios, (25, 75)).tolist(),
     }
-    verdict = "reached" if answer["share"] <= BAR else "missed"
+    verdict = "reached" if answer["share"] <= TARGET else "missed"
     low, high = answer["ratio_quartiles"]
     report(
-        f"    {capture.name}: report: {100 * answer['share']:.2f} % of an update ({verdict}: {100 * BAR:.0f} %), "
+        f"    {capture.name}: report: {100 * answer['share']:.2f} % of an update ({verdict}: {100 * TARGET:.0f} %), "
         f"{answer['milliseconds']:.1f} ms; with what can be left out {answer['ratio']:.3f} × the CPU time without "
         f"(quartiles {low:.3f}, {high:.3f})"
     )

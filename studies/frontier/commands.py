@@ -19,12 +19,12 @@ def frontier(
     axes: Annotated[
         list[str] | None, typer.Option(help="Only this axis, as iterations or layers. May be repeated.")
     ] = None,
-    updates: Annotated[int, typer.Option(min=1, help="Of each row.")] = 5,
-    most_iterations: Annotated[int | None, typer.Option(min=1, help="Leave out settings with more.")] = None,
+    updates: Annotated[int, typer.Option(min=1, help="Updates of each row.")] = 5,
+    most_iterations: Annotated[int | None, typer.Option(min=1, help="Leave out settings with more iterations.")] = None,
     only: Annotated[
         list[str] | None, typer.Option(help="Only this step: rows, times, convergence or page. May be repeated.")
     ] = None,
-    rounds: Annotated[int, typer.Option(min=1, help="In which every setting is timed once.")] = 5,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds of timing; every setting once in each.")] = 5,
     page: Annotated[
         Path | None, typer.Option(help="The page, as Markdown; plots go into a folder of its name. [OUT/frontier.md]")
     ] = None,

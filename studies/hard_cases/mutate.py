@@ -80,7 +80,7 @@ print("\\n" + json.dumps(found))
 
 
 class MutationError(RuntimeError):
-    """A mutation that cannot be made or judged: the message says which and why."""
+    """A mutation that cannot be made or measured: the message says which and why."""
 
 
 def mutants() -> Iterator[Guard]:

@@ -11,7 +11,7 @@ import numpy as np
 from scas4d_core.frame_report import FrameReport
 from studies.hard_frames.footage import Footage
 
-BAR = 0.03
+TARGET = 0.03
 """Share of an update that the checks may cost."""
 
 Share = tuple[float, float, float]
@@ -43,7 +43,7 @@ def cost(footage: Footage, updates: int = 8) -> Share:
 def in_words(footage: Footage, found: Share) -> str:
     """One line."""
     seconds, checks, witness = found
-    verdict = f"{'reached' if checks <= BAR else 'missed'}: {100 * BAR:.0f} %"
+    verdict = f"{'reached' if checks <= TARGET else 'missed'}: {100 * TARGET:.0f} %"
     return (
         f"{footage.name}: the checks take {100 * checks:.1f} % of an update of {seconds:.2f} s ({verdict}), "
         f"comparing its start and end {100 * witness:.1f} %"

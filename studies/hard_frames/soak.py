@@ -180,9 +180,13 @@ def violations(rows: Sequence[Row]) -> list[str]:
         if not row.still:
             found.append(at + "what stands has moved")
         if not row.resting <= RESTING_M:
-            found.append(at + f"what rests is {1000 * row.resting:.1f} mm from where it was, the bar is {RESTING_M} m")
+            found.append(
+                at + f"what rests is {1000 * row.resting:.1f} mm from where it was, the target is {RESTING_M} m"
+            )
         if row.frame % (2 * OUT) == 0 and not row.moving <= RETURN_M:
-            found.append(at + f"it came back {1000 * row.moving:.1f} mm from where it began, the bar is {RETURN_M} m")
+            found.append(
+                at + f"it came back {1000 * row.moving:.1f} mm from where it began, the target is {RETURN_M} m"
+            )
         if not row.unit <= UNIT:
             found.append(at + f"a rotation's norm is {row.unit:.1e} from 1")
         if not (row.longest <= GROWTH and row.shortest >= 1 / GROWTH):

@@ -14,9 +14,9 @@ def kernels(
     capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; the targets are for robot.")],
     out: Page = None,
     store: Annotated[Path, typer.Option(help="Folder of the study, for `scripts/bench table`.")] = QUALITY,
-    preset: Annotated[str, typer.Option(help="Named settings.")] = "scas4d",
-    frames: Annotated[int, typer.Option(min=3, help="Of the run that is timed; the first update does not count.")] = 8,
-    repeats: Annotated[int, typer.Option(min=1, help="Of the rasterizer and of its arithmetic.")] = 9,
+    preset: Annotated[str, typer.Option(help="Preset of settings.")] = "scas4d",
+    frames: Annotated[int, typer.Option(min=3, help="Frames of the timed run; the first update does not count.")] = 8,
+    repeats: Annotated[int, typer.Option(min=1, help="Repeats of the rasterizer and of its arithmetic.")] = 9,
     changes: Changes = None,
 ) -> None:
     """Measures the CPU kernels: rasterizer against its arithmetic, update against its passes, peak memory.
@@ -32,10 +32,10 @@ def kernels(
 
 
 def device(
-    gaussians: Annotated[int, typer.Option(min=100, help="That move; a quarter as many stand.")] = 8000,
-    size: Annotated[int, typer.Option(min=16, help="Pixels, side of the six pictures.")] = 384,
-    iterations: Annotated[int, typer.Option(min=1, help="Of the update.")] = 20,
-    repeats: Annotated[int, typer.Option(min=1, help="Of each stage, after a first call that compiles.")] = 5,
+    gaussians: Annotated[int, typer.Option(min=100, help="Moving Gaussians; a quarter as many stand.")] = 8000,
+    size: Annotated[int, typer.Option(min=16, help="Side of the six pictures in pixels.")] = 384,
+    iterations: Annotated[int, typer.Option(min=1, help="Iterations of the update.")] = 20,
+    repeats: Annotated[int, typer.Option(min=1, help="Repeats of each stage, after a first call that compiles.")] = 5,
     out: Page = None,
 ) -> None:
     """Compares the GPU with the CPU stage by stage, on a synthetic scene; fails where they disagree."""

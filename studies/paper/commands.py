@@ -18,7 +18,7 @@ def paper(
     quality: Annotated[
         Path | None, typer.Option(help="Folder of the study of quality, for captures that have rows there alone.")
     ] = QUALITY,
-    updates: Annotated[int, typer.Option(min=1, help="Of each row.")] = 5,
+    updates: Annotated[int, typer.Option(min=1, help="Updates of each row.")] = 5,
     measure: Annotated[
         bool, typer.Option("--measure/--no-measure", help="Measure rows that are missing; else leave them out.")
     ] = True,

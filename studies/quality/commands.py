@@ -16,13 +16,14 @@ def quality(
     captures: Captures,
     out: Study = QUALITY,
     preset: Annotated[
-        list[str] | None, typer.Option(help="scas4d (the default), adaptive or dynamic3dgs; may be repeated.")
+        list[str] | None, typer.Option(help="Preset: scas4d (the default), adaptive or dynamic3dgs. May be repeated.")
     ] = None,
     iterations: Annotated[
-        list[int] | None, typer.Option(min=1, help="Of an update; the preset's when left out. May be repeated.")
+        list[int] | None,
+        typer.Option(min=1, help="Iterations of an update; the preset's when left out. May be repeated."),
     ] = None,
     seed: Annotated[
-        list[int] | None, typer.Option(min=0, help="Of frame 0 and the updates, default 0. May be repeated.")
+        list[int] | None, typer.Option(min=0, help="Seed of frame 0 and the updates, default 0. May be repeated.")
     ] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Only so many frames; 1 measures frame 0 alone.")] = None,
     device: Annotated[str | None, typer.Option(help="cpu or cuda; the preset's when left out.")] = None,
@@ -110,7 +111,7 @@ def processors(
     captures: Captures,
     out: Annotated[Path, typer.Option(help="Folder of the study. Run again to go on.")] = Path("out/processors"),
     frames: Annotated[int, typer.Option(min=1, help="Updates of each run.")] = 5,
-    seeds: Annotated[int, typer.Option(min=1, help="Of the updates, on this processor.")] = 4,
+    seeds: Annotated[int, typer.Option(min=1, help="Seeds of the updates, on this processor.")] = 4,
     changes: Changes = None,
 ) -> None:
     """Compares a capture's result on this processor with that on lesser ones, beside the spread over seeds.

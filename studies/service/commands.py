@@ -16,7 +16,7 @@ Repeated = Annotated[
 
 def faults(
     capture: Repeated,
-    frames: Annotated[int, typer.Option(min=4, help="Sent in every scenario.")] = 20,
+    frames: Annotated[int, typer.Option(min=4, help="Frames sent in every scenario.")] = 20,
     kills: Annotated[int, typer.Option(min=0, help="kill -9 of the worker or the service, at random moments.")] = 30,
     cuts: Annotated[int, typer.Option(min=0, help="Files of the log that are cut.")] = 20,
     flips: Annotated[int, typer.Option(min=0, help="Files of the log in which a bit is flipped.")] = 1,
@@ -24,12 +24,12 @@ def faults(
         int, typer.Option(min=0, help="Bits flipped one by one in states, checkpoints, journal and frames.")
     ] = 200,
     turns: Annotated[
-        int, typer.Option(min=1, help="Without strangers and with them, each with a token and without.")
+        int, typer.Option(min=1, help="Turns without strangers and with them, each with a token and without.")
     ] = 3,
     part: Annotated[
         list[str] | None, typer.Option(help="Only this: kills, log, disk, bits or strangers. May be repeated.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the random moments and places.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random moments and places.")] = 0,
     work: Annotated[Path, typer.Option(help="Folder for data folders and logs; what is there goes.")] = Path(
         "out/faults"
     ),
@@ -73,11 +73,11 @@ def faults(
 
 
 def ingest(
-    frames: Annotated[int, typer.Option(min=1, help="A round.")] = 20,
-    cameras: Annotated[int, typer.Option(min=1, help="Of the rig.")] = 27,
-    megabytes: Annotated[float, typer.Option(min=0.01, help="Of one JPEG.")] = 1.0,
-    rounds: Annotated[int, typer.Option(min=1, help="Each measures both ways.")] = 5,
-    senders: Annotated[int, typer.Option(min=1, help="Connections of the one sending process.")] = 2,
+    frames: Annotated[int, typer.Option(min=1, help="Frames sent in a round.")] = 20,
+    cameras: Annotated[int, typer.Option(min=1, help="Cameras of the rig.")] = 27,
+    megabytes: Annotated[float, typer.Option(min=0.01, help="Size of one JPEG.")] = 1.0,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds; each measures both ways.")] = 5,
+    senders: Annotated[int, typer.Option(min=1, help="Connections of the sending process.")] = 2,
     work: Annotated[Path, typer.Option(help="Folder on the disk that is measured.")] = Path("out/ingest"),
     out: Page = None,
 ) -> None:
@@ -101,9 +101,9 @@ def views(
     rate: Annotated[
         list[float] | None, typer.Option(min=0.1, help="Views a second, default 1, 5 and 20. May be repeated.")
     ] = None,
-    updates: Annotated[int, typer.Option(min=1, help="A turn, without views and with.")] = 8,
-    turns: Annotated[int, typer.Option(min=1, help="Of each rate.")] = 3,
-    width: Annotated[int, typer.Option(min=1, help="Of a view, in pixels.")] = 256,
+    updates: Annotated[int, typer.Option(min=1, help="Updates a turn, without views and with.")] = 8,
+    turns: Annotated[int, typer.Option(min=1, help="Turns of each rate.")] = 3,
+    width: Annotated[int, typer.Option(min=1, help="Width of a view in pixels.")] = 256,
     work: Annotated[Path, typer.Option(help="Folder for the service's data; what is there goes.")] = Path("out/views"),
     out: Page = None,
     changes: Changes = None,

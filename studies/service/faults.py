@@ -77,8 +77,10 @@ def kills(
             f"{done['worker']} of the worker, {done['service']} of the service; {lost} acknowledged frames lost, "
             f"{len(expected)} states compared"
         )
-        bar = "0 acknowledged frames lost, final state bit-identical"
-        return ScenarioResult(f"kill -9 at {count} random moments over {len(study.frames)} frames", bar, found, faults)
+        target = "0 acknowledged frames lost, final state bit-identical"
+        return ScenarioResult(
+            f"kill -9 at {count} random moments over {len(study.frames)} frames", target, found, faults
+        )
     finally:
         service.stop()
 
@@ -149,8 +151,8 @@ def damaged_log(
         finally:
             victim.stop()
     found = f"started {cuts + flips} times; {dropped} frames set aside with their reason, all others committed"
-    bar = "starts, loses nothing acknowledged before the damage, says what it dropped"
-    return ScenarioResult(f"{cuts} cuts and {flips} flipped bytes of journal and frame log", bar, found, faults)
+    target = "starts, loses nothing acknowledged before the damage, says what it dropped"
+    return ScenarioResult(f"{cuts} cuts and {flips} flipped bytes of journal and frame log", target, found, faults)
 
 
 def _damage(folder: Path, kind: str, random_: random.Random, half: int) -> tuple[str, int | None]:
@@ -221,8 +223,10 @@ def full_disk(study: Study, expected: Mapping[int, str], echo: Echo) -> Scenario
         faults += sender.check() + compare(digests(service.data / "scenes" / scene / "states"), expected)
     finally:
         service.stop()
-    bar = "starts, loses nothing acknowledged before the damage, says what it dropped"
-    return ScenarioResult("disk full while ingesting", bar, "507 meanwhile; all committed once there was room", faults)
+    target = "starts, loses nothing acknowledged before the damage, says what it dropped"
+    return ScenarioResult(
+        "disk full while ingesting", target, "507 meanwhile; all committed once there was room", faults
+    )
 
 
 @contextlib.contextmanager
@@ -244,9 +248,9 @@ def flipped_bits(study: Study, count: int, seed: int, echo: Echo) -> ScenarioRes
         f"{counts['noticed']} noticed, {counts['harmless']} harmless; {len(found.remade)} states made again from "
         f"pictures, {len(found.lost)} named as lost, {len(found.unreported)} without their report"
     )
-    bar = "each noticed or harmless; no wrong picture, no 500, the scene goes on"
+    target = "each noticed or harmless; no wrong picture, no 500, the scene goes on"
     return ScenarioResult(
-        f"{count} flipped bits of {', '.join(damage.KINDS)}, half while down", bar, said, found.faults
+        f"{count} flipped bits of {', '.join(damage.KINDS)}, half while down", target, said, found.faults
     )
 
 

@@ -120,7 +120,7 @@ def study(
         usual, faults = _push(service, footage, [good(endless, index) for index in range(sent[-1].like + 1)], echo)
         echo(f"undisturbed: {usual.count} frames")
         scene, more = _push(service, footage, sent, echo)
-        lines = [_judged(part, scene, usual, footage) for part in parts]
+        lines = [_result(part, scene, usual, footage) for part in parts]
     finally:
         service.stop()
     faults += more
@@ -229,7 +229,7 @@ def _png(picture: NDArray[np.uint8]) -> bytes:
     return file.getvalue()
 
 
-def _judged(part: SentCase, scene: Pushed, usual: Pushed, footage: Footage) -> ServiceCaseResult:
+def _result(part: SentCase, scene: Pushed, usual: Pushed, footage: Footage) -> ServiceCaseResult:
     """The frames of one case, against the same of the undisturbed scene."""
     steps = []
     for number, sent in enumerate(part.sent):

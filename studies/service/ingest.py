@@ -26,7 +26,7 @@ from client.wire import FRAME_MEDIA_TYPE, IngestAnswer, frame_chunks
 from scas4d_core.cameras import Camera, Rig
 from studies.service.process import Service, StudyError
 
-BAR = 0.8
+TARGET = 0.8
 UNANSWERED = 2
 
 
@@ -198,11 +198,11 @@ def page(measured: IngestTimes, *, frames: int, cameras: int, size_bytes: int, s
             zip(measured.plain, measured.ingest, measured.socket, strict=True)
         )
     )
-    verdict = "reached" if measured.share(measured.ingest) >= BAR else "missed"
+    verdict = "reached" if measured.share(measured.ingest) >= TARGET else "missed"
     return (
         f"{frames} frames of {cameras} JPEGs of {size_bytes / 1e6:g} MB a round and way; "
         f"HTTP over {senders} connections, one WebSocket with {UNANSWERED} messages unanswered\n\n"
         "| round | plain fsynced writes, MB/s | HTTP, MB/s | share | WebSocket, MB/s | share |\n"
         f"|---|---|---|---|---|---|\n{rows}\n\n"
-        f"Median shares {shares[0]} and {shares[1]}, bar {100 * BAR:.0f} % (HTTP): {verdict}."
+        f"Median shares {shares[0]} and {shares[1]}, target {100 * TARGET:.0f} % (HTTP): {verdict}."
     )

@@ -10,10 +10,10 @@ Echo = Callable[[str], None]
 
 @dataclass
 class ScenarioResult:
-    """A fault, the bar, and what was found; with `faults` the bar is missed."""
+    """A fault, the target, and what was found; with `faults` the target is missed."""
 
     name: str
-    bar: str
+    target: str
     found: str
     faults: list[str] = field(default_factory=list)
 
@@ -25,8 +25,10 @@ class ScenarioResult:
 
 def table(outcomes: Sequence[ScenarioResult]) -> str:
     """As Markdown."""
-    rows = ["| fault | bar | found | |", "|---|---|---|---|"]
+    rows = ["| fault | target | found | |", "|---|---|---|---|"]
     for outcome in outcomes:
         found = "; ".join([*outcome.faults, *([outcome.found] if outcome.found else [])])
-        rows.append(f"| {outcome.name} | {outcome.bar} | {found} | {'reached' if outcome.reached else '**missed**'} |")
+        rows.append(
+            f"| {outcome.name} | {outcome.target} | {found} | {'reached' if outcome.reached else '**missed**'} |"
+        )
     return "\n".join(rows)

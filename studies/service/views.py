@@ -219,7 +219,7 @@ def line(row: ViewTimes) -> str:
 
 
 def table(rows: Sequence[ViewTimes]) -> str:
-    """As Markdown, with the bar."""
+    """As Markdown, with the target."""
     head = [
         "| views a second | idle, ms (95 %) | during updates, ms (95 %) | ratio | update alone, s | under views, s | "
         "slower | no answer |",
