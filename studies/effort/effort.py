@@ -139,7 +139,7 @@ def measure_adaptive(
 
 
 class Turns:
-    """Two settings on the same frames, in turns: what each frame took, and how well it was met.
+    """Two settings on the same frames, in turns: seconds and PSNR of each frame.
 
     Args:
         names: of the settings; the first is what the other is compared with.

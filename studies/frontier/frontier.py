@@ -1,4 +1,4 @@
-"""``scripts/bench frontier``: what accuracy costs in time, setting by setting.
+"""``scripts/bench frontier``: accuracy against time, setting by setting.
 
 Iterations by method, and one axis at a time around the default of 100 iterations of ``scas4d``. A row is one capture,
 one setting and one seed over the same first updates, so that all rows of a capture can be compared; every row is a row

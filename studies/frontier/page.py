@@ -1,4 +1,4 @@
-"""The page of the frontier: plots, what to choose for what, who is ahead at equal seconds, and the tables behind."""
+"""The page of the frontier: plots, advice, the comparison at equal seconds, and the tables behind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The plots of the frontier, as PNG files: accuracy over time, within an update, over frames, and where the time goes.
+"""The plots of the frontier, as PNG files: accuracy over time, within an update, over frames; time by stage.
 
 They are as wide as a column (``COLUMN``) or a page (``PAGE``) of a paper, with text of 6.5 to 8 points at that width.
 Colours are those of Okabe and Ito, told apart with any colour vision; shapes and labels say the same again. A colour is
@@ -92,10 +92,6 @@ FAR = 150
 """What a place that is far off its point counts: more than a line that is crossed, less than a name that is hidden."""
 LABEL_GAP = 8.5
 """Points between the middles of labels that stand one above the other."""
-
-
-class PlotsMissing(RuntimeError):
-    """matplotlib is not installed."""
 
 
 def draw_frontier(points: Sequence[Point], title: str, file: Path, deviations: Mapping[str, float]) -> None:
@@ -298,10 +294,8 @@ def draw_stages(points: Sequence[Point], title: str, file: Path) -> None:
 
 
 def _pyplot() -> Any:
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise PlotsMissing("plots need matplotlib; run pip install -e '.[bench]'") from error
+    import matplotlib
+
     matplotlib.use("Agg")
     from matplotlib import pyplot
 

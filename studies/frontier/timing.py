@@ -1,4 +1,4 @@
-"""Seconds of settings measured in turns, so that what else the machine does meets all of them alike.
+"""Seconds of settings measured in turns, so that other load of the machine meets all of them alike.
 
 Every setting has a reconstruction of its own, all in one process, from the frame 0 that the rows of the study share.
 In each round every setting updates to the next frame, in an order that turns from round to round. The first round loads
@@ -35,7 +35,7 @@ MANY_ITERATIONS = 500
 
 @dataclass
 class TimedVariant:
-    """One setting under way: its reconstruction, and what each counted update took."""
+    """One setting under way: its reconstruction, and the seconds of each counted update."""
 
     variant: Variant
     reconstruction: Any

@@ -1,4 +1,4 @@
-"""Rows and times of the frontier as points: what a setting reaches in how many seconds, and who is ahead at equal ones.
+"""Rows and times of the frontier as points of PSNR and seconds, and the comparison at equal seconds.
 
 Accuracy is that of the rows, over the same updates for all of a capture. Seconds are those of ``bench.timing``; where
 there are none, those of the row: CPU seconds if it ran on one thread, for they mind little what else a machine does.

@@ -1,4 +1,4 @@
-"""A measurement in a process of its own: its memory is not that of what ran before."""
+"""A measurement in a process of its own, so that its memory is not that of earlier work."""
 
 from __future__ import annotations
 

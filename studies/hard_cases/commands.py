@@ -72,10 +72,10 @@ def _frame_studies(
         _end(violations(rows))
         return
     from scas4d_core.captures import open_capture
-    from studies.hard_frames.footage import CapturedFootage, Footage, SyntheticFootage
+    from studies.hard_frames.footage import AnyFootage, CapturedFootage, SyntheticFootage
     from studies.quality.settings import settings_of
 
-    footages: list[Footage] = [
+    footages: list[AnyFootage] = [
         CapturedFootage(open_capture(path), settings_of("scas4d"), QUALITY / "first") for path in captures
     ]
     failed: list[str] = []

@@ -1,4 +1,4 @@
-"""The catalogue's Gaussians: where they are, how large, how opaque, and what is none."""
+"""The catalogue's Gaussians: unusual places, sizes and opacities, and numbers that are none."""
 
 from __future__ import annotations
 
@@ -186,7 +186,7 @@ def _culling_is_exact(problem: Rendering) -> list[str]:
 
 
 class Culled(Rendering):
-    """Of which only the culling is looked at, on the CPU."""
+    """Gaussians of which only the culling is checked, on the CPU."""
 
     def run(self, backend: str) -> BackendResult | None:
         """See ``Problem``."""

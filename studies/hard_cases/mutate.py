@@ -1,4 +1,4 @@
-"""Each guard taken away, in a copy of the sources and a process of its own: which cases fail then?
+"""Takes away each guard, in a copy of the sources and a process of its own, and notes the cases that fail then.
 
 The value in the copy's ``guards.py`` is replaced by the row's ``without``; where a comparison does the work and no
 value, the line in ``PATCHES`` is. Compiled kernels of the copies are not kept. Results are, by the digest of the

@@ -33,7 +33,7 @@ Echo = Callable[[str], None]
 
 @dataclass
 class CaseResult:
-    """A case in one size: what ran, what acted on the CPU, and what does not hold."""
+    """Result of a case in one size: backends that ran, guards that acted on the CPU, laws that do not hold."""
 
     case: str
     size: str

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from scas4d_core.frame_report import FrameReport
-from studies.hard_frames.footage import Footage
+from studies.hard_frames.footage import AnyFootage
 
 TARGET = 0.03
 """Share of an update that the checks may cost."""
@@ -32,7 +32,7 @@ def shares(reports: Sequence[FrameReport]) -> Share:
     return float(np.median(totals)), float(np.median(checks)), float(np.median(witness))
 
 
-def cost(footage: Footage, updates: int = 8) -> Share:
+def cost(footage: AnyFootage, updates: int = 8) -> Share:
     """Of so many updates of a footage after the first, which starts cold."""
     with TemporaryDirectory() as folder:
         scene = footage.start(Path(folder) / "states")
@@ -40,7 +40,7 @@ def cost(footage: Footage, updates: int = 8) -> Share:
     return shares(reports[1:])
 
 
-def in_words(footage: Footage, found: Share) -> str:
+def in_words(footage: AnyFootage, found: Share) -> str:
     """One line."""
     seconds, checks, witness = found
     verdict = f"{'reached' if checks <= TARGET else 'missed'}: {100 * TARGET:.0f} %"

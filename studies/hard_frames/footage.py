@@ -149,4 +149,4 @@ class CapturedFootage:
         return scene
 
 
-Footage = SyntheticFootage | CapturedFootage
+AnyFootage = SyntheticFootage | CapturedFootage

@@ -1,4 +1,4 @@
-"""Frames that are not what they should be: what each case sends, and what must come of it.
+"""Faulty frames: the frames that each case sends, and the laws that its result must keep.
 
 A case takes a footage that goes as it should, and says what is sent in place of its frames from one on: first the
 faulty ones, then good ones. What must hold in every case: all is finite, what is not as it should be is explained in

@@ -1,4 +1,4 @@
-"""Thousands of frames of a small scene: what time must not do to what stands, to rotations, to sizes and to memory.
+"""Thousands of frames of a small scene: resting Gaussians, rotations, sizes and memory must not drift.
 
 A ball goes six times around a vertical axis in 500 frames and turns about itself as often, then all the way back, and
 again. Beside it lies a ball that is labelled as moving and never moves, and a floor that stands. After each way there

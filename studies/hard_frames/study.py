@@ -1,4 +1,4 @@
-"""The frame cases run: each goes on from the same committed state, and is held against a run that nothing disturbs."""
+"""Runs the frame cases: each goes on from the same committed state, and is compared with an undisturbed run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import psnr
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.storage.history import History
-from studies.hard_frames.footage import Footage
+from studies.hard_frames.footage import AnyFootage
 from studies.hard_frames.frames import FrameCase, FrameOutcome, Pictures, Sent, named, violations
 
 AT = 5
@@ -25,7 +25,7 @@ UNIT = 1e-5
 
 @dataclass
 class FrameCaseResult:
-    """A case in one size.
+    """Result of a case in one size.
 
     Attributes:
         said: what the reports say of the faulty frames. against: dB of each frame against the undisturbed run, the good
@@ -46,7 +46,7 @@ class FrameStudy:
         folder: for committed states; what is there goes.
     """
 
-    def __init__(self, footage: Footage, folder: Path) -> None:
+    def __init__(self, footage: AnyFootage, folder: Path) -> None:
         self.footage, self.folder = footage, folder
         self.cases = named(footage)
         shutil.rmtree(folder, ignore_errors=True)
@@ -108,7 +108,7 @@ class FrameStudy:
 
 
 def study(
-    footage: Footage,
+    footage: AnyFootage,
     folder: Path,
     names: Sequence[str] = (),
     echo: Callable[[str], None] = print,

@@ -77,7 +77,7 @@ class Stage:
 
 
 class Bench:
-    """The synthetic scene, and each stage on both sides.
+    """The synthetic scene, and each stage on both devices.
 
     Args:
         device: "cuda", or "cpu" to compare with the dense twin, for tests.

@@ -1,4 +1,4 @@
-"""``scripts/bench kernels``: what the kernels cost against what they cannot do without.
+"""``scripts/bench kernels``: cost of the kernels against their bare arithmetic.
 
 1. The rasterizer, forward and backward, against a micro-kernel that does the arithmetic of as many blended pairs and
    nothing else (``bench.pairs``); both in turn, in this process, on the same threads. On all views of frame 0, and on a

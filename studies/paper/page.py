@@ -1,4 +1,4 @@
-"""The page of the paper's tables: each experiment beside the paper's figures, and where the outcome agrees."""
+"""The page of the paper's tables: each experiment beside the paper's figures, and whether the two agree."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Experiment:
-    """One experiment: a table of sides by captures, and what it is to show."""
+    """One experiment: a table of settings by captures, and the claims that it tests."""
 
     title: str
     source: str

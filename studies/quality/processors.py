@@ -1,4 +1,4 @@
-"""``scripts/bench processors``: how much of a capture's result is luck, of the processor and of the seed.
+"""``scripts/bench processors``: spread of a capture's result over processors and seeds.
 
 The first frames of a capture on this processor, on it as one with AVX2 alone, and as one of 2008, where kernels
 (``NUMBA_CPU_NAME``), numpy (``NPY_DISABLE_CPU_FEATURES``) and BLAS (``OPENBLAS_CORETYPE``) are concerned; beside them

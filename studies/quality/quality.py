@@ -1,4 +1,4 @@
-"""``scripts/bench quality``: how good the pictures, tracks and parts of captures are, and how long an update takes.
+"""``scripts/bench quality``: scores of the pictures, tracks and parts of captures, and seconds of an update.
 
 One row for every capture, preset, number of iterations and seed. Each row runs in a process of its own, so that peak
 memory is that row's; rows that are on disk already are not run again. Rows of a capture with the same settings of

@@ -26,7 +26,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import psnr
 from scas4d_core.query.committed import Committed
 from scas4d_core.storage.history import History
-from studies.hard_frames.footage import Footage
+from studies.hard_frames.footage import AnyFootage
 from studies.hard_frames.frames import FrameCase, FrameOutcome, Pictures, Sent, good, named, teleported, violations
 from studies.hard_frames.study import AT, sound
 from studies.service.process import PATIENCE_S, Service, StudyError
@@ -41,9 +41,9 @@ Echo = Callable[[str], None]
 
 
 class BackAndForth:
-    """A footage without an end: it turns round at both."""
+    """A footage played back and forth without an end."""
 
-    def __init__(self, footage: Footage) -> None:
+    def __init__(self, footage: AnyFootage) -> None:
         self._footage = footage
 
     def frame(self, index: int) -> Frame:
@@ -66,7 +66,7 @@ class BackAndForth:
 
 @dataclass
 class ServiceCaseResult:
-    """A case in one size, through the service."""
+    """Result of a case in one size, through the service."""
 
     case: FrameCase
     size: Any
@@ -102,7 +102,7 @@ def script(footage: BackAndForth, cases: Sequence[FrameCase]) -> tuple[list[Sent
 
 
 def study(
-    footage: Footage, folder: Path, names: Sequence[str] = (), echo: Echo = print
+    footage: AnyFootage, folder: Path, names: Sequence[str] = (), echo: Echo = print
 ) -> tuple[list[ServiceCaseResult], list[str]]:
     """Runs the cases whose name holds one of ``names``, or all.
 
@@ -150,7 +150,7 @@ class Pushed:
         record = self.committed.history.report(index)
         return FrameReport(**{item.name: record[item.name] for item in fields(FrameReport) if item.name in record})
 
-    def psnr(self, footage: Footage, index: int, truth: Pictures) -> float:
+    def psnr(self, footage: AnyFootage, index: int, truth: Pictures) -> float:
         """DB of the held-out cameras."""
         return float(
             np.mean(
@@ -159,7 +159,7 @@ class Pushed:
         )
 
 
-def _push(service: Service, footage: Footage, sent: Sequence[Sent], echo: Echo) -> tuple[Pushed, list[str]]:
+def _push(service: Service, footage: AnyFootage, sent: Sequence[Sent], echo: Echo) -> tuple[Pushed, list[str]]:
     """Frames pushed into a new scene, one after the other; and what went wrong on the way."""
     faults: list[str] = []
     scene = service.create(
@@ -229,7 +229,7 @@ def _png(picture: NDArray[np.uint8]) -> bytes:
     return file.getvalue()
 
 
-def _result(part: SentCase, scene: Pushed, usual: Pushed, footage: Footage) -> ServiceCaseResult:
+def _result(part: SentCase, scene: Pushed, usual: Pushed, footage: AnyFootage) -> ServiceCaseResult:
     """The frames of one case, against the same of the undisturbed scene."""
     steps = []
     for number, sent in enumerate(part.sent):

@@ -27,7 +27,7 @@ class StudyError(RuntimeError):
 
 
 class Service:
-    """Started by `start`, killed by `kill`, as often as one likes, over the same data folder.
+    """A service over one data folder; `start` and `kill` may be called again and again.
 
     Args:
         data: its folder. environment: further variables, as SCAS4D_ENGINE.

@@ -45,7 +45,7 @@ class Attack:
 
 @dataclass
 class AttackTimes:
-    """All turns without the attack, or with it.
+    """Measurements of all turns without the attack, or with it.
 
     Attributes:
         health: ms of each answer of `/health/live`. lost: questions without an answer of 200. memory: largest MB of the

@@ -40,7 +40,7 @@ Echo = Callable[[str], None]
 
 @dataclass
 class ViewTimes:
-    """One rate.
+    """Latencies and update times at one rate of views.
 
     Attributes:
         idle, loaded: ms, latency of each view without and during updates. alone, together: seconds of each update
