@@ -1,4 +1,4 @@
-"""`open_source`: the door for whatever a studio has; the files in the folder tell what it is."""
+"""`open_source`: opens a capture of any known layout, recognized by the files in its folder."""
 
 from __future__ import annotations
 

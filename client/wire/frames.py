@@ -130,7 +130,7 @@ class FrameReportModel(Model):
     curve: list[CurvePointModel] = Field(default_factory=list, description="Of the last attempt.")
     errors: dict[str, float | None] = Field(
         default_factory=dict,
-        description="Mean image loss on at most four training views, the witnesses: of the state before (still), "
+        description="Mean image loss on at most four training views, the probe views: of the state before (still), "
         "that going on as it moved (warm), and the end of the update (end).",
     )
     psnr: float | None = Field(default=None, description="dB, training views of the last iterations.")

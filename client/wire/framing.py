@@ -67,10 +67,8 @@ class IngestAnswer(Model):
     """Answers one binary message of `WS …/ingest`, as JSON text, in the order of the messages."""
 
     index: int | None = Field(description="Of the frame; null where the message could not be read.")
-    status: int = Field(description="What the HTTP door would have answered: 202, 409, 422, 429, 507 …")
-    retry_after: int | None = Field(
-        default=None, description="Seconds; what the HTTP door would have put into Retry-After."
-    )
+    status: int = Field(description="The status over HTTP: 202, 409, 422, 429, 507 …")
+    retry_after: int | None = Field(default=None, description="Seconds; the same as Retry-After over HTTP.")
     receipt: FrameReceipt | PartReceipt | None = Field(default=None, description="With status 202: it is on disk.")
     problem: ProblemDetails | None = Field(default=None, description="Otherwise.")
 

@@ -150,7 +150,7 @@ CASES = (
     ),
     HardCase(
         "origin far away",
-        "metres from the rig: recentred in float64 at the door",
+        "metres from the rig: recentred in float64 on entry",
         "survey coordinates; float32",
         (1e3, 1e4, 1e6),
         _shifted,

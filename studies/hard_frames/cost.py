@@ -21,15 +21,15 @@ def shares(reports: Sequence[FrameReport]) -> Share:
     """Medians over updates: seconds of one, share of the checks, share of comparing its start and its end.
 
     The checks are the stage ``judge``: the light of the pictures, the gate, what is plausible, who fits, and views of
-    cameras that are left out. Start and end are compared by the witnesses, which are a part of the update: it may
+    cameras that are left out. Start and end are compared on the probe views, which are a part of the update: it may
     end at any moment for them.
     """
     totals = [sum(report.seconds.values()) for report in reports]
     checks = [report.seconds["judge"] / total for report, total in zip(reports, totals, strict=True)]
-    witness = [
+    probes = [
         (report.seconds["start"] + report.seconds["end"]) / total for report, total in zip(reports, totals, strict=True)
     ]
-    return float(np.median(totals)), float(np.median(checks)), float(np.median(witness))
+    return float(np.median(totals)), float(np.median(checks)), float(np.median(probes))
 
 
 def cost(footage: AnyFootage, updates: int = 8) -> Share:
@@ -42,9 +42,9 @@ def cost(footage: AnyFootage, updates: int = 8) -> Share:
 
 def in_words(footage: AnyFootage, found: Share) -> str:
     """One line."""
-    seconds, checks, witness = found
+    seconds, checks, probes = found
     verdict = f"{'reached' if checks <= TARGET else 'missed'}: {100 * TARGET:.0f} %"
     return (
         f"{footage.name}: the checks take {100 * checks:.1f} % of an update of {seconds:.2f} s ({verdict}), "
-        f"comparing its start and end {100 * witness:.1f} %"
+        f"comparing its start and end {100 * probes:.1f} %"
     )

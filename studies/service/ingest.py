@@ -1,7 +1,7 @@
 """Rate of ingest over the loopback, against plain fsynced writes of the same records.
 
 All in one run and in turns, because a disk's speed drifts and what follows heavy writing pays for it: a record is the
-encoded pictures of one frame. The scene is paused, so that what is measured is the door: receive, check each picture's
+encoded pictures of one frame. The scene is paused, so that ingest alone is measured: receive, check each picture's
 structure, hash, write, sync, acknowledge.
 """
 

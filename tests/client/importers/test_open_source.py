@@ -1,4 +1,4 @@
-"""The door: layouts found, frames synchronized by name, and what a folder lacks said by name."""
+"""Captures opened: layouts found, frames synchronized by name, and what a folder lacks said by name."""
 
 from __future__ import annotations
 
