@@ -115,14 +115,13 @@ def _setting_error(error: ValidationError) -> SettingError:
     first = found[0]
     setting = ".".join(str(part) for part in first["loc"])
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-    remedy = "docs/settings.md lists all"
+    remedy = "docs/settings.md lists all with their ranges"
     if first["type"] == "extra_forbidden":
         fault = "there is no setting of this name"
         if near := difflib.get_close_matches(setting, list(_names(Settings().model_dump())), 1):
             remedy = f"did you mean {near[0]}? {remedy}"
     else:
         fault = str(first["ctx"]["error"]) if first["type"] == "value_error" else first["msg"]
-        remedy = f"give another value; {remedy}"
     return SettingError(setting, first["input"], f"{fault}{more}", remedy, error)
 
 

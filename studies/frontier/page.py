@@ -204,9 +204,9 @@ def _text(
 
 An iteration is one forward and backward render of one training view, or of several where a line says so. Each row
 covers the first {updates} updates of a capture, from a frame 0 that all its rows share; accuracy is the mean over these
-updates and the test cameras. Definitions: [quality.md](quality.md), `studies/quality/measure.py`. Seconds are medians
-of one update, pictures decoded and state committed. A setting is dominated where another one is at least as fast and
-more accurate.
+updates and the test cameras. Definitions: [quality.md](quality.md), `scas4d_core/metrics/evaluation.py`. Seconds are
+medians of one update, pictures decoded and state committed. A setting is dominated where another one is at least as
+fast and more accurate.
 
 ## What to choose
 
