@@ -1,12 +1,15 @@
-"""Options that several studies' commands share, and the writing of their pages."""
+"""Options, output and folders that several studies share."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+Echo = Callable[[str], None]
+"""Takes each line that a study prints."""
 QUALITY = Path("out/quality")
 """Folder of the study of quality, which other studies read."""
 FRONTIER = Path("out/frontier")

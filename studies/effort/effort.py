@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from client.cli.evaluate import Report
 from client.cli.scores import Row
 from scas4d_core.captures import Capture, open_capture
 from scas4d_core.metrics import psnr as image_psnr
@@ -24,8 +25,6 @@ from scas4d_core.settings import Settings
 from studies.effort.sequences import Shown, as_it_is, back_and_forth, repeated, slowed
 from studies.frontier.timing import started
 from studies.machine import core_version, machine
-
-Report = Callable[[str], None]
 
 TOLERANCE = 0.05
 """Of a budget that a frame may be off, or one iteration if that is more."""

@@ -17,11 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from client.cli.evaluate import Report
 from client.cli.scores import Row
 from scas4d_core.captures import open_capture
 from scas4d_core.presets import preset
 from scas4d_core.update.result import REPORT
-from studies.effort.effort import COUNTED_FROM, Report, changed, leave
+from studies.effort.effort import COUNTED_FROM, changed, leave
 from studies.frontier.timing import started
 
 TARGET = 0.02

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.util import find_spec
@@ -17,6 +17,7 @@ from studies.hard_cases import cluster_map, geometry, scenes, steps
 from studies.hard_cases.case import CPU, CUDA, REFERENCE, TORCH, HardCase
 from studies.machine import in_words as in_words_of
 from studies.machine import machine
+from studies.options import Echo
 
 SECTIONS: tuple[tuple[str, tuple[HardCase, ...]], ...] = (
     ("Gaussians rendered", geometry.CASES),
@@ -27,8 +28,6 @@ SECTIONS: tuple[tuple[str, tuple[HardCase, ...]], ...] = (
 CASES = tuple(case for _, cases in SECTIONS for case in cases)
 
 BEGIN, END = "<!-- scripts/bench stability: begin -->", "<!-- scripts/bench stability: end -->"
-
-Echo = Callable[[str], None]
 
 
 @dataclass

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from client.cli.evaluate import peak_megabytes
+from client.cli.evaluate import Report, peak_megabytes
 from client.cli.scores import Row
 from scas4d_core.cameras import Camera, rig_inside
 from scas4d_core.captures import open_capture
@@ -36,8 +36,6 @@ from studies.kernels.pairs import MicroKernel, blended_pairs
 from studies.machine import core_version, in_words, machine
 from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
 from studies.quality.targets import KERNELS, TARGETS
-
-Report = Callable[[str], None]
 
 PASSES = ("render", "render backward")
 """Stages of an update that are the rasterizer's."""

@@ -14,19 +14,18 @@ import os
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from client.cli.evaluate import Report
 from client.cli.scores import Row, Store, digest
 from scas4d_core.captures import open_capture
 from scas4d_core.metrics import psnr
 from studies.machine import core_version, machine
 from studies.quality.settings import settings_of
-
-Report = Callable[[str], None]
 
 PROCESSORS: Mapping[str, Mapping[str, str]] = {
     "this processor": {},

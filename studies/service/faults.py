@@ -23,8 +23,9 @@ from typing import Any
 from client.wire import FrameState
 from server.storage.events import Taken
 from server.storage.journal import read_journal
+from studies.options import Echo
 from studies.service import damage
-from studies.service.outcome import Echo, ScenarioResult
+from studies.service.outcome import ScenarioResult
 from studies.service.process import PATIENCE_S, Service, StudyError
 from studies.service.strangers import Attack, strangers
 from studies.service.study import AGAIN_S, FrameSender, Study, compare, digests, encoded_frames, undisturbed

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from scas4d_core.storage.history import History
 from studies.hard_frames.footage import AnyFootage
 from studies.hard_frames.frames import FrameCase, FrameOutcome, Pictures, Sent, good, named, teleported, violations
 from studies.hard_frames.study import AT, sound
+from studies.options import Echo
 from studies.service.process import PATIENCE_S, Service, StudyError
 
 FARTHEST = 1.0
@@ -36,8 +37,6 @@ FARTHEST = 1.0
 BETWEEN = 2
 """Good frames between the last that counts for one case and the first of the next."""
 AGAIN_S = 0.05
-
-Echo = Callable[[str], None]
 
 
 class BackAndForth:

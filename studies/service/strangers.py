@@ -20,7 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from client.wire import FrameState
-from studies.service.outcome import Echo, ScenarioResult
+from studies.options import Echo
+from studies.service.outcome import ScenarioResult
 from studies.service.process import Service, StudyError
 from studies.service.study import Study
 

@@ -14,7 +14,7 @@ import shutil
 import statistics
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -26,6 +26,7 @@ import numpy as np
 from client.wire import FrameState
 from scas4d_core.captures import Capture
 from studies.machine import in_words, machine
+from studies.options import Echo
 from studies.service.process import Service, StudyError
 from studies.service.study import encoded_frames
 
@@ -34,8 +35,6 @@ IDLE_S = 6.0
 """Of views while nothing is updated, a turn."""
 WARM_UP = 3
 """Updates before anything is measured: the first ones compile or load kernels and start cold."""
-
-Echo = Callable[[str], None]
 
 
 @dataclass

@@ -56,7 +56,7 @@ def test_the_page_keeps_what_stands_beside_its_marks(tmp_path: Path) -> None:
 @pytest.mark.parametrize("guard", list(mutate.mutants()), ids=lambda guard: guard.name)
 def test_each_guard_can_be_taken_away(guard: mutate.Guard, tmp_path: Path) -> None:
     """The places that a mutation edits are there once, and a section of the catalogue looks at it."""
-    for name in ("guards.py", "deformation_cpu.py", "hierarchy.py", "kernels/projection.py"):
+    for name in ("guards.py", "update/deformation.py", "structure/hierarchy.py", "kernels/projection.py"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text((mutate.CORE / name).read_text())
     before = {path: path.read_text() for path in tmp_path.rglob("*.py")}
@@ -68,7 +68,10 @@ def test_each_guard_can_be_taken_away(guard: mutate.Guard, tmp_path: Path) -> No
 def test_no_clamp_of_the_kernels_has_a_number_of_its_own() -> None:
     """Small and large literals stand in guards.py, or in a polynomial."""
     numbers = re.compile(r"(?<![\w.])\d+(?:\.\d+)?e[-+]?(\d+)")
-    others = [mutate.CORE / name for name in ("deformation.py", "losses.py", "picture_loss.py")]
+    others = [
+        mutate.CORE / name
+        for name in ("torch_backend/deformation.py", "torch_backend/losses.py", "update/picture_loss.py")
+    ]
     for path in [*(mutate.CORE / "kernels").glob("*.py"), *others]:
         code = re.sub(r'(?s:""".*?""")|#.*', "", path.read_text())
         tiny = [m.group() for m in numbers.finditer(code) if int(m.group(1)) >= 4 and len(m.group()) < 9]
