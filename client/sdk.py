@@ -58,7 +58,7 @@ def _sends_async(build: Callable[P, Call[T]]) -> Callable[Concatenate[AsyncClien
     return _signed(method, build)
 
 
-class _Settings:
+class _ClientBase:
     """Address, token and patience of both clients."""
 
     def __init__(self, url: str, token: str | None, patience: float, outage: float, on_retry: OnRetry | None) -> None:
@@ -78,7 +78,7 @@ class _Settings:
         return Retries(call, self.url, busy=self.patience, outage=self.outage, on_retry=self.on_retry)
 
 
-class Client(_Settings):
+class Client(_ClientBase):
     """The service at `url`. Close it, or use it in a `with`. May be shared by threads.
 
     Args:
@@ -214,7 +214,7 @@ class Client(_Settings):
         return self.frame(id, index)
 
 
-class AsyncClient(_Settings):
+class AsyncClient(_ClientBase):
     """The service at `url` for asyncio: arguments and errors as of `Client`, whose every method it has.
 
     >>> async def committed():

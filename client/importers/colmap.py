@@ -60,7 +60,7 @@ def is_model(folder: Path) -> bool:
 
 
 def read_colmap(folder: Path) -> Calibration:
-    """The rig of a model, and its cloud.
+    """Reads the rig of a model, and its cloud.
 
     Raises:
         CaptureError: a file is missing or broken, or a camera cannot be; the message names the file and the fault.
@@ -141,7 +141,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _fields(path: Path, number: int, line: str, kinds: str, what: str) -> list[Any]:
-    """Words of a line: `i` whole number, `f` number, `s` text; the last kind holds for all that follow."""
+    """Reads the words of a line: `i` whole number, `f` number, `s` text; the last kind holds for all that follow."""
     words = line.split(maxsplit=len(kinds) - 1 if kinds.endswith("s") else -1)
     if len(words) < len(kinds):
         raise CaptureError(f"{path}: line {number} has {len(words)} fields; needed: {what}")
@@ -186,7 +186,7 @@ def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
 
 
 class _Bytes:
-    """A file read piece by piece; says where it ends too early."""
+    """A binary file read piece by piece; its errors name the place where it ends too early."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -32,7 +32,7 @@ COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 def read_transforms(path: Path) -> Calibration:
-    """The rig of a `transforms.json`.
+    """Reads the rig of a `transforms.json`.
 
     Raises:
         CaptureError: a field is missing or cannot be; the message names file, picture, field and remedy.
@@ -86,7 +86,7 @@ def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: F
 
 
 def _model_unsaid(given: Mapping[str, Any]) -> str:
-    """instant-ngp names no model: it has `is_fisheye`, and coefficients where there is distortion."""
+    """The model where the file names none, as of instant-ngp: by `is_fisheye` and the coefficients."""
     if given.get("is_fisheye"):
         return "OPENCV_FISHEYE"
     return "OPENCV" if any(given.get(key) for key in COEFFICIENTS) else "PINHOLE"

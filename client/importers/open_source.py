@@ -27,7 +27,7 @@ def open_source(
     encoding: Encoding = "jpeg",
     use_masks: bool = True,
 ) -> Source:
-    """A capture of any layout that is known (docs/captures.md).
+    """Opens a capture of any layout that is known (docs/captures.md).
 
     Args:
         folder: of the capture.
@@ -68,7 +68,7 @@ def open_source(
 
 
 def open_prepared(folder: Path | str) -> Capture:
-    """A capture that the method reads without the importers: `reconstruct`, `evaluate` and `demo` take only such.
+    """Opens a capture that needs no importer: `reconstruct`, `evaluate` and `demo` take no other.
 
     Raises:
         CaptureError: another layout, or none; the message names the layouts and the way to this one.
@@ -84,7 +84,7 @@ def open_prepared(folder: Path | str) -> Capture:
 
 
 def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
-    """The rig: the one given, else transforms.json, else a COLMAP model in one of the usual places.
+    """Reads the given calibration, else transforms.json, else a COLMAP model in one of the usual places.
 
     Raises:
         CaptureError: there is none, or it cannot be read.

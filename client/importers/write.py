@@ -1,4 +1,4 @@
-"""Writes what was imported in the layout of Dynamic3DGaussians, which every command reads without any extra."""
+"""Writes an imported capture in the layout of Dynamic3DGaussians, which every command reads without any extra."""
 
 from __future__ import annotations
 
