@@ -1,4 +1,4 @@
-"""What can go wrong between a client and the service, as exceptions.
+"""Exceptions of the client: refusals of the service by kind, and a service that does not answer.
 
 ::
 
@@ -39,23 +39,23 @@ class ServiceError(RuntimeError):
 
 
 class InvalidRequest(ServiceError):
-    """A field that cannot be."""
+    """A field has a value that it cannot have."""
 
 
 class TooLarge(ServiceError):
-    """More than the service takes at once."""
+    """The request is larger than the service takes."""
 
 
 class NotAuthorized(ServiceError):
-    """No token, or not one that the service knows."""
+    """The token is missing, or the service does not know it."""
 
 
 class NotFound(ServiceError):
-    """No such scene, frame or camera."""
+    """There is no such scene, frame or camera."""
 
 
 class Conflict(ServiceError):
-    """What is there already does not allow it."""
+    """The scene's present state does not allow it."""
 
 
 class FrameGap(Conflict):

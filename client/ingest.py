@@ -31,6 +31,13 @@ class IngestSocket:
     Args:
         client: whose service, token, patience and `on_retry` are used.
         scene: id.
+
+    >>> n = client.scene(open_scene).next_frame
+    >>> with IngestSocket(client, open_scene) as socket:
+    ...     whole = socket.put_frame(n, pictures)
+    ...     parts = [socket.put_camera(n + 1, camera, pictures[camera]) for camera in ("c0", "c1")]
+    >>> whole.index == n, [part.absent for part in parts]
+    (True, [['c1'], []])
     """
 
     def __init__(self, client: Client, scene: str) -> None:
@@ -75,7 +82,7 @@ class IngestSocket:
     def _send(self, chunks: list[bytes]) -> FrameReceipt | PartReceipt:
         call: Call[Any] = Call("PUT", self._address, lambda response: None)
         client = self._client
-        retries = Retries(call, client.url, busy=client.patience, outage=client.outage, told=client.on_retry)
+        retries = Retries(call, client.url, busy=client.patience, outage=client.outage, on_retry=client.on_retry)
         while True:
             wait: float | None
             try:
@@ -114,7 +121,7 @@ class IngestSocket:
 
 
 def _as_response(answer: IngestAnswer) -> httpx.Response:
-    """The answer as the HTTP door would have given it, so that the same rules hold."""
+    """The answer as it would have come over HTTP, so that the same retries apply."""
     problem = {} if answer.problem is None else answer.problem.model_dump(mode="json", exclude_none=True)
     headers = {} if answer.retry_after is None else {"Retry-After": str(answer.retry_after)}
     return httpx.Response(answer.status, headers=headers, json=problem)

@@ -1,4 +1,4 @@
-"""When a call is sent again, and how long that goes on.
+"""Retries of calls: which answers are retried, after how long, and until when.
 
 Sent again is what does the same when it is done twice: reading, and every frame, which the service knows by its
 content.
@@ -46,7 +46,7 @@ OUTAGE_S = 20.0
 
 @dataclass(frozen=True)
 class Retry:
-    """Why a call waits before it is sent again.
+    """A wait before a call is sent again, with its reason.
 
     Attributes:
         reason: "busy": the service is there and has no room; "outage": it does not answer.
@@ -59,18 +59,20 @@ class Retry:
     detail: str
 
 
-Told = Callable[[Retry], None]
+OnRetry = Callable[[Retry], None]
 
 
 class Retries:
-    """Of one call: says after how many seconds it may be sent again, or raises."""
+    """Retries of one call: computes the seconds until it may be sent again, or raises."""
 
-    def __init__(self, call: Call[Any], url: str, *, busy: float, outage: float, told: Told | None = None) -> None:
+    def __init__(
+        self, call: Call[Any], url: str, *, busy: float, outage: float, on_retry: OnRetry | None = None
+    ) -> None:
         self.call = call
         self._url = url
         self._busy_left = busy
         self._outage = outage
-        self._told = told
+        self._on_retry = on_retry
         self._failed_at: float | None = None
         self._failures = 0
         self._lost = False
@@ -139,13 +141,13 @@ class Retries:
         return self._tell(Retry("outage", min(wait, left), detail))
 
     def _tell(self, retry: Retry) -> float:
-        if self._told is not None:
-            self._told(retry)
+        if self._on_retry is not None:
+            self._on_retry(retry)
         return retry.seconds
 
 
 def seconds_asked(header: str) -> float | None:
-    """What a Retry-After asks for, a number or a date; None where it says nothing that can be read."""
+    """Seconds that a Retry-After header asks for, a number or a date; None where it cannot be read."""
     if header.strip().isdigit():
         return float(header)
     try:

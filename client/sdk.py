@@ -18,7 +18,7 @@ import httpx
 from client import calls
 from client.calls import Call
 from client.errors import ServiceError
-from client.retries import BUSY_S, OUTAGE_S, Retries, Told
+from client.retries import BUSY_S, OUTAGE_S, OnRetry, Retries
 from client.wire import FINISHED, FrameReportModel, SceneState, SceneStatus
 
 __all__ = ["DEFAULT_URL", "AsyncClient", "Client", "ServiceError"]
@@ -58,10 +58,10 @@ def _sends_async(build: Callable[P, Call[T]]) -> Callable[Concatenate[AsyncClien
     return _signed(method, build)
 
 
-class _Settings:
-    """What both clients keep."""
+class _ClientBase:
+    """Address, token and patience of both clients."""
 
-    def __init__(self, url: str, token: str | None, patience: float, outage: float, on_retry: Told | None) -> None:
+    def __init__(self, url: str, token: str | None, patience: float, outage: float, on_retry: OnRetry | None) -> None:
         if not url.startswith(("http://", "https://")):
             raise ValueError(f"url {url!r} is no address of a service; write http://{url.partition('://')[2] or url}")
         self.url = url.rstrip("/")
@@ -75,10 +75,10 @@ class _Settings:
         return {"base_url": self.url, "timeout": httpx.Timeout(TIMEOUT_S, connect=10.0), "headers": headers}
 
     def _retries(self, call: Call[Any]) -> Retries:
-        return Retries(call, self.url, busy=self.patience, outage=self.outage, told=self.on_retry)
+        return Retries(call, self.url, busy=self.patience, outage=self.outage, on_retry=self.on_retry)
 
 
-class Client(_Settings):
+class Client(_ClientBase):
     """The service at `url`. Close it, or use it in a `with`. May be shared by threads.
 
     Args:
@@ -92,6 +92,15 @@ class Client(_Settings):
     Raises:
         ServiceError: the service refused; see `client.errors` for the kinds.
         ServiceUnreachable: nobody answered.
+
+    >>> with Client(url, patience=60) as client:
+    ...     new = client.create_scene(rig)
+    ...     receipt = client.put_frame(new.id, 0, pictures)
+    ...     report = client.wait(new.id, 0)
+    ...     picture = client.render(new.id, "c0")
+    ...     client.delete_scene(new.id)
+    >>> report.state, picture.shape
+    (<FrameState.COMMITTED: 'committed'>, (16, 24, 3))
     """
 
     def __init__(
@@ -101,7 +110,7 @@ class Client(_Settings):
         token: str | None = None,
         patience: float = BUSY_S,
         outage: float = OUTAGE_S,
-        on_retry: Told | None = None,
+        on_retry: OnRetry | None = None,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
         super().__init__(url, token, patience, outage, on_retry)
@@ -114,11 +123,19 @@ class Client(_Settings):
         self.close()
 
     def close(self) -> None:
-        """Closes its connections."""
+        """Closes its connections.
+
+        >>> client = Client(url)
+        >>> client.close()
+        """
         self._http.close()
 
     def send(self, call: Call[T]) -> T:
-        """Any call, with its retries."""
+        """Sends any call, with its retries.
+
+        >>> client.send(calls.scene(scene)).id == scene
+        True
+        """
         retries = self._retries(call)
         while True:
             wait: float | None
@@ -169,6 +186,9 @@ class Client(_Settings):
 
         Raises:
             TimeoutError: neither within `seconds`.
+
+        >>> [status.committed for status in client.watch(scene, 1)]
+        [3]
         """
         until = time.monotonic() + seconds
         while True:
@@ -185,14 +205,25 @@ class Client(_Settings):
 
         Raises:
             TimeoutError: none of these within `seconds`.
+
+        >>> client.wait(scene, 1).psnr
+        31.5
         """
         for _ in self.watch(id, index, seconds=seconds, every=every):
             pass
         return self.frame(id, index)
 
 
-class AsyncClient(_Settings):
-    """As `Client`, for asyncio."""
+class AsyncClient(_ClientBase):
+    """The service at `url` for asyncio: arguments and errors as of `Client`, whose every method it has.
+
+    >>> async def committed():
+    ...     async with AsyncClient(url) as client:
+    ...         status, report = await asyncio.gather(client.scene(scene), client.wait(scene, 1))
+    ...         return status.committed, report.index
+    >>> asyncio.run(committed())
+    (3, 1)
+    """
 
     def __init__(
         self,
@@ -201,7 +232,7 @@ class AsyncClient(_Settings):
         token: str | None = None,
         patience: float = BUSY_S,
         outage: float = OUTAGE_S,
-        on_retry: Told | None = None,
+        on_retry: OnRetry | None = None,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         super().__init__(url, token, patience, outage, on_retry)
@@ -218,7 +249,7 @@ class AsyncClient(_Settings):
         await self._http.aclose()
 
     async def send(self, call: Call[T]) -> T:
-        """Any call, with its retries."""
+        """As `Client.send`."""
         retries = self._retries(call)
         while True:
             wait: float | None

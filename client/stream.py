@@ -1,4 +1,4 @@
-"""Subscriptions to a scene, sync (`Stream`) and async (`AsyncStream`): what docs/stream.md describes, typed.
+"""Live stream of a scene, sync (`Stream`) and async (`AsyncStream`); docs/stream.md describes the protocol.
 
 ::
 
@@ -20,264 +20,52 @@ service; trajectories are then sent from their first frame. The iteration ends w
 from __future__ import annotations
 
 import asyncio
-import io
-import random
 import time
-from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from typing import Any
-from urllib.parse import quote
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from PIL import Image
 from websockets.asyncio.client import ClientConnection as AsyncConnection
 from websockets.asyncio.client import connect as connect_async
-from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import ClientConnection
 from websockets.sync.client import connect as connect_sync
-from websockets.typing import Subprotocol
 
-from client.errors import ServiceUnreachable, error_of_problem
-from client.wire import CameraModel, PartsModel, ProblemDetails, RenderRequest, TracksModel, TracksRequest
-from client.wire.base import Model
+from client.subscriptions import (
+    OUTAGE_S,
+    Event,
+    PartsEvent,
+    StreamSession,
+    SubscriptionRequest,
+    TracksEvent,
+    ViewEvent,
+    finished_frames,
+    parts,
+    scene_changes,
+    tracks,
+    view,
+)
 from client.wire.stream import (
     SCENE_GONE,
-    SERVER_MESSAGE,
-    STREAM_PROTOCOL,
-    BulkHead,
     FrameMessage,
     Gone,
-    NoRequest,
-    PartsSubscription,
     SceneMessage,
-    StreamProblem,
-    Subscribe,
-    Topic,
-    Unsubscribe,
-    Update,
-    unpack,
 )
-from scas4d_core.cameras import Camera
 
-OUTAGE_S = 20.0
-FIRST_WAIT_S = 0.2
-LONGEST_WAIT_S = 5.0
-UNREAD_MESSAGES = 2
-"""Read ahead of the caller. Few: what the service holds back is replaced by what is newer."""
-RETRIED_STATUSES = (429, 502, 503, 504)
-
-
-@dataclass(frozen=True)
-class Bulk:
-    """Bytes that came for a subscription.
-
-    Attributes:
-        id: the subscription's. tag: of the request that this answers. missed: what it took the place of, unsent.
-        frame: the newest that it knows. media_type: of `body`. headers: as the same request over HTTP has them.
-    """
-
-    id: str
-    tag: int | None
-    missed: int
-    frame: int
-    media_type: str
-    headers: Mapping[str, str]
-    body: bytes
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """The body of an npz; nothing is unpickled."""
-        with np.load(io.BytesIO(self.body), allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-
-
-@dataclass(frozen=True)
-class ViewEvent(Bulk):
-    """A view."""
-
-    def picture(self) -> NDArray[Any]:
-        """[H, W, 3] uint8 for colour, else [H, W]."""
-        with Image.open(io.BytesIO(self.body)) as picture:
-            return np.array(picture)
-
-
-@dataclass(frozen=True)
-class TracksEvent(Bulk):
-    """Trajectories over the frames `first` to `frame`, which go on where the message before ended."""
-
-    first: int
-
-    def model(self) -> TracksModel:
-        """Of a request for JSON."""
-        return TracksModel.model_validate_json(self.body)
-
-
-@dataclass(frozen=True)
-class PartsEvent(Bulk):
-    """Labels."""
-
-    def model(self) -> PartsModel:
-        """Of a request for JSON."""
-        return PartsModel.model_validate_json(self.body)
-
-
-Event = SceneMessage | FrameMessage | ViewEvent | TracksEvent | PartsEvent
-
-
-@dataclass(frozen=True)
-class Wish:
-    """What to subscribe to; made by the functions below."""
-
-    topic: Topic
-    request: Model
-
-
-def scene_changes() -> Wish:
-    """State, progress and queue at every change."""
-    return Wish(Topic.SCENE, NoRequest())
-
-
-def finished_frames() -> Wish:
-    """What became of each frame, with its metrics."""
-    return Wish(Topic.FRAMES, NoRequest())
-
-
-def view(
-    camera: Camera | str,
-    frame: int | None = None,
-    *,
-    kind: str = "colour",
-    format: str = "jpeg",
-    background: tuple[float, float, float] | None = None,
-    parts: int | None = None,
-) -> Wish:
-    """A view of every new frame, or of a chosen one; `Stream.update` moves the camera. As `client.calls.render`."""
-    request = {"camera": _wire(camera), "frame": frame, "kinds": [kind], "format": format}
-    return Wish(Topic.RENDER, RenderRequest.model_validate({**request, "background": background, "parts": parts}))
-
-
-def tracks(
-    *,
-    ids: Sequence[int] | None = None,
-    pixels: ArrayLike | None = None,
-    camera: Camera | str | None = None,
-    points: ArrayLike | None = None,
-    at: int | None = None,
-    first: int | None = None,
-    project: Sequence[Camera | str] = (),
-    format: str = "json",
-) -> Wish:
-    """Trajectories so far, then those of each new frame. As `client.calls.tracks`."""
-    request = {
-        "ids": None if ids is None else [int(id) for id in ids],
-        "pixels": None if pixels is None else np.asarray(pixels, dtype=np.float64).tolist(),
-        "camera": None if camera is None else _wire(camera),
-        "points": None if points is None else np.asarray(points, dtype=np.float64).tolist(),
-        "at": at,
-        "first": first,
-        "project": [_wire(one) for one in project],
-        "format": format,
-    }
-    return Wish(Topic.TRACKS, TracksRequest.model_validate(request))
-
-
-def parts(count: int | None = None, *, every: int = 1) -> Wish:
-    """Labels of all Gaussians, found anew when `every` more frames are there."""
-    return Wish(Topic.PARTS, PartsSubscription(count=count, every=every))
-
-
-def _wire(camera: Camera | str) -> CameraModel | str:
-    return camera if isinstance(camera, str) else CameraModel.of(camera)
-
-
-class _Session:
-    """What both streams know without a connection: the subscriptions, how to say them, how to read what comes."""
-
-    def __init__(self, url: str, scene: str, token: str | None, outage: float) -> None:
-        self.scene = scene
-        self.outage = outage
-        base = "ws" + url.rstrip("/").removeprefix("http")
-        self.address = f"{base}/v1/scenes/{quote(scene, safe='')}/stream"
-        self.arguments: dict[str, Any] = {
-            "subprotocols": [Subprotocol(STREAM_PROTOCOL)],
-            "additional_headers": {} if token is None else {"Authorization": f"Bearer {token}"},
-            "compression": None,  # bulk is compressed already
-            "max_size": None,  # the service is the one that was asked for bulk
-            "max_queue": UNREAD_MESSAGES,
-            "close_timeout": 2,
-        }
-        self.subscriptions: dict[str, Subscribe] = {}
-        self._failed_at: float | None = None
-        self._failures = 0
-
-    def subscribe(self, id: str, wish: Wish, tag: int | None) -> str:
-        request = wish.request.model_dump(mode="json", exclude_unset=True)
-        self.subscriptions[id] = Subscribe(id=id, topic=wish.topic, request=request, tag=tag)
-        return self.subscriptions[id].model_dump_json()
-
-    def update(self, id: str, tag: int | None, changes: Mapping[str, Any]) -> str:
-        request = dict(changes)
-        if "camera" in request and not isinstance(request["camera"], str):
-            request["camera"] = CameraModel.of(request["camera"]).model_dump(mode="json")
-        known = self.subscriptions[id]
-        self.subscriptions[id] = known.model_copy(update={"request": known.request | request, "tag": tag})
-        return Update(id=id, request=request, tag=tag).model_dump_json()
-
-    def unsubscribe(self, id: str) -> str:
-        self.subscriptions.pop(id)
-        return Unsubscribe(id=id).model_dump_json()
-
-    def read(self, data: str | bytes) -> Event | Gone | None:
-        """What a message means to the caller; None where it means nothing.
-
-        Raises:
-            ServiceError: the service refused what was asked for.
-        """
-        if isinstance(data, bytes):
-            return _event(*unpack(data))
-        message = SERVER_MESSAGE.validate_json(data)
-        if isinstance(message, StreamProblem):
-            raise error_of_problem(message.problem)
-        return message if isinstance(message, SceneMessage | FrameMessage | Gone) else None
-
-    def connected(self) -> None:
-        self._failed_at, self._failures = None, 0
-
-    def wait_after(self, error: Exception) -> float:
-        """Seconds until the next try.
-
-        Raises:
-            ServiceError: the service answered, and refused.
-            ServiceUnreachable: it was tried for long enough.
-        """
-        if isinstance(error, InvalidStatus) and error.response.status_code not in RETRIED_STATUSES:
-            raise error_of_problem(_problem(error)) from error
-        now = time.monotonic()
-        self._failed_at = now if self._failed_at is None else self._failed_at
-        if now - self._failed_at >= self.outage:
-            if isinstance(error, InvalidStatus):
-                raise error_of_problem(_problem(error)) from error
-            raise ServiceUnreachable(f"{self.address} cannot be reached: {error}") from error
-        self._failures += 1
-        grown = min(LONGEST_WAIT_S, FIRST_WAIT_S * 2.0 ** min(self._failures - 1, 16))
-        return grown * random.uniform(0.5, 1.0)
-
-
-def _event(head: BulkHead, body: bytes) -> ViewEvent | TracksEvent | PartsEvent:
-    given = (head.id, head.tag, head.missed, head.frame, head.media_type, head.headers, body)
-    if head.type == "tracks":
-        return TracksEvent(*given, first=head.frame if head.first is None else head.first)
-    return ViewEvent(*given) if head.type == "render" else PartsEvent(*given)
-
-
-def _problem(error: InvalidStatus) -> ProblemDetails:
-    body = error.response.body or b""
-    try:
-        return ProblemDetails.model_validate_json(bytes(body))
-    except ValueError:
-        text = bytes(body)[:200].decode("utf-8", "replace")
-        return ProblemDetails(title="unexpected answer", status=error.response.status_code, detail=text or str(error))
+__all__ = [
+    "AsyncStream",
+    "Event",
+    "FrameMessage",
+    "PartsEvent",
+    "SceneMessage",
+    "Stream",
+    "TracksEvent",
+    "ViewEvent",
+    "finished_frames",
+    "parts",
+    "scene_changes",
+    "tracks",
+    "view",
+]
 
 
 BROKEN = (OSError, ConnectionClosed, InvalidHandshake, EOFError)
@@ -296,10 +84,18 @@ class Stream:
     Raises:
         ServiceError: the service refused; `NotFound` where there is no such scene.
         ServiceUnreachable: nobody answered.
+
+    >>> with Stream(url, scene) as stream:
+    ...     stream.subscribe("live", view("c0"), tag=1)
+    ...     event = stream.receive(timeout=20)
+    ...     stream.update("live", frame=0, tag=2)
+    ...     stream.unsubscribe("live")
+    >>> event.id, event.tag, event.frame, event.picture().shape
+    ('live', 1, 2, (16, 24, 3))
     """
 
     def __init__(self, url: str, scene: str, *, token: str | None = None, outage: float = OUTAGE_S) -> None:
-        self._session = _Session(url, scene, token, outage)
+        self._session = StreamSession(url, scene, token, outage)
         self._connection: ClientConnection | None = None
         self._open = ExitStack()
 
@@ -324,9 +120,9 @@ class Stream:
         self._connection = None
         self._open.close()
 
-    def subscribe(self, id: str, wish: Wish, *, tag: int | None = None) -> None:
+    def subscribe(self, id: str, wanted: SubscriptionRequest, *, tag: int | None = None) -> None:
         """Begins a subscription under a name of yours; `tag` comes back with what is sent for it."""
-        self._send(self._session.subscribe(id, wish, tag))
+        self._send(self._session.subscribe(id, wanted, tag))
 
     def update(self, id: str, *, tag: int | None = None, **request: Any) -> None:
         """Changes members of a subscription's request, such as `camera` and `frame` of a view."""
@@ -384,10 +180,18 @@ class Stream:
 
 
 class AsyncStream:
-    """The same for asyncio: `async with`, `async for`."""
+    """A scene's stream for asyncio: use it in an `async with`, iterate with `async for`.
+
+    >>> async def newest():
+    ...     async with AsyncStream(url, scene) as stream:
+    ...         await stream.subscribe("what moves", parts(2))
+    ...         return await stream.receive()
+    >>> asyncio.run(newest()).model().count
+    2
+    """
 
     def __init__(self, url: str, scene: str, *, token: str | None = None, outage: float = OUTAGE_S) -> None:
-        self._session = _Session(url, scene, token, outage)
+        self._session = StreamSession(url, scene, token, outage)
         self._connection: AsyncConnection | None = None
 
     async def __aenter__(self) -> AsyncStream:
@@ -411,9 +215,9 @@ class AsyncStream:
         if self._connection is not None:
             await self._connection.close()
 
-    async def subscribe(self, id: str, wish: Wish, *, tag: int | None = None) -> None:
+    async def subscribe(self, id: str, wanted: SubscriptionRequest, *, tag: int | None = None) -> None:
         """As `Stream.subscribe`."""
-        await self._send(self._session.subscribe(id, wish, tag))
+        await self._send(self._session.subscribe(id, wanted, tag))
 
     async def update(self, id: str, *, tag: int | None = None, **request: Any) -> None:
         """As `Stream.update`."""

@@ -1,6 +1,12 @@
-"""Named settings."""
+"""Named settings, and what a scene changes in them."""
 
 from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from pydantic import ValidationError
 
 from scas4d_core.settings import LayerRates, Settings, UpdateSettings, Weights
 
@@ -47,12 +53,81 @@ PRESETS: dict[str, Settings] = {
 }
 
 
-def preset(name: str) -> Settings:
-    """The settings called ``name``.
+class SettingError(ValueError):
+    """A setting that is unknown, or a value that is out of its range.
+
+    Attributes:
+        setting: its dotted name, as "update.iterations".
+        value: the refused value.
+        fault: what is wrong, for a person.
+        remedy: what to give instead, for a person.
+        validation: pydantic's own error; None for an unknown preset.
+    """
+
+    def __init__(
+        self, setting: str, value: object, fault: str, remedy: str, validation: ValidationError | None = None
+    ) -> None:
+        super().__init__(f"setting {setting}={value!r}: {fault}; {remedy}")
+        self.setting = setting
+        self.value = value
+        self.fault = fault
+        self.remedy = remedy
+        self.validation = validation
+
+
+def preset(name: str, *changes: Mapping[str, Any]) -> Settings:
+    """The settings called ``name``, with changes given as nested mappings; later ones go over earlier ones.
 
     Raises:
-        ValueError: no such preset; the message lists those there are.
+        SettingError: no such preset or setting, or a value out of its range.
+
+    >>> preset("adaptive").update.iterations
+    50
+    >>> preset("adaptive", {"update": {"iterations": 20}}, {"device": "cuda"}).update.iterations
+    20
     """
     if name not in PRESETS:
-        raise ValueError(f"preset {name!r} is unknown; choose one of {', '.join(sorted(PRESETS))}")
-    return PRESETS[name]
+        known = ", ".join(sorted(PRESETS))
+        raise SettingError("preset", name, "there is no preset of this name", f"give one of {known}")
+    if not any(changes):
+        return PRESETS[name]
+    values = PRESETS[name].model_dump()
+    for change in changes:
+        values = _merged(values, change)
+    try:
+        return Settings.model_validate(values)
+    except ValidationError as error:
+        raise _setting_error(error) from None
+
+
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested mappings, the second over the first."""
+    result = dict(base)
+    for name, value in changes.items():
+        old = result.get(name)
+        result[name] = _merged(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return result
+
+
+def _setting_error(error: ValidationError) -> SettingError:
+    """The first error of a validation, with the nearest known name as the remedy for an unknown one."""
+    found = error.errors(include_url=False)
+    first = found[0]
+    setting = ".".join(str(part) for part in first["loc"])
+    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    remedy = "docs/settings.md lists all with their ranges"
+    if first["type"] == "extra_forbidden":
+        fault = "there is no setting of this name"
+        if near := difflib.get_close_matches(setting, list(_names(Settings().model_dump())), 1):
+            remedy = f"did you mean {near[0]}? {remedy}"
+    else:
+        fault = str(first["ctx"]["error"]) if first["type"] == "value_error" else first["msg"]
+    return SettingError(setting, first["input"], f"{fault}{more}", remedy, error)
+
+
+def _names(values: Mapping[str, Any], under: str = "") -> Iterator[str]:
+    """The dotted names of all settings and of their groups."""
+    for name, value in values.items():
+        yield f"{under}{name}"
+        if isinstance(value, Mapping):
+            yield from _names(value, f"{under}{name}.")

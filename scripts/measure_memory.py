@@ -13,15 +13,14 @@ import json
 
 import numpy as np
 
+from client.cli.evaluate import peak_megabytes
 from client.wire import RigModel
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import Frame, InitialPoints
 from scas4d_core.presets import preset
-from scas4d_core.settings import Settings
 from server.health.estimate import estimate
 from server.settings import ServerSettings
 from studies.constants import varied
-from studies.quality.quality import peak_megabytes
 
 
 def ring(count: int, size: int) -> Rig:
@@ -58,11 +57,8 @@ def main() -> None:
     parser.add_argument("--scale", type=float, default=1.0)
     parser.add_argument("--masks", action="store_true")
     given = parser.parse_args()
-    base = preset("scas4d").model_dump()
-    base["static"] |= {"iterations": 8, "max_gaussians": given.gaussians}
-    base["update"] |= {"iterations": 4}
-    base["scene"] |= {"image_scale": given.scale}
-    settings = Settings.model_validate(base)
+    static = {"iterations": 8, "max_gaussians": given.gaussians}
+    settings = preset("scas4d", {"static": static, "update": {"iterations": 4}, "scene": {"image_scale": given.scale}})
     rig = ring(given.cameras, given.size)
     normals = np.random.default_rng(0).normal(size=(given.gaussians, 3))
     points = 0.4 * normals / np.linalg.norm(normals, axis=1, keepdims=True)

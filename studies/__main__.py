@@ -1,6 +1,17 @@
 """`scripts/bench`, from a checkout: `python -m studies`."""
 
-from client.cli.main import run
-from studies.commands import app
+from __future__ import annotations
 
-run(app)
+
+def remedy(missing: ModuleNotFoundError) -> str:
+    """Tells what to install for a missing package, as matplotlib; studies need everything that the tests need."""
+    return f"this needs {missing.name}, which is not installed; in the checkout: scripts/setup dev"
+
+
+if __name__ == "__main__":
+    try:
+        from client.cli.main import run
+        from studies.commands import app
+    except ModuleNotFoundError as error:
+        raise SystemExit(f"scripts/bench: {remedy(error)}") from None
+    run(app, "scripts/bench", remedy)

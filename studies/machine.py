@@ -1,4 +1,4 @@
-"""What a figure was measured on, in words."""
+"""Machine and sources that a figure was measured on, in words."""
 
 from __future__ import annotations
 

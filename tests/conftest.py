@@ -1,22 +1,15 @@
-"""Tests share scenes, fakes and peers: `tests/helpers` is on the path, of their processes too."""
+"""Kernels are compiled once for all of pytest's processes; the longest tests come first."""
 
 import os
-import sys
-from pathlib import Path
 
 import pytest
 
 # Before torch loads OpenMP, which reads it once: threads that spin while they wait cost multiples on busy cores.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-sys.path.append(str(Path(__file__).parent / "helpers"))
-SHARED = ("core/storage", "server/connections", "server/ingest", "server/routes", "server/scene", "server/storage")
-for shared in SHARED:
-    sys.path.append(str(Path(__file__).parent / shared))  # tests that others take functions from
-
 
 WITHOUT_KERNELS = (
     "tests/core/captures", "tests/client/importers", "tests/core/metrics", "tests/server/connections",
-    "tests/test_docs.py", "tests/test_imports.py"
+    "tests/test_docs.py", "tests/test_house.py", "tests/test_imports.py", "tests/test_wheel.py",
 )  # fmt: skip
 """Tests that run no kernel, in no process: they go on while another process compiles."""
 LONGEST = (

@@ -1,62 +1,19 @@
-"""Imports point one way, in no circle, and what should be light is."""
+"""Imports between the packages point one way, and importing the client or the service's doors loads nothing heavy."""
 
 from __future__ import annotations
 
-import ast
 import subprocess
 import sys
-from collections.abc import Iterator
-from graphlib import TopologicalSorter
-from pathlib import Path
 
 import pytest
+from source_tree import MODULES, ROOT, imports, within
 
-ROOT = Path(__file__).parents[1]
-PACKAGES = ("scas4d_core", "server", "client")
 HEAVY = ("torch", "numba", "scipy", "sklearn", "pycolmap", "fastapi", "uvicorn")
 
 LIGHT_ROOMS = ("scas4d_core.cameras", "scas4d_core.captures", "scas4d_core.settings", "scas4d_core.presets")
 """What the client may import when it is imported; its heavy commands import the rest when they run."""
 
 NUMPY_ONLY = ("scas4d_core.cameras", "scas4d_core.gaussians", "scas4d_core.captures", "scas4d_core.settings")
-
-
-def module_name(path: Path) -> str:
-    parts = list(path.relative_to(ROOT).with_suffix("").parts)
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-
-
-MODULES = {module_name(path): path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))}
-
-
-def statements(tree: ast.AST, lazy: bool) -> Iterator[ast.Import | ast.ImportFrom]:
-    """Import statements of a module; without ``lazy`` only those that run when it is imported."""
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            yield node
-        elif isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING"):
-            continue
-        elif lazy or not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
-            yield from statements(node, lazy)
-
-
-def imports(name: str, lazy: bool) -> set[str]:
-    """Dotted names that a module imports; ``from package import module`` names the module."""
-    found: set[str] = set()
-    for node in statements(ast.parse(MODULES[name].read_text()), lazy):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        else:
-            assert node.level == 0, f"{name}: relative import"
-            module = node.module or ""
-            for alias in node.names:
-                inner = f"{module}.{alias.name}"
-                found.add(inner if inner in MODULES else module)
-    return found
-
-
-def within(name: str, packages: tuple[str, ...]) -> bool:
-    return any(name == package or name.startswith(package + ".") for package in packages)
 
 
 def test_the_tree_was_read() -> None:
@@ -84,13 +41,6 @@ def test_the_client_imports_only_light_rooms(name: str) -> None:
     assert not [other for other in core if not within(other, LIGHT_ROOMS)]
 
 
-def test_no_circles() -> None:
-    graph = {}
-    for name in MODULES:
-        graph[name] = {found for found in imports(name, lazy=False) if found in MODULES and found != name}
-    list(TopologicalSorter(graph).static_order())  # raises CycleError, which names the circle
-
-
 def loaded_by(*names: str) -> set[str]:
     """Top-level packages in ``sys.modules`` of a fresh interpreter after importing."""
     program = f"import {', '.join(names)}, sys; print(*{{name.split('.')[0] for name in sys.modules}})"
@@ -99,8 +49,7 @@ def loaded_by(*names: str) -> set[str]:
 
 
 def test_importing_the_client_loads_nothing_heavy() -> None:
-    names = ("cli", "commands", "sdk", "wire", "calls", "rig", "local", "ingest", "importers.door", "importers.write")
-    loaded = loaded_by(*(f"client.{name}" for name in names))
+    loaded = loaded_by(*(name for name in MODULES if within(name, ("client",))))
     assert not loaded & {*HEAVY, "server", "cv2", "av"}
     assert "scas4d_core" in loaded
 

@@ -1,4 +1,4 @@
-"""Budgets: what an update may cost, and what it brings."""
+"""Calls on budgets of updates, and on the measured accuracy against time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,11 @@ from client.wire.budgets import BudgetFields
 
 
 def budget(id: str) -> Call[SceneBudget]:
-    """What the updates of a scene may cost."""
+    """Reads the budget of a scene's updates.
+
+    >>> client.budget(scene).effective.iterations
+    100
+    """
     return Call("GET", path(id, "budget"), reads(SceneBudget))
 
 
@@ -22,12 +26,22 @@ def set_budget(id: str, **budget: Unpack[BudgetFields]) -> Call[SceneBudget]:
         id: of the scene.
         budget: fields of `client.wire.Budget`: iterations, budget_ms, stop_gain, still. A field that is left out, or
             None, is as the scene was made.
+
+    >>> found = client.set_budget(scene, iterations=50)
+    >>> found.effective.iterations, found.since
+    (50, 3)
+    >>> client.set_budget(scene).effective.iterations  # as the scene was made
+    100
     """
     return Call("PUT", path(id, "budget"), reads(SceneBudget), arguments=body(Budget(**budget)))
 
 
 def tradeoff(id: str) -> Call[TradeoffModel]:
-    """What accuracy costs in time, for this scene on its machine."""
+    """Reads the measured points of accuracy against time, for this scene on its machine.
+
+    >>> "measured" in [point.kind for point in client.tradeoff(scene).points]
+    True
+    """
     return Call("GET", path(id, "tradeoff"), reads(TradeoffModel))
 
 
@@ -40,11 +54,20 @@ def replay(id: str, iterations: Sequence[int] = (25, 50, 200), frames: int = 4) 
         id: of the scene.
         iterations: a frame, each a replay; the scene's own number is always measured too.
         frames: that are replayed; their pictures must still be held.
+
+    >>> client.replay(scene, [50], frames=1).replay.state
+    <ReplayState.RUNNING: 'running'>
+    >>> client.end_replay(scene).scene == scene
+    True
     """
     request = ReplayRequest(iterations=list(iterations), frames=frames)
     return Call("POST", path(id, "tradeoff"), reads(TradeoffModel), repeatable=False, arguments=body(request))
 
 
 def end_replay(id: str) -> Call[TradeoffModel]:
-    """Ends the replay that is running, if one is; what it has measured stays."""
+    """Ends the replay that is running, if one is; what it has measured stays.
+
+    >>> client.end_replay(scene).scene == scene
+    True
+    """
     return Call("DELETE", path(id, "tradeoff"), reads(TradeoffModel))

@@ -1,4 +1,4 @@
-"""`Call`: a request as a value, and what most calls are made of."""
+"""`Call`: a request as a value; paths, bodies and readers of answers that most calls share."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ class Call(Generic[T]):
 
 
 def path(*parts: str | int) -> str:
-    """Below /v1/scenes; what could lead elsewhere is quoted."""
+    """A path below /v1/scenes; each part is quoted."""
     return "/".join(["/v1/scenes", *(quote(str(part), safe="") for part in parts)])
 
 
 def reads(model: type[M]) -> Callable[[httpx.Response], M]:
-    """The answer's JSON as a model of the wire."""
+    """A reader of the answer's JSON as a model of the wire."""
     return lambda response: model.model_validate_json(response.content)
 
 
 def nothing(response: httpx.Response) -> None:
-    """For answers that say nothing more."""
+    """Reads nothing: for answers without a body."""
 
 
 def body(model: BaseModel) -> dict[str, Any]:
@@ -67,12 +67,12 @@ def wire_camera(camera: Camera | str) -> CameraModel | str:
 
 
 def read_picture(response: httpx.Response) -> NDArray[Any]:
-    """PNG, JPEG or WebP to [H, W, 3] or [H, W], 8 bit, or 16 for a depth."""
+    """Decodes PNG, JPEG or WebP to [H, W, 3] or [H, W], 8 bit, or 16 for a depth."""
     with Image.open(io.BytesIO(response.content)) as picture:
         return np.array(picture)
 
 
 def read_npz(response: httpx.Response) -> dict[str, NDArray[Any]]:
-    """Arrays by name; nothing is unpickled."""
+    """Reads the arrays of an npz by name; nothing is unpickled."""
     with np.load(io.BytesIO(response.content), allow_pickle=False) as file:
         return {name: file[name] for name in file.files}

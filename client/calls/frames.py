@@ -1,4 +1,4 @@
-"""Frames: sent whole or camera by camera, closed, declared missing, and what became of them."""
+"""Calls on frames: send whole or camera by camera, close, declare missing, read reports and exports."""
 
 from __future__ import annotations
 
@@ -29,6 +29,12 @@ def put_frame(
     Raises:
         FrameGap: `expected` is the index that comes next.
         Conflict: the index is known with other content.
+
+    >>> n = client.scene(open_scene).next_frame
+    >>> client.put_frame(open_scene, n, pictures).index == n
+    True
+    >>> client.wait(open_scene, n).state
+    <FrameState.COMMITTED: 'committed'>
     """
     arguments = _framed(index, images, masks or {}, time)
     return Call("PUT", path(id, "frames", index), reads(FrameReceipt), arguments=arguments)
@@ -49,18 +55,38 @@ def put_camera(
         image: JPEG, PNG or WebP.
         mask: PNG.
         time: seconds of the frame, the same for all its cameras.
+
+    >>> n = client.scene(open_scene).next_frame
+    >>> client.put_camera(open_scene, n, "c0", pictures["c0"]).absent
+    ['c1']
+    >>> client.put_camera(open_scene, n, "c1", pictures["c1"]).absent
+    []
     """
     arguments = _framed(index, {camera: image}, {} if mask is None else {camera: mask}, time, part=True)
     return Call("PUT", path(id, "frames", index, "cameras", camera), reads(PartReceipt), arguments=arguments)
 
 
 def close_frame(id: str, index: int) -> Call[FrameReceipt]:
-    """Closes a frame whose cameras send one by one: it goes without those that are not in."""
+    """Closes a frame whose cameras send one by one: it is reconstructed without those that are absent.
+
+    >>> n = client.scene(open_scene).next_frame
+    >>> client.put_camera(open_scene, n, "c0", pictures["c0"]).absent
+    ['c1']
+    >>> client.close_frame(open_scene, n).index == n
+    True
+    """
     return Call("POST", path(id, "frames", index, "close"), reads(FrameReceipt))
 
 
 def declare_missing(id: str, index: int, reason: str = "") -> Call[FrameReportModel]:
-    """Declares that frame `index`, which is next, will never come; for ever. The one after it is next then."""
+    """Declares that frame `index`, which is next, will never come; for ever. The one after it is next then.
+
+    >>> n = client.scene(open_scene).next_frame
+    >>> client.declare_missing(open_scene, n, "cable").state
+    <FrameState.MISSING: 'missing'>
+    >>> client.scene(open_scene).next_frame == n + 1
+    True
+    """
     arguments = body(MissingRequest(reason=reason))
     return Call("POST", path(id, "frames", index, "missing"), reads(FrameReportModel), arguments=arguments)
 
@@ -73,16 +99,30 @@ def _framed(
 
 
 def frame(id: str, index: int) -> Call[FrameReportModel]:
-    """What became of a frame."""
+    """Reads the report of a frame.
+
+    >>> report = client.frame(scene, 1)
+    >>> report.state, report.used_cameras
+    (<FrameState.COMMITTED: 'committed'>, ['c0', 'c1'])
+    """
     return Call("GET", path(id, "frames", index), reads(FrameReportModel))
 
 
 def frames(id: str, first: int = 0, limit: int = 500) -> Call[FrameList]:
-    """What became of many frames, from `first` on; `next` of the answer says where to go on."""
+    """Reads the reports of many frames, from `first` on; `next` of the answer is the index to go on with.
+
+    >>> listed = client.frames(scene, limit=1)
+    >>> [report.index for report in listed.frames], listed.next
+    ([0], 1)
+    """
     arguments = {"params": {"first": first, "limit": limit}}
     return Call("GET", path(id, "frames"), reads(FrameList), arguments=arguments)
 
 
 def ply(id: str, index: int) -> Call[bytes]:
-    """A committed frame as a 3DGS .ply."""
+    """Reads a committed frame as a 3DGS .ply.
+
+    >>> client.ply(scene, 1)[:3]
+    b'ply'
+    """
     return Call("GET", path(id, "frames", index, "splat.ply"), lambda response: response.content)

@@ -1,4 +1,4 @@
-"""What moves together."""
+"""Calls on parts: groups of Gaussians that move together."""
 
 from __future__ import annotations
 
@@ -7,6 +7,11 @@ from client.wire import PartsModel
 
 
 def parts(id: str, count: int | None = None) -> Call[PartsModel]:
-    """A part label for every Gaussian; `count` parts, or as many as a stated rule finds."""
+    """Reads a part label for every Gaussian; `count` parts, or as many as a stated rule finds.
+
+    >>> found = client.parts(scene, 2)
+    >>> found.count, len(found.labels) == len(found.ids)
+    (2, True)
+    """
     arguments = {"params": {} if count is None else {"count": count}}
     return Call("GET", path(id, "parts"), reads(PartsModel), arguments=arguments)

@@ -1,4 +1,4 @@
-"""Scenes: create, look at, pause, resume, delete; the cloud that frame 0 starts from."""
+"""Calls on scenes: create, read, pause, resume, delete; the initial points of frame 0."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def create_scene(
     frames_per_second: float = 30.0,
     ingest: IngestSettings | None = None,
 ) -> Call[SceneStatus]:
-    """A new scene. Never sent twice: that would make two.
+    """Creates a scene. The request is never sent twice: that would make two.
 
     Args:
         rig: its cameras, at the size of the pictures that will be sent.
@@ -34,6 +34,11 @@ def create_scene(
         settings: what differs from the preset, nested.
         frames_per_second: frame n without a time of its own is taken at n / frames_per_second.
         ingest: how the scene takes frames, and what it keeps of them.
+
+    >>> new = client.create_scene(rig, name="studio", settings={"update": {"iterations": 50}})
+    >>> new.state, new.settings["update"]["iterations"]
+    (<SceneState.AWAITING: 'awaiting_first_frame'>, 50)
+    >>> client.delete_scene(new.id)
     """
     request = SceneCreate(
         rig=RigModel.of(rig),
@@ -47,43 +52,84 @@ def create_scene(
 
 
 def estimate(rig: Rig, *, preset: str = "scas4d", settings: Mapping[str, Any] | None = None) -> Call[SceneEstimate]:
-    """Memory and disk that a scene would take; arguments as `create_scene`, and nothing is created."""
+    """Estimates the memory and disk that a scene would take; arguments as `create_scene`, and nothing is created.
+
+    >>> found = client.estimate(rig)
+    >>> found.memory_mb < found.limit_mb
+    True
+    """
     request = SceneCreate(rig=RigModel.of(rig), preset=preset, settings=dict(settings or {}))
     return Call("POST", "/v1/estimate", reads(SceneEstimate), arguments=body(request))
 
 
 def scenes() -> Call[list[SceneStatus]]:
-    """All scenes, oldest first."""
+    """Reads the status of all scenes, oldest first.
+
+    >>> scene in [status.id for status in client.scenes()]
+    True
+    """
     return Call("GET", path(), lambda response: SceneList.model_validate_json(response.content).scenes)
 
 
 def scene(id: str) -> Call[SceneStatus]:
-    """A scene's state, progress and queue."""
+    """Reads a scene's state, progress and queue.
+
+    >>> client.scene(scene).committed
+    3
+    """
     return Call("GET", path(id), reads(SceneStatus))
 
 
 def rig(id: str) -> Call[Rig]:
-    """A scene's cameras."""
+    """Reads a scene's cameras.
+
+    >>> client.rig(scene).names
+    ('c0', 'c1')
+    """
     return Call("GET", path(id, "rig"), lambda response: RigModel.model_validate_json(response.content).rig())
 
 
 def pause(id: str) -> Call[SceneStatus]:
-    """Lets the scene rest after the frame at work: it takes frames, and reconstructs none."""
+    """Pauses a scene after the frame at work: it takes frames, and reconstructs none.
+
+    >>> client.pause(scene).paused
+    True
+    >>> client.resume(scene).paused
+    False
+    """
     return Call("POST", path(id, "pause"), reads(SceneStatus))
 
 
 def resume(id: str) -> Call[SceneStatus]:
-    """Lets a paused scene go on."""
+    """Resumes a paused scene.
+
+    >>> client.resume(scene).paused
+    False
+    """
     return Call("POST", path(id, "resume"), reads(SceneStatus))
 
 
 def delete_scene(id: str) -> Call[None]:
-    """Ends a scene and removes all it has on disk."""
+    """Ends a scene and removes all it has on disk.
+
+    >>> new = client.create_scene(rig)
+    >>> client.delete_scene(new.id)
+    >>> new.id in [status.id for status in client.scenes()]
+    False
+    """
     return Call("DELETE", path(id), nothing)
 
 
 def put_points(id: str, points: InitialPoints) -> Call[PointsReceipt]:
-    """The cloud that frame 0 starts from; before frame 0."""
+    """Sends the initial points of frame 0; to be sent before it.
+
+    >>> from scas4d_core.captures import InitialPoints
+    >>> new = client.create_scene(rig)
+    >>> cloud = InitialPoints(positions=np.zeros((3, 3)), colours=np.full((3, 3), 0.5, np.float32))
+    >>> client.put_points(new.id, cloud).points
+    3
+    >>> client.delete_scene(new.id)
+    """
     arrays: dict[str, NDArray[Any]] = {"positions": points.positions, "colours": points.colours}
     if points.foreground is not None:
         arrays["foreground"] = points.foreground

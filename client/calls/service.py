@@ -1,4 +1,4 @@
-"""The service itself: is it there?"""
+"""Calls on the service itself: health, metrics, tickets."""
 
 from __future__ import annotations
 
@@ -7,20 +7,36 @@ from client.wire import Health, Ticket
 
 
 def live() -> Call[Health]:
-    """Does the process answer?"""
+    """Reads whether the process answers.
+
+    >>> client.live().status
+    'live'
+    """
     return Call("GET", "/health/live", reads(Health))
 
 
 def ready() -> Call[Health]:
-    """Does the service take scenes?"""
+    """Reads whether the service takes scenes; an error while it does not.
+
+    >>> client.ready().status
+    'ready'
+    """
     return Call("GET", "/health/ready", reads(Health))
 
 
 def metrics() -> Call[str]:
-    """Counters and gauges in the text format of Prometheus."""
+    """Reads counters and gauges in the text format of Prometheus.
+
+    >>> client.metrics().startswith("# HELP")
+    True
+    """
     return Call("GET", "/metrics", lambda response: response.text)
 
 
 def ticket() -> Call[Ticket]:
-    """A ticket that opens one WebSocket from a browser, which cannot send the token. Each call makes another."""
+    """Makes a ticket that opens one WebSocket from a browser, which cannot send the token.
+
+    >>> client.ticket().ticket != client.ticket().ticket
+    True
+    """
     return Call("POST", "/v1/tickets", reads(Ticket))

@@ -1,4 +1,4 @@
-"""Trajectories of ids, of pixels, of points."""
+"""Calls on trajectories of ids, of pixels, of points."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def tracks(
     frames: tuple[int, int] | None = None,
     project: Sequence[Camera | str] = (),
 ) -> Call[TracksModel]:
-    """Trajectories of exactly one of `ids`, `pixels` and `points`.
+    """Reads the trajectories of exactly one of `ids`, `pixels` and `points`.
 
     Args:
         id: of the scene.
@@ -35,6 +35,12 @@ def tracks(
         at: the first committed frame where None.
         frames: first and last, both included; all committed where None.
         project: cameras to project into, with visibility.
+
+    >>> found = client.tracks(scene, ids=[0, 1], frames=(0, 1))
+    >>> np.array(found.positions).shape
+    (2, 2, 3)
+    >>> client.tracks(scene, points=[[0, 0, 0]]).ids
+    [0]
     """
     request = _request(ids, pixels, camera, points, at, frames, project, "json")
     return Call("POST", path(id, "tracks", "query"), reads(TracksModel), arguments=body(request))
@@ -51,7 +57,11 @@ def tracks_arrays(
     frames: tuple[int, int] | None = None,
     project: Sequence[Camera | str] = (),
 ) -> Call[dict[str, NDArray[Any]]]:
-    """The same as the arrays of an npz: for many."""
+    """Reads trajectories as the arrays of an npz: for many. Arguments as of `tracks`.
+
+    >>> client.tracks_arrays(scene, ids=[0, 1], project=["c0"])["tracks_world"].shape
+    (3, 2, 3)
+    """
     request = _request(ids, pixels, camera, points, at, frames, project, "npz")
     return Call("POST", path(id, "tracks", "query"), read_npz, arguments=body(request))
 

@@ -1,4 +1,4 @@
-"""Novel views from committed frames."""
+"""Calls on novel views from committed frames."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def render(
     width: int | None = None,
     parts: int | None = None,
 ) -> Call[NDArray[Any]]:
-    """One kind of view as a picture: [H, W, 3] uint8 for colour, else [H, W].
+    """Renders one kind of view as a picture: [H, W, 3] uint8 for colour, else [H, W].
 
     Args:
         id: of the scene.
@@ -36,6 +36,11 @@ def render(
         background: RGB in 0…1; the scene's where None.
         width: pixels that the camera is scaled to.
         parts: how many parts to tell apart; by a stated rule where None.
+
+    >>> client.render(scene, "c0").shape
+    (16, 24, 3)
+    >>> client.render(scene, rig.cameras[1], 0, kind="depth").shape
+    (16, 24)
     """
     arguments = _asks(camera, frame, [kind], format, background, width, parts)
     return Call("POST", path(id, "render"), read_picture, arguments=arguments)
@@ -52,7 +57,11 @@ def render_file(
     width: int | None = None,
     parts: int | None = None,
 ) -> Call[bytes]:
-    """The same as the bytes that the service sends, in any of its formats."""
+    """Renders a view; returns the bytes that the service sends. Arguments as of `render`, any of its formats.
+
+    >>> client.render_file(scene, "c0", format="jpeg")[:2].hex()
+    'ffd8'
+    """
     arguments = _asks(camera, frame, [kind], format, background, width, parts)
     return Call("POST", path(id, "render"), lambda response: response.content, arguments=arguments)
 
@@ -67,7 +76,12 @@ def render_arrays(
     width: int | None = None,
     parts: int | None = None,
 ) -> Call[dict[str, NDArray[Any]]]:
-    """Several kinds of view as arrays by kind: colour 0…1, depth along z in the rig's units, alpha, parts."""
+    """Renders several kinds of view as arrays by kind: colour 0…1, depth along z in the rig's units, alpha, parts.
+
+    >>> views = client.render_arrays(scene, "c0", kinds=["colour", "depth"])
+    >>> views["colour"].shape, views["depth"].shape
+    ((16, 24, 3), (16, 24))
+    """
     arguments = _asks(camera, frame, kinds, "npz", background, width, parts)
     return Call("POST", path(id, "render"), read_npz, arguments=arguments)
 

@@ -1,4 +1,4 @@
-"""`scas4d push`, `import`, `scenes`, `watch`, `budget`: what talks to a service, or makes a capture ready for it."""
+"""`scas4d push`, `import`, `scenes`, `watch`, `budget`: commands that talk to a service or prepare a capture for it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from client import rig
-from client.cli.overrides import overrides
+from client.cli.changes import parse_changes
 from client.cli.progress import Bars, console
 from client.importers.open_source import open_source
 from client.importers.source import Source
@@ -21,7 +21,7 @@ PUSH_OUTAGE_S = 600.0
 
 
 class PicturesFrom(StrEnum):
-    """Where the pictures of a capture are."""
+    """The kind of files that hold a capture's pictures."""
 
     IMAGES = "images"
     VIDEOS = "videos"
@@ -29,48 +29,60 @@ class PicturesFrom(StrEnum):
 
 
 class Encoding(StrEnum):
-    """How pictures are encoded anew."""
+    """The format of pictures that are encoded anew."""
 
     JPEG = "jpeg"
     PNG = "png"
 
 
 class WhenFull(StrEnum):
-    """What happens to a frame when the queue is full."""
+    """The service's answer to a frame when the queue is full."""
 
     REFUSE = "refuse"
     SKIP = "skip"
 
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; docs/captures.md.")]
-Url = Annotated[str, typer.Option(envvar="SCAS4D_URL", help="Of the service.")]
-Token = Annotated[str | None, typer.Option(envvar="SCAS4D_TOKEN", help="Of the service; better in SCAS4D_TOKEN.")]
+Url = Annotated[str, typer.Option(envvar="SCAS4D_URL", help="Address of the service.")]
+Token = Annotated[
+    str | None, typer.Option(envvar="SCAS4D_TOKEN", help="Token of the service; better given in SCAS4D_TOKEN.")
+]
 Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene.")]
 Calibration = Annotated[
     Path | None, typer.Option(help="A transforms.json or the folder of a COLMAP model, if not in CAPTURE.")
 ]
-From = Annotated[PicturesFrom | None, typer.Option("--pictures", help="Which, where there are several kinds.")]
+From = Annotated[
+    PicturesFrom | None, typer.Option("--pictures", help="Kind of pictures to take, where a capture has several.")
+]
 CaptureFps = Annotated[
     float | None, typer.Option(min=0.001, help="Frames a second of the capture, where its files do not say.")
 ]
-Masks = Annotated[bool, typer.Option(help="Send the masks that are there.")]
-Encode = Annotated[Encoding, typer.Option(help="Of undistorted pictures and frames of video; jpeg has quality 95.")]
+Masks = Annotated[bool, typer.Option(help="Use the capture's masks.")]
+Encode = Annotated[
+    Encoding, typer.Option(help="Encoding of undistorted pictures and frames of video; jpeg has quality 95.")
+]
 
 
 def push(
     capture: CaptureFolder,
     url: Url = DEFAULT_URL,
     token: Token = None,
-    scene: Annotated[str | None, typer.Option(help="Go on with this scene, from its next frame.")] = None,
-    fps: Annotated[
-        float | None, typer.Option(min=0.001, help="Frames a second, as a rig would; as fast as taken where not given.")
+    scene: Annotated[
+        str | None, typer.Option(help="Continue this scene from its next frame; a new scene without it.")
     ] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="So many frames in all.")] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option(
+            min=0.001,
+            help="Send so many frames a second, as a rig would; without it as fast as the service takes them.",
+        ),
+    ] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Send until the scene has so many frames.")] = None,
     start: Annotated[int, typer.Option(min=0, help="The frame of the capture to begin with.")] = 0,
     loop: Annotated[bool, typer.Option("--loop", help="Back and forth, until --frames or Ctrl-C.")] = False,
     jitter: Annotated[float, typer.Option(min=0, help="Each frame leaves up to so many seconds late.")] = 0.0,
     drop: Annotated[float, typer.Option(min=0, max=0.99, help="Share of frames that the rig loses.")] = 0.0,
-    seed: Annotated[int, typer.Option(help="Of what is random: jitter and drop.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of jitter and drop.")] = 0,
     per_camera: Annotated[
         bool, typer.Option("--per-camera", help="Each camera sends its own pictures; --drop loses single ones.")
     ] = False,
@@ -84,13 +96,16 @@ def push(
     capture_fps: CaptureFps = None,
     masks: Masks = True,
     encoding: Encode = Encoding.JPEG,
-    preset: Annotated[str, typer.Option(help="Named settings: scas4d, adaptive or dynamic3dgs.")] = "scas4d",
+    preset: Annotated[str, typer.Option(help="Preset of settings: scas4d, adaptive or dynamic3dgs.")] = "scas4d",
     changes: Annotated[
-        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="As update.iterations=200.")
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="NAME=VALUE", help="Change a setting, as update.iterations=200. May be repeated."
+        ),
     ] = None,
 ) -> None:
     """Sends a capture to a running service as its rig would, and waits for the last frame."""
-    settings = overrides(changes or [])
+    settings = parse_changes(changes)
     source = _opened(capture, calibration, pictures, capture_fps, masks, encoding)
     with Client(url, token=token, outage=0) as client:
         client.live()  # a wrong address is said at once, an outage later is waited for
@@ -108,8 +123,8 @@ def push(
             preset=preset,
             settings=settings,
             ingest=IngestSettings(when_full=when_full.value),
-            told=bars,
-            said=lambda sentence: console.print(sentence, style="yellow", highlight=False),
+            on_progress=bars,
+            on_message=lambda sentence: console.print(sentence, style="yellow", highlight=False),
         )
         status = client.scene(delivery.scene)
     console.print(delivery.lateness.summary(fps), highlight=False, soft_wrap=True)
@@ -135,7 +150,7 @@ def scenes(url: Url = DEFAULT_URL, token: Token = None) -> None:
 
 
 def watch(scene: Scene, url: Url = DEFAULT_URL, token: Token = None) -> None:
-    """Prints what becomes of a scene's frames, as it happens, until Ctrl-C or the scene is deleted."""
+    """Prints each finished frame of a scene as it happens, until Ctrl-C or the scene is deleted."""
     from client.stream import Stream, finished_frames, scene_changes
     from client.wire.stream import FrameMessage, SceneMessage
 
@@ -158,25 +173,29 @@ def watch(scene: Scene, url: Url = DEFAULT_URL, token: Token = None) -> None:
 
 def budget(
     scene: Scene,
-    iterations: Annotated[int | None, typer.Option(min=1, help="A frame.")] = None,
+    iterations: Annotated[int | None, typer.Option(min=1, help="Iterations a frame.")] = None,
     milliseconds: Annotated[
-        float | None, typer.Option(min=0.001, help="A frame, decoding and commit included: as many iterations as fit.")
+        float | None,
+        typer.Option(min=0.001, help="Milliseconds a frame, decoding and commit included: as many iterations as fit."),
     ] = None,
     stop_gain: Annotated[
         float | None,
-        typer.Option(min=0, max=0.999, help="Ten iterations that bring less than this share end an update."),
+        typer.Option(
+            min=0, max=0.999, help="End an update once ten iterations lower its error by less than this share."
+        ),
     ] = None,
     still: Annotated[
         float | None,
         typer.Option(
-            min=-1, help="No iteration where the frame before shows it within 1 + this times the usual error."
+            min=-1,
+            help="Skip the iterations where the state before shows a frame within 1 + this times the usual error.",
         ),
     ] = None,
-    as_made: Annotated[bool, typer.Option("--as-made", help="As the scene was made.")] = False,
+    as_made: Annotated[bool, typer.Option("--as-made", help="Take every budget back: as the scene was made.")] = False,
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:
-    """Tells what a scene's updates may cost; with options, sets it from the next frame on."""
+    """Prints the budget of a scene's updates; with options, sets it from the next frame on."""
     given = (iterations, milliseconds, stop_gain, still)
     if as_made and any(value is not None for value in given):
         raise ValueError("--as-made stands for no other budget; leave it out, or the others")
@@ -199,9 +218,9 @@ def budget(
 
 def import_(
     capture: CaptureFolder,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="New folder.")],
-    frames: Annotated[int | None, typer.Option(min=1, help="Only so many frames.")] = None,
-    test: Annotated[list[str] | None, typer.Option(help="A camera to hold out, for measuring; repeatable.")] = None,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="New folder for the undistorted capture.")],
+    frames: Annotated[int | None, typer.Option(min=1, help="Import only so many frames.")] = None,
+    test: Annotated[list[str] | None, typer.Option(help="Hold out a camera, for measuring. May be repeated.")] = None,
     calibration: Calibration = None,
     pictures: From = None,
     capture_fps: CaptureFps = None,
@@ -213,12 +232,12 @@ def import_(
 
     source = _opened(capture, calibration, pictures, capture_fps, masks, encoding)
     with Bars() as bars:
-        write_dynamic3dgs(source, out, frames=frames, test=test or (), told=bars)
+        write_dynamic3dgs(source, out, frames=frames, test=test or (), on_progress=bars)
     console.print(f"{out}: {len(source.rig)} cameras; try: scas4d push {out}", highlight=False, soft_wrap=True)
 
 
 def frame_line(report: FrameReportModel, missed: int = 0) -> str:
-    """What became of a frame, for a person."""
+    """A finished frame's report as one line."""
     parts = [f"frame {report.index}: {report.state}"]
     if report.psnr is not None:
         parts.append(f"{report.psnr:.1f} dB")

@@ -1,4 +1,4 @@
-"""The main job in one command: a service, a capture streamed through it, pictures."""
+"""`scas4d demo`: starts a service, streams a capture through it, saves pictures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ POLL_S = 1.0
 
 @contextmanager
 def running_service(data: Path, log: Path, port: int = 8000) -> Iterator[str]:
-    """A service of its own on the loopback, at `port` or where that is taken at a free one; its address.
+    """Runs a service on the loopback, at `port` or, where that is taken, at a free one; yields its address.
 
     The first start of all compiles the kernels: it is waited for as long as the process lives.
 
@@ -62,7 +62,7 @@ def running_service(data: Path, log: Path, port: int = 8000) -> Iterator[str]:
 
 
 def _free(port: int) -> int:
-    """The port (any for 0) if nobody listens there, else 0."""
+    """Returns the port (any for 0) if nobody listens there, else 0."""
     with socket.socket() as probe:
         try:
             probe.bind(("127.0.0.1", port))
@@ -85,7 +85,7 @@ def _ready(url: str, log: Path) -> bool:
 
 
 def _token() -> str | None:
-    """The service that was started here reads it too."""
+    """The token from the environment, which the started service reads too."""
     return os.environ.get("SCAS4D_TOKEN")
 
 
@@ -96,7 +96,7 @@ def _last_words(log: Path) -> str:
 
 
 def run(capture: Capture, url: str, out: Path, *, frames: int | None, preset: str, settings: Mapping[str, Any]) -> str:
-    """Streams the capture through the service at `url` and saves what comes back; the scene's id.
+    """Streams the capture through the service at `url` and saves its renders; returns the scene's id.
 
     `out` gets truth | render | difference of every test camera and frame (of one training camera where there are no
     test cameras), and depth and parts of the last frame.
@@ -107,7 +107,9 @@ def run(capture: Capture, url: str, out: Path, *, frames: int | None, preset: st
             if earlier.name == name:  # each would be one of the few that the service takes
                 client.delete_scene(earlier.id)
         with Bars() as bars:
-            delivery = rig.push(capture, client, name=name, frames=frames, preset=preset, settings=settings, told=bars)
+            delivery = rig.push(
+                capture, client, name=name, frames=frames, preset=preset, settings=settings, on_progress=bars
+            )
         status = client.scene(delivery.scene)
         if status.last_committed is None:
             raise RuntimeError(f"no frame was committed: {status.error}")
@@ -120,7 +122,7 @@ def run(capture: Capture, url: str, out: Path, *, frames: int | None, preset: st
 
 
 def _report(client: Client, id: str, frames: int) -> None:
-    """One line on time; frames set aside by name."""
+    """Prints a line on time, and a line for each frame that was set aside."""
     reports = [client.frame(id, index) for index in range(frames)]
     for report in reports:
         if report.state != "committed":
@@ -132,7 +134,7 @@ def _report(client: Client, id: str, frames: int) -> None:
 
 
 def save_views(capture: Capture, client: Client, id: str, frames: int, out: Path) -> list[float]:
-    """The pictures of every committed frame; mean PSNR by frame over the cameras."""
+    """Saves pictures of every committed frame; returns the mean PSNR over the cameras by frame."""
     cameras = capture.full_test_rig.cameras if capture.full_test_rig is not None else capture.full_rig.cameras[:1]
     scores = []
     with Bars() as bars:

@@ -1,4 +1,4 @@
-"""What the client alone does without: packages of the service and the method, asked for where a command needs them."""
+"""Optional packages: which extra installs a module that a command misses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CUDA = ("torch", "gsplat")
 
 
 def need_server() -> None:
-    """For commands that start other processes: these would fail where nobody looks.
+    """Checks that the service is installed, for commands that start it in another process.
 
     Raises:
         ModuleNotFoundError: something of the extra `server` is not installed.
@@ -25,7 +25,7 @@ def need_server() -> None:
 
 
 def remedy(missing: ModuleNotFoundError) -> str | None:
-    """What to install, in a sentence; None where the module is none of an extra."""
+    """Says what to install, in a sentence; None where the module belongs to no extra."""
     package = (missing.name or "").partition(".")[0]
     extra = "server" if package in SERVER else "cuda" if package in CUDA else None
     if extra is None:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import os
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from pydantic import ValidationError
 
 from client import __version__
 from client.cli import commands, extras
-from client.cli.overrides import overrides, refusal
+from client.cli.changes import parse_changes
 from client.cli.progress import console
 from client.errors import ServiceError, ServiceUnreachable
 from client.importers.open_source import open_prepared
@@ -24,10 +24,13 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, help="Online 4D re
 commands.register(app)
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture.")]
-Preset = Annotated[str, typer.Option(help="Named settings: scas4d, adaptive or dynamic3dgs.")]
-Changes = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="As update.iterations=200.")]
-Frames = Annotated[int | None, typer.Option(min=1, help="Only so many frames.")]
-Out = Annotated[Path, typer.Option(help="Where pictures go.")]
+Preset = Annotated[str, typer.Option(help="Preset of settings: scas4d, adaptive or dynamic3dgs.")]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NAME=VALUE", help="Change a setting, as update.iterations=200. May be repeated."),
+]
+Frames = Annotated[int | None, typer.Option(min=1, help="Take only so many frames.")]
+Out = Annotated[Path, typer.Option(help="Folder for the results.")]
 
 
 @app.command()
@@ -41,7 +44,7 @@ def serve(
         Path | None, typer.Option(help="TOML file of settings; docs/operations.md lists them. The environment wins.")
     ] = None,
 ) -> None:
-    """Starts the service. What is not given here is read from the environment (SCAS4D_...), then from the file."""
+    """Starts the service. Settings not given here are read from the environment (SCAS4D_...), then from the file."""
     if config is not None:
         os.environ["SCAS4D_CONFIG"] = str(config)
     from server.serve import serve as run
@@ -66,7 +69,7 @@ def demo(
     """Starts a service, streams the sample capture through it, and leaves renders beside the truth."""
     from client.cli import demo as main_job
 
-    opened, settings = open_prepared(capture), overrides(changes or [])
+    opened, settings = open_prepared(capture), parse_changes(changes)
     stays = sys.stdout.isatty() if stay is None else stay
     data, log = out / "data", out / "service.log"
     with main_job.running_service(data, log, port) as url:
@@ -90,13 +93,13 @@ def reconstruct(
     out: Out = Path("out/reconstruct"),
     frames: Frames = None,
     preset: Preset = "scas4d",
-    device: Annotated[str | None, typer.Option(help="cpu or cuda.")] = None,
+    device: Annotated[str | None, typer.Option(help="Device of the updates: cpu or cuda.")] = None,
     changes: Changes = None,
 ) -> None:
     """Reconstructs a capture in this process, without a service: pictures, states, and a .ply of the last frame."""
     from client.cli.reconstruct import reconstruct as run
 
-    given = [*(changes or []), *([f"device={device}"] if device else [])]
+    given = parse_changes([*(changes or []), *([f"device={device}"] if device else [])])
     run(capture, out, frames=frames, preset=preset, changes=given)
 
 
@@ -107,16 +110,15 @@ def evaluate(
     frames: Frames = None,
     preset: Preset = "scas4d",
     changes: Changes = None,
-    again: Annotated[bool, typer.Option("--again", help="Measure anew what is there already.")] = False,
+    again: Annotated[
+        bool, typer.Option("--again", help="Measure anew, even where the folder holds the scores.")
+    ] = False,
 ) -> None:
     """Prints a capture's scores on its test cameras and ground truth; reconstructs it unless `out` has them already."""
-    if open_prepared(capture).full_test_rig is None:
-        raise CaptureError(
-            f"{capture}: no test cameras (test_meta.json) to measure on; `scas4d reconstruct` needs none"
-        )
-    from studies.commands import quality  # a checkout has it; the wheel does not
+    from client.cli.evaluate import evaluate as run
 
-    quality([capture], out=out, frames=frames, preset=[preset], changes=changes, again=again)
+    open_prepared(capture)  # says which command prepares a capture that is not
+    run(capture, out, frames=frames, preset_name=preset, changes=parse_changes(changes), again=again)
 
 
 def _version(wanted: bool) -> None:
@@ -132,24 +134,27 @@ def options(version: Annotated[bool, typer.Option("--version", callback=_version
 
 def main() -> None:
     """The entry point."""
-    run(app)
+    run(app, "scas4d", extras.remedy)
 
 
-def run(commands: typer.Typer) -> None:
-    """Runs a command line: errors that a user can mend are one line, not a traceback."""
+def run(commands: typer.Typer, name: str, remedy: Callable[[ModuleNotFoundError], str | None]) -> None:
+    """Runs a command line: an error that a user can mend becomes one line, not a traceback.
+
+    Args:
+        commands: the command line. name: the command as a user writes it.
+        remedy: says what to install for a missing module; None where that would not help.
+    """
     try:
-        commands()
+        commands(prog_name=name)
     except ModuleNotFoundError as error:
-        remedy = extras.remedy(error)
-        if remedy is None:
+        install = remedy(error)
+        if install is None:
             raise
-        raise SystemExit(f"scas4d: {remedy}") from None
-    except ValidationError as error:
-        raise SystemExit(f"scas4d: {refusal(error)}") from None
+        raise SystemExit(f"{name}: {install}") from None
     except ServiceUnreachable as error:
-        raise SystemExit(f"scas4d: {error}; start one with: scas4d serve") from None
+        raise SystemExit(f"{name}: {error}; start one with: scas4d serve") from None
     except (ServiceError, CaptureError, ImageError, RuntimeError, ValueError, OSError) as error:
-        raise SystemExit(f"scas4d: {error}") from None
+        raise SystemExit(f"{name}: {error}") from None
 
 
 if __name__ == "__main__":

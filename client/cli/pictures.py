@@ -1,4 +1,4 @@
-"""Renders beside the truth. Numpy and Pillow only."""
+"""Comparison pictures: renders beside the truth. Numpy and Pillow only."""
 
 from __future__ import annotations
 
@@ -14,6 +14,12 @@ DIFFERENCE_GAIN = 4
 """Differences are this much brighter, or nobody would see them."""
 
 Picture = NDArray[np.uint8]
+
+
+def eight_bit(colour: NDArray[np.floating]) -> Picture:
+    """Colour in 0…1, [H, W, 3], rounded to 0…255; what lies outside is clipped."""
+    rounded: Picture = np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8)
+    return rounded
 
 
 def comparison(truth: Picture, render: Picture) -> Picture:
@@ -45,7 +51,7 @@ def brightness(depth: NDArray[np.floating]) -> Picture:
 
 
 def save(path: Path, picture: Picture) -> Path:
-    """As PNG; folders are made."""
+    """Saves a picture as PNG; folders are made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(picture).save(path)
     return path

@@ -1,4 +1,4 @@
-"""Progress of what takes long: bars in a terminal, a line now and then elsewhere."""
+"""Progress of long work: bars in a terminal, a line every few seconds elsewhere."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LINE_S = 10.0
 
 
 class Bars:
-    """One bar a stage; a stage that is over keeps its bar. Call it with (stage, done, total).
+    """Progress bars, one a stage. Call it with (stage, done, total).
 
     Args:
         to: the terminal, or what stands in its place.

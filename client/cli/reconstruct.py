@@ -1,39 +1,103 @@
-"""A reconstruction in this process, for `scas4d reconstruct`."""
+"""`scas4d reconstruct`: a capture reconstructed in this process, without a service."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from client.cli import pictures
 from client.cli.progress import Bars, console
 from client.importers.open_source import open_prepared
-from scas4d_core.captures import open_capture
+from scas4d_core.captures import Capture, open_capture
+from scas4d_core.presets import preset as named
+from scas4d_core.settings import Settings
+
+if TYPE_CHECKING:
+    from scas4d_core.first_frame.static_scene import StaticResult
+    from scas4d_core.frame_report import FrameReport
+    from scas4d_core.reconstruction import Reconstruction
+    from scas4d_core.storage.history import History
 
 
-def reconstruct(folder: Path, out: Path, *, frames: int | None, preset: str, changes: Sequence[str]) -> None:
-    """Runs every frame; `out` gets pictures beside the truth, `states/` and `last.ply`.
+@dataclass(frozen=True)
+class ReconstructedFrame:
+    """One frame that was committed or held.
+
+    Attributes:
+        index: of the frame in the capture.
+        seconds: wall-clock time of this frame alone, decoding included. cpu_seconds: of the processor, all threads.
+        report: of the update; None for frame 0.
+    """
+
+    index: int
+    seconds: float
+    cpu_seconds: float
+    report: FrameReport | None
+
+
+def reconstruct_frames(
+    capture: Capture,
+    settings: Settings,
+    count: int,
+    *,
+    history: History | None = None,
+    static: StaticResult | None = None,
+    progress: Callable[[str, int, int], None],
+) -> Iterator[tuple[Reconstruction, ReconstructedFrame]]:
+    """Reconstructs the first `count` frames of a capture, one after another; yields after each.
+
+    Args:
+        capture: at full size; the reconstruction scales its pictures itself.
+        settings: of the reconstruction.
+        count: frames, at least 1.
+        history: of the states; in memory where None.
+        static: a fitted frame 0; fitted here where None.
+        progress: called with (stage, done, total).
+    """
+    from scas4d_core.reconstruction import Reconstruction
+
+    started, cpu = time.perf_counter(), time.process_time()
+    reconstruction = Reconstruction.start(
+        capture.rig,
+        capture.frame(0),
+        settings,
+        points=capture.points,
+        progress=lambda now: progress(f"frame 0, {now.stage}", now.done, now.total),
+        history=history,
+        static=static,
+    )
+    report: FrameReport | None = None
+    for index in range(count):
+        if index:
+            started, cpu = time.perf_counter(), time.process_time()
+            report = reconstruction.step(capture.frame(index))
+        done = ReconstructedFrame(index, time.perf_counter() - started, time.process_time() - cpu, report)
+        progress("frames", index + 1, count)
+        yield reconstruction, done
+
+
+def reconstruct(folder: Path, out: Path, *, frames: int | None, preset: str, changes: Mapping[str, Any]) -> None:
+    """Reconstructs every frame; `out` gets pictures beside the truth, `states/` and `last.ply`.
 
     Args:
         folder: of the capture.
         out: folder; made when missing.
         frames: how many; all where None.
         preset: named settings.
-        changes: what differs, as ``update.iterations=200``.
+        changes: what differs from the preset, nested.
     """
     given = open_prepared(folder)  # the reconstruction resizes what it is given
 
     from scas4d_core.query.ply import write_ply
-    from scas4d_core.reconstruction import Reconstruction
     from scas4d_core.storage.history import History
-    from scas4d_core.warm_up import warm_up_elsewhere
-    from studies.quality.job import settings_of
 
-    settings = settings_of(preset, overrides=changes)
+    settings = named(preset, changes)
     capture = open_capture(folder, image_scale=settings.scene.image_scale)
     count = min(frames or capture.frame_count, capture.frame_count)
     rig = capture.test_rig or capture.rig
@@ -41,29 +105,28 @@ def reconstruct(folder: Path, out: Path, *, frames: int | None, preset: str, cha
     if (out / "states" / "fixed.npz").exists():  # of an earlier run, like the pictures beside it
         shutil.rmtree(out / "states")
     history = History(out / "states")
-    if settings.device == "cpu":
-        with console.status("compiling the kernels (once)"):
-            warm_up_elsewhere()
+    compile_kernels(settings)
     with Bars() as bars:
-
-        def told(progress: Any) -> None:
-            bars(progress.stage, progress.done, progress.total)
-
-        reconstruction = Reconstruction.start(
-            given.rig, given.frame(0), settings, points=given.points, progress=told, history=history
-        )
-        for index in range(count):
-            if index:
-                reconstruction.step(given.frame(index))
-            bars("frames", index + 1, count)
+        for reconstruction, done in reconstruct_frames(given, settings, count, history=history, progress=bars):
+            index = done.index
             truth = capture.test_frame(index) if capture.test_rig is not None else capture.frame(index)
             scores = []
             for camera in cameras:
-                colour = reconstruction.render(camera, index).colour
-                render = np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8)
-                true = truth.images[camera.name]
+                render, true = (
+                    pictures.eight_bit(reconstruction.render(camera, index).colour),
+                    truth.images[camera.name],
+                )
                 scores.append(pictures.psnr(true, render))
                 pictures.save(out / f"camera_{camera.name}" / f"{index:06d}.png", pictures.comparison(true, render))
             console.print(f"frame {index}: {np.mean(scores):.2f} dB")
     write_ply(out / "last.ply", history.gaussians(history.indices[-1]), reconstruction.world)
     console.print(f"pictures, states and last.ply: {out}")
+
+
+def compile_kernels(settings: Settings) -> None:
+    """Compiles the CPU kernels in a process beside, unless the cache has them; nothing for another device."""
+    from scas4d_core.warm_up import warm_up_elsewhere
+
+    if settings.device == "cpu":
+        with console.status("compiling the kernels (once)"):
+            warm_up_elsewhere()

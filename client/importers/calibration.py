@@ -18,8 +18,8 @@ STILL_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """One picture that a calibration speaks of.
+class CalibratedImage:
+    """One picture that a calibration names, with its camera.
 
     Attributes:
         path: as the file names it.
@@ -46,7 +46,7 @@ class Calibration:
 
     source: Path
     cameras: tuple[LensCamera, ...]
-    views: Mapping[str, tuple[View, ...]]
+    views: Mapping[str, tuple[CalibratedImage, ...]]
     points: InitialPoints | None = None
     fps: float | None = None
 
@@ -63,9 +63,9 @@ def natural(text: str) -> list[tuple[int, int, str]]:
 
 
 def calibration(
-    source: Path, views: Sequence[View], *, points: InitialPoints | None = None, fps: float | None = None
+    source: Path, views: Sequence[CalibratedImage], *, points: InitialPoints | None = None, fps: float | None = None
 ) -> Calibration:
-    """Views to cameras. A camera is called like the folder of its pictures or, where all lie in one, like its picture.
+    """Groups pictures by camera. A camera is named by its pictures' folder or, where all lie in one, by its picture.
 
     Raises:
         CaptureError: no views, a camera that moves, or a name that cannot be.
@@ -73,7 +73,7 @@ def calibration(
     if not views:
         raise CaptureError(f"{source}: lists no camera")
     one_folder = len({view.path.parent for view in views}) == 1
-    by_name: dict[str, list[View]] = {}
+    by_name: dict[str, list[CalibratedImage]] = {}
     for view in views:
         by_name.setdefault(view.path.stem if one_folder else view.path.parent.name, []).append(view)
     cameras = []
@@ -88,7 +88,7 @@ def calibration(
     return Calibration(source, tuple(cameras), {name: tuple(found) for name, found in by_name.items()}, points, fps)
 
 
-def _still(source: Path, name: str, views: Sequence[View]) -> LensCamera:
+def _still(source: Path, name: str, views: Sequence[CalibratedImage]) -> LensCamera:
     first = views[0].lens
     for view in views[1:]:
         for field in ("world_to_camera", "intrinsics", "distortion"):

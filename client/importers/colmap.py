@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from client.importers.calibration import Calibration, View, calibration
+from client.importers.calibration import CalibratedImage, Calibration, calibration
 from client.importers.lens import MODELS, LensCamera, lens_camera
 from scas4d_core.captures import CaptureError, InitialPoints
 
@@ -55,12 +55,12 @@ class _Image:
 
 
 def is_model(folder: Path) -> bool:
-    """Do the files of a model lie in the folder?"""
+    """True where the files of a model lie in the folder."""
     return any((folder / f"cameras{end}").is_file() for end in (".bin", ".txt"))
 
 
 def read_colmap(folder: Path) -> Calibration:
-    """The rig of a model, and its cloud.
+    """Reads the rig of a model, and its cloud.
 
     Raises:
         CaptureError: a file is missing or broken, or a camera cannot be; the message names the file and the fault.
@@ -78,7 +78,9 @@ def read_colmap(folder: Path) -> Calibration:
     points = None
     if files["points3D"].is_file():
         points = _cloud(list(_binary_points(files["points3D"]) if binary else _text_points(files["points3D"])))
-    views = [View(PurePosixPath(image.name.replace("\\", "/")), _lens(files, cameras, image)) for image in images]
+    views = [
+        CalibratedImage(PurePosixPath(image.name.replace("\\", "/")), _lens(files, cameras, image)) for image in images
+    ]
     return calibration(folder, views, points=points)
 
 
@@ -139,7 +141,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _fields(path: Path, number: int, line: str, kinds: str, what: str) -> list[Any]:
-    """Words of a line: `i` whole number, `f` number, `s` text; the last kind holds for all that follow."""
+    """Reads the words of a line: `i` whole number, `f` number, `s` text; the last kind holds for all that follow."""
     words = line.split(maxsplit=len(kinds) - 1 if kinds.endswith("s") else -1)
     if len(words) < len(kinds):
         raise CaptureError(f"{path}: line {number} has {len(words)} fields; needed: {what}")
@@ -184,7 +186,7 @@ def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
 
 
 class _Bytes:
-    """A file read piece by piece; says where it ends too early."""
+    """A binary file read piece by piece; its errors name the place where it ends too early."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -1,4 +1,4 @@
-"""Packages that only the importers need, loaded when they are."""
+"""Packages that only the importers need, loaded on first use."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class MissingExtra(RuntimeError):
 
 
 def load(module: str, *, needed: str) -> Any:
-    """The module; `needed` says for what.
+    """Imports a module; `needed` names its purpose in the error.
 
     Raises:
         MissingExtra: it is not installed; the message names the extra.
@@ -28,10 +28,10 @@ def load(module: str, *, needed: str) -> Any:
 
 
 def opencv() -> Any:
-    """OpenCV, for lenses with distortion."""
+    """Imports OpenCV, for lenses with distortion."""
     return load("cv2", needed="undoing a lens's distortion")
 
 
 def pyav() -> Any:
-    """PyAV, for video."""
+    """Imports PyAV, for video."""
     return load("av", needed="reading video")

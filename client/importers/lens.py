@@ -35,7 +35,7 @@ MODELS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class LensCamera:
-    """A calibrated camera as it is, with its distortion.
+    """A calibrated camera with its distortion.
 
     Attributes:
         name: identifies the camera within its rig.
@@ -56,12 +56,12 @@ class LensCamera:
 
     @property
     def fisheye(self) -> bool:
-        """Is the distortion one of the angle?"""
+        """True where the distortion is one of the angle."""
         return self.model == "OPENCV_FISHEYE"
 
     @property
     def straight(self) -> bool:
-        """Is it a pinhole camera already? (A fisheye without coefficients is not.)"""
+        """True for a pinhole camera. (A fisheye without coefficients is none.)"""
         return not self.fisheye and not self.distortion.any()
 
     def pinhole(self, intrinsics: Float | None = None) -> Camera:
@@ -83,7 +83,7 @@ def lens_camera(
     *,
     source: str,
 ) -> LensCamera:
-    """A camera from the parameters of its model by name (`MODELS`), checked.
+    """Makes a camera from the parameters of its model by name (`MODELS`), checked.
 
     Args:
         name: of the camera.

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from client.importers.calibration import Calibration, View, calibration
+from client.importers.calibration import CalibratedImage, Calibration, calibration
 from client.importers.lens import MODELS, lens_camera
 from scas4d_core.captures import CaptureError
 from scas4d_core.captures.files import read_json
@@ -32,7 +32,7 @@ COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 def read_transforms(path: Path) -> Calibration:
-    """The rig of a `transforms.json`.
+    """Reads the rig of a `transforms.json`.
 
     Raises:
         CaptureError: a field is missing or cannot be; the message names file, picture, field and remedy.
@@ -54,7 +54,7 @@ def read_transforms(path: Path) -> Calibration:
     return calibration(path, views, fps=fps)
 
 
-def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: Float, scale: float) -> View:
+def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: Float, scale: float) -> CalibratedImage:
     file = frame.get("file_path")
     if not isinstance(file, str) or not PurePosixPath(file).name:
         raise CaptureError(f"{where} has no file_path")
@@ -82,11 +82,11 @@ def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: F
     camera = lens_camera(file, model, parameters, pose, size, source=where)
     path = PurePosixPath(file)
     time = _number(where, frame, "time") if frame.get("time") is not None else None
-    return View(path, camera, time)
+    return CalibratedImage(path, camera, time)
 
 
 def _model_unsaid(given: Mapping[str, Any]) -> str:
-    """instant-ngp names no model: it has `is_fisheye`, and coefficients where there is distortion."""
+    """The model where the file names none, as of instant-ngp: by `is_fisheye` and the coefficients."""
     if given.get("is_fisheye"):
         return "OPENCV_FISHEYE"
     return "OPENCV" if any(given.get(key) for key in COEFFICIENTS) else "PINHOLE"

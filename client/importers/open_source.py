@@ -1,4 +1,4 @@
-"""`open_source`: the door for whatever a studio has; the files in the folder tell what it is."""
+"""`open_source`: opens a capture of any known layout, recognized by the files in its folder."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from client.importers.calibration import Calibration
 from client.importers.colmap import is_model, read_colmap
 from client.importers.nerfstudio import FILE, read_transforms
 from client.importers.pictures import PictureFiles, folders_of, named_files
-from client.importers.source import CaptureSource, Encoding, ImportedSource, Pictures, Source
+from client.importers.source import CaptureSource, Encoding, ImportedSource, PictureReader, Source
 from client.importers.videos import Videos, find_videos
 from scas4d_core.captures import Capture, CaptureError, open_capture
 from scas4d_core.captures.dynamic3dgs import TRAIN_META
@@ -27,7 +27,7 @@ def open_source(
     encoding: Encoding = "jpeg",
     use_masks: bool = True,
 ) -> Source:
-    """A capture of any layout that is known (docs/captures.md).
+    """Opens a capture of any layout that is known (docs/captures.md).
 
     Args:
         folder: of the capture.
@@ -41,6 +41,10 @@ def open_source(
     Raises:
         CaptureError: no known layout, or a fault in one of the files; the message says what is missing.
         MissingExtra: a lens or a video needs a package of the extra `importers`.
+
+    >>> source = open_source(folder)
+    >>> source.rig.names, source.frame_count
+    (('0', '1'), 4)
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -64,7 +68,7 @@ def open_source(
 
 
 def open_prepared(folder: Path | str) -> Capture:
-    """A capture that the method reads without the importers: `reconstruct`, `evaluate` and `demo` take only such.
+    """Opens a capture that needs no importer: `reconstruct`, `evaluate` and `demo` take no other.
 
     Raises:
         CaptureError: another layout, or none; the message names the layouts and the way to this one.
@@ -80,7 +84,7 @@ def open_prepared(folder: Path | str) -> Capture:
 
 
 def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
-    """The rig: the one given, else transforms.json, else a COLMAP model in one of the usual places.
+    """Reads the given calibration, else transforms.json, else a COLMAP model in one of the usual places.
 
     Raises:
         CaptureError: there is none, or it cannot be read.
@@ -102,7 +106,7 @@ def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
     )
 
 
-def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | None) -> Pictures:
+def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | None) -> PictureReader:
     images, videos = folder / "images", folder / "videos"
     has_images = images.is_dir() and any(path.is_dir() for path in images.iterdir())
     if wanted == "named" or (wanted is None and min(len(views) for views in calibration.views.values()) > 1):

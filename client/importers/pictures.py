@@ -22,7 +22,7 @@ SHOWN = 3
 
 
 class PictureFiles:
-    """[T] files by camera.
+    """Picture files of T frames by camera.
 
     Raises:
         CaptureError: the first picture of a camera cannot be read, or is not of the calibrated size.
@@ -49,11 +49,11 @@ class PictureFiles:
         return path if path.suffix.lower() in SENT else None
 
     def decoded(self, index: int, camera: str) -> Picture:
-        """[H, W, 3]."""
+        """Decodes a picture, [H, W, 3]."""
         return decode_image(self._files[index][camera], size=self._sizes[camera])
 
     def check_same_frames(self, masks: Sequence[Mapping[str, Path]]) -> None:
-        """Masks must be called like the pictures.
+        """Refuses masks that are not named like the pictures.
 
         Raises:
             CaptureError: a mask or a picture is without the other.
@@ -69,7 +69,7 @@ class PictureFiles:
 
 
 def check_size(path: Path, camera: str, size: tuple[int, int]) -> None:
-    """A picture must be as large as its camera was calibrated for."""
+    """Refuses a picture of another size than its camera was calibrated for."""
     try:
         found = picture_size(path)
     except ImageError as fault:
@@ -82,7 +82,7 @@ def check_size(path: Path, camera: str, size: tuple[int, int]) -> None:
 
 
 def folders_of(root: Path, calibration: Calibration, *, what: str = "pictures") -> list[dict[str, Path]]:
-    """[T] the files of ``root/<camera>/``, one of each frame a camera.
+    """The files of ``root/<camera>/`` by frame, [T]: one a camera.
 
     Raises:
         CaptureError: a camera has no folder, or a folder lacks a frame that others have.
@@ -126,7 +126,7 @@ def _pictures_in(folder: Path) -> dict[str, Path]:
 
 
 def named_files(folder: Path, calibration: Calibration) -> tuple[list[dict[str, Path]], list[float]]:
-    """[T] the files that the calibration names, and their times where it says: frame t is each camera's t-th.
+    """The files that the calibration names by frame, [T], and their times if any; frame t is each camera's t-th.
 
     Raises:
         CaptureError: a file is not there, cameras have different numbers of pictures, or times differ.

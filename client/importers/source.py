@@ -1,4 +1,4 @@
-"""`Source`: what can be sent: a rig of pinhole cameras and, by frame and camera, an encoded picture."""
+"""`Source`: a capture to be sent: a rig of pinhole cameras and an encoded picture by frame and camera."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ JPEG_QUALITY = 95
 
 
 class Source(Protocol):
-    """A capture as a rig would send it: what is sent are files, of pinhole cameras."""
+    """A capture as a rig would send it: files of pinhole cameras."""
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name of the capture, for people."""
 
     @property
     def rig(self) -> Rig:
@@ -36,7 +36,7 @@ class Source(Protocol):
 
     @property
     def frame_count(self) -> int:
-        """T."""
+        """Number of frames T."""
 
     @property
     def fps(self) -> float:
@@ -48,7 +48,7 @@ class Source(Protocol):
 
     @property
     def remarks(self) -> Sequence[str]:
-        """What a person should know about how it was read."""
+        """Remarks on the reading, for a person."""
 
     def time(self, index: int) -> float:
         """Seconds of a frame, rising."""
@@ -85,12 +85,12 @@ class CaptureSource:
         return self._capture.encoded_mask(index, camera)
 
 
-class Pictures(Protocol):
-    """The pictures of the cameras as they took them: files or videos."""
+class PictureReader(Protocol):
+    """Reads the pictures as the cameras took them, from files or videos."""
 
     @property
     def frame_count(self) -> int:
-        """T."""
+        """Number of frames T."""
 
     @property
     def fps(self) -> float | None:
@@ -98,7 +98,7 @@ class Pictures(Protocol):
 
     @property
     def remarks(self) -> Sequence[str]:
-        """What a person should know about how they were read."""
+        """Remarks on the reading, for a person."""
 
     def time(self, index: int) -> float | None:
         """Seconds, where the pictures say."""
@@ -107,7 +107,7 @@ class Pictures(Protocol):
         """The picture's own file, if it has one that the service takes."""
 
     def decoded(self, index: int, camera: str) -> Picture:
-        """[H, W, 3]."""
+        """Decodes a picture, [H, W, 3]."""
 
 
 class ImportedSource:
@@ -132,7 +132,7 @@ class ImportedSource:
         self,
         name: str,
         calibration: Calibration,
-        pictures: Pictures,
+        pictures: PictureReader,
         *,
         masks: tuple[Mapping[str, Path], ...] = (),
         fps: float | None = None,
@@ -155,7 +155,7 @@ class ImportedSource:
         return Rig(tuple(undistorter.camera for undistorter in self._undistorters.values()))
 
     def undistorter(self, camera: str) -> Undistorter:
-        """What undoes a camera's lens."""
+        """The undistorter of a camera's lens."""
         return self._undistorters[camera]
 
     def time(self, index: int) -> float:
@@ -196,7 +196,7 @@ class ImportedSource:
 
 
 def encode(picture: Picture, encoding: Encoding) -> bytes:
-    """A picture or mask as the bytes of a file."""
+    """Encodes a picture or mask as the bytes of a file."""
     file = io.BytesIO()
     image = Image.fromarray(picture)
     if encoding == "png":

@@ -1,4 +1,4 @@
-"""Distortion and fisheye undone by OpenCV: from a lens to a pinhole camera of the same place and picture size.
+"""Undoes distortion and fisheye with OpenCV: from a lens to a pinhole camera of the same place and picture size.
 
 The pinhole looks at the largest part of the picture, of the picture's own shape, in which every pixel was seen: no
 black corners. Its pixels are as square as the lens's, its principal point follows.
@@ -34,7 +34,7 @@ HALF = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Undistorter:
-    """Of one camera. Where the lens is straight, nothing is done and OpenCV is not needed.
+    """Undistorts the pictures of one camera. A straight lens needs nothing, and no OpenCV.
 
     Args:
         lens: as calibrated.
@@ -66,7 +66,7 @@ class Undistorter:
 
     @cached_property
     def valid(self) -> NDArray[np.bool_]:
-        """[H, W] where the undistorted picture was seen by the camera."""
+        """Mask [H, W] of the undistorted pixels that the camera saw."""
         if self.lens.straight:
             return np.ones((self.lens.height, self.lens.width), dtype=bool)
         u, v = self._maps  # of OpenCV: the picture's edges are at −0.5 and size − 0.5
@@ -74,7 +74,7 @@ class Undistorter:
         return np.asarray(inside)
 
     def picture(self, picture: Picture) -> Picture:
-        """[H, W, 3] as the lens saw it to [H, W, 3] as the pinhole would.
+        """Undistorts a picture: [H, W, 3] of the lens to [H, W, 3] of the pinhole camera.
 
         Lanczos: painted dots land within 0.02 pixels of where they belong; cubic interpolation moves them by up to
         0.08 and linear blurs.
@@ -82,7 +82,7 @@ class Undistorter:
         return self._remapped(picture, "INTER_LANCZOS4")
 
     def mask(self, mask: Picture) -> Picture:
-        """[H, W] of labels; each pixel takes the nearest one's."""
+        """Undistorts a mask of labels [H, W]; each pixel takes the nearest one's."""
         return self._remapped(mask, "INTER_NEAREST")
 
     def _remapped(self, picture: Picture, how: str) -> Picture:
@@ -99,7 +99,7 @@ class Undistorter:
 
 
 def _shifted(intrinsics: Float) -> Float:
-    """The same in OpenCV's pixels."""
+    """The same intrinsics for OpenCV's pixel centres, which are at whole numbers."""
     shifted = intrinsics.copy()
     shifted[:2, 2] -= HALF
     return shifted
@@ -183,7 +183,7 @@ def _from_angles(lens: LensCamera, distorted: Float, where: str) -> Float:
 
 
 def _rising(lens: LensCamera, rays: Float, where: str) -> None:
-    """The radial factor must not turn back between the axis and the border: there, two rays share a pixel."""
+    """Refuses a radial factor that turns back between the axis and the border: there, two rays share a pixel."""
     k1, k2, _, _, k3, k4, k5, k6 = lens.distortion
     r = np.linspace(0, np.linalg.norm(rays, axis=-1).max(), 1024)
     s = r * r

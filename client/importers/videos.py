@@ -1,4 +1,4 @@
-"""Frames from one video a camera, decoded by PyAV when they are looked at, exactly the frame asked for.
+"""Frames from one video a camera, each decoded by PyAV when it is asked for.
 
 The times of all frames are read from the packets, without decoding. A frame is found by going back to the key frame
 before it and decoding on until its own time comes; going forward frame by frame decodes each once.
@@ -27,7 +27,7 @@ ALIKE = 0.05
 
 
 class Video:
-    """One file.
+    """One video file.
 
     Attributes:
         times: [T] seconds of each frame since the first.
@@ -72,7 +72,7 @@ class Video:
         return float(np.median(np.diff(self.times))) if len(self) > 1 else 0.0
 
     def frame(self, index: int) -> Picture:
-        """[H, W, 3] sRGB values of frame `index`.
+        """Decodes frame `index`: [H, W, 3] sRGB values.
 
         Raises:
             CaptureError: it cannot be decoded.
@@ -99,7 +99,7 @@ class Video:
         if frame.rotation:
             raise CaptureError(
                 f"{self.path}: its metadata turns the picture by {frame.rotation}°, and whether the calibration was of "
-                "turned pictures cannot be told; store the pixels as calibrated and drop the rotation"
+                "turned pictures cannot be recognized; store the pixels as calibrated and drop the rotation"
             )
         picture: Picture = frame.to_ndarray(format="rgb24")
         return picture
@@ -110,7 +110,7 @@ class Video:
 
 
 class Videos:
-    """One video a camera, of one rate, begun at one moment. The shortest says how many frames there are.
+    """One video a camera, of one rate, begun at one moment. The shortest gives the number of frames.
 
     Raises:
         CaptureError: a camera without a video, sizes or rates that differ from the calibration's or each other's.
@@ -163,12 +163,12 @@ class Videos:
         return None
 
     def decoded(self, index: int, camera: str) -> Picture:
-        """[H, W, 3]."""
+        """Decodes a picture, [H, W, 3]."""
         return self._videos[camera].frame(index)
 
 
 def find_videos(folder: Path, calibration: Calibration) -> dict[str, Path]:
-    """``folder/<camera>.mp4`` (or another of `ENDS`) by camera.
+    """Finds ``folder/<camera>.mp4`` (or another of `ENDS`) by camera.
 
     Raises:
         CaptureError: a camera has none, or two.

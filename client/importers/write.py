@@ -1,4 +1,4 @@
-"""Writes what was imported in the layout of Dynamic3DGaussians, which every command reads without any extra."""
+"""Writes an imported capture in the layout of Dynamic3DGaussians, which every command reads without any extra."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from client.importers.source import Source
 from scas4d_core.cameras import Camera
 from scas4d_core.captures import CaptureError
 
-Told = Callable[[str, int, int], None]
+OnProgress = Callable[[str, int, int], None]
 
 
 def write_dynamic3dgs(
@@ -24,7 +24,7 @@ def write_dynamic3dgs(
     *,
     frames: int | None = None,
     test: Collection[str] = (),
-    told: Told | None = None,
+    on_progress: OnProgress | None = None,
 ) -> None:
     """Writes a capture: pictures under `ims/`, masks under `seg/`, cameras in `train_meta.json` and `test_meta.json`.
 
@@ -35,10 +35,15 @@ def write_dynamic3dgs(
         out: folder, new or empty.
         frames: how many; all where None.
         test: cameras to hold out, for measuring.
-        told: hears ("frames", done, total).
+        on_progress: hears ("frames", done, total).
 
     Raises:
         CaptureError: the folder is not empty, cameras differ in size, or a test camera is unknown or the last.
+
+    >>> from client.importers.open_source import open_source
+    >>> write_dynamic3dgs(open_source(folder), out, frames=2, test=["1"])
+    >>> sorted(path.name for path in out.iterdir())
+    ['ims', 'init_pt_cld.npz', 'seg', 'test_meta.json', 'train_meta.json']
     """
     cameras = source.rig.cameras
     if out.exists() and any(out.iterdir()):
@@ -66,8 +71,8 @@ def write_dynamic3dgs(
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
         for index in range(count):
             list(pool.map(write, [index] * len(cameras), source.rig.names))
-            if told is not None:
-                told("frames", index + 1, count)
+            if on_progress is not None:
+                on_progress("frames", index + 1, count)
     points = source.points
     if points is not None:
         foreground = () if points.foreground is None else (points.foreground[:, None],)

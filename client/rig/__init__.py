@@ -3,6 +3,6 @@
 from client.rig.delivery import Delivery, Lateness
 from client.rig.pace import Pace
 from client.rig.sequence import Sequence
-from client.rig.simulator import Told, push
+from client.rig.simulator import OnProgress, push
 
-__all__ = ["Delivery", "Lateness", "Pace", "Sequence", "Told", "push"]
+__all__ = ["Delivery", "Lateness", "OnProgress", "Pace", "Sequence", "push"]

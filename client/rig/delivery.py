@@ -1,4 +1,4 @@
-"""What became of a push."""
+"""Result of a push: the scene, the lost frames, and how late the frames were."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from client.wire import SceneStatus
 
 @dataclass
 class Lateness:
-    """How far the sending fell behind the pace, in seconds, and what it waited for.
+    """Seconds by which the sending fell behind the pace, and seconds waited, by reason.
 
     Attributes:
         late: by how much each frame was acknowledged after its moment, plus one period: 0 means before the next one.
@@ -52,7 +52,7 @@ class Lateness:
 
 @dataclass
 class Delivery:
-    """What became of a push.
+    """Result of a push.
 
     Attributes:
         scene: id.

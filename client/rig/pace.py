@@ -1,4 +1,4 @@
-"""When a rig takes its frames, and what of it is lost: the clock of the rig simulator."""
+"""Pace of the rig simulator: frame rate, jitter and losses."""
 
 from __future__ import annotations
 
@@ -8,13 +8,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Pace:
-    """How a rig behaves.
+    """Frame rate, jitter and losses of a simulated rig; the same seed gives the same.
 
     Attributes:
         fps: frames a second; None sends as fast as the service takes them.
         jitter: seconds that a frame is late at most, evenly distributed: cables, encoders, switches.
         drop: share of frames that the rig loses, 0…1. Frame 0 is never lost.
         seed: of what is random here.
+
+    >>> pace = Pace(fps=30, drop=0.5)
+    >>> [pace.loses(index) for index in range(4)] == [pace.loses(index) for index in range(4)]
+    True
+    >>> pace.loses(0)
+    False
     """
 
     fps: float | None = None
@@ -31,7 +37,7 @@ class Pace:
             raise ValueError(f"drop {self.drop!r} must be a share from 0 to below 1")
 
     def loses(self, index: int, camera: str = "") -> bool:
-        """Is this frame (or this camera's picture of it) lost? The same answer every time."""
+        """True where this frame (or this camera's picture of it) is lost; the same answer every time."""
         return index > 0 and random.Random(f"{self.seed} {index} {camera} lost").random() < self.drop
 
     def late(self, index: int, camera: str = "") -> float:

@@ -1,4 +1,4 @@
-"""How the rig simulator's frames leave: as requests or over WebSockets, whole or each camera for itself, in time."""
+"""Sends the rig simulator's frames in time: as requests or over WebSockets, whole or camera by camera."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from client.rig.pace import Pace
 from client.rig.sequence import Files, Sequence
 from client.sdk import Client
 
-Said = Callable[[str], None]
+OnMessage = Callable[[str], None]
 
 
 class Requests:
@@ -24,16 +24,16 @@ class Requests:
         self._scene = scene
 
     def frame(self, index: int, files: Files) -> None:
-        """A whole frame."""
+        """Sends a whole frame."""
         self._client.put_frame(self._scene, index, files.images, files.masks, time=files.time)
 
     def camera(self, index: int, name: str, files: Files) -> None:
-        """One camera's pictures."""
+        """Sends one camera's pictures."""
         mask = files.masks.get(name)
         self._client.put_camera(self._scene, index, name, files.images[name], mask, time=files.time)
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Does nothing: no connection is kept."""
 
 
 class Sockets:
@@ -45,11 +45,11 @@ class Sockets:
         self._sockets: dict[str, IngestSocket] = {}
 
     def frame(self, index: int, files: Files) -> None:
-        """A whole frame."""
+        """Sends a whole frame."""
         self._of("").put_frame(index, files.images, files.masks, time=files.time)
 
     def camera(self, index: int, name: str, files: Files) -> None:
-        """One camera's pictures, over its own socket."""
+        """Sends one camera's pictures over its own socket."""
         self._of(name).put_camera(index, name, files.images[name], files.masks.get(name), time=files.time)
 
     def close(self) -> None:
@@ -74,7 +74,7 @@ class Sender:
         sequence: Sequence,
         pace: Pace,
         delivery: Delivery,
-        said: Said,
+        on_message: OnMessage,
         per_camera: bool,
     ) -> None:
         self._client = client
@@ -82,13 +82,13 @@ class Sender:
         self._sequence = sequence
         self._pace = pace
         self._delivery = delivery
-        self._said = said
+        self._on_message = on_message
         names = sequence.source.rig.names
         self._cameras = ThreadPoolExecutor(max_workers=len(names), thread_name_prefix="camera") if per_camera else None
         self.start_clock()
 
     def start_clock(self) -> None:
-        """The next frame is due now; the rate is counted from here."""
+        """Starts the clock: the next frame is due now."""
         self._began = time.monotonic()
         self._sent = 0
         self._delivery.lateness.began = self._began
@@ -104,7 +104,7 @@ class Sender:
             except FrameGap as gap:
                 if gap.expected == index:
                     raise
-                self._said(f"the service expects frame {gap.expected} next, not {index}: going on there")
+                self._on_message(f"the service expects frame {gap.expected} next, not {index}: going on there")
                 index = gap.expected
                 continue
             if due is not None:
@@ -137,7 +137,7 @@ class Sender:
         if len(sending) < len(files.images):
             self._client.close_frame(id, index)
             lost = ", ".join(name for name in files.images if name not in sending)
-            self._said(f"frame {index}: the rig lost the pictures of {lost}; closed without them")
+            self._on_message(f"frame {index}: the rig lost the pictures of {lost}; closed without them")
 
     def _send_camera(self, index: int, name: str, files: Files) -> None:
         time.sleep(self._pace.late(index, name))
@@ -146,7 +146,7 @@ class Sender:
     def _lose(self, index: int) -> None:
         self._client.declare_missing(self._delivery.scene, index, reason="lost by the rig simulator")
         self._delivery.lost.append(index)
-        self._said(f"frame {index}: lost by the rig, declared missing")
+        self._on_message(f"frame {index}: lost by the rig, declared missing")
 
     def close(self) -> None:
         """Ends its threads."""

@@ -41,7 +41,7 @@ class Sequence:
         return FOREVER if self.loop else self._last + 1
 
     def place(self, index: int) -> int:
-        """Which frame of the capture is frame `index` of the scene."""
+        """The frame of the capture that is frame `index` of the scene."""
         if index <= self._last:
             return self.start + index
         if self._last == 0:
@@ -56,7 +56,7 @@ class Sequence:
         return self.time(self._last) + (index - self._last) / self.source.fps
 
     def files(self, index: int) -> Files:
-        """The files of a frame; those of the next are made meanwhile."""
+        """Returns the files of a frame; those of the next are made meanwhile."""
         future = self._ahead[1] if self._ahead and self._ahead[0] == index else self._reader.submit(self._files, index)
         found = future.result()
         if index + 1 < len(self):

@@ -12,13 +12,13 @@ from client.importers.source import CaptureSource, Source
 from client.retries import Retry
 from client.rig.delivery import Delivery, Lateness
 from client.rig.pace import Pace
-from client.rig.sender import Requests, Said, Sender, Sockets
+from client.rig.sender import OnMessage, Requests, Sender, Sockets
 from client.rig.sequence import Sequence
 from client.sdk import Client
 from client.wire import IngestSettings, SceneStatus
 from scas4d_core.captures import Capture
 
-Told = Callable[[str, int, int], None]
+OnProgress = Callable[[str, int, int], None]
 """(stage, done, total)."""
 
 
@@ -37,8 +37,8 @@ def push(
     preset: str = "scas4d",
     settings: Mapping[str, Any] | None = None,
     ingest: IngestSettings | None = None,
-    told: Told | None = None,
-    said: Said | None = None,
+    on_progress: OnProgress | None = None,
+    on_message: OnMessage | None = None,
 ) -> Delivery:
     """Creates a scene, sends its cloud and every frame in order and in time, and waits until the last is finished.
 
@@ -60,16 +60,22 @@ def push(
         preset: named settings.
         settings: what differs from the preset, nested.
         ingest: how the scene takes frames.
-        told: hears of progress: the stages of frame 0, then "frames" with the number finished.
-        said: hears sentences: outages, frames that were lost, where it goes on.
+        on_progress: hears of progress: the stages of frame 0, then "frames" with the number finished.
+        on_message: hears sentences: outages, frames that were lost, where it goes on.
 
     Raises:
         ServiceError, ServiceUnreachable: as by the client.
         RuntimeError: the scene failed, or has other cameras than the capture.
+
+    >>> from client.importers.open_source import open_source
+    >>> delivery = push(open_source(folder), client, frames=2)
+    >>> delivery.status.committed
+    2
+    >>> client.delete_scene(delivery.scene)
     """
     source = CaptureSource(source) if isinstance(source, Capture) else source
-    told = told or (lambda stage, done, total: None)
-    said = said or (lambda sentence: None)
+    on_progress = on_progress or (lambda stage, done, total: None)
+    on_message = on_message or (lambda sentence: None)
     sequence = Sequence(source, start=start, loop=loop)
     with ExitStack() as stack:
         stack.callback(sequence.close)
@@ -88,39 +94,39 @@ def push(
         else:
             status = client.scene(scene)
             _check_cameras(status, source)
-            said(f"scene {scene} goes on with frame {status.next_frame}")
+            on_message(f"scene {scene} goes on with frame {status.next_frame}")
         delivery = Delivery(status.id)
         way = Sockets(client, status.id) if websocket else Requests(client, status.id)
         stack.callback(way.close)
-        sender = Sender(client, way, sequence, pace or Pace(), delivery, said, per_camera)
+        sender = Sender(client, way, sequence, pace or Pace(), delivery, on_message, per_camera)
         stack.callback(sender.close)
-        stack.enter_context(_listening(client, delivery.lateness, said))
+        stack.enter_context(_listening(client, delivery.lateness, on_message))
         try:
             for index in sender.send_all(status.next_frame, count):
                 if index == 0:
-                    _follow(client, status.id, 0, count, told)
+                    _follow(client, status.id, 0, count, on_progress)
                     sender.start_clock()
                 else:
-                    told("frames", _finished(client.scene(status.id)), count)
+                    on_progress("frames", _finished(client.scene(status.id)), count)
             delivery.lateness.ended = time.monotonic()
             # A frame that was lost is finished at once, those before it are not.
             last = next((index for index in reversed(range(count)) if index not in delivery.lost), 0)
-            _follow(client, status.id, last, count, told)
+            _follow(client, status.id, last, count, on_progress)
         except KeyboardInterrupt:  # how a loop without end is ended
-            said("interrupted")
+            on_message("interrupted")
             delivery.lateness.ended = delivery.lateness.ended or time.monotonic()
         delivery.status = client.scene(status.id)
-        told("frames", _finished(delivery.status), count)
+        on_progress("frames", _finished(delivery.status), count)
     return delivery
 
 
 class _listening:
     """Counts what the client waits for, and says when an outage begins."""
 
-    def __init__(self, client: Client, lateness: Lateness, said: Said) -> None:
+    def __init__(self, client: Client, lateness: Lateness, on_message: OnMessage) -> None:
         self._client = client
         self._lateness = lateness
-        self._said = said
+        self._on_message = on_message
         self._before = client.on_retry
         self._out = False
         self._lock = threading.Lock()
@@ -140,7 +146,7 @@ class _listening:
                 self._lateness.outage += retry.seconds
                 self._lateness.outage_count += 1
                 if not self._out:
-                    self._said(f"the service does not answer ({retry.detail}); trying on")
+                    self._on_message(f"the service does not answer ({retry.detail}); trying on")
             self._out = retry.reason == "outage"
         if self._before is not None:
             self._before(retry)
@@ -154,17 +160,17 @@ def _check_cameras(status: SceneStatus, source: Source) -> None:
         )
 
 
-def _follow(client: Client, id: str, index: int, count: int, told: Told) -> None:
+def _follow(client: Client, id: str, index: int, count: int, on_progress: OnProgress) -> None:
     """Tells of progress until a frame is finished."""
     for status in client.watch(id, index):
         if status.state == "failed":
             raise RuntimeError(f"scene {id} failed: {status.error}")
         if status.progress is not None:
-            told(status.progress.stage, status.progress.done, status.progress.total)
+            on_progress(status.progress.stage, status.progress.done, status.progress.total)
         elif index == 0 and not _finished(status):
-            told("starting the scene", 0, 1)
+            on_progress("starting the scene", 0, 1)
         else:
-            told("frames", _finished(status), count)
+            on_progress("frames", _finished(status), count)
 
 
 def _finished(status: SceneStatus) -> int:

@@ -1,4 +1,4 @@
-"""What the models on the wire are made of."""
+"""Base class and field types of the models on the wire."""
 
 from __future__ import annotations
 
@@ -23,6 +23,6 @@ Pixel = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
 
 
 class Model(BaseModel):
-    """An unknown field is an error, so that a misspelt one is noticed."""
+    """Base of the models on the wire. An unknown field is an error, so that a misspelt one is noticed."""
 
     model_config = ConfigDict(extra="forbid")

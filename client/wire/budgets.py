@@ -1,4 +1,4 @@
-"""What an update may cost, on the wire."""
+"""Budgets of updates, on the wire."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Iterations = Annotated[int, Field(strict=True, ge=1, le=MOST_ITERATIONS)]
 
 
 class Budget(Model):
-    """What the updates of a scene may cost. What is null is as the scene was made."""
+    """Limits of a scene's updates. A field that is null is as the scene was made."""
 
     iterations: Iterations | None = Field(default=None, description="A frame; of `update.iterations`.")
     budget_ms: float | None = Field(
@@ -56,7 +56,7 @@ class BudgetFields(TypedDict, total=False):
 
 
 class EffectiveBudget(Model):
-    """What holds, with nothing left open."""
+    """The limits that apply, each field filled in."""
 
     iterations: int
     budget_ms: float | None = Field(description="Milliseconds a frame; null: no limit.")

@@ -1,4 +1,4 @@
-"""What a scene will take, before it is created."""
+"""Memory and disk that a scene will take, before it is created."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames on the wire: what was taken, and what became of it."""
+"""Frames on the wire: receipts and reports."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class PartReceipt(Model):
 
 
 class FrameState(StrEnum):
-    """Where a frame is. The last four are for ever."""
+    """State of a frame. The last four are final."""
 
     OPEN = "open"
     QUEUED = "queued"
@@ -54,7 +54,7 @@ class MissingRequest(Model):
 
 
 class CameraFitModel(Model):
-    """How well one camera's picture was met, when it was last rendered: a bumped or changed camera shows."""
+    """Fit of one camera's picture when it was last rendered: a bumped or changed camera shows."""
 
     psnr: float | None = Field(description="dB.")
     colour_shift: tuple[float, float, float] | None = Field(
@@ -68,7 +68,7 @@ class CameraFitModel(Model):
 
 
 class CurvePointModel(Model):
-    """How far an update was."""
+    """One point of an update's progress."""
 
     iterations: int
     milliseconds: float = Field(description="Since the update began, after decoding.")
@@ -76,7 +76,7 @@ class CurvePointModel(Model):
 
 
 class FrameReportModel(Model):
-    """What became of a frame."""
+    """Report of one frame: its state, times, errors and metrics."""
 
     scene: str
     index: int
@@ -111,7 +111,7 @@ class FrameReportModel(Model):
     exposure: float | None = Field(default=None, description="Times brighter than the light that the colours are in.")
     held_gaussians: int | None = Field(default=None, description="That stayed as they were before, one by one.")
     guards: dict[str, int] = Field(default_factory=dict, description="How often each guard acted.")
-    budget: Budget | None = Field(default=None, description="What the update was told; nulls: as the scene was made.")
+    budget: Budget | None = Field(default=None, description="Budget of the update; nulls: as the scene was made.")
     iterations: int | None = None
     planned: list[tuple[int, int]] = Field(
         default_factory=list, description="(iteration, iterations in all) whenever that was planned otherwise."
@@ -130,7 +130,7 @@ class FrameReportModel(Model):
     curve: list[CurvePointModel] = Field(default_factory=list, description="Of the last attempt.")
     errors: dict[str, float | None] = Field(
         default_factory=dict,
-        description="Mean image loss on at most four training views, the witnesses: of the state before (still), "
+        description="Mean image loss on at most four training views, the probe views: of the state before (still), "
         "that going on as it moved (warm), and the end of the update (end).",
     )
     psnr: float | None = Field(default=None, description="dB, training views of the last iterations.")

@@ -46,7 +46,7 @@ class FramingError(ValueError):
 
 
 class FileKind(StrEnum):
-    """What a file is."""
+    """Kind of a file: image or mask."""
 
     IMAGE = "image"
     MASK = "mask"
@@ -61,7 +61,7 @@ class FrameFile(Model):
 
 
 class FrameHead(Model):
-    """What a frame consists of."""
+    """Head of a framed body: the frame's index, time and files."""
 
     index: int = Field(ge=0, le=MAX_INDEX)
     time: FiniteFloat | None = Field(default=None, description="Seconds; by the scene's frame rate where not given.")
@@ -76,10 +76,8 @@ class IngestAnswer(Model):
     """Answers one binary message of `WS …/ingest`, as JSON text, in the order of the messages."""
 
     index: int | None = Field(description="Of the frame; null where the message could not be read.")
-    status: int = Field(description="What the HTTP door would have answered: 202, 409, 422, 429, 507 …")
-    retry_after: int | None = Field(
-        default=None, description="Seconds; what the HTTP door would have put into Retry-After."
-    )
+    status: int = Field(description="The status over HTTP: 202, 409, 422, 429, 507 …")
+    retry_after: int | None = Field(default=None, description="Seconds; the same as Retry-After over HTTP.")
     receipt: FrameReceipt | PartReceipt | None = Field(default=None, description="With status 202: it is on disk.")
     problem: ProblemDetails | None = Field(default=None, description="Otherwise.")
 

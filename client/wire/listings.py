@@ -1,4 +1,4 @@
-"""What became of many frames at once, on the wire."""
+"""Reports of many frames at once, on the wire."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from client.wire.rigs import RigModel
 
 
 class Retention(Model):
-    """What is kept of something that comes frame by frame: all of it, the last N frames, or the newest bytes."""
+    """Retention of data that comes frame by frame: all of it, the last N frames, or the newest bytes."""
 
     last: int | None = Field(default=None, ge=0, description="Frames. Not together with `bytes`.")
     bytes: int | None = Field(default=None, ge=0, description="At most so many. Not together with `last`.")
@@ -26,7 +26,7 @@ class Retention(Model):
 
 
 class IngestSettings(Model):
-    """How the scene takes frames, and what it keeps."""
+    """Rules of a scene for frames that are sent, and for what it keeps of them."""
 
     queue_frames: int | None = Field(
         default=None, ge=1, le=10_000, description="Frames acknowledged and not finished; the service's where null."
@@ -74,7 +74,7 @@ class SceneCreate(Model):
 
 
 class SceneState(StrEnum):
-    """Where a scene is."""
+    """State of a scene."""
 
     AWAITING = "awaiting_first_frame"
     INITIALISING = "initialising"
@@ -86,7 +86,7 @@ class SceneState(StrEnum):
 
 
 class ProgressModel(Model):
-    """How far the first frame is."""
+    """Progress of the first frame."""
 
     stage: str
     done: int

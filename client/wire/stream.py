@@ -38,7 +38,7 @@ Tag = Annotated[
 
 
 class Topic(StrEnum):
-    """What can be subscribed to."""
+    """Topic of a subscription."""
 
     SCENE = "scene"
     FRAMES = "frames"
@@ -110,7 +110,7 @@ CLIENT_MESSAGE: TypeAdapter[Subscribe | Update | Unsubscribe] = TypeAdapter(Clie
 
 
 class StreamLimits(Model):
-    """What the service bears from one client."""
+    """Limits of the service for one client."""
 
     subscriptions: int = Field(description="At a time.")
     message_bytes: int = Field(description="Of one message of the client.")
@@ -142,7 +142,7 @@ class Unsubscribed(Model):
 
 
 class StreamProblem(Model):
-    """What was wrong. With an id: the subscription stays and waits for its next `update` or frame."""
+    """A refusal. With an id: the subscription stays and waits for its next `update` or frame."""
 
     type: Literal["error"] = "error"
     id: SubscriptionId | None = None
@@ -160,7 +160,7 @@ class SceneMessage(Model):
 
 
 class FrameMessage(Model):
-    """What became of a frame: committed with its metrics, or why not."""
+    """Report of a frame: committed with its metrics, or the reason why not."""
 
     type: Literal["frame"] = "frame"
     id: SubscriptionId
@@ -187,7 +187,7 @@ SERVER_MESSAGE: TypeAdapter[Hello | Subscribed | Unsubscribed | StreamProblem | 
 
 
 class BulkHead(Model):
-    """What the bytes after the head are."""
+    """Head of a binary message: describes the bytes after it."""
 
     type: Literal["render", "tracks", "parts"]
     id: SubscriptionId

@@ -15,7 +15,7 @@ MOST_BUDGETS = 8
 
 
 class PointKind(StrEnum):
-    """Where a point comes from."""
+    """Origin of a point: measured, extrapolated or replayed."""
 
     MEASURED = "measured"
     REPLAYED = "replayed"
@@ -23,7 +23,7 @@ class PointKind(StrEnum):
 
 
 class TradeoffPoint(Model):
-    """What a frame costs with so many iterations, and what it brings."""
+    """Milliseconds, error and PSNR of a frame with so many iterations."""
 
     kind: PointKind = Field(
         description="measured: frames that the scene committed. replayed: frames of the scene, updated again in the "
@@ -32,8 +32,8 @@ class TradeoffPoint(Model):
     iterations: int = Field(description="A frame. Measured: what frames ran, to two significant digits.")
     milliseconds: float = Field(description="A frame from decoding to the end of the commit; the median.")
     error: float | None = Field(
-        description="Mean image loss of the witnesses, at most four training views, for what was committed; null where "
-        "not measured. What is extrapolated has none."
+        description="Mean image loss of the probe views, at most four training views, of the committed state; null "
+        "where not measured. What is extrapolated has none."
     )
     psnr: float | None = Field(description="dB, of training views as they were last rendered; null as `error`.")
     frames: int = Field(description="That went into it; 0 for what is extrapolated.")
@@ -41,7 +41,7 @@ class TradeoffPoint(Model):
 
 
 class CurveMean(Model):
-    """How far updates were after so many iterations of those that they had in all."""
+    """Mean progress of updates after so many of their iterations."""
 
     planned: int = Field(description="Iterations in all.")
     iterations: int
@@ -59,7 +59,7 @@ class TimeModel(Model):
 
 
 class ReplayState(StrEnum):
-    """Where the replay is that was asked for last."""
+    """State of the replay that was asked for last."""
 
     NONE = "none"
     RUNNING = "running"
@@ -81,7 +81,7 @@ class ReplayStatus(Model):
 
 
 class TradeoffModel(Model):
-    """What accuracy costs in time, for this scene on this machine."""
+    """Accuracy against time, for this scene on this machine."""
 
     scene: str
     points: list[TradeoffPoint] = Field(description="By kind, then by iterations.")
@@ -92,7 +92,7 @@ class TradeoffModel(Model):
 
 
 class ReplayRequest(Model):
-    """Which budgets are to be measured."""
+    """A request to measure budgets."""
 
     iterations: Annotated[list[Iterations], Field(min_length=1, max_length=MOST_BUDGETS)] = Field(
         default=[25, 50, 200], description="A frame, each a replay. The scene's own number is always measured too."

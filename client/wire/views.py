@@ -12,7 +12,7 @@ from client.wire.rigs import CameraModel
 
 
 class RenderKind(StrEnum):
-    """What to render."""
+    """Kind of a render."""
 
     COLOUR = "colour"
     DEPTH = "depth"
@@ -21,7 +21,7 @@ class RenderKind(StrEnum):
 
 
 class RenderFormat(StrEnum):
-    """How the render is encoded."""
+    """Encoding of a render."""
 
     PNG = "png"
     JPEG = "jpeg"

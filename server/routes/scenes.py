@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from fastapi import APIRouter, Response
-from pydantic import ValidationError
 
 from client.wire import SceneCreate, SceneList, SceneStatus
 from scas4d_core.cameras import CameraError
-from scas4d_core.presets import PRESETS
+from scas4d_core.presets import SettingError, preset
 from scas4d_core.settings import Settings
 from server.health import devices, estimate
 from server.http import validation
@@ -19,30 +16,16 @@ from server.routes.access import AllScenes, TheScene, TheSettings
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
 
-def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """Nested dictionaries, the second over the first."""
-    result = dict(base)
-    for name, value in changes.items():
-        old = result.get(name)
-        result[name] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
-    return result
-
-
 def scene_settings(request: SceneCreate) -> Settings:
     """The preset with the request's changes."""
-    base = PRESETS.get(request.preset)
-    if base is None:
-        raise Problem(
-            422,
-            f"there is no preset {request.preset!r}",
-            field="preset",
-            value=request.preset,
-            remedy=f"give one of {', '.join(sorted(PRESETS))}, and what differs from it as settings",
-        )
     try:
-        return Settings.model_validate(merged(base.model_dump(), request.settings))
-    except ValidationError as error:
-        raise validation.first_of(error, model=Settings, prefix="settings") from None
+        return preset(request.preset, request.settings)
+    except SettingError as error:
+        if error.validation is not None:
+            raise validation.first_of(error.validation, model=Settings, prefix="settings") from None
+        raise Problem(
+            422, f"there is no preset {request.preset!r}", field="preset", value=request.preset, remedy=error.remedy
+        ) from None
 
 
 def check_unit(request: SceneCreate, settings: Settings) -> None:

@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from client.cli.evaluate import Report
+from client.cli.scores import Row
 from scas4d_core.captures import Capture, open_capture
 from scas4d_core.metrics import psnr as image_psnr
 from scas4d_core.presets import preset
@@ -23,9 +25,6 @@ from scas4d_core.settings import Settings
 from studies.effort.sequences import Shown, as_it_is, back_and_forth, repeated, slowed
 from studies.frontier.timing import started
 from studies.machine import core_version, machine
-from studies.quality.store import Row
-
-Report = Callable[[str], None]
 
 TOLERANCE = 0.05
 """Of a budget that a frame may be off, or one iteration if that is more."""
@@ -41,7 +40,7 @@ COUNTED_FROM = 2
 
 @dataclass
 class Kept:
-    """How one budget was kept: seconds of each counted frame, its iterations, and the seconds of one."""
+    """Measured frames under one budget: seconds and iterations of each, and the seconds of one iteration."""
 
     milliseconds: float
     seconds: list[float] = field(default_factory=list)
@@ -133,13 +132,13 @@ def measure_adaptive(
         answer = {"sequence": what, **turns.row()}
         answers.append(answer)
         difference = answer["psnr"][name] - answer["psnr"]["scas4d"]
-        told = "" if answer["time_repeats"] is None else f", repeats {100 * answer['time_repeats']:.0f} %"
-        report(f"    {capture.name}, {what}: {100 * answer['time']:.0f} % of the time{told}, {difference:+.2f} dB")
+        ratio = "" if answer["time_repeats"] is None else f", repeats {100 * answer['time_repeats']:.0f} %"
+        report(f"    {capture.name}, {what}: {100 * answer['time']:.0f} % of the time{ratio}, {difference:+.2f} dB")
     return leave(out, f"{capture.name}-{name}", capture, {"name": name, "sequences": answers})
 
 
 class Turns:
-    """Two settings on the same frames, in turns: what each frame took, and how well it was met.
+    """Two settings on the same frames, in turns: seconds and PSNR of each frame.
 
     Args:
         names: of the settings; the first is what the other is compared with.

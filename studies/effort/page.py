@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from client.cli.scores import Row
 from studies.effort.effort import SEEDS, TOLERANCE
-from studies.effort.report import BAR
-from studies.quality.store import Row
+from studies.effort.report import TARGET
 
 KEPT = 0.95
 """Share of the frames that have to keep a budget."""
@@ -108,13 +108,13 @@ def _report(rows: Sequence[Row]) -> list[str]:
         "|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        verdict = "reached" if row["share"] <= BAR else "**missed**"
+        verdict = "reached" if row["share"] <= TARGET else "**missed**"
         low, high = row["ratio_quartiles"]
         lines.append(
             f"| {row['capture']} | {row['updates']} | {row['milliseconds']:.1f} | {100 * row['share']:.2f} % "
             f"| {100 * row['share_worst']:.2f} % | {row['ratio']:.3f} ({low:.3f} to {high:.3f}) | {verdict} |"
         )
-    return [*lines, "", f"The target: at most {100 * BAR:.0f} % of an update.", ""]
+    return [*lines, "", f"The target: at most {100 * TARGET:.0f} % of an update.", ""]
 
 
 def _gain(one: Row) -> float:

@@ -1,4 +1,4 @@
-"""What an update spends on its own report: the share of its stage, and the check that the stage leaves nothing out.
+"""Cost of an update's own report: the share of its stage, and the check that the stage leaves nothing out.
 
 The stage ``report`` has the stage timers themselves, losses that nothing but the curve asks for, the cameras' colour
 shifts, and assembling and writing the record; publishing it, as a worker does, is timed here and belongs to it. What is
@@ -17,14 +17,15 @@ from typing import Any
 
 import numpy as np
 
+from client.cli.evaluate import Report
+from client.cli.scores import Row
 from scas4d_core.captures import open_capture
 from scas4d_core.presets import preset
 from scas4d_core.update.result import REPORT
-from studies.effort.effort import COUNTED_FROM, Report, changed, leave
+from studies.effort.effort import COUNTED_FROM, changed, leave
 from studies.frontier.timing import started
-from studies.quality.store import Row
 
-BAR = 0.02
+TARGET = 0.02
 """Share of an update that its report may cost."""
 
 
@@ -73,10 +74,10 @@ def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report
         "ratio": float(np.median(ratios)),
         "ratio_quartiles": np.percentile(ratios, (25, 75)).tolist(),
     }
-    verdict = "reached" if answer["share"] <= BAR else "missed"
+    verdict = "reached" if answer["share"] <= TARGET else "missed"
     low, high = answer["ratio_quartiles"]
     report(
-        f"    {capture.name}: report: {100 * answer['share']:.2f} % of an update ({verdict}: {100 * BAR:.0f} %), "
+        f"    {capture.name}: report: {100 * answer['share']:.2f} % of an update ({verdict}: {100 * TARGET:.0f} %), "
         f"{answer['milliseconds']:.1f} ms; with what can be left out {answer['ratio']:.3f} × the CPU time without "
         f"(quartiles {low:.3f}, {high:.3f})"
     )

@@ -1,4 +1,4 @@
-"""How an update converges: the test cameras' PSNR of the state after some of its iterations.
+"""Convergence of an update: the test cameras' PSNR of the state after some of its iterations.
 
 Rates fall and layers begin by shares of an update's iterations, so the curve of a long update does not run through the
 ends of shorter ones. The test cameras are rendered beside the update and never reach it.
@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from client.cli.evaluate import Report
+from client.cli.scores import Row
 from scas4d_core import metrics
 from scas4d_core.captures import Capture, open_capture
 from scas4d_core.gaussians import Gaussians
@@ -21,8 +23,6 @@ from scas4d_core.warm_up import warm_up_elsewhere
 from studies.frontier.frontier import Variant
 from studies.frontier.timing import started
 from studies.machine import core_version
-from studies.quality.quality import Report
-from studies.quality.store import Row
 
 CHECKPOINTS = (0, 1, 2, 4, 7, 10, 15, 20, 25, 30, 40, 50, 60, 70, 80, 90, 100, 125, 150, 175, 200, 225, 250, 275)
 """Iterations after which the state is looked at, as far as an update has them; its end is looked at in any case."""
@@ -30,7 +30,7 @@ WATCHED = (("scas4d", 25), ("scas4d", 100), ("scas4d", 300), ("dynamic3dgs", 100
 """Preset and iterations."""
 
 Look = Callable[[int, Any, Any, Any, Any], None]
-"""Told the iterations done, means, factors, opacities and features."""
+"""Called with the iterations done, means, factors, opacities and features."""
 
 
 class WatchedPictures:
@@ -92,7 +92,7 @@ def measure_convergence(
 
 
 def read_convergence(out: Path, capture: str) -> Row | None:
-    """What ``measure_convergence`` left for a capture; None where it was not measured."""
+    """Reads the measurements of ``measure_convergence`` for a capture; None where there are none."""
     path = out / "convergence" / f"{capture}.json"
     if not path.exists():
         return None

@@ -1,4 +1,4 @@
-"""``scripts/bench frontier``: what accuracy costs in time, setting by setting.
+"""``scripts/bench frontier``: accuracy against time, setting by setting.
 
 Iterations by method, and one axis at a time around the default of 100 iterations of ``scas4d``. A row is one capture,
 one setting and one seed over the same first updates, so that all rows of a capture can be compared; every row is a row
@@ -14,12 +14,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from client.cli.evaluate import Job, Report
+from client.cli.scores import Row, Store
 from scas4d_core.presets import PRESETS
 from scas4d_core.settings import Settings
-from studies.quality.job import Job, settings_of
-from studies.quality.quality import Report, run_jobs
+from studies.quality.quality import run_jobs
 from studies.quality.runs import completed
-from studies.quality.store import Row, Store
+from studies.quality.settings import settings_of
 
 METHODS = ("scas4d", "dynamic3dgs")
 ITERATIONS = (10, 25, 50, 100, 200, 300, 500, 1000, 2000)
@@ -53,7 +54,7 @@ class Variant:
     @property
     def settings(self) -> Settings:
         """Complete."""
-        return settings_of(self.preset, self.iterations, overrides=[f"update.seed={self.seed}", *self.changes])
+        return settings_of(self.preset, self.iterations, changes=[f"update.seed={self.seed}", *self.changes])
 
     def job(self, capture: Path, updates: int) -> Job:
         """The row of a capture over so many updates, or over all."""
@@ -182,7 +183,7 @@ def row_of(rows: Iterable[Row], variant: Variant, capture: str, updates: int) ->
             continue
         given = row["given"]
         frames = row["capture_frames"] if variant.whole else min(updates + 1, row["capture_frames"])
-        told = completed(row["settings"], settings)
-        if given == {"frames": frames, "masks": True, "points": True} and told == settings:
+        filled = completed(row["settings"], settings)
+        if given == {"frames": frames, "masks": True, "points": True} and filled == settings:
             return row
     return None

@@ -1,4 +1,4 @@
-"""The page of the frontier: plots, what to choose for what, who is ahead at equal seconds, and the tables behind."""
+"""The page of the frontier: plots, advice, the comparison at equal seconds, and the tables behind."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from math import log2
 from pathlib import Path
 
+from client.cli.scores import Store
 from studies.effort.page import effort_text
 from studies.frontier import plots
 from studies.frontier.convergence import read_convergence
@@ -23,7 +24,6 @@ from studies.frontier.tradeoff import (
     undominated,
 )
 from studies.machine import in_words
-from studies.quality.store import Store
 
 PREVIEW_LOSS_DB = 4.0
 """A preview may lose so much against the default."""
@@ -31,7 +31,7 @@ LIVE_GAIN_DB = 1.0
 """A live show goes on to a slower setting while it gains this much for each doubling of the time."""
 ARCHIVE_GAIN_DB = 0.1
 """An archive takes the fastest setting within this of the best."""
-BARS = ("scas4d 10", "scas4d 25", "scas4d 50", "scas4d 100", "dynamic3dgs 100", "dynamic3dgs 200")
+STAGE_ROWS = ("scas4d 10", "scas4d 25", "scas4d 50", "scas4d 100", "dynamic3dgs 100", "dynamic3dgs 200")
 """Labels of the settings whose stages are drawn."""
 AXIS_WORDS: Mapping[str, str] = {
     "adaptive": "Other presets",
@@ -136,7 +136,7 @@ def equal_table(compared: Sequence[EqualSeconds]) -> str:
 
 
 def equal_words(compared: Sequence[EqualSeconds]) -> str:
-    """How often ``scas4d`` is ahead, and by how much at least."""
+    """Says in how many comparisons ``scas4d`` is ahead, and by how much at least."""
     leads = [one.lead for one in compared if one.lead is not None]
     missing = len(compared) - len(leads)
     if not leads:
@@ -162,7 +162,7 @@ def _draw(
     if whole is not None:
         plots.draw_drift(points, whole, folder / "drift.png")
         drawn.append("drift.png")
-    bars = [p for label in BARS for p in means if p.variant.label == label and not p.variant.whole]
+    bars = [p for label in STAGE_ROWS for p in means if p.variant.label == label and not p.variant.whole]
     plots.draw_stages(bars, words, folder / "stages.png")
     return [*drawn, "stages.png"]
 
@@ -204,7 +204,7 @@ def _text(
 
 An iteration is one forward and backward render of one training view, or of several where a row says so. Each row
 covers the first {updates} updates of a capture, from the same frame 0; accuracy is the mean over these updates and the
-test cameras. Definitions: [quality.md](quality.md), `studies/quality/measure.py`. Seconds are medians of
+test cameras. Definitions: [quality.md](quality.md), `scas4d_core/metrics/evaluation.py`. Seconds are medians of
 one update, decoding and commit included. A setting is dominated if another one is at least as fast and more accurate.
 
 ## Recommended settings
@@ -311,16 +311,16 @@ def _over(points: Sequence[Point], axis: str, captures: Sequence[str]) -> str:
 
 
 def _spreads(points: Sequence[Point], captures: Sequence[str]) -> str:
-    """What chance does: the standard deviation over the seeds of the updates."""
-    told = []
+    """The effect of chance: the standard deviation over the seeds of the updates."""
+    spreads = []
     for method in METHODS:
         by_capture = {name: spread(points, method, name) for name in captures}
         found = {name: value for name, value in by_capture.items() if value is not None}
         if found:
             count = max(seeds for _, seeds in found.values())
             words = ", ".join(f"{name} {deviation:.2f}" for name, (deviation, _) in found.items())
-            told.append(f"`{method}` {words} ({count} seeds)")
-    return f"Standard deviation of PSNR over seeds of the updates, dB: {'; '.join(told)}." if told else ""
+            spreads.append(f"`{method}` {words} ({count} seeds)")
+    return f"Standard deviation of PSNR over seeds of the updates, dB: {'; '.join(spreads)}." if spreads else ""
 
 
 def _provenance(out: Path, captures: Sequence[str]) -> str:

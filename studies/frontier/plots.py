@@ -1,4 +1,4 @@
-"""The plots of the frontier, as PNG files: accuracy over time, within an update, over frames, and where the time goes.
+"""The plots of the frontier, as PNG files: accuracy over time, within an update, over frames; time by stage.
 
 They are as wide as a column (``COLUMN``) or a page (``PAGE``) of a paper, with text of 6.5 to 8 points at that width.
 Colours are those of Okabe and Ito, told apart with any colour vision; shapes and labels say the same again. A colour is
@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from client.cli.scores import Row
 from scas4d_core.update.result import REPORT
 from studies.frontier.frontier import DEFAULT, METHODS
 from studies.frontier.tradeoff import Point, curve, of_axis, spread, undominated
-from studies.quality.store import Row
 
 OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#CC79A7", "#F0E442", "#000000")
 COLOURS = dict(zip(METHODS, OKABE_ITO, strict=False))
@@ -92,10 +92,6 @@ FAR = 150
 """What a place that is far off its point counts: more than a line that is crossed, less than a name that is hidden."""
 LABEL_GAP = 8.5
 """Points between the middles of labels that stand one above the other."""
-
-
-class PlotsMissing(RuntimeError):
-    """matplotlib is not installed."""
 
 
 def draw_frontier(points: Sequence[Point], title: str, file: Path, deviations: Mapping[str, float]) -> None:
@@ -264,7 +260,7 @@ def draw_drift(points: Sequence[Point], capture: str, file: Path) -> None:
 
 
 def draw_stages(points: Sequence[Point], title: str, file: Path) -> None:
-    """Where the time of a frame goes, a bar a setting.
+    """Draws the time of a frame by stage, a bar a setting.
 
     Args:
         points: in the order of the bars, the first on top.
@@ -298,10 +294,8 @@ def draw_stages(points: Sequence[Point], title: str, file: Path) -> None:
 
 
 def _pyplot() -> Any:
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise PlotsMissing("plots need matplotlib; run pip install -e '.[bench]'") from error
+    import matplotlib
+
     matplotlib.use("Agg")
     from matplotlib import pyplot
 

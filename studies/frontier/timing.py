@@ -1,4 +1,4 @@
-"""Seconds of settings measured in turns, so that what else the machine does meets all of them alike.
+"""Seconds of settings measured in turns, so that other load of the machine meets all of them alike.
 
 Every setting has a reconstruction of its own, all in one process, from the frame 0 that the rows of the study share.
 In each round every setting updates to the next frame, in an order that turns from round to round. The first round loads
@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
+from client.cli.evaluate import Report
+from client.cli.scores import Row
 from scas4d_core.captures import Capture, open_capture
 from scas4d_core.settings import Settings
 from scas4d_core.warm_up import warm_up_elsewhere
 from studies.frontier.frontier import Variant
 from studies.machine import core_version, machine
-from studies.quality.quality import Report
 from studies.quality.runs import completed
-from studies.quality.store import Row
 
 ROUNDS = 5
 """That are counted."""
@@ -34,8 +34,8 @@ MANY_ITERATIONS = 500
 
 
 @dataclass
-class Timed:
-    """One setting under way: its reconstruction, and what each counted update took."""
+class TimedVariant:
+    """One setting under way: its reconstruction, and the seconds of each counted update."""
 
     variant: Variant
     reconstruction: Any
@@ -84,7 +84,7 @@ def measure_times(
     turns = min(rounds + 1, capture.frame_count - 1)
     if turns < 2:
         raise ValueError(f"{folder} has {capture.frame_count} frame(s); timing needs at least 3")
-    timed = [Timed(variant, started(capture, variant.settings, out)) for variant in _distinct(variants)]
+    timed = [TimedVariant(variant, started(capture, variant.settings, out)) for variant in _distinct(variants)]
     ratios: list[list[float]] = [[] for _ in timed]
     for turn in range(turns):
         taken: dict[int, float] = {}
@@ -112,7 +112,7 @@ def measure_times(
 
 
 def read_times(out: Path, capture: str) -> Row | None:
-    """What ``measure_times`` left for a capture; None where it was not measured."""
+    """Reads the times of ``measure_times`` for a capture; None where there are none."""
     path = out / "timing" / f"{capture}.json"
     if not path.exists():
         return None
@@ -185,7 +185,7 @@ def started(capture: Capture, settings: Settings, out: Path, states: Path | None
     return reconstruction
 
 
-def _answer(one: Timed, ratios: Sequence[float]) -> Row:
+def _answer(one: TimedVariant, ratios: Sequence[float]) -> Row:
     names = dict.fromkeys(name for stages in one.stages for name in stages)
     return {
         "label": one.variant.label,

@@ -1,4 +1,4 @@
-"""Rows and times of the frontier as points: what a setting reaches in how many seconds, and who is ahead at equal ones.
+"""Rows and times of the frontier as points of PSNR and seconds, and the comparison at equal seconds.
 
 Accuracy is that of the rows, over the same updates for all of a capture. Seconds are those of ``bench.timing``; where
 there are none, those of the row: CPU seconds if it ran on one thread, for they mind little what else a machine does.
@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from client.cli.scores import Row, Store
 from studies.frontier.frontier import AXES, DEFAULT, METHODS, Variant, row_of, variants
 from studies.frontier.timing import read_times, time_of
-from studies.quality.store import Row, Store
 
 SCORES = (
     "psnr",
@@ -139,12 +139,12 @@ class EqualSeconds:
 
     @property
     def lead(self) -> float | None:
-        """How far ``scas4d`` is ahead, in dB."""
+        """The lead of ``scas4d`` in dB."""
         return None if self.psnr is None else self.psnr - self.baseline_psnr
 
 
 def equal_seconds(points: Sequence[Point], captures: Sequence[str]) -> list[EqualSeconds]:
-    """Who is ahead at equal seconds, at every budget of ``BUDGETS`` that was measured."""
+    """Compares the methods at equal seconds, at every budget of ``BUDGETS`` that was measured."""
     own, other = METHODS
     found = []
     for capture in captures:

@@ -1,4 +1,4 @@
-"""A measurement in a process of its own: its memory is not that of what ran before."""
+"""A measurement in a process of its own, so that its memory is not that of earlier work."""
 
 from __future__ import annotations
 
@@ -8,6 +8,6 @@ from typing import Any
 
 
 def in_a_process(function: Callable[..., Any], *arguments: Any) -> Any:
-    """What a function of a module returns, computed in a fresh process."""
+    """Calls a function of a module in a fresh process; returns its result."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         return pool.apply(function, arguments)

@@ -1,4 +1,4 @@
-"""What a hard case is, and the laws that all of them share."""
+"""Hard cases as values, and the laws that all of them share."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ CPU, TORCH, CUDA = "cpu", "torch float32", "cuda"
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
-    """What one backend made of a case.
+class BackendResult:
+    """Result of one backend on a case.
 
     Attributes:
         values, gradients: arrays by name.
@@ -30,17 +30,17 @@ class Outcome:
     guards: Mapping[str, int] = field(default_factory=dict)
 
 
-class Problem(Protocol):
+class SizedCase(Protocol):
     """A case made in one size."""
 
-    def run(self, backend: str) -> Outcome | None:
+    def run(self, backend: str) -> BackendResult | None:
         """Compute it; None where the backend has no such computation."""
 
-    def violations(self, outcomes: Mapping[str, Outcome]) -> list[str]:
-        """What does not hold, in words."""
+    def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
+        """Laws that do not hold, in words."""
 
 
-def _nothing_more(problem: Any, outcomes: Mapping[str, Outcome]) -> list[str]:
+def _nothing_more(problem: Any, outcomes: Mapping[str, BackendResult]) -> list[str]:
     return []
 
 
@@ -62,12 +62,12 @@ class HardCase:
     what: str
     source: str
     sizes: tuple[Any, ...]
-    make: Callable[[Any], Problem]
-    holds: Callable[[Any, Mapping[str, Outcome]], list[str]] = _nothing_more
+    make: Callable[[Any], SizedCase]
+    holds: Callable[[Any, Mapping[str, BackendResult]], list[str]] = _nothing_more
     slow: bool = False
 
 
-def not_finite(outcome: Outcome, backend: str) -> list[str]:
+def not_finite(outcome: BackendResult, backend: str) -> list[str]:
     """A line for each array that holds NaN or infinity."""
     arrays = [*outcome.values.items(), *((f"gradient of {name}", a) for name, a in outcome.gradients.items())]
     return [
@@ -77,7 +77,7 @@ def not_finite(outcome: Outcome, backend: str) -> list[str]:
     ]
 
 
-def beyond(outcome: Outcome, backend: str, bound: float) -> list[str]:
+def beyond(outcome: BackendResult, backend: str, bound: float) -> list[str]:
     """A line for each gradient with a number larger than a bound."""
     return [
         f"{backend}: gradient of {name} reaches {np.abs(array).max():.3g}, beyond {bound:.3g}"
@@ -92,7 +92,9 @@ def apart(found: NDArray[Any], truth: NDArray[Any], least: float = 1e-30) -> flo
     return float(difference / max(float(np.linalg.norm(truth.astype(np.float64))), least)) if difference > 0 else 0.0
 
 
-def unexpected_counts(outcome: Outcome, expected: Mapping[str, int] | None, silent: Sequence[str] = ()) -> list[str]:
+def unexpected_counts(
+    outcome: BackendResult, expected: Mapping[str, int] | None, silent: Sequence[str] = ()
+) -> list[str]:
     """A line where the CPU's guards acted otherwise than expected; None: anything goes."""
     if expected is None:
         return []

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from scas4d_core.kernels.cascade import PARAMETERS
-from studies.hard_cases.case import CPU, REFERENCE, HardCase, Outcome
+from studies.hard_cases.case import CPU, REFERENCE, BackendResult, HardCase
 from studies.hard_cases.deforming import Deforming
 
 COUNT, COARSE, FINE = 120, 3, 12
@@ -54,7 +54,7 @@ def _saturated(exponent: float) -> Deforming:
     return replace(made, guards={"exponent": members(made)} if clamped else {}, gradient=5e-3)
 
 
-def _alive(problem: Deforming, outcomes: Mapping[str, Outcome]) -> list[str]:
+def _alive(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
     """The factor and its gradient are not 0 before the clamp: a cluster that shrank can grow again."""
     exponent = float(problem.clusters[-1][0, S])
     rows = problem.labels[-1] == 0
@@ -77,7 +77,7 @@ def _fold(strength: float) -> Deforming:
     return replace(made, means=means, guards=None, turn=5e-2, gradient=5e-2, bound=1e7)
 
 
-def _folds_are_counted(problem: Deforming, outcomes: Mapping[str, Outcome]) -> list[str]:
+def _folds_are_counted(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
     """As many as have a negative determinant in float64."""
     before, after = problem.factors.astype(np.float64), outcomes[REFERENCE].values["factors"]
     folded = int(np.count_nonzero(np.linalg.det(before) * np.linalg.det(after) < 0))
@@ -97,7 +97,7 @@ def _straight_back(steepness: float) -> Deforming:
     )
 
 
-def _half_turn_counted(problem: Deforming, outcomes: Mapping[str, Outcome]) -> list[str]:
+def _half_turn_counted(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
     acted = outcomes[CPU].guards["half_turn"]
     return [] if acted == 1 else [f"the half turn was counted {acted} times, once is right"]
 
@@ -137,7 +137,7 @@ def _identity(count: int) -> Deforming:
     return replace(made, deltas=np.zeros_like(made.deltas), gradient=None, bound=1e3)
 
 
-def _same_bits(problem: Deforming, outcomes: Mapping[str, Outcome]) -> list[str]:
+def _same_bits(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
     moved = np.abs(outcomes[CPU].values["means"] - problem.means).max()
     changed = np.abs(outcomes[CPU].values["factors"] - problem.factors).max()
     turned = np.abs(outcomes[CPU].values["turns"] - (1, 0, 0, 0)).max()
@@ -202,7 +202,7 @@ def _not_finite(value: float, what: str = "means", count: int = 3) -> Deforming:
     return replace(made, guards={"held_back": count})
 
 
-def _apart(problem: Deforming, outcomes: Mapping[str, Outcome]) -> list[str]:
+def _apart(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
     """The others move as in float64 without the bad rows, which ``violations`` checks; nor have those a gradient."""
     own = outcomes[CPU].gradients["own"][problem.bad]
     return [] if np.all(own == 0) else ["cpu: a row that is held back has a gradient of its own"]
@@ -241,7 +241,7 @@ def _published(s: float) -> Deforming:
     return replace(made, kind="published")
 
 
-def _still(problem: Deforming, outcomes: Mapping[str, Outcome]) -> list[str]:
+def _still(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
     worst = max(float(np.abs(o.values["terms"]).max()) for o in outcomes.values())
     return [] if worst < 1e-6 else [f"where nothing moves a neighbour term is {worst:.2g}"]
 

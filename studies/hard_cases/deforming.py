@@ -17,7 +17,7 @@ from studies.hard_cases.case import (
     CPU,
     CUDA,
     REFERENCE,
-    Outcome,
+    BackendResult,
     Values,
     apart,
     beyond,
@@ -79,13 +79,13 @@ class Deforming:
         spread = float(np.square(where[sound] - where[sound].mean(axis=0)).sum(axis=1).mean())
         return build_neighbours(where, 4, 1 / max(spread, 1e-30))
 
-    def run(self, backend: str) -> Outcome | None:
+    def run(self, backend: str) -> BackendResult | None:
         """See ``Problem``."""
         if backend == CPU:
             return self._cpu()
         return self._torch(backend)
 
-    def _cpu(self) -> Outcome:
+    def _cpu(self) -> BackendResult:
         count = len(self.means)
         starts = tuple(np.searchsorted(k, np.arange(k.max() + 2)).astype(np.int64) for k in self.labels)
         hierarchy = Hierarchy(np.arange(count), tuple(k.astype(np.int32) for k in self.labels), starts)
@@ -99,9 +99,9 @@ class Deforming:
         model.backward(*self.weights(), 0.0)
         gradients: Values = {f"layer {k}": g.copy() for k, g in enumerate(model.cluster_gradients)}
         gradients["own"] = model.delta_gradients.copy()
-        return Outcome(values, gradients, dict(model.guards))
+        return BackendResult(values, gradients, dict(model.guards))
 
-    def _torch(self, backend: str) -> Outcome:
+    def _torch(self, backend: str) -> BackendResult:
         import torch
 
         from scas4d_core.torch_backend import deformation, losses
@@ -152,15 +152,17 @@ class Deforming:
             values[name] = values[name].astype(np.float64 if backend == REFERENCE else np.float32)
             values[name][sound] = getattr(moved, name).detach().cpu().numpy()
         values["terms"] = terms.detach().cpu().numpy()
-        return Outcome(values, {name: np.zeros(1) if g is None else g.cpu().numpy() for name, g in gradients.items()})
+        return BackendResult(
+            values, {name: np.zeros(1) if g is None else g.cpu().numpy() for name, g in gradients.items()}
+        )
 
-    def violations(self, outcomes: Mapping[str, Outcome]) -> list[str]:
+    def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
         """See ``Problem``: finite, bounded, unit turns, bad rows held and apart, in agreement."""
         found = []
         for backend, outcome in outcomes.items():
             sound = ~self.bad if self.bad.size else np.ones(len(self.means), bool)
             rows = {name: v[sound] for name, v in outcome.values.items() if name != "terms"}
-            found += not_finite(Outcome(rows, outcome.gradients), backend) + beyond(outcome, backend, self.bound)
+            found += not_finite(BackendResult(rows, outcome.gradients), backend) + beyond(outcome, backend, self.bound)
             norms = np.linalg.norm(rows["turns"], axis=1)
             if norms.size and np.abs(norms - 1).max() > 1e-4:
                 found.append(f"{backend}: a turn has length {norms[np.abs(norms - 1).argmax()]:.4g}")
@@ -174,7 +176,9 @@ class Deforming:
             found += self._disagreement(outcomes[backend], outcomes[REFERENCE], backend, sound)
         return found
 
-    def _disagreement(self, outcome: Outcome, truth: Outcome, backend: str, sound: NDArray[np.bool_]) -> list[str]:
+    def _disagreement(
+        self, outcome: BackendResult, truth: BackendResult, backend: str, sound: NDArray[np.bool_]
+    ) -> list[str]:
         found = []
         if self.value is not None and sound.any():
             off = np.abs(outcome.values["means"][sound] - truth.values["means"][sound]).max()

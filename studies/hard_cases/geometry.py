@@ -1,4 +1,4 @@
-"""The catalogue's Gaussians: where they are, how large, how opaque, and what is none."""
+"""The catalogue's Gaussians: unusual places, sizes and opacities, and numbers that are none."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scas4d_core.cameras import Camera
 from scas4d_core.kernels.blend import blend
 from scas4d_core.kernels.projection import DEPTH, TILE
 from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
-from studies.hard_cases.case import CPU, HardCase, Outcome
+from studies.hard_cases.case import CPU, BackendResult, HardCase
 from studies.hard_cases.rendering import Rendering
 
 WIDTH, HEIGHT = 48, 40
@@ -122,7 +122,7 @@ def _at_one_pixel(count: int) -> Rendering:
     return among(count, means=means, factors=0.01 * np.eye(3), opacities=0.02, value=2e-3, gradient=2e-2, bound=1e8)
 
 
-def _opaque(problem: Rendering, outcomes: Mapping[str, Outcome]) -> list[str]:
+def _opaque(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[str]:
     """Behind the middle of an opaque Gaussian little is seen: the cap keeps it drawn, at alpha 1 the stop would not."""
     rows = np.flatnonzero(problem.opacities >= 0.98)
     places, _ = problem.camera.project(problem.means[rows])
@@ -186,13 +186,13 @@ def _culling_is_exact(problem: Rendering) -> list[str]:
 
 
 class Culled(Rendering):
-    """Of which only the culling is looked at, on the CPU."""
+    """Gaussians of which only the culling is checked, on the CPU."""
 
-    def run(self, backend: str) -> Outcome | None:
+    def run(self, backend: str) -> BackendResult | None:
         """See ``Problem``."""
         return self._cpu() if backend == CPU else None
 
-    def violations(self, outcomes: Mapping[str, Outcome]) -> list[str]:
+    def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
         """See ``Problem``."""
         return _culling_is_exact(self)
 
@@ -203,7 +203,7 @@ def _equal_depths(count: int) -> Rendering:
     return among(count, means=means, factors=BALL)
 
 
-def _by_row(problem: Rendering, outcomes: Mapping[str, Outcome]) -> list[str]:
+def _by_row(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[str]:
     """Ties are drawn in row order: with the rows of a tie swapped, the picture is another; twice the same bits."""
     again = problem.run(CPU)
     assert again is not None
@@ -222,7 +222,7 @@ def _mirrored(count: int) -> Rendering:
     return among(count, factors=BALL * np.array([1, 1, -1.0]))
 
 
-def _as_unmirrored(problem: Rendering, outcomes: Mapping[str, Outcome]) -> list[str]:
+def _as_unmirrored(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[str]:
     plain = replace(problem, factors=np.abs(problem.factors) * (problem.factors != 0))
     rows = np.linalg.det(problem.factors) < 0
     factors = problem.factors.copy()
@@ -233,7 +233,7 @@ def _as_unmirrored(problem: Rendering, outcomes: Mapping[str, Outcome]) -> list[
     return [] if off < 1e-6 else [f"a mirrored factor changes the picture by {off:.2g}"]
 
 
-def _nothing_seen(problem: Rendering, outcomes: Mapping[str, Outcome]) -> list[str]:
+def _nothing_seen(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[str]:
     return [
         f"{backend}: alpha up to {outcome.values['alpha'].max():.2g} where nothing is drawn"
         for backend, outcome in outcomes.items()
@@ -262,7 +262,7 @@ def _steep(weight: float) -> Rendering:
     )
 
 
-def _counted_steep(problem: Rendering, outcomes: Mapping[str, Outcome]) -> list[str]:
+def _counted_steep(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[str]:
     acted = outcomes[CPU].guards["gradient_not_finite"]
     if problem.weight >= 1e35 and acted == 0:
         return ["no gradient was given up, though weights are at float32's end"]
@@ -290,7 +290,7 @@ def _scaled(scale: float) -> Rendering:
     return replace(made, limits=made.limits._replace(near=0.01 * scale), bound=1e7 / min(scale, 1.0))
 
 
-def _as_unscaled(problem: Rendering, outcomes: Mapping[str, Outcome]) -> list[str]:
+def _as_unscaled(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[str]:
     plain = ordinary().run(CPU)
     assert plain is not None
     off = np.abs(plain.values["features"] - outcomes[CPU].values["features"])

@@ -1,4 +1,4 @@
-"""Each guard taken away, in a copy of the sources and a process of its own: which cases fail then?
+"""Takes away each guard, in a copy of the sources and a process of its own, and notes the cases that fail then.
 
 The value in the copy's ``guards.py`` is replaced by the row's ``without``; where a comparison does the work and no
 value, the line in ``PATCHES`` is. Compiled kernels of the copies are not kept. Results are, by the digest of the
@@ -80,7 +80,7 @@ print("\\n" + json.dumps(found))
 
 
 class MutationError(RuntimeError):
-    """A mutation that cannot be made or judged: the message says which and why."""
+    """A mutation that cannot be made or measured: the message says which and why."""
 
 
 def mutants() -> Iterator[Guard]:
@@ -163,14 +163,14 @@ def sources() -> str:
 
 
 def known(store: Path) -> dict[str, list[str]] | None:
-    """What ``study`` has found for these sources; None where it has not been run to its end."""
+    """Results of ``study`` for these sources; None where it has not been run to its end."""
     file = store / f"mutations-{sources()}.json"
     results: dict[str, list[str]] = json.loads(file.read_text()) if file.exists() else {}
     found = {guard.name: results[guard.name] for guard in mutants() if guard.name in results}
     return found if len(found) == len(list(mutants())) else None
 
 
-def study(store: Path, told: Callable[[str], None] = print) -> dict[str, list[str]]:
+def study(store: Path, echo: Callable[[str], None] = print) -> dict[str, list[str]]:
     """Takes every guard away in turn; the failing cases by guard.
 
     Args:
@@ -193,5 +193,5 @@ def study(store: Path, told: Callable[[str], None] = print) -> dict[str, list[st
             results[guard.name] = failing_without(guard, sections_of(guard))
             file.write_text(json.dumps(results, indent=1))
         cases = results[guard.name]
-        told(f"without {guard.name}: {', '.join(cases) if cases else 'NOTHING fails'}")
+        echo(f"without {guard.name}: {', '.join(cases) if cases else 'NOTHING fails'}")
     return {name: cases for name, cases in results.items() if name != CONTROL}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import Camera
 from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
 from scas4d_core.rasterize.limits import DEFAULT, GSPLAT, Limits
-from studies.hard_cases.case import CPU, CUDA, REFERENCE, Outcome, apart, beyond, not_finite, unexpected_counts
+from studies.hard_cases.case import CPU, CUDA, REFERENCE, BackendResult, apart, beyond, not_finite, unexpected_counts
 
 Array = NDArray[np.float32]
 
@@ -61,7 +61,7 @@ class Rendering:
             (self.weight * rng.normal(size=shape[1:])).astype(np.float32),
         )
 
-    def run(self, backend: str) -> Outcome | None:
+    def run(self, backend: str) -> BackendResult | None:
         """See ``Problem``."""
         if backend == CPU:
             return self._cpu()
@@ -69,7 +69,7 @@ class Rendering:
             return self._torch(backend)
         return None
 
-    def _cpu(self) -> Outcome:
+    def _cpu(self) -> BackendResult:
         rasterizer = CpuRasterizer(self.limits)
         picture = rasterizer.forward(
             self.means, self.factors, self.opacities, self.features.copy(), CameraArrays.of(self.camera), BACKGROUND
@@ -81,9 +81,9 @@ class Rendering:
         found = rasterizer.backward(g_image, g_alpha)
         names = ("means", "factors", "opacities", "features")
         gradients = {name: getattr(found, name).copy() for name in names}
-        return Outcome(values, gradients, dict(rasterizer.guards))
+        return BackendResult(values, gradients, dict(rasterizer.guards))
 
-    def _torch(self, backend: str) -> Outcome:
+    def _torch(self, backend: str) -> BackendResult:
         import torch
 
         from scas4d_core.rasterize import cuda, twin
@@ -102,7 +102,7 @@ class Rendering:
         features = torch.movedim(picture.features, -1, 0)
         loss = (features * by_feature).sum() + (picture.alpha * by_alpha).sum()
         gradients = torch.autograd.grad(loss, leaves, allow_unused=True)
-        return Outcome(
+        return BackendResult(
             {"features": features.detach().cpu().numpy(), "alpha": picture.alpha.detach().cpu().numpy()},
             {
                 name: np.zeros(leaf.shape) if g is None else g.cpu().numpy()
@@ -118,7 +118,7 @@ class Rendering:
             features=self.features[kept], bad=np.zeros(int(kept.sum()), bool), guards=None,
         )  # fmt: skip
 
-    def violations(self, outcomes: Mapping[str, Outcome]) -> list[str]:
+    def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
         """See ``Problem``: finite, bounded, within the hull of the colours, bad rows apart, in agreement."""
         found = []
         for backend, outcome in outcomes.items():
@@ -139,7 +139,7 @@ class Rendering:
         drawn = np.concatenate([drawn, BACKGROUND[None]])
         return float(drawn.min()), float(drawn.max())
 
-    def _outside(self, outcome: Outcome, backend: str) -> list[str]:
+    def _outside(self, outcome: BackendResult, backend: str) -> list[str]:
         low, high = self._range()
         slack = 1e-4 * max(high - low, 1e-3)
         picture, alpha = outcome.values["features"], outcome.values["alpha"]
@@ -152,7 +152,7 @@ class Rendering:
             found.append(f"{backend}: {1 - alpha.max():.2g} of the light is left, less than {LEAST_LIGHT:g}")
         return found
 
-    def _touched(self, outcome: Outcome, backend: str) -> list[str]:
+    def _touched(self, outcome: BackendResult, backend: str) -> list[str]:
         if not self.bad.any() or (backend == REFERENCE and self.value is None):
             return []
         return [
@@ -161,14 +161,14 @@ class Rendering:
             if np.any(gradient[self.bad] != 0)
         ]
 
-    def _spoilt(self, outcome: Outcome) -> list[str]:
+    def _spoilt(self, outcome: BackendResult) -> list[str]:
         alone = self.without(self.bad)._cpu()
         same = all(np.array_equal(outcome.values[name], alone.values[name]) for name in alone.values) and all(
             np.array_equal(outcome.gradients[name][~self.bad], alone.gradients[name]) for name in alone.gradients
         )
         return [] if same else ["cpu: the others' picture or gradients are not what they are without the bad rows"]
 
-    def _disagreement(self, outcome: Outcome, truth: Outcome, backend: str) -> list[str]:
+    def _disagreement(self, outcome: BackendResult, truth: BackendResult, backend: str) -> list[str]:
         found = []
         if self.value is not None:
             low, high = self._range()

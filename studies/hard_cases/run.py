@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.util import find_spec
@@ -17,6 +17,7 @@ from studies.hard_cases import cluster_map, geometry, scenes, steps
 from studies.hard_cases.case import CPU, CUDA, REFERENCE, TORCH, HardCase
 from studies.machine import in_words as in_words_of
 from studies.machine import machine
+from studies.options import Echo
 
 SECTIONS: tuple[tuple[str, tuple[HardCase, ...]], ...] = (
     ("Gaussians rendered", geometry.CASES),
@@ -28,12 +29,10 @@ CASES = tuple(case for _, cases in SECTIONS for case in cases)
 
 BEGIN, END = "<!-- scripts/bench stability: begin -->", "<!-- scripts/bench stability: end -->"
 
-Told = Callable[[str], None]
-
 
 @dataclass
-class Line:
-    """A case in one size: what ran, what acted on the CPU, and what does not hold."""
+class CaseResult:
+    """Result of a case in one size: backends that ran, guards that acted on the CPU, laws that do not hold."""
 
     case: str
     size: str
@@ -69,9 +68,9 @@ def selected(names: Sequence[str] | None, slow: bool) -> list[HardCase]:
     return [case for case in CASES if slow or not case.slow]
 
 
-def run_case(case: HardCase, size: Any, on: Iterable[str]) -> Line:
+def run_case(case: HardCase, size: Any, on: Iterable[str]) -> CaseResult:
     """One case in one size; what raises does not hold."""
-    line = Line(case.name, str(size))
+    line = CaseResult(case.name, str(size))
     started = time.perf_counter()
     try:
         with np.errstate(all="ignore"):
@@ -87,7 +86,7 @@ def run_case(case: HardCase, size: Any, on: Iterable[str]) -> Line:
     return line
 
 
-def run(names: Sequence[str] | None = None, *, slow: bool = True, told: Told = print) -> list[Line]:
+def run(names: Sequence[str] | None = None, *, slow: bool = True, echo: Echo = print) -> list[CaseResult]:
     """All sizes of the selected cases; tells each as it is done."""
     on = backends()
     lines = []
@@ -95,11 +94,11 @@ def run(names: Sequence[str] | None = None, *, slow: bool = True, told: Told = p
         for size in case.sizes:
             line = run_case(case, size, on)
             lines.append(line)
-            told(f"{'holds' if not line.violations else 'FAILS'}  {case.name}, {line.size}  {in_words(line.guards)}")
+            echo(f"{'holds' if not line.violations else 'FAILS'}  {case.name}, {line.size}  {in_words(line.guards)}")
             for violation in line.violations:
-                told(f"       {violation}")
+                echo(f"       {violation}")
     failed = sum(bool(line.violations) for line in lines)
-    told(f"{len({line.case for line in lines})} cases, {len(lines)} with sizes, {failed} do not hold")
+    echo(f"{len({line.case for line in lines})} cases, {len(lines)} with sizes, {failed} do not hold")
     return lines
 
 
@@ -108,9 +107,9 @@ def in_words(guards: dict[str, int]) -> str:
     return ", ".join(f"{name} {count:,}" for name, count in sorted(guards.items(), key=lambda item: -item[1]))
 
 
-def catalogue_table(lines: Sequence[Line]) -> str:
+def catalogue_table(lines: Sequence[CaseResult]) -> str:
     """One row a case: what is hard, its source, its sizes, and those that do not hold."""
-    by_case: dict[str, list[Line]] = {}
+    by_case: dict[str, list[CaseResult]] = {}
     for line in lines:
         by_case.setdefault(line.case, []).append(line)
     text = []
@@ -145,7 +144,7 @@ def guards_table(guards: Iterable[Guard], failing: dict[str, list[str]] | None =
     return "\n".join(lines)
 
 
-def page(lines: Sequence[Line], failing: dict[str, list[str]] | None, on: str, date: str) -> str:
+def page(lines: Sequence[CaseResult], failing: dict[str, list[str]] | None, on: str, date: str) -> str:
     """The generated part of docs/hard-cases.md."""
     count, failed = len({line.case for line in lines}), sum(bool(line.violations) for line in lines)
     observed = "\n".join(f"- `{name}`: {words}" for name, words in OBSERVED.items())

@@ -13,7 +13,7 @@ from scas4d_core.cameras import Camera, Rig, WorldFrame
 from scas4d_core.captures.frame import Frame
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.settings import Settings
-from studies.hard_cases.case import CPU, HardCase, Outcome
+from studies.hard_cases.case import CPU, BackendResult, HardCase
 from studies.kernels.synthetic import ball_on_a_floor, moved, photograph, rig
 
 SIZE, BALL = 32, 400
@@ -21,7 +21,7 @@ SIZE, BALL = 32, 400
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class HardScene:
     """A ball that moves over a floor, for two updates from the true frame 0.
 
     Attributes:
@@ -36,7 +36,7 @@ class Scene:
     metres_per_unit: float | str = 1.0
     least: float = 0.0
 
-    def run(self, backend: str) -> Outcome | None:
+    def run(self, backend: str) -> BackendResult | None:
         """See ``Problem``: on the CPU."""
         if backend != CPU:
             return None
@@ -65,9 +65,9 @@ class Scene:
         extent = np.ptp(truth.means[rows], axis=0).max()
         values["error"] = np.linalg.norm(last.means[rows] - truth.means[rows], axis=1) / extent
         values["standing"] = np.abs(last.means[~rows] - first.means[~rows])
-        return Outcome(values)
+        return BackendResult(values)
 
-    def violations(self, outcomes: Mapping[str, Outcome]) -> list[str]:
+    def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
         """See ``Problem``: finite, unit turns, what stands stands, nothing flies off, the pictures are met."""
         values = outcomes[CPU].values
         found = [f"{name} is not finite" for name, array in values.items() if not np.isfinite(array).all()]
@@ -111,23 +111,23 @@ def _lens(focal: float, cx: float = SIZE / 2, cy: float = SIZE / 2) -> list[list
     return [[focal, 0, cx], [0, focal, cy], [0, 0, 1]]
 
 
-def _scaled(scale: float) -> Scene:
+def _scaled(scale: float) -> HardScene:
     """The user's unit is 1/scale metres, and the user says so with metres_per_unit "auto"."""
-    return Scene(_six(), WorldFrame(np.zeros(3), 1 / scale), "auto", least=37.5)
+    return HardScene(_six(), WorldFrame(np.zeros(3), 1 / scale), "auto", least=37.5)
 
 
-def _unsaid(scale: float) -> Scene:
+def _unsaid(scale: float) -> HardScene:
     """The same, and the user says nothing: rates and bounds in metres are others then."""
-    return Scene(_six(), WorldFrame(np.zeros(3), 1 / scale), 1.0)
+    return HardScene(_six(), WorldFrame(np.zeros(3), 1 / scale), 1.0)
 
 
-def _shifted(metres: float) -> Scene:
-    return Scene(_six(), WorldFrame(np.array([-metres, metres, 0.3 * metres])), 1.0, least=40)
+def _shifted(metres: float) -> HardScene:
+    return HardScene(_six(), WorldFrame(np.array([-metres, metres, 0.3 * metres])), 1.0, least=40)
 
 
-def _cameras(names: tuple[int, ...]) -> Scene:
+def _cameras(names: tuple[int, ...]) -> HardScene:
     least = 30 if len(names) > 1 else 26  # one camera does not tell how far away what moves is
-    return Scene(Rig(tuple(_six().cameras[k] for k in names)), least=least)
+    return HardScene(Rig(tuple(_six().cameras[k] for k in names)), least=least)
 
 
 CASES = (
@@ -136,7 +136,7 @@ CASES = (
         "of the same ball over a floor as the cases below",
         "what the others are held against",
         ("metres",),
-        lambda s: Scene(_six(), least=40),
+        lambda s: HardScene(_six(), least=40),
     ),
     HardCase(
         "other units, said", "lengths times this, metres_per_unit auto", "users' units", (1e-3, 1e-2, 1e2, 1e3), _scaled
@@ -167,14 +167,14 @@ CASES = (
         "two of the six have half and this many times the focal length",
         "rigs of mixed lenses",
         (2.0, 8.0),
-        lambda k: Scene(_with({1: _lens(20.0), 2: _lens(40.0 * k)}), least=40),
+        lambda k: HardScene(_with({1: _lens(20.0), 2: _lens(40.0 * k)}), least=40),
     ),
     HardCase(
         "principal points outside",
         "of two of the six, in pictures beside the middle",
         "cropped rigs",
         (0.6, 2.0),
-        lambda k: Scene(
+        lambda k: HardScene(
             _with({1: _lens(40.0, SIZE / 2 + k * SIZE), 4: _lens(40.0, SIZE / 2, SIZE / 2 - k * SIZE)}), least=40
         ),
     ),

@@ -17,13 +17,22 @@ from scas4d_core.query.ply import split_factors
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.structure.neighbours import build_neighbours
 from studies.hard_cases.apart import in_a_process
-from studies.hard_cases.case import CPU, REFERENCE, HardCase, Outcome, apart, beyond, not_finite, unexpected_counts
+from studies.hard_cases.case import (
+    CPU,
+    REFERENCE,
+    BackendResult,
+    HardCase,
+    apart,
+    beyond,
+    not_finite,
+    unexpected_counts,
+)
 
 Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class HardStep:
     """A function of arrays, on the CPU and where there is one in float64.
 
     Attributes:
@@ -33,17 +42,17 @@ class Step:
         more: violations of what else must hold.
     """
 
-    compute: Mapping[str, Callable[[], Outcome]]
+    compute: Mapping[str, Callable[[], BackendResult]]
     agreement: float | None = 1e-4
     bound: float = 1e38
     guards: Mapping[str, int] | None = field(default_factory=dict)
-    more: Callable[[Mapping[str, Outcome]], list[str]] = lambda outcomes: []
+    more: Callable[[Mapping[str, BackendResult]], list[str]] = lambda outcomes: []
 
-    def run(self, backend: str) -> Outcome | None:
+    def run(self, backend: str) -> BackendResult | None:
         """See ``Problem``."""
         return self.compute[backend]() if backend in self.compute else None
 
-    def violations(self, outcomes: Mapping[str, Outcome]) -> list[str]:
+    def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
         """See ``Problem``."""
         found = []
         for backend, outcome in outcomes.items():
@@ -63,7 +72,7 @@ LARGEST = EXPONENT * np.log(2.0)
 """Of an exponential's argument."""
 
 
-def _adam(gradient: Callable[[int, Array], None], acted: int, flushed: int = 0, **changes: Any) -> Step:
+def _adam(gradient: Callable[[int, Array], None], acted: int, flushed: int = 0, **changes: Any) -> HardStep:
     """Twenty steps over a table of which ``gradient(step, table)`` spoils some numbers."""
 
     def start() -> tuple[Array, list[Array]]:
@@ -75,7 +84,7 @@ def _adam(gradient: Callable[[int, Array], None], acted: int, flushed: int = 0, 
             gradients.append(table)
         return np.zeros((1100, 9), np.float32), gradients
 
-    def on_cpu() -> Outcome:
+    def on_cpu() -> BackendResult:
         parameters, gradients = start()
         first, second = np.zeros_like(parameters), np.zeros_like(parameters)
         rates = np.full(9, 0.01, np.float32)
@@ -83,9 +92,9 @@ def _adam(gradient: Callable[[int, Array], None], acted: int, flushed: int = 0, 
         for step, table in enumerate(gradients, 1):
             counts += adam(parameters, table, first, second, rates, EVERY_ROW, np.float32(0.9), np.float32(0.999), step)
         values = {"parameters": parameters, "first": first, "second": second}
-        return Outcome(values, {}, dict(zip(ACTED, counts.tolist(), strict=True)))
+        return BackendResult(values, {}, dict(zip(ACTED, counts.tolist(), strict=True)))
 
-    def in_torch() -> Outcome:
+    def in_torch() -> BackendResult:
         import torch
 
         parameters, gradients = start()
@@ -96,9 +105,9 @@ def _adam(gradient: Callable[[int, Array], None], acted: int, flushed: int = 0, 
             # A gradient that is none is 0, one too large as large as is taken.
             leaf.grad = torch.nan_to_num(wide, nan=0.0, posinf=1e18, neginf=-1e18).clamp(-1e18, 1e18)
             optimizer.step()
-        return Outcome({"parameters": leaf.detach().numpy()})
+        return BackendResult({"parameters": leaf.detach().numpy()})
 
-    return Step({CPU: on_cpu, REFERENCE: in_torch}, guards={ACTED[0]: acted, ACTED[1]: flushed}, **changes)
+    return HardStep({CPU: on_cpu, REFERENCE: in_torch}, guards={ACTED[0]: acted, ACTED[1]: flushed}, **changes)
 
 
 def _spoil(value: float, once: bool) -> Callable[[int, Array], None]:
@@ -119,39 +128,39 @@ def _tiny(value: float) -> Callable[[int, Array], None]:
 
 
 def denormal(array: NDArray[Any]) -> int:
-    """How many numbers are neither 0 nor normal in float32."""
+    """Count of numbers that are neither 0 nor normal in float32."""
     return int(np.count_nonzero((array != 0) & (np.abs(array) < np.finfo(np.float32).tiny)))
 
 
-def _no_denormals(outcomes: Mapping[str, Outcome]) -> list[str]:
+def _no_denormals(outcomes: Mapping[str, BackendResult]) -> list[str]:
     values = outcomes[CPU].values
     return [f"{denormal(values[name])} denormal numbers in the {name} moments" for name in ("first", "second")
             if denormal(values[name])]  # fmt: skip
 
 
-def _decaying(outcomes: Mapping[str, Outcome]) -> list[str]:
+def _decaying(outcomes: Mapping[str, BackendResult]) -> list[str]:
     return _no_denormals(outcomes)
 
 
 def _activation(
     columns: slice, value: Any, guards: dict[str, int], agreement: float | None = 1e-4, pull: float = 1.0
-) -> Step:
+) -> HardStep:
     """A tenth of 300 rows of frame 0's parameters take a value in some columns."""
     rng = np.random.default_rng(12)
     table = rng.normal(size=(300, activation.COLUMNS)).astype(np.float32)
     table[::10, columns] = value
     pulls = [(pull * rng.normal(size=shape)).astype(np.float32) for shape in ((300, 3), (300, 3, 3), (300,), (300, 4))]
 
-    def on_cpu() -> Outcome:
+    def on_cpu() -> BackendResult:
         names = ("means", "factors", "opacities", "features")
         arrays = [np.full_like(pull, np.nan) for pull in pulls]
         counts = activation.activate(table, *arrays)
         gradients = np.full_like(table, np.nan)
         activation.activate_backward(table, *arrays[1:], *pulls, gradients)
         acted = dict(zip(activation.ACTED, counts.tolist(), strict=True))
-        return Outcome(dict(zip(names, arrays, strict=True)), {"parameters": gradients}, acted)
+        return BackendResult(dict(zip(names, arrays, strict=True)), {"parameters": gradients}, acted)
 
-    def in_torch() -> Outcome:
+    def in_torch() -> BackendResult:
         import torch
 
         from scas4d_core.torch_backend.deformation import quaternion_matrices
@@ -170,12 +179,12 @@ def _activation(
         }  # fmt: skip
         loss = sum((v * torch.tensor(pull)).sum() for v, pull in zip(values.values(), pulls, strict=True))
         (gradients,) = torch.autograd.grad(loss, [leaf])  # type: ignore[arg-type]
-        return Outcome({n: v.detach().numpy() for n, v in values.items()}, {"parameters": gradients.numpy()})
+        return BackendResult({n: v.detach().numpy() for n, v in values.items()}, {"parameters": gradients.numpy()})
 
-    return Step({CPU: on_cpu, REFERENCE: in_torch}, guards=guards, agreement=agreement)
+    return HardStep({CPU: on_cpu, REFERENCE: in_torch}, guards=guards, agreement=agreement)
 
 
-def _opposite(scale: float) -> Step:
+def _opposite(scale: float) -> HardStep:
     """Q and −q, of any length: the same Gaussian, and opposite gradients."""
     rng = np.random.default_rng(13)
     table = rng.normal(size=(64, activation.COLUMNS)).astype(np.float32)
@@ -183,7 +192,7 @@ def _opposite(scale: float) -> Step:
     table[32:] = table[:32]
     table[32:, 3:7] *= -1
 
-    def on_cpu() -> Outcome:
+    def on_cpu() -> BackendResult:
         shapes = ((64, 3), (64, 3, 3), (64,), (64, 4))
         arrays = [np.empty(shape, np.float32) for shape in shapes]
         counts = activation.activate(table, *arrays)
@@ -191,24 +200,24 @@ def _opposite(scale: float) -> Step:
         pulls = [np.ones(shape, np.float32) for shape in shapes]
         activation.activate_backward(table, *arrays[1:], *pulls, gradients)
         acted = dict(zip(activation.ACTED, counts.tolist(), strict=True))
-        return Outcome({"factors": arrays[1]}, {"parameters": gradients}, acted)
+        return BackendResult({"factors": arrays[1]}, {"parameters": gradients}, acted)
 
-    def opposite(outcomes: Mapping[str, Outcome]) -> list[str]:
+    def opposite(outcomes: Mapping[str, BackendResult]) -> list[str]:
         factors, g = outcomes[CPU].values["factors"], outcomes[CPU].gradients["parameters"][:, 3:7]
         same = np.array_equal(factors[:32], factors[32:]) and np.array_equal(g[:32], -g[32:])
         return [] if same else ["q and −q are not the same Gaussian"]
 
-    return Step({CPU: on_cpu}, more=opposite)
+    return HardStep({CPU: on_cpu}, more=opposite)
 
 
-def _pictures(rendered: Any, target: Any, size: tuple[int, int] = (40, 37), agreement: float | None = 2e-3) -> Step:
+def _pictures(rendered: Any, target: Any, size: tuple[int, int] = (40, 37), agreement: float | None = 2e-3) -> HardStep:
     """The image loss of two pictures, arrays or numbers that fill them; no pixel pulls with more than its own share."""
     height, width = size
     shape = (3, height, width)
     image = np.broadcast_to(np.asarray(rendered, np.float32), shape).copy()
     truth = np.broadcast_to(np.asarray(target, np.float32), shape).copy()
 
-    def on_cpu() -> Outcome:
+    def on_cpu() -> BackendResult:
         pitch = image_loss.stride(width)
         scratch = np.zeros((6, 3, height + 2 * image_loss.REACH, pitch), np.float32)
         means, squares = np.empty_like(truth), np.empty_like(truth)
@@ -219,9 +228,9 @@ def _pictures(rendered: Any, target: Any, size: tuple[int, int] = (40, 37), agre
         exposure = np.tile(np.array([1, 0], np.float32), (3, 1))
         weights = np.full(3, 1 / 3, np.float32)
         image_loss.image_loss(image, exposure, truth, means, squares, weights, scratch, gradient, rows, by_exposure)
-        return Outcome({"loss": rows[..., 0].sum(dtype=np.float64)[None]}, {"picture": gradient})
+        return BackendResult({"loss": rows[..., 0].sum(dtype=np.float64)[None]}, {"picture": gradient})
 
-    def in_torch() -> Outcome:
+    def in_torch() -> BackendResult:
         import torch
 
         from scas4d_core.torch_backend import losses
@@ -231,21 +240,21 @@ def _pictures(rendered: Any, target: Any, size: tuple[int, int] = (40, 37), agre
         loss = losses.image_loss(leaf.permute(1, 2, 0), other.permute(1, 2, 0))
         (gradient,) = torch.autograd.grad(loss, [leaf])
         figure = losses.psnr(leaf.detach().permute(1, 2, 0), other.permute(1, 2, 0))
-        return Outcome(
+        return BackendResult(
             {"loss": loss.detach().numpy()[None], "psnr": figure.numpy()[None]}, {"picture": gradient.numpy()}
         )
 
-    return Step({CPU: on_cpu, REFERENCE: in_torch}, agreement=agreement, bound=100 / image.size)
+    return HardStep({CPU: on_cpu, REFERENCE: in_torch}, agreement=agreement, bound=100 / image.size)
 
 
 def _noise(seed: int) -> Array:
     return np.random.default_rng(seed).integers(0, 2, (3, 40, 37)).astype(np.float32)
 
 
-def _clustering(points: Callable[[np.random.Generator], NDArray[Any]], wished: tuple[int, ...]) -> Step:
+def _clustering(points: Callable[[np.random.Generator], NDArray[Any]], wished: tuple[int, ...]) -> HardStep:
     """Every finite Gaussian in one cluster of each layer, each cluster whole and nested, the same twice."""
 
-    def on_cpu() -> Outcome:
+    def on_cpu() -> BackendResult:
         means = points(np.random.default_rng(14)).astype(np.float32)
         found = build_hierarchy(means, np.ones(len(means), bool), wished, 8)
         again = build_hierarchy(means, np.ones(len(means), bool), wished, 8)
@@ -256,14 +265,14 @@ def _clustering(points: Callable[[np.random.Generator], NDArray[Any]], wished: t
         full = all((np.diff(starts) > 0).all() and starts[-1] == len(found.rows) for starts in found.starts)
         capped = all(size <= wish for size, wish in zip(found.sizes, wished, strict=False))
         laws = np.array([whole, same, nested, full, capped, found.left_out == np.count_nonzero(~finite)], float)
-        return Outcome({"laws": laws}, {}, {"left_out_of_hierarchy": found.left_out})
+        return BackendResult({"laws": laws}, {}, {"left_out_of_hierarchy": found.left_out})
 
-    def lawful(outcomes: Mapping[str, Outcome]) -> list[str]:
+    def lawful(outcomes: Mapping[str, BackendResult]) -> list[str]:
         names = ("every finite row once", "the same twice", "nested", "none empty", "no more than wished", "counted")
         laws = outcomes[CPU].values["laws"]
         return [f"clustering: not {name}" for name, law in zip(names, laws, strict=True) if not law]
 
-    return Step({CPU: on_cpu}, guards=None, more=lawful)
+    return HardStep({CPU: on_cpu}, guards=None, more=lawful)
 
 
 MILLION_MB = 600
@@ -282,36 +291,36 @@ def _megabytes_of_clustering(count: int) -> float:
     return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
 
 
-def _million(count: int) -> Step:
-    def on_cpu() -> Outcome:
-        return Outcome({"MB": np.array([in_a_process(_megabytes_of_clustering, count)])})
+def _million(count: int) -> HardStep:
+    def on_cpu() -> BackendResult:
+        return BackendResult({"MB": np.array([in_a_process(_megabytes_of_clustering, count)])})
 
-    def bounded(outcomes: Mapping[str, Outcome]) -> list[str]:
+    def bounded(outcomes: Mapping[str, BackendResult]) -> list[str]:
         took = float(outcomes[CPU].values["MB"][0])
         return [] if took <= MILLION_MB else [f"clustering {count:,} took {took:.0f} MB, more than {MILLION_MB}"]
 
-    return Step({CPU: on_cpu}, more=bounded)
+    return HardStep({CPU: on_cpu}, more=bounded)
 
 
-def _graph(points: NDArray[Any]) -> Step:
+def _graph(points: NDArray[Any]) -> HardStep:
     """Neighbours with finite weights and distances, and no one its own."""
 
-    def on_cpu() -> Outcome:
+    def on_cpu() -> BackendResult:
         graph = build_neighbours(points, 20, 2000.0)
-        return Outcome({"weights": graph.weights, "distances": graph.distances, "index": graph.index})
+        return BackendResult({"weights": graph.weights, "distances": graph.distances, "index": graph.index})
 
-    def apart_from_itself(outcomes: Mapping[str, Outcome]) -> list[str]:
+    def apart_from_itself(outcomes: Mapping[str, BackendResult]) -> list[str]:
         index, weights = outcomes[CPU].values["index"], outcomes[CPU].values["weights"]
         own = (index == np.arange(len(index))[:, None]) & (weights > 0)
         return [f"{own.sum()} Gaussians are their own neighbours"] if own.any() else []
 
-    return Step({CPU: on_cpu}, more=apart_from_itself)
+    return HardStep({CPU: on_cpu}, more=apart_from_itself)
 
 
-def _split(lengths: tuple[float, float, float]) -> Step:
+def _split(lengths: tuple[float, float, float]) -> HardStep:
     """Factors split into a rotation and lengths for export: Σ again, also where lengths are nearly equal."""
 
-    def on_cpu() -> Outcome:
+    def on_cpu() -> BackendResult:
         rng = np.random.default_rng(15)
         turns = np.linalg.qr(rng.normal(size=(2, 200, 3, 3)))[0]
         factors = (turns[0] * np.array(lengths) @ turns[1]).astype(np.float32)
@@ -320,15 +329,15 @@ def _split(lengths: tuple[float, float, float]) -> Step:
         wide = factors.astype(np.float64)
         truth = wide @ np.swapaxes(wide, 1, 2)
         off = np.abs(found - truth).max() / np.abs(truth).max()
-        return Outcome({"off": np.array([off]), "hands": np.linalg.det(axes)})
+        return BackendResult({"off": np.array([off]), "hands": np.linalg.det(axes)})
 
-    def same(outcomes: Mapping[str, Outcome]) -> list[str]:
+    def same(outcomes: Mapping[str, BackendResult]) -> list[str]:
         off, hands = float(outcomes[CPU].values["off"][0]), outcomes[CPU].values["hands"]
         return ([] if off < 1e-6 else [f"Σ is {off:.2g} off after the split"]) + (
             [] if np.abs(hands - 1).max() < 1e-6 else ["a split's axes are no rotation"]
         )
 
-    return Step({CPU: on_cpu}, more=same)
+    return HardStep({CPU: on_cpu}, more=same)
 
 
 QUATERNION, SCALE, OPACITY = slice(3, 7), slice(7, 10), slice(10, 11)

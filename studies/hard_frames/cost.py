@@ -1,4 +1,4 @@
-"""What the checks cost: share of an update, by its stage timers, the bar against it."""
+"""Cost of the checks: share of an update by its stage timers, against the target."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from scas4d_core.frame_report import FrameReport
-from studies.hard_frames.footage import Filmed, MadeUp
+from studies.hard_frames.footage import AnyFootage
 
-BAR = 0.03
+TARGET = 0.03
 """Share of an update that the checks may cost."""
 
 Share = tuple[float, float, float]
@@ -21,18 +21,18 @@ def shares(reports: Sequence[FrameReport]) -> Share:
     """Medians over updates: seconds of one, share of the checks, share of comparing its start and its end.
 
     The checks are the stage ``judge``: the light of the pictures, the gate, what is plausible, who fits, and views of
-    cameras that are left out. Start and end are compared by the witnesses, which are a part of the update: it may
+    cameras that are left out. Start and end are compared on the probe views, which are a part of the update: it may
     end at any moment for them.
     """
     totals = [sum(report.seconds.values()) for report in reports]
     checks = [report.seconds["judge"] / total for report, total in zip(reports, totals, strict=True)]
-    witness = [
+    probes = [
         (report.seconds["start"] + report.seconds["end"]) / total for report, total in zip(reports, totals, strict=True)
     ]
-    return float(np.median(totals)), float(np.median(checks)), float(np.median(witness))
+    return float(np.median(totals)), float(np.median(checks)), float(np.median(probes))
 
 
-def cost(footage: MadeUp | Filmed, updates: int = 8) -> Share:
+def cost(footage: AnyFootage, updates: int = 8) -> Share:
     """Of so many updates of a footage after the first, which starts cold."""
     with TemporaryDirectory() as folder:
         scene = footage.start(Path(folder) / "states")
@@ -40,11 +40,11 @@ def cost(footage: MadeUp | Filmed, updates: int = 8) -> Share:
     return shares(reports[1:])
 
 
-def in_words(footage: MadeUp | Filmed, found: Share) -> str:
+def in_words(footage: AnyFootage, found: Share) -> str:
     """One line."""
-    seconds, checks, witness = found
-    verdict = f"{'reached' if checks <= BAR else 'missed'}: {100 * BAR:.0f} %"
+    seconds, checks, probes = found
+    verdict = f"{'reached' if checks <= TARGET else 'missed'}: {100 * TARGET:.0f} %"
     return (
         f"{footage.name}: the checks take {100 * checks:.1f} % of an update of {seconds:.2f} s ({verdict}), "
-        f"comparing its start and end {100 * witness:.1f} %"
+        f"comparing its start and end {100 * probes:.1f} %"
     )

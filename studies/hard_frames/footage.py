@@ -1,4 +1,4 @@
-"""Footages for the frame cases: one made up, which can do anything, and captures."""
+"""Footage for the frame cases: synthetic, which can show anything, and captures."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from studies.quality.first_frame import first_frame_key, load_first_frame, save_
 Pictures = Mapping[str, NDArray[np.uint8]]
 
 CAMERAS, SIZE = 10, 64
-"""Of the made-up rig, and pixels of a picture's side."""
+"""Of the synthetic rig, and pixels of a picture's side."""
 ANGLE = 0.08
 """Radians that the ball goes around in a frame: 11 mm and 5 degrees."""
 NOISE = 3.0
@@ -33,14 +33,14 @@ RATE = 30.0
 """Frames a second."""
 
 
-class MadeUp:
+class SyntheticFootage:
     """A ball that goes around over a floor, beside one that lies there; frame 0 is known, but for a few millimetres.
 
     Attributes:
         name, rig, held_out, settings, count: of the footage.
     """
 
-    name = "made up"
+    name = "synthetic"
     count = 24
 
     def __init__(self, settings: Settings | None = None) -> None:
@@ -105,7 +105,7 @@ class MadeUp:
         return Frame(index, index / RATE, images, shown.masks), photograph(state, self._others).images
 
 
-class Filmed:
+class CapturedFootage:
     """A capture with test cameras; its frame 0 is fitted once and kept.
 
     Args:
@@ -147,3 +147,6 @@ class Filmed:
         if found is None and scene.static is not None and scene.report is not None:
             save_first_frame(self._kept, scene.static, scene.report.seconds["fit"])
         return scene
+
+
+AnyFootage = SyntheticFootage | CapturedFootage

@@ -1,4 +1,4 @@
-"""Frames that are not what they should be: what each case sends, and what must come of it.
+"""Faulty frames: the frames that each case sends, and the laws that its result must keep.
 
 A case takes a footage that goes as it should, and says what is sent in place of its frames from one on: first the
 faulty ones, then good ones. What must hold in every case: all is finite, what is not as it should be is explained in
@@ -39,7 +39,7 @@ class Footage(Protocol):
         """The training pictures."""
 
     def truth(self, index: int) -> Pictures:
-        """What the held-out cameras see."""
+        """True pictures of the held-out cameras."""
 
     def jumped(self, index: int, sizes: float) -> tuple[Frame, Pictures] | None:
         """The same with the object moved by so many times its own size; None where that cannot be had."""
@@ -62,8 +62,8 @@ class Sent:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
-    """What came of one.
+class FrameOutcome:
+    """Outcome of one frame.
 
     Attributes:
         sent: what was sent. report: of the frame. kept: whether the state is that before, bit by bit. sound: whether
@@ -80,7 +80,7 @@ class Step:
 
 
 Make = Callable[[Footage, int, Any], "list[Sent] | None"]
-Holds = Callable[[Sequence[Step], Any], list[str]]
+Holds = Callable[[Sequence[FrameOutcome], Any], list[str]]
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,8 @@ class FrameCase:
     holds: Holds
 
 
-def violations(case: FrameCase, steps: Sequence[Step], size: Any) -> list[str]:
-    """What does not hold, a sentence each."""
+def violations(case: FrameCase, steps: Sequence[FrameOutcome], size: Any) -> list[str]:
+    """Laws that do not hold, a sentence each."""
     found = [f"frame {step.report.index}: not finite, or a rotation is no unit" for step in steps if not step.sound]
     faulty = [step for step in steps if not step.sent.good]
     found += case.holds(faulty, size)
@@ -118,7 +118,7 @@ def violations(case: FrameCase, steps: Sequence[Step], size: Any) -> list[str]:
 # What must hold of the faulty frames
 
 
-def held(steps: Sequence[Step], size: Any) -> list[str]:
+def held(steps: Sequence[FrameOutcome], size: Any) -> list[str]:
     """The state stays as it was, and the report says why."""
     found = [f"frame {step.report.index}: the state has changed" for step in steps if not step.kept]
     return found + [f"frame {s.report.index}: not said to be held" for s in steps if not _says(s, "held as it was")]
@@ -131,7 +131,7 @@ def left_out(names: Callable[[Any], Sequence[str]], first: int = 0, may: Sequenc
         first: number of the faulty frame from which on they have to be.
     """
 
-    def holds(steps: Sequence[Step], size: Any) -> list[str]:
+    def holds(steps: Sequence[FrameOutcome], size: Any) -> list[str]:
         found = []
         for number, step in enumerate(steps):
             wanted, dropped = set(names(size)), set(step.report.dropped)
@@ -145,7 +145,7 @@ def left_out(names: Callable[[Any], Sequence[str]], first: int = 0, may: Sequenc
     return holds
 
 
-def near(steps: Sequence[Step], size: Any) -> list[str]:
+def near(steps: Sequence[FrameOutcome], size: Any) -> list[str]:
     """The frames are followed nearly as well as usual."""
     return [
         f"frame {step.report.index}: {step.psnr - step.usual:+.2f} dB against the undisturbed run"
@@ -154,13 +154,13 @@ def near(steps: Sequence[Step], size: Any) -> list[str]:
     ]
 
 
-def stood(steps: Sequence[Step], size: Any) -> list[str]:
+def stood(steps: Sequence[FrameOutcome], size: Any) -> list[str]:
     """Nothing is moved, and the report says so."""
     found = [f"frame {step.report.index}: the state has changed" for step in steps if not step.kept]
     return found + [f"frame {s.report.index}: not said to stand" for s in steps if s.report.iterations]
 
 
-def jumped(steps: Sequence[Step], size: Any) -> list[str]:
+def jumped(steps: Sequence[FrameOutcome], size: Any) -> list[str]:
     """Degraded at first, and explained; then found again."""
     found = [] if steps[0].report.degraded else [f"frame {steps[0].report.index}: not degraded"]
     last = steps[-1]
@@ -169,12 +169,12 @@ def jumped(steps: Sequence[Step], size: Any) -> list[str]:
     return found
 
 
-def explained(steps: Sequence[Step], size: Any) -> list[str]:
+def explained(steps: Sequence[FrameOutcome], size: Any) -> list[str]:
     """Each is degraded, or left cameras out, and says why."""
     return [f"frame {s.report.index}: not explained" for s in steps if not (s.report.degraded or s.report.dropped)]
 
 
-def _says(step: Step, words: str) -> bool:
+def _says(step: FrameOutcome, words: str) -> bool:
     return (step.report.degraded or "").startswith(words)
 
 

@@ -1,4 +1,4 @@
-"""Thousands of frames of a small scene: what time must not do to what stands, to rotations, to sizes and to memory.
+"""Thousands of frames of a small scene: resting Gaussians, rotations, sizes and memory must not drift.
 
 A ball goes six times around a vertical axis in 500 frames and turns about itself as often, then all the way back, and
 again. Beside it lies a ball that is labelled as moving and never moves, and a floor that stands. After each way there
@@ -44,22 +44,22 @@ SETTINGS = Settings(
 PIXEL_M = 0.023
 """Metres that a pixel sees at the middle of the scene: what the pictures can tell."""
 RESTING_M = 4 * PIXEL_M
-"""Bar: root mean square of how far Gaussians that rest, but may move, are from where they were, in any row: an update
-finds where a ball of ten pixels is with some error, and a few in a row may err to the same side."""
+"""Target: root mean square of how far Gaussians that rest, but may move, are from where they were, in any row: an
+update finds where a ball of ten pixels is with some error, and a few in a row may err to the same side."""
 RESTING_MEAN_M = PIXEL_M
-"""Bar: the mean of that over a run."""
+"""Target: the mean of that over a run."""
 RETURN_M = PIXEL_M
-"""Bar: the same of those that move, when they are back where they began."""
+"""Target: the same of those that move, when they are back where they began."""
 TREND = 1.5
-"""Bar: times as far as in the first half that what rests may be from where it was in the second half, on average."""
+"""Target: times as far as in the first half that what rests may be from where it was in the second half, on average."""
 UNIT = 1e-5
-"""Bar: how far from 1 the norm of a rotation may be."""
+"""Target: how far from 1 the norm of a rotation may be."""
 GROWTH = 10.5
-"""Bar: times longer or shorter than in frame 0 that an axis may be; ``attempts.SHRUNK`` holds them, less rounding."""
+"""Target: times longer or shorter than in frame 0 that an axis may be; ``attempts.SHRUNK`` holds them."""
 HALF = 10
 """Rows that a half needs for that."""
 MEMORY = 1.1
-"""Bar: times the memory of the first tenth that the last tenth may take."""
+"""Target: times the memory of the first tenth that the last tenth may take."""
 
 
 @dataclass(frozen=True)
@@ -119,15 +119,15 @@ class Soak:
     def rows(self) -> list[Row]:
         """Those up to where the scene is."""
         file = self.folder / "rows.jsonl"
-        told = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
-        return [Row(**row) for row in told if row["frame"] <= self.done]
+        rows = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+        return [Row(**row) for row in rows if row["frame"] <= self.done]
 
     def frame(self, index: int) -> Frame:
-        """What the cameras see."""
+        """Pictures of all cameras."""
         shown = photograph(true_state(self.first, index), self._rig)
         return Frame(index, index / RATE, shown.images, shown.masks)
 
-    def run(self, frames: int, every: int = 100, told: Callable[[Row], None] = lambda row: None) -> list[Row]:
+    def run(self, frames: int, every: int = 100, echo: Callable[[Row], None] = lambda row: None) -> list[Row]:
         """Go on until so many frames after the first are done, a row every so many of them; all rows."""
         rows, began, degraded, since = self.rows, 0.0, 0, 0
         while self.done < frames:
@@ -139,7 +139,7 @@ class Soak:
                 rows.append(self._measured(began / since, report.psnr, degraded))
                 with (self.folder / "rows.jsonl").open("a") as file:
                     file.write(json.dumps(asdict(rows[-1])) + "\n")
-                told(rows[-1])
+                echo(rows[-1])
                 self.scene.history.retain(last=2)
                 began, degraded, since = 0.0, 0, 0
         return rows
@@ -171,7 +171,7 @@ class Soak:
 
 
 def violations(rows: Sequence[Row]) -> list[str]:
-    """What does not hold, a sentence each."""
+    """Targets that are missed, a sentence each."""
     found = []
     for row in rows:
         at = f"frame {row.frame}: "
@@ -180,9 +180,13 @@ def violations(rows: Sequence[Row]) -> list[str]:
         if not row.still:
             found.append(at + "what stands has moved")
         if not row.resting <= RESTING_M:
-            found.append(at + f"what rests is {1000 * row.resting:.1f} mm from where it was, the bar is {RESTING_M} m")
+            found.append(
+                at + f"what rests is {1000 * row.resting:.1f} mm from where it was, the target is {RESTING_M} m"
+            )
         if row.frame % (2 * OUT) == 0 and not row.moving <= RETURN_M:
-            found.append(at + f"it came back {1000 * row.moving:.1f} mm from where it began, the bar is {RETURN_M} m")
+            found.append(
+                at + f"it came back {1000 * row.moving:.1f} mm from where it began, the target is {RETURN_M} m"
+            )
         if not row.unit <= UNIT:
             found.append(at + f"a rotation's norm is {row.unit:.1e} from 1")
         if not (row.longest <= GROWTH and row.shortest >= 1 / GROWTH):

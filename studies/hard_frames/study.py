@@ -1,4 +1,4 @@
-"""The frame cases run: each goes on from the same committed state, and is held against a run that nothing disturbs."""
+"""Runs the frame cases: each goes on from the same committed state, and is compared with an undisturbed run."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import psnr
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.storage.history import History
-from studies.hard_frames.footage import Filmed, MadeUp
-from studies.hard_frames.frames import FrameCase, Pictures, Sent, Step, named, violations
+from studies.hard_frames.footage import AnyFootage
+from studies.hard_frames.frames import FrameCase, FrameOutcome, Pictures, Sent, named, violations
 
 AT = 5
 """The frame at which each case begins: by then it is known what is usual."""
@@ -24,8 +24,8 @@ UNIT = 1e-5
 
 
 @dataclass
-class Line:
-    """A case in one size.
+class FrameCaseResult:
+    """Result of a case in one size.
 
     Attributes:
         said: what the reports say of the faulty frames. against: dB of each frame against the undisturbed run, the good
@@ -46,7 +46,7 @@ class FrameStudy:
         folder: for committed states; what is there goes.
     """
 
-    def __init__(self, footage: MadeUp | Filmed, folder: Path) -> None:
+    def __init__(self, footage: AnyFootage, folder: Path) -> None:
         self.footage, self.folder = footage, folder
         self.cases = named(footage)
         shutil.rmtree(folder, ignore_errors=True)
@@ -64,7 +64,7 @@ class FrameStudy:
             self.usual[at] = self._measured(self._scene, at, self.footage.truth(at))
         return self.usual[index]
 
-    def run(self, case: FrameCase, size: Any) -> Line | None:
+    def run(self, case: FrameCase, size: Any) -> FrameCaseResult | None:
         """None where the footage cannot show it, or is too short."""
         try:
             sent = case.make(self.footage, AT, size)
@@ -72,14 +72,14 @@ class FrameStudy:
             return None
         if sent is None:
             return None
-        line = Line(case, size)
+        line = FrameCaseResult(case, size)
         steps = self._steps(sent)
         line.against = [step.psnr - step.usual for step in steps]
         line.said = list(dict.fromkeys(_said(step) for step in steps if not step.sent.good))
         line.violations = violations(case, steps, size)
         return line
 
-    def _steps(self, sent: Sequence[Sent]) -> list[Step]:
+    def _steps(self, sent: Sequence[Sent]) -> list[FrameOutcome]:
         scene, steps = self._branch("case"), []
         for number, one in enumerate(sent):
             index = AT + number
@@ -87,7 +87,7 @@ class FrameStudy:
             report = scene.step(replace(one.frame, index=index, time=index * self._interval))
             after = scene.history.gaussians(index)
             steps.append(
-                Step(
+                FrameOutcome(
                     one, report, _same(before, after), sound(after), self._measured(scene, index, one.truth),
                     self.undisturbed(one.like),
                 )
@@ -108,29 +108,32 @@ class FrameStudy:
 
 
 def study(
-    footage: MadeUp | Filmed, folder: Path, names: Sequence[str] = (), told: Callable[[str], None] = print
-) -> list[Line]:
+    footage: AnyFootage,
+    folder: Path,
+    names: Sequence[str] = (),
+    echo: Callable[[str], None] = print,
+) -> list[FrameCaseResult]:
     """All cases whose name holds one of ``names``, or all, in all sizes; tells each as it is done."""
     of, lines = FrameStudy(footage, folder), []
-    told(f"{footage.name}, undisturbed: {', '.join(f'{of.undisturbed(index):.1f}' for index in range(1, AT + 4))} dB")
+    echo(f"{footage.name}, undisturbed: {', '.join(f'{of.undisturbed(index):.1f}' for index in range(1, AT + 4))} dB")
     for case in of.cases:
         if names and not any(name in case.name for name in names):
             continue
         for size in case.sizes:
             line = of.run(case, size)
             if line is None:
-                told(f"-      {case.name}, {size}: {footage.name} cannot show it")
+                echo(f"-      {case.name}, {size}: {footage.name} cannot show it")
                 continue
             lines.append(line)
-            told(f"{'holds' if not line.violations else 'FAILS'}  {case.name}, {size}  {_decibels(line.against)} dB")
+            echo(f"{'holds' if not line.violations else 'FAILS'}  {case.name}, {size}  {_decibels(line.against)} dB")
             for sentence in [*line.said, *(f"! {violation}" for violation in line.violations)]:
-                told(f"       {sentence}")
+                echo(f"       {sentence}")
     failed = sum(bool(line.violations) for line in lines)
-    told(f"{len({line.case.name for line in lines})} frame cases, {len(lines)} with sizes, {failed} do not hold")
+    echo(f"{len({line.case.name for line in lines})} frame cases, {len(lines)} with sizes, {failed} do not hold")
     return lines
 
 
-def table(lines: Sequence[Line]) -> str:
+def table(lines: Sequence[FrameCaseResult]) -> str:
     """As Markdown, one row a case and size."""
     rows = ["| case | size | what | the reports say | dB against undisturbed | holds |", "|" + "---|" * 6]
     for line in lines:
@@ -146,8 +149,8 @@ def _decibels(values: Sequence[float]) -> str:
     return " ".join(f"{value:+.1f}" for value in values)
 
 
-def _said(step: Step) -> str:
-    """What a report says, in one line."""
+def _said(step: FrameOutcome) -> str:
+    """A frame's report in one line."""
     report = step.report
     words = [] if report.degraded is None else [report.degraded]
     if report.dropped:
@@ -163,7 +166,7 @@ def _same(before: Gaussians, after: Gaussians) -> bool:
 
 
 def sound(state: Gaussians) -> bool:
-    """Whether a state is finite and its rotations are units."""
+    """True where a state is finite and its rotations are units."""
     finite = all(bool(np.isfinite(array).all()) for array in state.arrays().values())
     norms = np.linalg.norm(state.rotations.astype(np.float64), axis=1)
     return finite and bool(np.abs(norms - 1).max() <= UNIT)

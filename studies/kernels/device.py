@@ -1,4 +1,4 @@
-"""``scripts/bench device``: the CPU and a torch device side by side, stage by stage, on a scene made up for it.
+"""``scripts/bench device``: the CPU and a torch device side by side, stage by stage, on a synthetic scene.
 
 Every stage gets the same float32 arrays on both: the picture, its gradients, the cascade and its gradients, the losses,
 and one whole update. The difference of two arrays is |a − b| / |b| in the Euclidean norm, b the CPU's: single pixels
@@ -35,7 +35,7 @@ from scas4d_core.update.result import Updated
 from scas4d_core.update.schedule import first_lengths
 from scas4d_core.update.views import ViewFactory
 from scas4d_core.update.warm_start import Motion
-from studies.kernels import synthetic as made_up
+from studies.kernels import synthetic
 from studies.machine import in_words, machine
 
 Array = NDArray[np.float32]
@@ -55,7 +55,7 @@ full size however small a gradient is. One unit in the last place moves the CPU'
 
 @dataclass(frozen=True)
 class Stage:
-    """How far apart the two are in one stage.
+    """Difference of the two devices in one stage.
 
     Attributes:
         name: of the stage.
@@ -72,12 +72,12 @@ class Stage:
 
     @property
     def agrees(self) -> bool:
-        """Whether every array is within the stage's tolerance; NaN is not."""
+        """True where every array is within the stage's tolerance; NaN is not."""
         return all(difference <= TOLERANCES[self.name] for difference in self.differences.values())
 
 
 class Bench:
-    """The made-up scene, and each stage on both sides.
+    """The synthetic scene, and each stage on both devices.
 
     Args:
         device: "cuda", or "cpu" to compare with the dense twin, for tests.
@@ -88,9 +88,9 @@ class Bench:
 
     def __init__(self, device: str, gaussians: int, size: int, iterations: int) -> None:
         rng = np.random.default_rng(0)
-        self.device, self.rig = device, made_up.rig(size)
-        self.before = made_up.ball_on_a_floor(gaussians, rng)
-        self.frame = made_up.photograph(made_up.moved(self.before), self.rig)
+        self.device, self.rig = device, synthetic.rig(size)
+        self.before = synthetic.ball_on_a_floor(gaussians, rng)
+        self.frame = synthetic.photograph(synthetic.moved(self.before), self.rig)
         self.settings = settings = UpdateSettings(
             iterations=iterations, clusters=(8, 64, 512), coarse_until=0.25, neighbour_falloff=200, rate_end=0.1
         )

@@ -1,4 +1,4 @@
-"""``scripts/bench kernels``: what the kernels cost against what they cannot do without.
+"""``scripts/bench kernels``: cost of the kernels against their bare arithmetic.
 
 1. The rasterizer, forward and backward, against a micro-kernel that does the arithmetic of as many blended pairs and
    nothing else (``bench.pairs``); both in turn, in this process, on the same threads. On all views of frame 0, and on a
@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
+from client.cli.evaluate import Report, peak_megabytes
+from client.cli.scores import Row
 from scas4d_core.cameras import Camera, rig_inside
 from scas4d_core.captures import open_capture
 from scas4d_core.gaussians import Gaussians
@@ -33,11 +35,7 @@ from scas4d_core.settings import Settings
 from studies.kernels.pairs import MicroKernel, blended_pairs
 from studies.machine import core_version, in_words, machine
 from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
-from studies.quality.quality import peak_megabytes
-from studies.quality.store import Row
-from studies.quality.targets import BARS, KERNELS
-
-Report = Callable[[str], None]
+from studies.quality.targets import KERNELS, TARGETS
 
 PASSES = ("render", "render backward")
 """Stages of an update that are the rasterizer's."""
@@ -204,12 +202,12 @@ def spread(values: Any) -> dict[str, float]:
 
 def table(row: Row) -> str:
     """The figures as one Markdown table."""
-    bars = {bar.metric: bar for bar in BARS if bar.run == KERNELS}
+    targets = {target.metric: target for target in TARGETS if target.run == KERNELS}
 
     def line(what: str, of: dict[str, float], unit: str, metric: str | None = None, digits: int = 2) -> str:
         must, word = "", ""
         if metric is not None:
-            threshold, sense = bars[metric].threshold, bars[metric].sense
+            threshold, sense = targets[metric].threshold, targets[metric].sense
             assert threshold is not None
             reached = of["median"] < threshold or (sense == "≤" and of["median"] == threshold)
             must, word = f"{sense} {threshold:g} {unit}", "reached" if reached else "**missed**"

@@ -1,4 +1,4 @@
-"""Blended pixel–Gaussian pairs: how many a picture has, and what their arithmetic alone costs.
+"""Blended pixel–Gaussian pairs: their number in a picture, and the cost of their arithmetic alone.
 
 A pair is blended where the Gaussian's alpha is at least the floor and the pixel is not finished. The micro-kernel does
 for each pair what ``kernels.blend`` does forward and backward (exp, alpha, transmittance, four channels; the products

@@ -1,4 +1,4 @@
-"""A scene made up for comparisons: a coloured ball over a floor, seen by six cameras around it."""
+"""Synthetic scene for comparisons: a coloured ball over a floor, seen by six cameras around it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def ball_on_a_floor(count: int, rng: np.random.Generator) -> Gaussians:
 
 
 def moved(before: Gaussians) -> Gaussians:
-    """What moves, turned about the vertical and shifted."""
+    """The moving Gaussians, turned about the vertical and shifted."""
     c, s = np.cos(TURN), np.sin(TURN)
     turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     means, factors, rows = before.means.copy(), before.factors.copy(), before.moving

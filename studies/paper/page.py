@@ -1,10 +1,11 @@
-"""The page of the paper's tables: each experiment beside the paper's figures, and where the outcome agrees."""
+"""The page of the paper's tables: each experiment beside the paper's figures, and whether the two agree."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from client.cli.scores import Store
 from studies.frontier.frontier import UPDATES, Variant
 from studies.frontier.tradeoff import read_points
 from studies.machine import in_words
@@ -13,14 +14,13 @@ from studies.paper.paper import (
     EXPERIMENTS,
     FACTOR,
     SMALL,
+    ClaimResult,
     Experiment,
     Measured,
-    Outcome,
+    compare,
     iteration_ratio,
-    judge,
     measured,
 )
-from studies.quality.store import Store
 
 DIGITS: Mapping[str, int] = {"psnr": 2, "ssim": 3, "mte_2d_oracle": 2, "parts_ari": 3}
 """By score."""
@@ -33,13 +33,13 @@ def write_paper_page(
 
     Args:
         out: folder of the frontier. captures: names. page: Markdown file. updates: that the rows cover.
-        quality: folder of the study of the bars, for captures that the frontier has no rows of.
+        quality: folder of the study of quality, for captures that the frontier has no rows of.
     """
     ours = measured(out, captures, updates, quality)
     points = read_points(out, captures, updates)
     ratio = iteration_ratio(points)
     there = [name for name in captures if any(point.capture == name for point in points)]
-    outcomes = {experiment.title: judge(experiment, ours) for experiment in EXPERIMENTS}
+    outcomes = {experiment.title: compare(experiment, ours) for experiment in EXPERIMENTS}
     sections = "\n\n".join(
         section(experiment, outcomes[experiment.title], ours, captures, ratio) for experiment in EXPERIMENTS
     )
@@ -78,7 +78,11 @@ does not agree with one that is not. If the paper shows only a picture, the clai
 
 
 def section(
-    experiment: Experiment, outcomes: Sequence[Outcome], ours: Measured, captures: Sequence[str], ratio: float | None
+    experiment: Experiment,
+    outcomes: Sequence[ClaimResult],
+    ours: Measured,
+    captures: Sequence[str],
+    ratio: float | None,
 ) -> str:
     """An experiment as Markdown: table, outcome, note."""
     names = [name for name in SCENES if name in captures]
@@ -92,19 +96,19 @@ def section(
         mean = _mean([own[name] for name in shared])
         paper = _mean([side.paper[name] for name in shared]) if side.paper else None
         lines.append("| " + " | ".join([side.name, *cells, _cell(mean, paper, digits)]) + " |")
-    told = "\n".join(f"- {sentence(outcome, digits, unit)}" for outcome in outcomes)
+    sentences = "\n".join(f"- {sentence(outcome, digits, unit)}" for outcome in outcomes)
     note = experiment.note.format(ratio="–" if ratio is None else f"{ratio:.2f} times that")
     parts = [
         f"## {experiment.title}",
         f"Paper: {experiment.source}." + (f" In{unit}." if unit else ""),
         "\n".join(lines),
-        told,
+        sentences,
         note,
     ]
     return "\n\n".join(part for part in parts if part)
 
 
-def sentence(outcome: Outcome, digits: int, unit: str) -> str:
+def sentence(outcome: ClaimResult, digits: int, unit: str) -> str:
     """A claim and how it came out."""
     what = f"{outcome.claim.what[0].upper()}{outcome.claim.what[1:]} ({outcome.claim.first} – {outcome.claim.second})"
     if outcome.own is None:
@@ -117,13 +121,13 @@ def sentence(outcome: Outcome, digits: int, unit: str) -> str:
     return f"{what}: {figures}; {_word(outcome)}, on {outcome.same_sign} of {len(outcome.captures)} captures alone."
 
 
-def summary(outcomes: Sequence[Outcome], by_title: Mapping[str, Sequence[Outcome]]) -> str:
+def summary(outcomes: Sequence[ClaimResult], by_title: Mapping[str, Sequence[ClaimResult]]) -> str:
     """Counts, and a line for each claim that does not agree."""
-    told = [outcome for outcome in outcomes if outcome.agrees != "not measured"]
-    counts = {word: sum(o.agrees == word for o in told) for word in ("sign and size", "sign", "no")}
+    known = [outcome for outcome in outcomes if outcome.agrees != "not measured"]
+    counts = {word: sum(o.agrees == word for o in known) for word in ("sign and size", "sign", "no")}
     lines = [
         f"Of {len(outcomes)} comparisons {counts['sign and size']} agree in sign and size, {counts['sign']} in sign, "
-        f"{counts['no']} do not, and {len(outcomes) - len(told)} are not measured.",
+        f"{counts['no']} do not, and {len(outcomes) - len(known)} are not measured.",
         "",
         "| experiment | comparison | here | paper | agrees in |",
         "|---|---|---|---|---|",
@@ -140,7 +144,7 @@ def summary(outcomes: Sequence[Outcome], by_title: Mapping[str, Sequence[Outcome
 
 
 def _commands(captures: Sequence[str], there: Sequence[str], page: Path) -> str:
-    """What measures the rows and writes the page."""
+    """The commands that measure the rows and write the page."""
     command = "scripts/bench paper " + " ".join(f"CAPTURES/{name}" for name in there)
     more = " ".join(f"CAPTURES/{name}" for name in captures if name not in there)
     if not more:
@@ -149,7 +153,7 @@ def _commands(captures: Sequence[str], there: Sequence[str], page: Path) -> str:
 
 
 def _elsewhere(captures: Sequence[str], there: Sequence[str]) -> str:
-    """Where the figures of captures come from that the study has no rows of."""
+    """The source of figures for captures that the study has no rows of."""
     others = [name for name in captures if name not in there]
     if not others:
         return ""
@@ -162,7 +166,7 @@ def needed() -> list[Variant]:
     return list(dict.fromkeys(side.variant for experiment in EXPERIMENTS for side in experiment.sides))
 
 
-def _word(outcome: Outcome) -> str:
+def _word(outcome: ClaimResult) -> str:
     if outcome.agrees == "no":
         return "does not agree"
     return f"agrees in {outcome.agrees}"

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from client.cli.scores import Store
 from studies.frontier.frontier import AXES, DEFAULT, Variant
 from studies.frontier.tradeoff import Point, read_points
 from studies.paper import figures
 from studies.paper.figures import Figures
 from studies.quality.runs import measured_runs
-from studies.quality.store import Store
 
 FACTOR = 2.0
 """Between two differences that agree in size."""
@@ -37,7 +37,7 @@ def variant(label: str) -> Variant:
 
 
 @dataclass(frozen=True)
-class Side:
+class ClaimSetting:
     """One setting of an experiment: the paper's name, the frontier's setting, the paper's figures (empty: none)."""
 
     name: str
@@ -61,18 +61,18 @@ class Claim:
 
 @dataclass(frozen=True)
 class Experiment:
-    """One experiment: a table of sides by captures, and what it is to show."""
+    """One experiment: a table of settings by captures, and the claims that it tests."""
 
     title: str
     source: str
     score: str
     unit: str
-    sides: tuple[Side, ...]
+    sides: tuple[ClaimSetting, ...]
     claims: tuple[Claim, ...]
     note: str = ""
 
 
-OURS = Side("Ours, 100", DEFAULT, figures.PSNR_100)
+OURS = ClaimSetting("Ours, 100", DEFAULT, figures.PSNR_100)
 BASE_100, BASE_300 = variant("dynamic3dgs 100"), variant("dynamic3dgs 300")
 BASE_2000, OURS_2000 = variant("dynamic3dgs 2000"), variant("scas4d 2000")
 SINGLE = ("K=1: 64", "K=1: 320", "K=1: 1280")
@@ -82,8 +82,8 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         "Online comparison, PSNR", "table 1", "psnr", "dB",
         (
             OURS,
-            Side("Dynamic3DGS, 100", BASE_100, figures.PSNR_BASELINE_100),
-            Side("Dynamic3DGS, 2000", BASE_2000, figures.PSNR_BASELINE_2000),
+            ClaimSetting("Dynamic3DGS, 100", BASE_100, figures.PSNR_BASELINE_100),
+            ClaimSetting("Dynamic3DGS, 2000", BASE_2000, figures.PSNR_BASELINE_2000),
         ),
         (
             Claim("ahead at the same iterations", "Ours, 100", "Dynamic3DGS, 100"),
@@ -93,9 +93,9 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     Experiment(
         "Online comparison, SSIM", "table 1", "ssim", "",
         (
-            Side("Ours, 100", DEFAULT, figures.SSIM_100),
-            Side("Dynamic3DGS, 100", BASE_100, figures.SSIM_BASELINE_100),
-            Side("Dynamic3DGS, 2000", BASE_2000, figures.SSIM_BASELINE_2000),
+            ClaimSetting("Ours, 100", DEFAULT, figures.SSIM_100),
+            ClaimSetting("Dynamic3DGS, 100", BASE_100, figures.SSIM_BASELINE_100),
+            ClaimSetting("Dynamic3DGS, 2000", BASE_2000, figures.SSIM_BASELINE_2000),
         ),
         (
             Claim("ahead at the same iterations", "Ours, 100", "Dynamic3DGS, 100"),
@@ -104,7 +104,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     ),
     Experiment(
         "Same wall clock, PSNR", "appendix", "psnr", "dB",
-        (OURS, Side("Dynamic3DGS, 300", BASE_300, figures.PSNR_BASELINE_300)),
+        (OURS, ClaimSetting("Dynamic3DGS, 300", BASE_300, figures.PSNR_BASELINE_300)),
         (Claim("ahead of three times the iterations", "Ours, 100", "Dynamic3DGS, 300"),),
         "The paper takes 300 iterations of the baseline for as long as 100 of its own. Here an iteration of the "
         "baseline costs {ratio} of one of `scas4d`; at truly equal seconds: accuracy-and-time.md.",
@@ -112,14 +112,15 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     Experiment(
         "Same wall clock, SSIM", "appendix", "ssim", "",
         (
-            Side("Ours, 100", DEFAULT, figures.SSIM_100),
-            Side("Dynamic3DGS, 300", BASE_300, figures.SSIM_BASELINE_300),
+            ClaimSetting("Ours, 100", DEFAULT, figures.SSIM_100),
+            ClaimSetting("Dynamic3DGS, 300", BASE_300, figures.SSIM_BASELINE_300),
         ),
         (Claim("ahead of three times the iterations", "Ours, 100", "Dynamic3DGS, 300"),),
     ),
     Experiment(
         "Convergence: 2000 iterations of both", "figure", "psnr", "dB",
-        (Side("Ours, 2000", OURS_2000, {}), OURS, Side("Dynamic3DGS, 2000", BASE_2000, figures.PSNR_BASELINE_2000)),
+        (ClaimSetting("Ours, 2000", OURS_2000, {}), OURS,
+         ClaimSetting("Dynamic3DGS, 2000", BASE_2000, figures.PSNR_BASELINE_2000)),
         (
             Claim("both end at the same point", "Ours, 2000", "Dynamic3DGS, 2000", 0),
             Claim("100 iterations are close to convergence", "Ours, 2000", "Ours, 100", 0),
@@ -128,11 +129,11 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     Experiment(
         "Number of layers", "table and appendix", "psnr", "dB",
         (
-            *(Side(label, variant(label), figures.PSNR_LAYERS[1]) for label in SINGLE),
-            Side("K=2", variant("K=2"), figures.PSNR_LAYERS[2]),
-            Side("K=3", DEFAULT, figures.PSNR_LAYERS[3]),
-            Side("K=4", variant("K=4"), figures.PSNR_LAYERS[4]),
-            Side("K=5", variant("K=5"), figures.PSNR_LAYERS[5]),
+            *(ClaimSetting(label, variant(label), figures.PSNR_LAYERS[1]) for label in SINGLE),
+            ClaimSetting("K=2", variant("K=2"), figures.PSNR_LAYERS[2]),
+            ClaimSetting("K=3", DEFAULT, figures.PSNR_LAYERS[3]),
+            ClaimSetting("K=4", variant("K=4"), figures.PSNR_LAYERS[4]),
+            ClaimSetting("K=5", variant("K=5"), figures.PSNR_LAYERS[5]),
         ),
         (
             *(Claim(f"three layers over one of {label.split()[-1]}", "K=3", label) for label in SINGLE),
@@ -146,22 +147,22 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     Experiment(
         "Clusters of the first layer", "appendix", "psnr", "dB",
         (
-            *(Side(f"N={n}", variant(f"N={n}"), figures.PSNR_FIRST_LAYER[n]) for n in (16, 32, 48)),
-            Side("N=64", DEFAULT, figures.PSNR_FIRST_LAYER[64]),
+            *(ClaimSetting(f"N={n}", variant(f"N={n}"), figures.PSNR_FIRST_LAYER[n]) for n in (16, 32, 48)),
+            ClaimSetting("N=64", DEFAULT, figures.PSNR_FIRST_LAYER[64]),
         ),
         tuple(Claim(f"64 clusters over {n}", "N=64", f"N={n}") for n in (16, 32, 48)),
     ),
     Experiment(
         "Largest scale", "appendix", "psnr", "dB",
         (
-            Side("max_scale 0.02", DEFAULT, figures.PSNR_100),
-            Side("max_scale 2.0", variant("max_scale 2 m"), figures.PSNR_MAX_SCALE_2),
+            ClaimSetting("max_scale 0.02", DEFAULT, figures.PSNR_100),
+            ClaimSetting("max_scale 2.0", variant("max_scale 2 m"), figures.PSNR_MAX_SCALE_2),
         ),
         (Claim("the bound is needed", "max_scale 0.02", "max_scale 2.0"),),
     ),
     Experiment(
         "Entangled against separate covariance", "a figure", "psnr", "dB",
-        (Side("Entangled", DEFAULT, {}), Side("Separate", variant("separate covariance"), {})),
+        (ClaimSetting("Entangled", DEFAULT, {}), ClaimSetting("Separate", variant("separate covariance"), {})),
         (Claim("better pictures", "Entangled", "Separate", 1),),
         "The paper shows a picture of its wheel. Separate (`update.covariance`): the cascade moves means alone, and a "
         "Gaussian's own ΔR and Δs are all that changes its covariance; they begin at once (`update.own_start` 0), "
@@ -170,15 +171,15 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     Experiment(
         "Tracking: 2D MTE, the best candidate taken, as in the paper", "table 3", "mte_2d_oracle", "% of the diagonal",
         (
-            Side("Ours, 100", DEFAULT, figures.MTE_100),
-            Side("Dynamic3DGS, 100", BASE_100, figures.MTE_BASELINE_100),
+            ClaimSetting("Ours, 100", DEFAULT, figures.MTE_100),
+            ClaimSetting("Dynamic3DGS, 100", BASE_100, figures.MTE_BASELINE_100),
         ),
         (Claim("smaller error (negative is better)", "Ours, 100", "Dynamic3DGS, 100"),),
     ),
     Experiment(
         "Segmentation: parts from the cascade's motion against each Gaussian's own", "appendix, a figure", "parts_ari",
         "adjusted Rand index",
-        (Side("Ours, 100", DEFAULT, {}), Side("Dynamic3DGS, 2000", BASE_2000, {})),
+        (ClaimSetting("Ours, 100", DEFAULT, {}), ClaimSetting("Dynamic3DGS, 2000", BASE_2000, {})),
         (Claim("better parts", "Ours, 100", "Dynamic3DGS, 2000", 1),),
         "The paper shows pictures; the index is against true labels, over the updates of the row.",
     ),
@@ -192,8 +193,8 @@ AgreementWord = Literal["sign and size", "sign", "no", "not measured"]
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """How a claim came out.
+class ClaimResult:
+    """A claim of the paper beside our figures.
 
     Attributes:
         paper: the paper's mean gain over the captures that both have; None where it prints none.
@@ -211,7 +212,7 @@ class Outcome:
 
 
 def measured(out: Path, captures: Sequence[str], updates: int, quality: Path | None = None) -> Measured:
-    """Our figures: rows of the frontier and, for captures that it has none of, rows of the bars over shared updates."""
+    """Our figures: rows of the frontier; for captures without any, rows of the study of quality over shared updates."""
     found: dict[tuple[Variant, str], dict[str, float]] = {}
     for point in read_points(out, captures, updates):
         for score in SMALL:
@@ -232,12 +233,12 @@ def measured(out: Path, captures: Sequence[str], updates: int, quality: Path | N
     return found
 
 
-def judge(experiment: Experiment, ours: Measured) -> list[Outcome]:
+def compare(experiment: Experiment, ours: Measured) -> list[ClaimResult]:
     """Each claim of an experiment against what was measured."""
     return [_outcome(experiment, claim, ours) for claim in experiment.claims]
 
 
-def _outcome(experiment: Experiment, claim: Claim, ours: Measured) -> Outcome:
+def _outcome(experiment: Experiment, claim: Claim, ours: Measured) -> ClaimResult:
     sides = {side.name: side for side in experiment.sides}
     first, second = sides[claim.first], sides[claim.second]
     mine = [ours.get((side.variant, experiment.score), {}) for side in (first, second)]
@@ -246,18 +247,18 @@ def _outcome(experiment: Experiment, claim: Claim, ours: Measured) -> Outcome:
     if printed:
         both = [name for name in both if name in first.paper and name in second.paper]
     if not both:
-        return Outcome(claim, None, None, (), 0, "not measured")
+        return ClaimResult(claim, None, None, (), 0, "not measured")
     gains = [mine[0][name] - mine[1][name] for name in both]
     own = sum(gains) / len(both)
     small = SMALL[experiment.score]
     if not printed:
         assert claim.expected is not None
         same = sum(_sign(gain, small) == claim.expected for gain in gains)
-        return Outcome(claim, None, own, tuple(both), same, "sign" if _sign(own, small) == claim.expected else "no")
+        return ClaimResult(claim, None, own, tuple(both), same, "sign" if _sign(own, small) == claim.expected else "no")
     theirs = [first.paper[name] - second.paper[name] for name in both]
     paper = sum(theirs) / len(both)
     same = sum(_agrees(gain, their, small) != "no" for gain, their in zip(gains, theirs, strict=True))
-    return Outcome(claim, paper, own, tuple(both), same, _agrees(own, paper, small))
+    return ClaimResult(claim, paper, own, tuple(both), same, _agrees(own, paper, small))
 
 
 def _agrees(own: float, paper: float, small: float) -> AgreementWord:

@@ -36,8 +36,8 @@ def first_frame_key(capture: Capture, settings: Settings) -> str:
         settings: those of the scene and of frame 0 count.
     """
     hasher = hashlib.sha256()
-    told = [VERSION, settings.scene.model_dump(mode="json"), settings.static.model_dump(mode="json")]
-    hasher.update(json.dumps(told, sort_keys=True).encode())
+    described = [VERSION, settings.scene.model_dump(mode="json"), settings.static.model_dump(mode="json")]
+    hasher.update(json.dumps(described, sort_keys=True).encode())
     for camera in capture.full_rig.cameras:
         hasher.update(f"{camera.name} {camera.width} {camera.height}".encode())
         hasher.update(camera.intrinsics.tobytes() + camera.world_to_camera.tobytes())

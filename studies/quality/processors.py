@@ -1,4 +1,4 @@
-"""``scripts/bench processors``: how much of a capture's result is luck, of the processor and of the seed.
+"""``scripts/bench processors``: spread of a capture's result over processors and seeds.
 
 The first frames of a capture on this processor, on it as one with AVX2 alone, and as one of 2008, where kernels
 (``NUMBA_CPU_NAME``), numpy (``NPY_DISABLE_CPU_FEATURES``) and BLAS (``OPENBLAS_CORETYPE``) are concerned; beside them
@@ -14,21 +14,20 @@ import os
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from client.cli.evaluate import Report
+from client.cli.scores import Row, Store, digest
 from scas4d_core.captures import open_capture
 from scas4d_core.metrics import psnr
 from studies.machine import core_version, machine
-from studies.quality.job import settings_of
-from studies.quality.store import Row, Store, digest
+from studies.quality.settings import settings_of
 
-Report = Callable[[str], None]
-
-TARGETS: Mapping[str, Mapping[str, str]] = {
+PROCESSORS: Mapping[str, Mapping[str, str]] = {
     "this processor": {},
     "AVX2 and FMA": {
         "NUMBA_CPU_NAME": "x86-64-v3",
@@ -64,13 +63,13 @@ def run(
     """
     store, rows = Store(out), []
     for capture in captures:
-        for target, seed in [*((name, 0) for name in TARGETS), *(("this processor", k) for k in range(1, seeds))]:
+        for target, seed in [*((name, 0) for name in PROCESSORS), *(("this processor", k) for k in range(1, seeds))]:
             key = f"{capture.resolve().name}-{target.replace(' ', '-')}-s{seed}-{digest(frames, list(changes))}"
             row = store.row(key)
             if row is None or row["core"] != core_version():
                 report(key)
                 row = {"key": key, "capture": capture.resolve().name, "target": target, "seed": seed}
-                row |= _apart(capture, TARGETS[target], frames, seed, changes)
+                row |= _apart(capture, PROCESSORS[target], frames, seed, changes)
                 store.put(row)
             rows.append(row)
     text = table(rows)
@@ -80,7 +79,7 @@ def run(
 
 
 def same_bits(rows: Sequence[Row], capture: str) -> bool:
-    """Whether the states of a capture are the same on all targets that were measured."""
+    """True where the states of a capture are the same on all processors that were measured."""
     own = [row for row in rows if row["capture"] == capture and row["seed"] == 0]
     return len({json.dumps(row["states"]) for row in own}) == 1
 
@@ -88,13 +87,13 @@ def same_bits(rows: Sequence[Row], capture: str) -> bool:
 def table(rows: Sequence[Row]) -> str:
     """A line a capture: decibels by target, whether the bits are the same, and the spread over seeds."""
     lines = [
-        f"| capture | {' | '.join(TARGETS)} | states | seeds: spread (standard deviation) |",
-        "|---" * (len(TARGETS) + 3) + "|",
+        f"| capture | {' | '.join(PROCESSORS)} | states | seeds: spread (standard deviation) |",
+        "|---" * (len(PROCESSORS) + 3) + "|",
     ]
     for name in dict.fromkeys(row["capture"] for row in rows):
         own = [row for row in rows if row["capture"] == name]
         by_target = {row["target"]: row for row in own if row["seed"] == 0}
-        means = [f"{statistics.fmean(by_target[target]['psnr']):.2f} dB" for target in TARGETS]
+        means = [f"{statistics.fmean(by_target[target]['psnr']):.2f} dB" for target in PROCESSORS]
         by_seed = [statistics.fmean(row["psnr"]) for row in own if row["target"] == "this processor"]
         spread = f"{max(by_seed) - min(by_seed):.2f} dB"
         if len(by_seed) > 1:
@@ -112,7 +111,7 @@ def measure(capture: Path, frames: int, seed: int, changes: Sequence[str]) -> Ro
     opened = open_capture(capture)
     if opened.test_rig is None:
         raise ValueError(f"{capture} has no test cameras, so there is nothing to measure on")
-    settings = settings_of("scas4d", overrides=changes)
+    settings = settings_of("scas4d", changes=changes)
     settings = settings.model_copy(update={"update": settings.update.model_copy(update={"seed": seed})})
     scene = Reconstruction.start(opened.rig, opened.frame(0), settings, points=opened.points)
     row: Row = {"psnr": [], "states": [], "core": core_version(), "machine": machine()}

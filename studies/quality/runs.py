@@ -1,4 +1,4 @@
-"""The runs that the bars need: which captures, with which preset and changes. ``scripts/bench bars`` measures them."""
+"""Runs that the targets need: captures, preset and changes of each. ``scripts/bench targets`` measures them."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from client.cli.evaluate import Job, Report
+from client.cli.scores import Row, Store
 from scas4d_core.presets import preset
 from scas4d_core.settings import Settings
-from studies.quality.job import Job, settings_of
-from studies.quality.quality import Report, run_jobs
-from studies.quality.store import Row, Store
-from studies.quality.table import OBJECT_CAPTURES
+from studies.quality.quality import OBJECT_CAPTURES, run_jobs
+from studies.quality.settings import settings_of
 
 CAPTURES = (*OBJECT_CAPTURES, "stage", "basketball")
-"""Every capture of the bars, by the name of its folder."""
+"""Every capture of the targets, by the name of its folder."""
 
 CAPTURE_CHANGES: Mapping[str, tuple[str, ...]] = {}
 """What a scene itself asks for in every run of it (its budget of Gaussians, its floor), never what tunes a method."""
@@ -53,8 +53,8 @@ class Run:
     frames: int | None = None
 
     def settings(self, capture: str) -> Settings:
-        """What is run on a capture, complete."""
-        return settings_of(self.preset, self.iterations, overrides=[*CAPTURE_CHANGES.get(capture, ()), *self.changes])
+        """Complete settings of the run on a capture."""
+        return settings_of(self.preset, self.iterations, changes=[*CAPTURE_CHANGES.get(capture, ()), *self.changes])
 
     def job(self, folder: Path, frames: int | None = None) -> Job:
         """The row of one capture, of at most so many frames."""
@@ -112,7 +112,7 @@ def measure_runs(
             raise ValueError(f"run {name!r} is unknown; choose of {', '.join(RUNS)}")
     for name in only:
         if name not in CAPTURES:
-            raise ValueError(f"capture {name!r} has no bars; choose of {', '.join(CAPTURES)}")
+            raise ValueError(f"capture {name!r} has no targets; choose of {', '.join(CAPTURES)}")
     jobs: list[Job] = []
     missing: dict[str, None] = {}
     for name in names or RUNS:
@@ -155,8 +155,8 @@ def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
             for row in rows:
                 given = row["given"]
                 withheld = (given["masks"], given["points"])
-                told = completed(row["settings"], settings)
-                same = all(told.get(group) == settings[group] for group in groups)
+                filled = completed(row["settings"], settings)
+                same = all(filled.get(group) == settings[group] for group in groups)
                 if row["capture"] != capture or not same or withheld != (run.masks, run.points):
                     continue
                 best = found.get((name, capture))

@@ -1,4 +1,4 @@
-"""The bars that the method has to reach, as data, and whether measured rows reach them."""
+"""The targets that the method has to reach, as data, compared with measured rows."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Literal
 
 import numpy as np
 
+from client.cli.scores import Row, Store, markdown, stage_table
 from scas4d_core.presets import preset
 from studies.machine import in_words
+from studies.quality.quality import OBJECT_CAPTURES
 from studies.quality.runs import CAPTURES, OTHER_MAP, RUNS, measured_runs
-from studies.quality.store import Row, Store
-from studies.quality.table import OBJECT_CAPTURES, markdown, stage_table
 
 KERNELS = "kernels"
-"""Stands for the study of ``bench.kernels`` where a bar names a run."""
+"""Stands for the study of ``studies.kernels`` where a target names a run."""
 MAPS = f"the {preset('scas4d').update.cluster_map} cluster map over the {OTHER_MAP} one"
 K1 = ("clusters-64", "clusters-320", "clusters-1280")
 
@@ -26,7 +26,7 @@ Rows = Mapping[tuple[str, str], Row]
 
 
 @dataclass(frozen=True)
-class Bar:
+class Target:
     """One figure that has to be reached.
 
     Attributes:
@@ -52,59 +52,66 @@ class Bar:
     mean: bool = False
 
 
-BARS: tuple[Bar, ...] = (
-    Bar("frame 0, test cameras", "scas4d", "psnr_first", ("robot",), "≥", 36.0),
-    Bar("frame 0, test cameras", "scas4d", "psnr_first", ("wheel", "pendulums", "spring"), "≥", 34.5),
-    Bar("frame 0, test cameras", "scas4d", "psnr_first", ("cloth",), "≥", 30.5),
-    Bar("frame 0, test cameras", "scas4d", "psnr_first", ("stage",), "≥", 30.0),
-    Bar("frame 0 without points and masks, within 1 dB of 36", "robot-unaided", "psnr_first", ("robot",), "≥", 35.0),
-    Bar(
+TARGETS: tuple[Target, ...] = (
+    Target("frame 0, test cameras", "scas4d", "psnr_first", ("robot",), "≥", 36.0),
+    Target("frame 0, test cameras", "scas4d", "psnr_first", ("wheel", "pendulums", "spring"), "≥", 34.5),
+    Target("frame 0, test cameras", "scas4d", "psnr_first", ("cloth",), "≥", 30.5),
+    Target("frame 0, test cameras", "scas4d", "psnr_first", ("stage",), "≥", 30.0),
+    Target("frame 0 without points and masks, within 1 dB of 36", "robot-unaided", "psnr_first", ("robot",), "≥", 35.0),
+    Target(
         "frame 0 without points and masks over that with them",
         "robot-unaided", "psnr_first", ("robot",), "≥", -1.0, over=("scas4d",),
     ),
-    Bar("Gaussians", "scas4d", "gaussians", ("robot",), "≤", 25_000, ""),
-    Bar("updates", "scas4d", "psnr", ("robot",), "≥", 31.0),
-    Bar("updates", "scas4d", "psnr", OBJECT_CAPTURES, "≥", 30.5, mean=True),
-    Bar("updates (room, shadows)", "scas4d", "psnr", ("stage",), "≥", 27.0),
-    Bar("scas4d over dynamic3dgs, both at 100", "scas4d", "psnr", ("robot",), "≥", 8.0, over=("dynamic3dgs",)),
-    Bar(
+    Target("Gaussians", "scas4d", "gaussians", ("robot",), "≤", 25_000, ""),
+    Target("updates", "scas4d", "psnr", ("robot",), "≥", 31.0),
+    Target("updates", "scas4d", "psnr", OBJECT_CAPTURES, "≥", 30.5, mean=True),
+    Target("updates (room, shadows)", "scas4d", "psnr", ("stage",), "≥", 27.0),
+    Target("scas4d over dynamic3dgs, both at 100", "scas4d", "psnr", ("robot",), "≥", 8.0, over=("dynamic3dgs",)),
+    Target(
         "scas4d over dynamic3dgs, both at 100",
         "scas4d", "psnr", ("wheel", "pendulums", "cloth", "spring", "stage", "basketball"), ">", 0.0,
         over=("dynamic3dgs",),
     ),
-    Bar("scas4d at 100 over dynamic3dgs at 2000", "scas4d", "psnr", ("robot",), ">", 0.0, over=("dynamic3dgs-2000",)),
-    Bar(
+    Target(
+        "scas4d at 100 over dynamic3dgs at 2000", "scas4d", "psnr", ("robot",), ">", 0.0, over=("dynamic3dgs-2000",),
+    ),
+    Target(
         "scas4d at 100 over dynamic3dgs at 2000",
         "scas4d", "psnr", OBJECT_CAPTURES, "≥", -0.5, over=("dynamic3dgs-2000",), mean=True,
     ),
-    Bar("dynamic3dgs at 2000", "dynamic3dgs-2000", "psnr", ("robot",), "≥", 28.5),
-    Bar("three layers over the best single one (64, 320, 1280)", "scas4d", "psnr", OBJECT_CAPTURES, ">", 0.0, over=K1),
-    Bar(MAPS, "scas4d", "psnr", OBJECT_CAPTURES, ">", 0.0, over=("other-map",), mean=True),
-    Bar(MAPS, "scas4d", "psnr", CAPTURES, over=("other-map",)),
-    Bar("frame 0, from its cloud (the paper has 30.25)", "scas4d", "psnr_first", ("basketball",), "≥", 29.0),
-    Bar("mean loss of the updates against frame 0", "scas4d", "loss", ("basketball",), "≤", 0.5),
-    Bar("worst loss of an update against frame 0", "scas4d", "loss_worst", ("basketball",), "≤", 1.0),
-    Bar("pixels that changed since frame 0", "scas4d", "psnr_changed", ("basketball",)),
-    Bar("frame 0 without its cloud", "basketball-cloudless", "psnr_first", ("basketball",), "≥", 24.0),
-    Bar(
+    Target("dynamic3dgs at 2000", "dynamic3dgs-2000", "psnr", ("robot",), "≥", 28.5),
+    Target(
+        "three layers over the best single one (64, 320, 1280)", "scas4d", "psnr", OBJECT_CAPTURES, ">", 0.0, over=K1,
+    ),
+    Target(MAPS, "scas4d", "psnr", OBJECT_CAPTURES, ">", 0.0, over=("other-map",), mean=True),
+    Target(MAPS, "scas4d", "psnr", CAPTURES, over=("other-map",)),
+    Target("frame 0, from its cloud (the paper has 30.25)", "scas4d", "psnr_first", ("basketball",), "≥", 29.0),
+    Target("mean loss of the updates against frame 0", "scas4d", "loss", ("basketball",), "≤", 0.5),
+    Target("worst loss of an update against frame 0", "scas4d", "loss_worst", ("basketball",), "≤", 1.0),
+    Target("pixels that changed since frame 0", "scas4d", "psnr_changed", ("basketball",)),
+    Target("frame 0 without its cloud", "basketball-cloudless", "psnr_first", ("basketball",), "≥", 24.0),
+    Target(
         "3D tracks, median error", "scas4d", "track_3d_median", ("robot", "pendulums", "cloth", "spring"),
         "≤", 0.8, "% of the extent",
     ),
-    Bar("3D tracks, median error", "scas4d", "track_3d_median", ("wheel",), "≤", 2.0, "% of the extent"),
-    Bar(
+    Target("3D tracks, median error", "scas4d", "track_3d_median", ("wheel",), "≤", 2.0, "% of the extent"),
+    Target(
         "2D tracks without oracle, median error", "scas4d", "mte_2d", ("robot", "pendulums", "cloth", "spring"),
         "≤", 0.5, "% of the diagonal",
     ),
-    Bar("parts, adjusted Rand index", "scas4d", "parts_ari", ("robot", "pendulums"), "≥", 0.7, ""),
-    Bar("parts over dynamic3dgs at 100", "scas4d", "parts_ari", ("robot", "pendulums"), ">", 0.0, "", ("dynamic3dgs",)),
-    Bar(
+    Target("parts, adjusted Rand index", "scas4d", "parts_ari", ("robot", "pendulums"), "≥", 0.7, ""),
+    Target(
+        "parts over dynamic3dgs at 100",
+        "scas4d", "parts_ari", ("robot", "pendulums"), ">", 0.0, "", ("dynamic3dgs",),
+    ),
+    Target(
         "parts over dynamic3dgs at 2000",
         "scas4d", "parts_ari", ("robot", "pendulums"), ">", 0.0, "", ("dynamic3dgs-2000",),
     ),
-    Bar("rasterizer over its arithmetic, on frame 0", KERNELS, "ratio_rasterizer", ("robot",), "≤", 2.0, "×"),
-    Bar("rasterizer over its arithmetic, on a cloud", KERNELS, "ratio_rasterizer_cloud", ("robot",), "≤", 2.0, "×"),
-    Bar("update over its rasterizer passes", KERNELS, "ratio_update", ("robot",), "≤", 3.0, "×"),
-    Bar("peak memory of a run, frame 0 included", KERNELS, "peak_mb", ("robot",), "<", 1500.0, "MB"),
+    Target("rasterizer over its arithmetic, on frame 0", KERNELS, "ratio_rasterizer", ("robot",), "≤", 2.0, "×"),
+    Target("rasterizer over its arithmetic, on a cloud", KERNELS, "ratio_rasterizer_cloud", ("robot",), "≤", 2.0, "×"),
+    Target("update over its rasterizer passes", KERNELS, "ratio_update", ("robot",), "≤", 3.0, "×"),
+    Target("peak memory of a run, frame 0 included", KERNELS, "peak_mb", ("robot",), "<", 1500.0, "MB"),
 )  # fmt: skip
 """In the order of the table."""
 
@@ -115,12 +122,12 @@ class Verdict:
 
     Attributes:
         capture: name, or "mean of …". value: the figure, None where not all of it is measured.
-        parts: the figures of the run and of what it is compared with, where the bar is a difference.
+        parts: the figures of the run and of what it is compared with, where the target is a difference.
         updates: how many updates the figure covers, in words; "frame 0" where none.
         reached: None where there is no figure or no threshold.
     """
 
-    bar: Bar
+    target: Target
     capture: str
     value: float | None
     parts: tuple[float, float] | None
@@ -137,62 +144,64 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Figure:
-    """What a bar is about on one capture: the value, the two it is the difference of, and the updates covered."""
+    """A target's figure on one capture: the value, the two it is the difference of, and the updates covered."""
 
     value: float
     parts: tuple[float, float] | None
     updates: str
 
 
-def judge(rows: Rows, bars: Sequence[Bar] = BARS) -> list[Verdict]:
-    """Every bar, one verdict a capture, or one for a mean."""
+def compare(rows: Rows, targets: Sequence[Target] = TARGETS) -> list[Verdict]:
+    """Every target, one verdict a capture, or one for a mean."""
     verdicts = []
-    for bar in bars:
-        figures = {capture: figure_of(bar, capture, rows) for capture in bar.captures}
-        if bar.mean:
-            verdicts.append(_verdict(bar, "mean of " + ", ".join(bar.captures), _mean(list(figures.values()))))
+    for target in targets:
+        figures = {capture: figure_of(target, capture, rows) for capture in target.captures}
+        if target.mean:
+            verdicts.append(_verdict(target, "mean of " + ", ".join(target.captures), _mean(list(figures.values()))))
         else:
-            verdicts += [_verdict(bar, capture, figure) for capture, figure in figures.items()]
+            verdicts += [_verdict(target, capture, figure) for capture, figure in figures.items()]
     return verdicts
 
 
-def figure_of(bar: Bar, capture: str, rows: Rows) -> Figure | None:
-    """What the rows of a capture say; None where one that is needed is missing or lacks the value."""
-    needed = [rows.get((run, capture)) for run in (bar.run, *bar.over)]
+def figure_of(target: Target, capture: str, rows: Rows) -> Figure | None:
+    """The figure of a capture; None where a row that is needed is missing or lacks the value."""
+    needed = [rows.get((run, capture)) for run in (target.run, *target.over)]
     there = [row for row in needed if row is not None]
     if len(there) < len(needed):
         return None
     updates = min(int(row.get("updates", 0)) for row in there)
-    values = [_value(row, bar.metric, updates) for row in there]
+    values = [_value(row, target.metric, updates) for row in there]
     known = [value for value in values if value is not None]
     if len(known) < len(values):
         return None
     own, others = known[0], known[1:]
-    words = _updates(bar.metric, there, updates)
+    words = _updates(target.metric, there, updates)
     if not others:
         return Figure(own, None, words)
     return Figure(own - max(others), (own, max(others)), words)
 
 
-def bar_table(verdicts: Sequence[Verdict]) -> str:
+def target_table(verdicts: Sequence[Verdict]) -> str:
     """A Markdown table of verdicts."""
     lines = ["| figure | capture | target | measured | | updates |", "|---|---|---|---|---|---|"]
     for verdict in verdicts:
-        bar = verdict.bar
-        must = "–" if bar.threshold is None else f"{bar.sense} {_number(bar, bar.threshold)} {bar.unit}".strip()
-        measured = "–" if verdict.value is None else _number(bar, verdict.value)
+        target = verdict.target
+        must = "–"
+        if target.threshold is not None:
+            must = f"{target.sense} {_number(target, target.threshold)} {target.unit}".strip()
+        measured = "–" if verdict.value is None else _number(target, verdict.value)
         if verdict.value is not None and verdict.parts is not None:
-            measured += f" ({_plain(bar, verdict.parts[0])} against {_plain(bar, verdict.parts[1])})"
-        cells = [bar.what, verdict.capture, must, measured, verdict.word, verdict.updates]
+            measured += f" ({_plain(target, verdict.parts[0])} against {_plain(target, verdict.parts[1])})"
+        cells = [target.what, verdict.capture, must, measured, verdict.word, verdict.updates]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
 def count_words(verdicts: Sequence[Verdict]) -> str:
-    """How many bars are reached, missed, and not measured."""
-    judged = [verdict for verdict in verdicts if verdict.bar.threshold is not None]
-    reached, missed = (sum(verdict.reached is answer for verdict in judged) for answer in (True, False))
-    return f"{reached} reached, {missed} missed, {len(judged) - reached - missed} not measured, of {len(judged)}"
+    """Counts the targets that are reached, missed, and not measured."""
+    compared = [verdict for verdict in verdicts if verdict.target.threshold is not None]
+    reached, missed = (sum(verdict.reached is answer for verdict in compared) for answer in (True, False))
+    return f"{reached} reached, {missed} missed, {len(compared) - reached - missed} not measured, of {len(compared)}"
 
 
 def read_study(folder: Path) -> dict[tuple[str, str], Row]:
@@ -206,14 +215,14 @@ def read_study(folder: Path) -> dict[tuple[str, str], Row]:
 
 
 def left_out(folder: Path, rows: Rows) -> int:
-    """How many finished rows in the folder of a study belong to no run as it is set today, or are not its longest."""
+    """Counts finished rows that belong to no run as it is set today, or are not its longest."""
     used = {row.get("key") for row in rows.values()}
     return sum("error" not in row and row["key"] not in used for row in Store(folder).rows())
 
 
 def page(rows: Rows) -> str:
-    """The page of the documentation: commands, machine, date, the table of the bars, and the rows behind it."""
-    verdicts = judge(rows)
+    """The page of the documentation: commands, machine, date, the table of the targets, and the rows behind it."""
+    verdicts = compare(rows)
     known = list(rows.values())
     days = sorted({str(row["measured"])[:10] for row in known if "measured" in row})
     machines = sorted({in_words(row["machine"]) for row in known if "machine" in row})
@@ -226,7 +235,7 @@ Pictures, tracks and parts on the test cameras and ground truth of the captures,
 the rows and write the page; rows that are measured already are kept (`CAPTURES` holds the captures' folders):
 
 ```
-scripts/bench bars CAPTURES
+scripts/bench targets CAPTURES
 scripts/bench kernels CAPTURES/robot --store out/quality --out docs/kernels.md
 scripts/bench table out/quality --out docs/quality.md
 ```
@@ -237,13 +246,13 @@ scripts/bench table out/quality --out docs/quality.md
 
 An iteration is one forward and backward render of one training view. Figures are means over updates and test cameras;
 "updates" is the number of updates measured. A difference is taken over the updates that both sides have. Definitions
-of the metrics: `scas4d_core/metrics/` and `studies/quality/measure.py`.
+of the metrics: `scas4d_core/metrics/`.
 
 ## Targets
 
 {count_words(verdicts)}.
 
-{bar_table(verdicts)}
+{target_table(verdicts)}
 
 ## Rows
 
@@ -274,7 +283,7 @@ def _value(row: Row, metric: str, updates: int) -> float | None:
 
 
 def _updates(metric: str, rows: Sequence[Row], shared: int) -> str:
-    """Which updates a figure covers; those of each row where their values are not taken over the shared ones."""
+    """The updates that a figure covers; those of each row where values are not taken over the shared ones."""
     if metric == "psnr_first":
         return "frame 0"
     if "capture_frames" not in rows[0]:
@@ -293,31 +302,31 @@ def _mean(figures: Sequence[Figure | None]) -> Figure | None:
     return Figure(float(np.mean([figure.value for figure in known])), both, words)
 
 
-def _verdict(bar: Bar, capture: str, figure: Figure | None) -> Verdict:
+def _verdict(target: Target, capture: str, figure: Figure | None) -> Verdict:
     if figure is None:
-        return Verdict(bar, capture, None, None, "–", None)
-    return Verdict(bar, capture, figure.value, figure.parts, figure.updates, _reached(bar, figure.value))
+        return Verdict(target, capture, None, None, "–", None)
+    return Verdict(target, capture, figure.value, figure.parts, figure.updates, _reached(target, figure.value))
 
 
-def _reached(bar: Bar, value: float) -> bool | None:
-    """Figures are judged as measured, not as they are rounded for the table."""
-    if bar.threshold is None:
+def _reached(target: Target, value: float) -> bool | None:
+    """Figures are compared as measured, not as they are rounded for the table."""
+    if target.threshold is None:
         return None
     return {
-        "≥": value >= bar.threshold,
-        ">": value > bar.threshold,
-        "≤": value <= bar.threshold,
-        "<": value < bar.threshold,
-    }[bar.sense]
+        "≥": value >= target.threshold,
+        ">": value > target.threshold,
+        "≤": value <= target.threshold,
+        "<": value < target.threshold,
+    }[target.sense]
 
 
-def _number(bar: Bar, value: float) -> str:
-    return f"{value:+.{_digits(bar)}f}" if bar.over else _plain(bar, value)
+def _number(target: Target, value: float) -> str:
+    return f"{value:+.{_digits(target)}f}" if target.over else _plain(target, value)
 
 
-def _plain(bar: Bar, value: float) -> str:
-    return f"{value:,.{_digits(bar)}f}"
+def _plain(target: Target, value: float) -> str:
+    return f"{value:,.{_digits(target)}f}"
 
 
-def _digits(bar: Bar) -> int:
-    return 0 if bar.metric in ("gaussians", "peak_mb") else 3 if bar.metric == "parts_ari" else 2
+def _digits(target: Target) -> int:
+    return 0 if target.metric in ("gaussians", "peak_mb") else 3 if target.metric == "parts_ari" else 2

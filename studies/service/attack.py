@@ -21,7 +21,7 @@ EVERY_S = 0.2
 
 @dataclass
 class Hold:
-    """One connection: what it sends first, and how many bytes of header after that."""
+    """One connection: its first bytes, and how many bytes of header follow."""
 
     connection: socket.socket
     first: bytes

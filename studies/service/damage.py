@@ -1,4 +1,4 @@
-"""What single flipped bits cost, wherever they are: each is noticed or harmless, and no picture is wrong.
+"""Single flipped bits, wherever they are: each must be noticed or harmless, and no picture wrong.
 
 One scene, frame after frame. Before each frame one bit of one file is flipped, under the service as it runs, or while
 it is down; then views are asked for, the next frame is sent, and all is compared with a run that nothing disturbed.
@@ -25,7 +25,7 @@ from server.storage.frame_store import FrameDamage, read_pictures
 from server.storage.journal import read_journal
 from server.storage.layout import DataFolder
 from studies.service.process import Service, StudyError
-from studies.service.study import AGAIN_S, Sender, Study, digests
+from studies.service.study import AGAIN_S, FrameSender, Study, digests
 
 KINDS = ("state", "checkpoint", "fixed", "journal", "frame")
 BEFORE = 6
@@ -43,7 +43,7 @@ Pictures = dict[int, bytes]
 
 @dataclass
 class Flips:
-    """What came of the flipped bits.
+    """Outcome of the flipped bits.
 
     Attributes:
         counts: noticed or harmless, by kind. remade, lost: frames whose state is another one, or gone.
@@ -59,7 +59,7 @@ class Flips:
 
 
 def frames_for(count: int) -> int:
-    """How many frames a study of so many flips sends."""
+    """Number of frames that a study of so many flips sends."""
     return BEFORE + count
 
 
@@ -69,7 +69,7 @@ def undisturbed(study: Study) -> tuple[dict[int, str], Pictures]:
     service.start()
     try:
         scene = study.create(service)
-        sender = Sender(study, service, scene)
+        sender = FrameSender(study, service, scene)
         for index in range(len(study.frames)):
             sender.send(index)
         service.finish(scene, len(study.frames))
@@ -79,7 +79,7 @@ def undisturbed(study: Study) -> tuple[dict[int, str], Pictures]:
         service.stop()
 
 
-def flips(study: Study, count: int, seed: int, told: Callable[[str], None]) -> Flips:
+def flips(study: Study, count: int, seed: int, echo: Callable[[str], None]) -> Flips:
     """Flips `count` bits, as many of each kind, half of them while the service is down."""
     random_ = random.Random(seed)
     expected, views = undisturbed(study)
@@ -88,7 +88,7 @@ def flips(study: Study, count: int, seed: int, told: Callable[[str], None]) -> F
     found = Flips()
     try:
         scene = study.create(service, keep_frames={"last": KEPT})
-        sender = Sender(study, service, scene)
+        sender = FrameSender(study, service, scene)
         for index in range(BEFORE):
             sender.send(index)
         service.finish(scene, BEFORE)
@@ -100,7 +100,7 @@ def flips(study: Study, count: int, seed: int, told: Callable[[str], None]) -> F
                 outcome = one.run(down, found, views)
                 sender.send(BEFORE + number)
                 service.finish(scene, BEFORE + number + 1)
-                told(f"{said}: {outcome}")
+                echo(f"{said}: {outcome}")
             except StudyError as error:
                 one.faults.append(str(error))
             found.faults += [f"{said}: {fault}" for fault in one.faults]
@@ -180,7 +180,7 @@ class _Flip:
         return outcome
 
     def _harmless(self) -> bool:
-        """Whether everything that can be read of the file is what was written."""
+        """True where everything that can be read of the file is what was written."""
         try:
             if self.kind == "frame":
                 return bool(read_pictures(self.file.parent, self.file.name).images)
@@ -223,7 +223,7 @@ class _Flip:
             self.faults.append("an answer names a path of the server")
 
     def _put_right(self, flipped: bytes) -> None:
-        """What the service could not mend is whole again, so that the next bit is the only one."""
+        """Restores what the service could not mend, so that the next bit is the only one."""
         try:
             with self.file.open("r+b") as opened:
                 opened.seek(self.at)

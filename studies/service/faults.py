@@ -1,5 +1,4 @@
-"""What kills, cuts, flipped bits and a full disk cost: nothing acknowledged, and not a bit of the states. And what
-strangers without a token cost (`studies.service.strangers`).
+"""Kills, cuts, flipped bits, a full disk and strangers: none may cost an acknowledged frame or a bit of the states.
 
 Each scenario runs the whole service as a process of its own. The undisturbed run comes first; the others are compared
 with it, state by state and bit by bit.
@@ -24,11 +23,12 @@ from client.wire import FrameState
 from server.storage.events import FrameAccepted
 from server.storage.journal import read_journal
 from server.storage.layout import DataFolder, SceneFolder
+from studies.options import Echo
 from studies.service import damage
-from studies.service.outcome import Outcome, Told
+from studies.service.outcome import ScenarioResult
 from studies.service.process import PATIENCE_S, Service, StudyError
 from studies.service.strangers import Attack, strangers
-from studies.service.study import AGAIN_S, Sender, Study, compare, digests, encoded_frames, undisturbed
+from studies.service.study import AGAIN_S, FrameSender, Study, compare, digests, encoded_frames, undisturbed
 
 TURN_S = 15.0
 """Of updates without strangers; with them, until the last connection is closed."""
@@ -39,7 +39,9 @@ PARTS = ("kills", "log", "disk", "bits", "strangers")
 """The scenarios by name."""
 
 
-def kills(study: Study, expected: Mapping[int, str], update_s: float, count: int, seed: int, told: Told) -> Outcome:
+def kills(
+    study: Study, expected: Mapping[int, str], update_s: float, count: int, seed: int, echo: Echo
+) -> ScenarioResult:
     """`kill -9` of the worker or the whole service, `count` times, at random moments of the capture."""
     random_ = random.Random(seed)
     moments: dict[int, list[str]] = {}
@@ -50,7 +52,7 @@ def kills(study: Study, expected: Mapping[int, str], update_s: float, count: int
     service = study.service("kills")
     service.start()
     scene = study.create(service)
-    sender = Sender(study, service, scene)
+    sender = FrameSender(study, service, scene)
     done = {"worker": 0, "service": 0}
     try:
         for index in range(len(study.frames)):
@@ -64,7 +66,7 @@ def kills(study: Study, expected: Mapping[int, str], update_s: float, count: int
                 else:
                     _kill_worker(service, scene, killed)
                 done[victim] += 1
-                told(f"killed the {victim} at frame {index}: {sum(done.values())} of {count}")
+                echo(f"killed the {victim} at frame {index}: {sum(done.values())} of {count}")
             thread.join()
         service.finish(scene, len(study.frames))
         service.kill()
@@ -76,8 +78,10 @@ def kills(study: Study, expected: Mapping[int, str], update_s: float, count: int
             f"{done['worker']} of the worker, {done['service']} of the service; {lost} acknowledged frames lost, "
             f"{len(expected)} states compared"
         )
-        bar = "0 acknowledged frames lost, final state bit-identical"
-        return Outcome(f"kill -9 at {count} random moments over {len(study.frames)} frames", bar, found, faults)
+        target = "0 acknowledged frames lost, final state bit-identical"
+        return ScenarioResult(
+            f"kill -9 at {count} random moments over {len(study.frames)} frames", target, found, faults
+        )
     finally:
         service.stop()
 
@@ -98,7 +102,9 @@ def _kill_worker(service: Service, scene: str, killed: Counter[int]) -> None:
     raise StudyError("there was no worker to kill")
 
 
-def damaged_log(study: Study, expected: Mapping[int, str], cuts: int, flips: int, seed: int, told: Told) -> Outcome:
+def damaged_log(
+    study: Study, expected: Mapping[int, str], cuts: int, flips: int, seed: int, echo: Echo
+) -> ScenarioResult:
     """Files of the log cut, or a bit flipped, under a service that is down; then it starts, says so, and goes on.
 
     Half of the frames are committed, the other half wait, as after a kill.
@@ -108,7 +114,7 @@ def damaged_log(study: Study, expected: Mapping[int, str], cuts: int, flips: int
     service.start()
     half = len(study.frames) // 2
     scene = study.create(service)
-    sender = Sender(study, service, scene)
+    sender = FrameSender(study, service, scene)
     for index in range(half):
         sender.send(index)
     service.finish(scene, half)
@@ -130,7 +136,7 @@ def damaged_log(study: Study, expected: Mapping[int, str], cuts: int, flips: int
         try:
             victim.http.post(f"/v1/scenes/{scene}/resume")
             status = victim.finish(scene, len(study.frames) if hit is None else 0)
-            told(f"{said}: {'; '.join(status.damage) or 'nothing to say'}")
+            echo(f"{said}: {'; '.join(status.damage) or 'nothing to say'}")
             wrong = _check_damaged(victim, scene, sender, hit)
             wrong += compare(digests(folder.states), expected, range(hit, len(study.frames)) if hit else ())
             if hit is not None:
@@ -146,8 +152,8 @@ def damaged_log(study: Study, expected: Mapping[int, str], cuts: int, flips: int
         finally:
             victim.stop()
     found = f"started {cuts + flips} times; {dropped} frames set aside with their reason, all others committed"
-    bar = "starts, loses nothing acknowledged before the damage, says what it dropped"
-    return Outcome(f"{cuts} cuts and {flips} flipped bytes of journal and frame log", bar, found, faults)
+    target = "starts, loses nothing acknowledged before the damage, says what it dropped"
+    return ScenarioResult(f"{cuts} cuts and {flips} flipped bytes of journal and frame log", target, found, faults)
 
 
 def _damage(folder: SceneFolder, kind: str, random_: random.Random, half: int) -> tuple[str, int | None]:
@@ -169,7 +175,7 @@ def _damage(folder: SceneFolder, kind: str, random_: random.Random, half: int) -
     return f"{kind} of {file.name} at byte {at}", hit
 
 
-def _check_damaged(service: Service, scene: str, sender: Sender, hit: int | None) -> list[str]:
+def _check_damaged(service: Service, scene: str, sender: FrameSender, hit: int | None) -> list[str]:
     faults = []
     for index, receipt in sender.receipts.items():
         report = service.frame(scene, index)
@@ -180,7 +186,7 @@ def _check_damaged(service: Service, scene: str, sender: Sender, hit: int | None
     return faults
 
 
-def full_disk(study: Study, expected: Mapping[int, str], told: Told) -> Outcome:
+def full_disk(study: Study, expected: Mapping[int, str], echo: Echo) -> ScenarioResult:
     """No file may grow: first for the service, then for the worker; then there is room again.
 
     The limit on the size of files is set on the running processes (RLIMIT_FSIZE), so that every write fails where a
@@ -191,14 +197,14 @@ def full_disk(study: Study, expected: Mapping[int, str], told: Told) -> Outcome:
     faults: list[str] = []
     try:
         scene = study.create(service)
-        sender = Sender(study, service, scene)
+        sender = FrameSender(study, service, scene)
         half = len(study.frames) // 2
         for index in range(half):
             sender.send(index)
         service.finish(scene, half)
         with _no_room(service.pid):
             answers = [service.put(scene, half, *study.frames[half]) for _ in range(3)]
-            told(f"while the disk is full: {[answer.status_code for answer in answers]}")
+            echo(f"while the disk is full: {[answer.status_code for answer in answers]}")
             faults += [f"answered {answer.status_code}, not 507" for answer in answers if answer.status_code != 507]
             if service.status(scene).next_frame != half:
                 faults.append("a frame was taken that was not acknowledged")
@@ -209,7 +215,7 @@ def full_disk(study: Study, expected: Mapping[int, str], told: Told) -> Outcome:
             until = time.monotonic() + PATIENCE_S
             while "room" not in (service.status(scene).error or "") and time.monotonic() < until:
                 time.sleep(AGAIN_S)
-            told(f"while the worker has no room: {service.status(scene).error}")
+            echo(f"while the worker has no room: {service.status(scene).error}")
             if service.frame(scene, half).state != FrameState.UPDATING:
                 faults.append("the worker did not wait for room")
         for index in range(half + 1, len(study.frames)):
@@ -218,8 +224,10 @@ def full_disk(study: Study, expected: Mapping[int, str], told: Told) -> Outcome:
         faults += sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
     finally:
         service.stop()
-    bar = "starts, loses nothing acknowledged before the damage, says what it dropped"
-    return Outcome("disk full while ingesting", bar, "507 meanwhile; all committed once there was room", faults)
+    target = "starts, loses nothing acknowledged before the damage, says what it dropped"
+    return ScenarioResult(
+        "disk full while ingesting", target, "507 meanwhile; all committed once there was room", faults
+    )
 
 
 @contextlib.contextmanager
@@ -232,17 +240,19 @@ def _no_room(pid: int) -> Any:
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def flipped_bits(study: Study, count: int, seed: int, told: Told) -> Outcome:
+def flipped_bits(study: Study, count: int, seed: int, echo: Echo) -> ScenarioResult:
     """Single bits over everything on disk, with and without a restart (`studies.service.damage`)."""
     longer = replace(study, frames=encoded_frames(study.capture, damage.frames_for(count)))
-    found = damage.flips(longer, count, seed, told)
+    found = damage.flips(longer, count, seed, echo)
     counts = Counter(kind.rpartition(" ")[2] for kind in found.counts.elements())
     said = (
         f"{counts['noticed']} noticed, {counts['harmless']} harmless; {len(found.remade)} states made again from "
         f"pictures, {len(found.lost)} named as lost, {len(found.unreported)} without their report"
     )
-    bar = "each noticed or harmless; no wrong picture, no 500, the scene goes on"
-    return Outcome(f"{count} flipped bits of {', '.join(damage.KINDS)}, half while down", bar, said, found.faults)
+    target = "each noticed or harmless; no wrong picture, no 500, the scene goes on"
+    return ScenarioResult(
+        f"{count} flipped bits of {', '.join(damage.KINDS)}, half while down", target, said, found.faults
+    )
 
 
 def run(
@@ -256,8 +266,8 @@ def run(
     attack: Attack | None = None,
     turns: int = 3,
     parts: Sequence[str] = PARTS,
-    told: Told = print,
-) -> list[Outcome]:
+    echo: Echo = print,
+) -> list[ScenarioResult]:
     """The scenarios of `parts`.
 
     Args:
@@ -268,16 +278,16 @@ def run(
     outcomes = []
     if set(parts) & {"kills", "log", "disk"}:
         expected, update_s = undisturbed(study)
-        told(f"undisturbed: {len(expected)} states, {update_s:.2f} s an update")
+        echo(f"undisturbed: {len(expected)} states, {update_s:.2f} s an update")
         if "kills" in parts:
-            outcomes.append(kills(study, expected, update_s, moments, seed, told))
+            outcomes.append(kills(study, expected, update_s, moments, seed, echo))
         if "log" in parts:
-            outcomes.append(damaged_log(study, expected, cuts, flips, seed, told))
+            outcomes.append(damaged_log(study, expected, cuts, flips, seed, echo))
         if "disk" in parts:
-            outcomes.append(full_disk(study, expected, told))
+            outcomes.append(full_disk(study, expected, echo))
     if "bits" in parts:
-        outcomes.append(flipped_bits(study, bits, seed, told))
+        outcomes.append(flipped_bits(study, bits, seed, echo))
     if "strangers" in parts:
         for token in (False, True):
-            outcomes.append(strangers(study, attack or Attack(), turns=turns, seconds=TURN_S, token=token, told=told))
+            outcomes.append(strangers(study, attack or Attack(), turns=turns, seconds=TURN_S, token=token, echo=echo))
     return outcomes

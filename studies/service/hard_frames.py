@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -27,9 +27,10 @@ from scas4d_core.metrics import psnr
 from scas4d_core.query.committed import CommittedScene
 from scas4d_core.storage.history import History
 from server.storage.layout import DataFolder
-from studies.hard_frames.footage import Filmed, MadeUp
-from studies.hard_frames.frames import FrameCase, Pictures, Sent, Step, good, named, teleported, violations
+from studies.hard_frames.footage import AnyFootage
+from studies.hard_frames.frames import FrameCase, FrameOutcome, Pictures, Sent, good, named, teleported, violations
 from studies.hard_frames.study import AT, sound
+from studies.options import Echo
 from studies.service.process import PATIENCE_S, Service, StudyError
 
 FARTHEST = 1.0
@@ -38,13 +39,11 @@ BETWEEN = 2
 """Good frames between the last that counts for one case and the first of the next."""
 AGAIN_S = 0.05
 
-Told = Callable[[str], None]
-
 
 class BackAndForth:
-    """A footage without an end: it turns round at both."""
+    """A footage played back and forth without an end."""
 
-    def __init__(self, footage: MadeUp | Filmed) -> None:
+    def __init__(self, footage: AnyFootage) -> None:
         self._footage = footage
 
     def frame(self, index: int) -> Frame:
@@ -66,8 +65,8 @@ class BackAndForth:
 
 
 @dataclass
-class Line:
-    """A case in one size, through the service."""
+class ServiceCaseResult:
+    """Result of a case in one size, through the service."""
 
     case: FrameCase
     size: Any
@@ -77,8 +76,8 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Part:
-    """What is sent for one case, from which index of the scene on."""
+class SentCase:
+    """Frames sent for one case, from an index of the scene on."""
 
     case: FrameCase
     size: Any
@@ -86,25 +85,25 @@ class Part:
     sent: Sequence[Sent]
 
 
-def script(footage: BackAndForth, cases: Sequence[FrameCase]) -> tuple[list[Sent], list[Part]]:
+def script(footage: BackAndForth, cases: Sequence[FrameCase]) -> tuple[list[Sent], list[SentCase]]:
     """All that is sent, and the parts of it that are cases; a jump for good is followed by one back."""
     sent = [good(footage, index) for index in range(AT)]
-    parts: list[Part] = []
+    parts: list[SentCase] = []
     for case in cases:
         for size in case.sizes:
             like = sent[-1].like + 1
             found = case.make(footage, like, size)
             if found is None or (case.make is teleported and size > FARTHEST):
                 continue
-            parts.append(Part(case, size, len(sent), found))
+            parts.append(SentCase(case, size, len(sent), found))
             sent += found
             sent += [good(footage, sent[-1].like + 1 + number) for number in range(BETWEEN if found[-1].good else 6)]
     return sent, parts
 
 
 def study(
-    footage: MadeUp | Filmed, folder: Path, names: Sequence[str] = (), told: Told = print
-) -> tuple[list[Line], list[str]]:
+    footage: AnyFootage, folder: Path, names: Sequence[str] = (), echo: Echo = print
+) -> tuple[list[ServiceCaseResult], list[str]]:
     """Runs the cases whose name holds one of ``names``, or all.
 
     Returns:
@@ -118,20 +117,20 @@ def study(
     service = Service(folder / "data")
     service.start()
     try:
-        usual, faults = _push(service, footage, [good(endless, index) for index in range(sent[-1].like + 1)], told)
-        told(f"undisturbed: {usual.count} frames")
-        scene, more = _push(service, footage, sent, told)
-        lines = [_judged(part, scene, usual, footage) for part in parts]
+        usual, faults = _push(service, footage, [good(endless, index) for index in range(sent[-1].like + 1)], echo)
+        echo(f"undisturbed: {usual.count} frames")
+        scene, more = _push(service, footage, sent, echo)
+        lines = [_result(part, scene, usual, footage) for part in parts]
     finally:
         service.stop()
     faults += more
     for line in lines:
-        told(f"{'holds' if not line.violations else 'FAILS'}  {line.case.name}, {line.size}  {line.last:+.1f} dB")
-        told(f"       {line.said}")
+        echo(f"{'holds' if not line.violations else 'FAILS'}  {line.case.name}, {line.size}  {line.last:+.1f} dB")
+        echo(f"       {line.said}")
         for violation in line.violations:
-            told(f"       ! {violation}")
+            echo(f"       ! {violation}")
     failed = sum(bool(line.violations) for line in lines)
-    told(f"{len(lines)} cases with sizes in {len(sent)} frames, {failed} do not hold; faults: {faults or 'none'}")
+    echo(f"{len(lines)} cases with sizes in {len(sent)} frames, {failed} do not hold; faults: {faults or 'none'}")
     return lines, faults
 
 
@@ -151,7 +150,7 @@ class Pushed:
         record = self.committed.history.report(index)
         return FrameReport(**{item.name: record[item.name] for item in fields(FrameReport) if item.name in record})
 
-    def psnr(self, footage: MadeUp | Filmed, index: int, truth: Pictures) -> float:
+    def psnr(self, footage: AnyFootage, index: int, truth: Pictures) -> float:
         """DB of the held-out cameras."""
         return float(
             np.mean(
@@ -160,7 +159,7 @@ class Pushed:
         )
 
 
-def _push(service: Service, footage: MadeUp | Filmed, sent: Sequence[Sent], told: Told) -> tuple[Pushed, list[str]]:
+def _push(service: Service, footage: AnyFootage, sent: Sequence[Sent], echo: Echo) -> tuple[Pushed, list[str]]:
     """Frames pushed into a new scene, one after the other; and what went wrong on the way."""
     faults: list[str] = []
     scene = service.create(
@@ -196,7 +195,7 @@ def _push(service: Service, footage: MadeUp | Filmed, sent: Sequence[Sent], told
         report = service.frame(scene, index)
         if report.state != FrameState.COMMITTED or report.attempts:
             faults.append(f"frame {index} is {report.state} after {report.attempts} deaths: {report.error}")
-    told(f"scene {scene}: {status.next_frame} frames, {len(faults)} faults")
+    echo(f"scene {scene}: {status.next_frame} frames, {len(faults)} faults")
     history = History.load(DataFolder(service.data).scene(scene).states)
     return Pushed(
         CommittedScene(history, footage.rig.world_frame(footage.settings.scene.metres_per_unit)), len(sent)
@@ -230,7 +229,7 @@ def _png(picture: NDArray[np.uint8]) -> bytes:
     return file.getvalue()
 
 
-def _judged(part: Part, scene: Pushed, usual: Pushed, footage: MadeUp | Filmed) -> Line:
+def _result(part: SentCase, scene: Pushed, usual: Pushed, footage: AnyFootage) -> ServiceCaseResult:
     """The frames of one case, against the same of the undisturbed scene."""
     steps = []
     for number, sent in enumerate(part.sent):
@@ -238,7 +237,7 @@ def _judged(part: Part, scene: Pushed, usual: Pushed, footage: MadeUp | Filmed) 
         before, after = scene.state(index - 1).arrays(), scene.state(index).arrays()
         like = BackAndForth(footage).truth(sent.like)
         steps.append(
-            Step(
+            FrameOutcome(
                 replace(sent, frame=Frame(index, 0.0, {}, {})),
                 scene.report(index),
                 all(np.array_equal(before[name], after[name]) for name in before),
@@ -254,10 +253,12 @@ def _judged(part: Part, scene: Pushed, usual: Pushed, footage: MadeUp | Filmed) 
             for step in faulty
         )
     )
-    return Line(part.case, part.size, said, steps[-1].psnr - steps[-1].usual, violations(part.case, steps, part.size))
+    return ServiceCaseResult(
+        part.case, part.size, said, steps[-1].psnr - steps[-1].usual, violations(part.case, steps, part.size)
+    )
 
 
-def table(lines: Sequence[Line]) -> str:
+def table(lines: Sequence[ServiceCaseResult]) -> str:
     """As Markdown."""
     rows = ["| case | size | the reports say | dB, last frame | holds |", "|" + "---|" * 5]
     for line in lines:

@@ -1,7 +1,7 @@
-"""How fast frames come in over the loopback, against what plain fsynced writes of the same records reach.
+"""Rate of ingest over the loopback, against plain fsynced writes of the same records.
 
 All in one run and in turns, because a disk's speed drifts and what follows heavy writing pays for it: a record is the
-encoded pictures of one frame. The scene is paused, so that what is measured is the door: receive, check each picture's
+encoded pictures of one frame. The scene is paused, so that ingest alone is measured: receive, check each picture's
 structure, hash, write, sync, acknowledge.
 """
 
@@ -26,12 +26,12 @@ from client.wire import FRAME_MEDIA_TYPE, IngestAnswer, frame_chunks
 from scas4d_core.cameras import Camera, Rig
 from studies.service.process import Service, StudyError
 
-BAR = 0.8
+TARGET = 0.8
 UNANSWERED = 2
 
 
 @dataclass(frozen=True)
-class Measured:
+class IngestTimes:
     """Megabytes a second of plain writes, over HTTP and over a WebSocket, one number a round."""
 
     plain: list[float]
@@ -73,7 +73,7 @@ def noise_rig(cameras: int, side: int = 1024) -> Rig:
     return Rig(tuple(found))
 
 
-def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds: int, senders: int) -> Measured:
+def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds: int, senders: int) -> IngestTimes:
     """Sends `frames` frames a round and writes the same bytes plainly, in turns."""
     rig = noise_rig(cameras)
     pictures = [jpeg(size_bytes, seed) for seed in range(cameras)]
@@ -102,7 +102,7 @@ def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds:
                 first += frames if way else 0
                 if number:  # the first round warms caches, connections and the pool of threads
                     found[way].append(megabytes / took)
-        return Measured(*found)
+        return IngestTimes(*found)
     finally:
         service.stop()
         shutil.rmtree(plain_folder, ignore_errors=True)
@@ -188,7 +188,7 @@ def _socket(service: Service, scene: str, records: Sequence[dict[str, bytes]], f
     return took
 
 
-def page(measured: Measured, *, frames: int, cameras: int, size_bytes: int, senders: int) -> str:
+def page(measured: IngestTimes, *, frames: int, cameras: int, size_bytes: int, senders: int) -> str:
     """As Markdown."""
     shares = [f"{100 * measured.share(took):.0f} %" for took in (measured.ingest, measured.socket)]
     rows = "\n".join(
@@ -198,11 +198,11 @@ def page(measured: Measured, *, frames: int, cameras: int, size_bytes: int, send
             zip(measured.plain, measured.ingest, measured.socket, strict=True)
         )
     )
-    verdict = "reached" if measured.share(measured.ingest) >= BAR else "missed"
+    verdict = "reached" if measured.share(measured.ingest) >= TARGET else "missed"
     return (
         f"{frames} frames of {cameras} JPEGs of {size_bytes / 1e6:g} MB a round and way; "
         f"HTTP over {senders} connections, one WebSocket with {UNANSWERED} messages unanswered\n\n"
         "| round | plain fsynced writes, MB/s | HTTP, MB/s | share | WebSocket, MB/s | share |\n"
         f"|---|---|---|---|---|---|\n{rows}\n\n"
-        f"Median shares {shares[0]} and {shares[1]}, bar {100 * BAR:.0f} % (HTTP): {verdict}."
+        f"Median shares {shares[0]} and {shares[1]}, target {100 * TARGET:.0f} % (HTTP): {verdict}."
     )

@@ -2,31 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-
-Told = Callable[[str], None]
 
 
 @dataclass
-class Outcome:
-    """A fault, the bar, and what was found; with `faults` the bar is missed."""
+class ScenarioResult:
+    """A fault, the target, and what was found; with `faults` the target is missed."""
 
     name: str
-    bar: str
+    target: str
     found: str
     faults: list[str] = field(default_factory=list)
 
     @property
     def reached(self) -> bool:
-        """Whether nothing went wrong."""
+        """True where nothing went wrong."""
         return not self.faults
 
 
-def table(outcomes: Sequence[Outcome]) -> str:
+def table(outcomes: Sequence[ScenarioResult]) -> str:
     """As Markdown."""
-    rows = ["| fault | bar | found | |", "|---|---|---|---|"]
+    rows = ["| fault | target | found | |", "|---|---|---|---|"]
     for outcome in outcomes:
         found = "; ".join([*outcome.faults, *([outcome.found] if outcome.found else [])])
-        rows.append(f"| {outcome.name} | {outcome.bar} | {found} | {'reached' if outcome.reached else '**missed**'} |")
+        rows.append(
+            f"| {outcome.name} | {outcome.target} | {found} | {'reached' if outcome.reached else '**missed**'} |"
+        )
     return "\n".join(rows)

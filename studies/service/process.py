@@ -28,7 +28,7 @@ class StudyError(RuntimeError):
 
 
 class Service:
-    """Started by `start`, killed by `kill`, as often as one likes, over the same data folder.
+    """A service over one data folder; `start` and `kill` may be called again and again.
 
     Args:
         data: its folder. environment: further variables, as SCAS4D_ENGINE.
@@ -112,7 +112,7 @@ class Service:
         return SceneStatus.model_validate_json(self.http.get(f"/v1/scenes/{scene}").content)
 
     def frame(self, scene: str, index: int) -> FrameReportModel:
-        """What became of a frame."""
+        """The report of a frame."""
         return FrameReportModel.model_validate_json(self.http.get(f"/v1/scenes/{scene}/frames/{index}").content)
 
     def finish(self, scene: str, frames: int) -> SceneStatus:

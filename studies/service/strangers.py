@@ -1,4 +1,4 @@
-"""What strangers without a token cost: `/health/live`, memory and updates with an attack and without, in turns.
+"""Cost of strangers without a token: `/health/live`, memory and updates with an attack and without, in turns.
 
 The attack is `studies.service.attack`, in a process of its own; a service runs with a token and one without. The scene
 goes on updating all the time, in the turns with the attack until its last connection is closed.
@@ -20,7 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from client.wire import FrameState
-from studies.service.outcome import Outcome, Told
+from studies.options import Echo
+from studies.service.outcome import ScenarioResult
 from studies.service.process import Service, StudyError
 from studies.service.study import Study
 
@@ -36,7 +37,7 @@ WARM_UP = 3
 
 @dataclass(frozen=True)
 class Attack:
-    """How much at once: bytes of one endless header, half-sent headers, hanging uploads."""
+    """Size of an attack: bytes of one endless header, half-sent headers, hanging uploads."""
 
     header: int = 300_000_000
     halves: int = 300
@@ -44,8 +45,8 @@ class Attack:
 
 
 @dataclass
-class Side:
-    """All turns without the attack, or with it.
+class AttackTimes:
+    """Measurements of all turns without the attack, or with it.
 
     Attributes:
         health: ms of each answer of `/health/live`. lost: questions without an answer of 200. memory: largest MB of the
@@ -65,7 +66,7 @@ class Side:
 class Watch:
     """Asks `/health/live` and reads the service's memory, from a thread, while the block runs."""
 
-    def __init__(self, service: Service, side: Side) -> None:
+    def __init__(self, service: Service, side: AttackTimes) -> None:
         self._service, self._side = service, side
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -136,7 +137,7 @@ class Updates:
         return f"/v1/scenes/{self.scene}/frames/{self._next + AT_ONCE}"
 
 
-def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token: bool, told: Told) -> Outcome:
+def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token: bool, echo: Echo) -> ScenarioResult:
     """The attack on one service.
 
     Args:
@@ -147,7 +148,7 @@ def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token
     name = "strangers-token" if token else "strangers"
     service = Study(study.folder, study.capture, study.frames, study.settings, environment).service(name)
     service.start()
-    without, attacked = Side(), Side()
+    without, attacked = AttackTimes(), AttackTimes()
     closed, left = 0.0, 0
     try:
         updates = Updates(study, service)
@@ -164,13 +165,13 @@ def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token
                     attacked.updates += updates.run(AT_ONCE)
             ended = json.loads(attacker.communicate()[0])
             closed, left = max(closed, ended["seconds"]), left + int(ended["open"])
-            told(
+            echo(
                 f"turn {turn + 1}: all closed after {ended['seconds']:.1f} s, {ended['open']} left; "
                 f"{ended['sent'] / 1e6:.1f} MB of header sent; /health/live p99 {attacked.p(99):.1f} ms"
             )
     finally:
         service.stop()
-    return judge(attack, without, attacked, closed, left, token=token)
+    return compare(attack, without, attacked, closed, left, token=token)
 
 
 def _start(port: int, path: str, attack: Attack) -> subprocess.Popen[bytes]:
@@ -179,7 +180,9 @@ def _start(port: int, path: str, attack: Attack) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-m", "studies.service.attack", *options], stdout=subprocess.PIPE)
 
 
-def judge(attack: Attack, without: Side, attacked: Side, closed: float, left: int, *, token: bool) -> Outcome:
+def compare(
+    attack: Attack, without: AttackTimes, attacked: AttackTimes, closed: float, left: int, *, token: bool
+) -> ScenarioResult:
     """The row of the table.
 
     Args:
@@ -205,7 +208,7 @@ def judge(attack: Attack, without: Side, attacked: Side, closed: float, left: in
         f"{without.memory:.0f} → {attacked.memory:.0f} MB; all closed after {closed:.0f} s; an update "
         f"{statistics.median(without.updates):.3f} → {statistics.median(attacked.updates):.3f} s ({slower:.2f} times)"
     )
-    return Outcome(
+    return ScenarioResult(
         f"strangers, {'a token' if token else 'no token'}: an endless header of {attack.header / 1e6:.0f} MB, "
         f"{attack.halves} half-sent headers, {attack.uploads} hanging uploads at once",
         f"/health/live answers, p99 + {P99_MS:.0f} ms; memory + {MEMORY_MB:.0f} MB; closed within {CLOSED_S:.0f} s; "

@@ -1,4 +1,4 @@
-"""What a study of the service sends, to which service, and what it compares: the frames, their sender, the states."""
+"""Frames of a study of the service, their sender, and the states that are compared."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Files = tuple[dict[str, bytes], dict[str, bytes]]
 
 @dataclass(frozen=True)
 class Study:
-    """What is sent, and where to.
+    """Frames to be sent, and the service that takes them.
 
     Attributes:
         folder: for data folders and logs. frames: encoded pictures and masks of each. settings: of the scene.
@@ -98,7 +98,7 @@ def compare(found: Mapping[int, str], expected: Mapping[int, str], but: Sequence
     return faults + ([f"states {others} are not bit-identical"] if others else [])
 
 
-class Sender:
+class FrameSender:
     """Sends frames as a rig would that never gives up, and keeps what was acknowledged."""
 
     def __init__(self, study: Study, service: Service, scene: str) -> None:
@@ -145,7 +145,7 @@ def undisturbed(study: Study) -> tuple[dict[int, str], float]:
     service.start()
     try:
         scene = study.create(service)
-        sender = Sender(study, service, scene)
+        sender = FrameSender(study, service, scene)
         sender.send(0)
         service.finish(scene, 1)
         began = time.monotonic()

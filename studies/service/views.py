@@ -1,4 +1,4 @@
-"""What live views cost an update, and an update the views: a scene under an open-loop load of renders.
+"""Live views beside updates, each slowed by the other: a scene under an open-loop load of renders.
 
 A service runs in a process of its own. For each rate: views while nothing is updated, updates while nobody looks, and
 both together, in turns, because a machine's speed drifts. Arrivals are at fixed times whatever came of the requests
@@ -14,7 +14,7 @@ import shutil
 import statistics
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -26,21 +26,20 @@ import numpy as np
 from client.wire import FrameState
 from scas4d_core.captures import Capture
 from studies.machine import in_words, machine
+from studies.options import Echo
 from studies.service.process import Service, StudyError
 from studies.service.study import encoded_frames
 
-BAR_RATE, BAR_LATENCY, BAR_SLOWER = 5.0, 2.0, 0.25
+TARGET_RATE, TARGET_LATENCY, TARGET_SLOWER = 5.0, 2.0, 0.25
 IDLE_S = 6.0
 """Of views while nothing is updated, a turn."""
 WARM_UP = 3
 """Updates before anything is measured: the first ones compile or load kernels and start cold."""
 
-Told = Callable[[str], None]
-
 
 @dataclass
-class Measured:
-    """One rate.
+class ViewTimes:
+    """Latencies and update times at one rate of views.
 
     Attributes:
         idle, loaded: ms, latency of each view without and during updates. alone, together: seconds of each update
@@ -66,7 +65,7 @@ class Measured:
 
 
 class Load:
-    """Views at a rate, from a thread, until told to stop."""
+    """Views at a rate, from a thread, until it is stopped."""
 
     def __init__(self, url: str, cameras: Sequence[str], rate: float, width: int) -> None:
         self.latencies: list[float] = []
@@ -109,7 +108,7 @@ class Load:
         self.latencies.append(1000 * (time.perf_counter() - due))
 
 
-class Sender:
+class CaptureSender:
     """Frames of a capture that are sent to a scene, some at a time."""
 
     def __init__(self, service: Service, scene: str, capture: Capture, count: int) -> None:
@@ -143,8 +142,8 @@ def measure(
     width: int,
     settings: Mapping[str, Any],
     environment: Mapping[str, str],
-    told: Told,
-) -> list[Measured]:
+    echo: Echo,
+) -> list[ViewTimes]:
     """Runs the study.
 
     Args:
@@ -162,15 +161,15 @@ def measure(
         scene = service.create(capture.rig, settings, ingest={"queue_frames": updates + 1})
         if capture.points is not None:
             put_points(service, scene, capture)
-        frames = Sender(service, scene, capture, many)
-        told("frame 0 …")
+        frames = CaptureSender(service, scene, capture, many)
+        echo("frame 0 …")
         frames.update(1)
         frames.update(WARM_UP)
         url = f"http://127.0.0.1:{service.port}/v1/scenes/{scene}/"
         names = capture.rig.names
         with Load(url, names, 2.0, width):  # connections, the reader's kernels
             time.sleep(3.0)
-        found = [Measured(rate) for rate in rates]
+        found = [ViewTimes(rate) for rate in rates]
         for _ in range(turns):
             for row in found:
                 with Load(url, names, row.rate, width) as load:
@@ -182,7 +181,7 @@ def measure(
                     row.together += frames.update(updates)
                 row.loaded += load.latencies
                 row.refused += load.refused
-                told(line(row))
+                echo(line(row))
         return found
     finally:
         with contextlib.suppress(Exception):
@@ -204,7 +203,7 @@ def put_points(service: Service, scene: str, capture: Capture) -> None:
         raise StudyError(answer.text)
 
 
-def line(row: Measured) -> str:
+def line(row: ViewTimes) -> str:
     """One row of the table."""
     cells = [
         f"{row.rate:g}",
@@ -218,8 +217,8 @@ def line(row: Measured) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def table(rows: Sequence[Measured]) -> str:
-    """As Markdown, with the bar."""
+def table(rows: Sequence[ViewTimes]) -> str:
+    """As Markdown, with the target."""
     head = [
         "| views a second | idle, ms (95 %) | during updates, ms (95 %) | ratio | update alone, s | under views, s | "
         "slower | no answer |",
@@ -227,17 +226,17 @@ def table(rows: Sequence[Measured]) -> str:
     ]
     text = "\n".join([*head, *map(line, rows)])
     for row in rows:
-        if row.rate == BAR_RATE:
-            reached = row.latency <= BAR_LATENCY and row.slower <= BAR_SLOWER and row.refused == 0
+        if row.rate == TARGET_RATE:
+            reached = row.latency <= TARGET_LATENCY and row.slower <= TARGET_SLOWER and row.refused == 0
             text += (
-                f"\n\nBar at {BAR_RATE:g} a second: median at most {BAR_LATENCY:g} times the idle one, updates at most "
-                f"{100 * BAR_SLOWER:.0f} % slower: {'reached' if reached else '**missed**'} "
+                f"\n\nTarget at {TARGET_RATE:g} a second: median at most {TARGET_LATENCY:g} times the idle one, "
+                f"updates at most {100 * TARGET_SLOWER:.0f} % slower: {'reached' if reached else '**missed**'} "
                 f"({row.latency:.2f} times, {100 * row.slower:+.0f} %)."
             )
     return text
 
 
-def page(rows: Sequence[Measured], capture: str, width: int, updates: int, turns: int) -> str:
+def page(rows: Sequence[ViewTimes], capture: str, width: int, updates: int, turns: int) -> str:
     """The table with what it was measured on."""
     day = datetime.now(UTC).date().isoformat()
     return (

@@ -6,8 +6,8 @@ import os
 import shutil
 
 import pytest
+from browser_page import FRAMES, push, start_scene
 from running import Running, fake_settings
-from stage import FRAMES, push, start_scene
 
 from client.sdk import Client
 
@@ -46,7 +46,7 @@ def page(chromium):
 @pytest.fixture(scope="session")
 def service(tmp_path_factory):
     folder = tmp_path_factory.mktemp("viewer")
-    running = Running(fake_settings(folder, engine="drawn:engine", max_render_pixels=2_000_000))
+    running = Running(fake_settings(folder, engine="browser_engine:engine", max_render_pixels=2_000_000))
     yield running
     running.stop()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fakes
 import pytest
-from stage import opened, push, shown, start_scene, until
+from browser_page import opened, push, shown, start_scene, until
 
 from client.sdk import Client
 from client.wire import Budget

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from browser_page import FRAMES, canvas, opened, push, shown, start_scene, until
 from running import Running, fake_settings
-from stage import FRAMES, canvas, opened, push, shown, start_scene, until
 
 from client.sdk import Client
 from client.wire import part_colour
@@ -184,7 +184,7 @@ def test_a_scene_from_its_first_frame_to_its_deletion(page, service, finished):
 
 
 def test_it_connects_again_when_the_service_restarts(page, tmp_path):
-    settings = fake_settings(tmp_path, engine="drawn:engine")
+    settings = fake_settings(tmp_path, engine="browser_engine:engine")
     service = Running(settings)
     try:
         with Client(service.url, patience=30) as sdk:
@@ -222,7 +222,7 @@ def test_an_address_of_no_scene_is_told_and_the_others_are_offered(page, service
 
 
 def test_without_a_scene_it_says_what_to_do(page, tmp_path):
-    service = Running(fake_settings(tmp_path, engine="drawn:engine"))
+    service = Running(fake_settings(tmp_path, engine="browser_engine:engine"))
     try:
         page.goto(service.url)
         until(page, "document.querySelector('#curtain').innerText.includes('scas4d push')")
@@ -233,7 +233,7 @@ def test_without_a_scene_it_says_what_to_do(page, tmp_path):
 
 def test_a_token_is_asked_for_and_the_stream_opens_with_a_ticket(page, tmp_path):
     token = "a-token-that-is-long-enough"
-    service = Running(fake_settings(tmp_path, engine="drawn:engine", token=token))
+    service = Running(fake_settings(tmp_path, engine="browser_engine:engine", token=token))
     try:
         with Client(service.url, token=token, patience=30) as sdk:
             id = start_scene(sdk)

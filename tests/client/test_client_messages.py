@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from client.cli.extras import CUDA, SERVER
+from client.cli.extras import CUDA, SERVER, remedy
 
 FAKES = str(Path(__file__).parents[1] / "helpers")
 ALONE = f"""
@@ -51,11 +51,6 @@ def refused(*arguments, **more):
         ("demo --capture TINY --out OUT", "server"),
         ("reconstruct TINY --out OUT", "server"),
         ("evaluate TINY --out OUT", "server"),
-        ("bench quality TINY --out OUT", "server"),
-        ("bench ingest --frames 1 --work OUT", "server"),
-        ("bench views TINY --work OUT", "server"),
-        ("bench faults TINY --work OUT", "server"),
-        ("bench device", "cuda"),
     ],
 )
 def test_the_client_alone_names_what_to_install(capture_folder, tmp_path, command, extra):
@@ -65,9 +60,18 @@ def test_the_client_alone_names_what_to_install(capture_folder, tmp_path, comman
     assert f"pip install -e '.[{extra}]'" in said
 
 
+@pytest.mark.parametrize("package", CUDA)
+def test_a_missing_package_for_the_gpu_names_its_extra(package):
+    said = remedy(ModuleNotFoundError(f"No module named {package!r}", name=f"{package}.cuda"))
+    assert said is not None
+    assert package in said
+    assert "pip install -e '.[cuda]'" in said
+    assert remedy(ModuleNotFoundError("No module named 'other'", name="other")) is None
+
+
 def test_the_client_alone_still_helps(tmp_path):
     (tmp_path / "sitecustomize.py").write_text(ALONE)
-    for command in (["--help"], ["serve", "--help"], ["bench", "quality", "--help"]):
+    for command in (["--help"], ["serve", "--help"], ["evaluate", "--help"]):
         assert scas4d(*command, before=[tmp_path]).returncode == 0
 
 
@@ -88,8 +92,11 @@ def test_evaluate_asks_for_test_cameras(capture_folder, tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ("update.iterations=x", "setting update.iterations: it cannot be 'x'"),
-        ("update.iteration=4", "setting update.iteration: there is none of this name"),
+        ("update.iterations=x", "setting update.iterations='x': "),
+        (
+            "update.iteration=4",
+            "there is no setting of this name; did you mean update.iterations?",
+        ),
     ],
 )
 def test_a_setting_that_cannot_be_is_named_with_its_value(capture_folder, tmp_path, change, said):

@@ -81,7 +81,7 @@ def test_the_summary_says_how_far_behind():
 def test_a_rig_that_loses_frames_goes_on(client, capture, websocket):
     said = []
     pace = Pace(drop=0.5, seed=1)
-    delivery = push(capture, client, pace=pace, frames=20, loop=True, websocket=websocket, said=said.append)
+    delivery = push(capture, client, pace=pace, frames=20, loop=True, websocket=websocket, on_message=said.append)
     lost = [index for index in range(20) if pace.loses(index)]
     assert delivery.lost == lost != []
     states = [client.frame(delivery.scene, index).state for index in range(20)]
@@ -115,7 +115,7 @@ def test_each_camera_sends_its_own(client, capture, websocket):
 def test_a_scene_is_gone_on_with(client, capture):
     first = push(capture, client, frames=2)
     said = []
-    second = push(capture, client, scene=first.scene, said=said.append)
+    second = push(capture, client, scene=first.scene, on_message=said.append)
     assert second.scene == first.scene
     assert second.status.committed == 4
     assert len(second.lateness.late) == 2
@@ -144,7 +144,7 @@ def test_after_a_gap_it_goes_on_where_the_service_says(client, capture):
     def scene_id():
         return client.scenes()[0].id
 
-    delivery = push(capture, client, told=meddle, said=said.append)
+    delivery = push(capture, client, on_progress=meddle, on_message=said.append)
     assert [client.frame(delivery.scene, index).state for index in range(4)] == [
         "committed",
         "committed",
@@ -168,7 +168,7 @@ def test_a_full_queue_is_waited_for_and_counted(client, capture):
 
     heard = []
     client.on_retry = go_on
-    delivery = push(capture, client, frames=12, loop=True, told=rest, ingest=IngestSettings(queue_frames=1))
+    delivery = push(capture, client, frames=12, loop=True, on_progress=rest, ingest=IngestSettings(queue_frames=1))
     assert delivery.status.committed == 12
     assert heard == ["busy"] * delivery.lateness.busy_count != []
     assert delivery.lateness.busy > 0
@@ -194,7 +194,9 @@ def test_a_restart_of_the_service_is_waited_out(capture, tmp_path):
 
     try:
         with Client(running.url, outage=60, patience=60) as client:
-            delivery = push(capture, client, pace=Pace(fps=10), frames=20, loop=True, told=told, said=said.append)
+            delivery = push(
+                capture, client, pace=Pace(fps=10), frames=20, loop=True, on_progress=told, on_message=said.append
+            )
             restarting.join()
             assert [client.frame(delivery.scene, index).state for index in range(20)] == ["committed"] * 20
         assert delivery.lateness.outage_count > 0

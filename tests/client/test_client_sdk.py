@@ -17,7 +17,10 @@ def test_the_rig_simulator_sends_a_capture(service, capture_folder):
     told = []
     with Client(service.url) as client:
         status = push(
-            open_capture(capture_folder), client, told=lambda *now: told.append(now), settings={"update": {"seed": 3}}
+            open_capture(capture_folder),
+            client,
+            on_progress=lambda *now: told.append(now),
+            settings={"update": {"seed": 3}},
         ).status
         assert (status.name, status.committed, status.state) == ("tiny", 4, "ready")
         assert status.cameras == ["0", "1"]

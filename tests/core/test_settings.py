@@ -12,7 +12,7 @@ import pytest
 from pydantic import BaseModel, ValidationError
 
 from scas4d_core import settings as module
-from scas4d_core.presets import PRESETS, preset
+from scas4d_core.presets import PRESETS, SettingError, preset
 from scas4d_core.settings import Settings, UpdateSettings, Weights
 
 CORE = Path(module.__file__).parent
@@ -52,7 +52,7 @@ def test_presets_are_what_they_are_called() -> None:
 
 
 def test_an_unknown_preset_names_those_there_are() -> None:
-    with pytest.raises(ValueError, match=r"'fast' is unknown; choose one of .*scas4d"):
+    with pytest.raises(ValueError, match=r"preset='fast': there is no preset of this name; give one of .*scas4d"):
         preset("fast")
 
 
@@ -137,3 +137,33 @@ def test_the_constant_of_a_former_setting_is_where_it_is_said_to_be(model: type[
     assert name not in model.model_fields
     owner, _, attribute = constant.place.rpartition(".")
     assert not owner or getattr(importlib.import_module(owner), attribute) == constant.value
+
+
+def test_changes_go_over_the_preset_later_ones_over_earlier_ones() -> None:
+    changed = preset("adaptive", {"update": {"iterations": 20, "seed": 3}}, {"update": {"seed": 4}, "device": "cuda"})
+    assert (changed.update.iterations, changed.update.seed, changed.device) == (20, 4, "cuda")
+    assert changed.update.beta1 == PRESETS["adaptive"].update.beta1
+    assert PRESETS["adaptive"].update.iterations == 50
+    assert preset("adaptive", {}) == PRESETS["adaptive"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "setting", "value", "words"),
+    [
+        ({"update": {"iteration": 4}}, "update.iteration", 4, "did you mean update.iterations?"),
+        ({"update": {"iterations": 0}}, "update.iterations", 0, "greater than or equal to 1"),
+        ({"update": {"clusters": [64, 8]}}, "update.clusters", [64, 8], "do not ascend"),
+        ({"upd": {"seed": 1}}, "upd", {"seed": 1}, "no setting of this name"),
+        ({"update": 4}, "update", 4, "UpdateSettings"),
+    ],
+)
+def test_a_refused_change_names_setting_value_fault_and_remedy(
+    changes: dict[str, object], setting: str, value: object, words: str
+) -> None:
+    with pytest.raises(SettingError) as refused:
+        preset("scas4d", changes)
+    error = refused.value
+    assert (error.setting, error.value) == (setting, value)
+    assert words in error.fault + error.remedy
+    assert str(error) == f"setting {setting}={value!r}: {error.fault}; {error.remedy}"
+    assert error.remedy

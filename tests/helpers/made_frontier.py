@@ -3,8 +3,8 @@
 from math import exp, log10
 from pathlib import Path
 
+from client.cli.scores import Store, digest
 from studies.frontier.frontier import Variant, variants
-from studies.quality.store import Store, digest
 
 STAGES = ("render", "cascade", "adam")
 

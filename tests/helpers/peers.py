@@ -26,6 +26,24 @@ PATIENCE_S = 30
 LARGE_MB = 16
 SHORT = dict(header_seconds=0.8, body_seconds=0.8, keep_alive_seconds=1.2, unread_seconds=0.8, header_kb=8)
 HOST = b"Host: 127.0.0.1\r\n"
+GET = b"GET /echo HTTP/1.1\r\n" + HOST
+
+
+def put(path, length=None, *more):
+    kind = b"Transfer-Encoding: chunked" if length is None else b"Content-Length: %d" % length
+    return b"PUT %s HTTP/1.1\r\n" % path + HOST + b"".join(line + b"\r\n" for line in (kind, *more)) + b"\r\n"
+
+
+def drip(peer, piece, most=20):
+    """Sends a piece every tenth of a second; seconds until the service had enough."""
+    began = time.monotonic()
+    while time.monotonic() - began < most:
+        try:
+            peer.send(piece)
+        except OSError:
+            break
+        time.sleep(0.1)
+    return time.monotonic() - began
 
 
 class Peer:

@@ -32,7 +32,11 @@ def pushed(tmp_path_factory):
     try:
         with Client(running.url) as client:
             delivery = rig.push(
-                open_capture(CAPTURE), client, frames=FRAMES, settings=SETTINGS, told=lambda *now: told.append(now)
+                open_capture(CAPTURE),
+                client,
+                frames=FRAMES,
+                settings=SETTINGS,
+                on_progress=lambda *now: told.append(now),
             )
             yield client, delivery.status, told
     finally:

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from running import HEIGHT, WIDTH, make_rig
 
-from client.cli.overrides import overrides
+from client.cli.changes import parse_changes
 from client.cli.pictures import coloured, comparison, psnr
 from client.rig import push
 from client.sdk import Client
@@ -176,16 +176,16 @@ def test_a_setting_the_service_refuses_is_named(service, capture_folder):
     assert "settings.update.iteration" in done.stderr
 
 
-def test_overrides():
+def test_changes_are_parsed():
     changes = ["update.iterations=200", "device=cuda", "update.clusters=[64]", "scene.metres_per_unit=auto"]
-    assert overrides(changes) == {
+    assert parse_changes(changes) == {
         "update": {"iterations": 200, "clusters": [64]},
         "device": "cuda",
         "scene": {"metres_per_unit": "auto"},
     }
     for bad in (["update"], ["a=1", "a.b=2"]):
         with pytest.raises(ValueError, match="setting"):
-            overrides(bad)
+            parse_changes(bad)
 
 
 def test_pictures():

@@ -8,6 +8,7 @@ import struct
 import numpy as np
 import pytest
 from lenses import HEIGHT, LENSES, WIDTH
+from rigs import colmap_model as model
 from rigs import lenses
 
 from client.importers.colmap import read_colmap
@@ -15,24 +16,6 @@ from client.importers.lens import MODELS
 from scas4d_core.captures import CaptureError
 
 pycolmap = pytest.importorskip("pycolmap")
-
-
-def model(rig, folder, name, binary, points=3, path="{}.jpg", parameters=None):
-    """A model of the rig in `folder`, one COLMAP camera a camera."""
-    reconstruction = pycolmap.Reconstruction()
-    for number, (camera, lens) in enumerate(rig.items(), 1):
-        values = parameters if parameters is not None else [LENSES[name].get(key, 0.0) for key in MODELS[name]]
-        colmap = pycolmap.Camera(model=name, width=WIDTH, height=HEIGHT, params=values, camera_id=number)
-        reconstruction.add_camera_with_trivial_rig(colmap)
-        pose = pycolmap.Rigid3d(lens.world_to_camera[:3])
-        image = pycolmap.Image(name=path.format(camera), camera_id=number, image_id=number)
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(np.array([1.0, 2.0]))] * number)
-        reconstruction.add_image_with_trivial_frame(image, pose)
-    for number in range(points):
-        reconstruction.add_point3D(np.array([number, 0.5, -1.0]), pycolmap.Track(), np.array([255, 51 * number, 0]))
-    folder.mkdir(parents=True, exist_ok=True)
-    reconstruction.write_binary(folder) if binary else reconstruction.write_text(folder)
-    return folder
 
 
 @pytest.mark.parametrize("binary", [False, True])

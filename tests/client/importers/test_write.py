@@ -36,7 +36,7 @@ def distorted(tmp_path):
 def test_what_was_imported_is_a_capture(distorted, tmp_path):
     source = open_source(distorted, encoding="png")
     told = []
-    write_dynamic3dgs(source, tmp_path / "out", test=["cam2"], told=lambda *now: told.append(now))
+    write_dynamic3dgs(source, tmp_path / "out", test=["cam2"], on_progress=lambda *now: told.append(now))
     capture = open_capture(tmp_path / "out")
     assert told == [("frames", 1, 2), ("frames", 2, 2)]
     assert (capture.full_rig.names, capture.full_test_rig.names) == (("cam1", "cam10"), ("cam2",))
@@ -55,8 +55,8 @@ def test_what_was_imported_is_a_capture(distorted, tmp_path):
 
 def test_a_cloud_of_unknown_foreground_comes_along(tmp_path):
     pytest.importorskip("pycolmap")
+    from rigs import colmap_model as model
     from rigs import write_pictures
-    from test_colmap import model
 
     model(lenses("PINHOLE"), tmp_path / "in/sparse/0", "PINHOLE", True)
     write_pictures(tmp_path / "in/images")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from cases import Motion, doubles, law, on_cpu, seeds, some_motion, some_rotation
 from hypothesis import given
 from hypothesis import strategies as st
+from law_cases import Motion, doubles, law, on_cpu, seeds, some_motion, some_rotation
 from torch.testing import assert_close
 
 from scas4d_core.torch_backend.deformation import (

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 import torch
-from cases import Motion, Splats, doubles, law, seeds, some_motion, some_splats
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from law_cases import Motion, Splats, doubles, law, seeds, some_motion, some_splats
 from torch import Tensor
 
 from scas4d_core.rasterize import twin

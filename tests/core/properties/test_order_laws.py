@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from box_scene import MOVING, make_box, moved, take_frame
-from cases import law, seeds
-from dyadic import RIG
+from box_scene import MOVING, RIG, make_box, moved, take_frame
 from hypothesis import given
+from law_cases import law, seeds
 
 from scas4d_core.cameras import Rig
 from scas4d_core.gaussians import Gaussians

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from box_scene import MOVING, make_box, make_rig, moved, take_frame
-from cases import doubles
+from law_cases import doubles
 from torch import Tensor
 
 from scas4d_core.gaussians import Gaussians

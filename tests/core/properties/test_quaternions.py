@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from cases import doubles, law
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from law_cases import doubles, law
 
 from scas4d_core.gaussians import quaternions_to_matrices
 from scas4d_core.torch_backend.deformation import (

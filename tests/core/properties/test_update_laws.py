@@ -12,9 +12,9 @@ from itertools import permutations, product
 import numpy as np
 import pytest
 import torch
-from cases import doubles, law, seeds, some_rotation
 from hypothesis import given
 from hypothesis import strategies as st
+from law_cases import doubles, law, seeds, some_rotation
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera

@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from box_scene import make_box, moved, take_frame
-from cases import law, some_rotation
-from dyadic import RIG
+from box_scene import RIG, make_box, moved, take_frame
 from hypothesis import example, given
 from hypothesis import strategies as st
+from law_cases import law, some_rotation
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import Capture, InitialPoints, open_capture

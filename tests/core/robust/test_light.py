@@ -17,7 +17,7 @@ from scas4d_core.robust.outliers import Look, Past
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 from studies.hard_frames import footage as frames_footage
-from studies.hard_frames.footage import MadeUp
+from studies.hard_frames.footage import SyntheticFootage
 
 PATIENCE = 4
 FROM = 4
@@ -30,9 +30,9 @@ WITHIN_DB = 0.5
 NOISE = 1.0
 """Levels of 255: with more of it, what seems to move without masks differs from light to light."""
 
-GIVEN: Settings = MadeUp().settings
+GIVEN: Settings = SyntheticFootage().settings
 SETTINGS = GIVEN.model_copy(update={"update": GIVEN.update.model_copy(update={"patience": PATIENCE})})
-FOOTAGE = MadeUp(SETTINGS)
+FOOTAGE = SyntheticFootage(SETTINGS)
 
 
 @pytest.fixture(autouse=True)

@@ -21,10 +21,10 @@ from scas4d_core.update.picture_loss import PictureLoss
 from scas4d_core.update.probe_views import VIEWS, Witness, mean_error, spread
 from scas4d_core.update.stopping import Counted
 from scas4d_core.update.views import TrainingView, ViewFactory
-from studies.hard_frames.footage import ANGLE, MadeUp
+from studies.hard_frames.footage import ANGLE, SyntheticFootage
 from studies.hard_frames.scene import BALL, GOES, first_state, gone
 
-FOOTAGE = MadeUp()
+FOOTAGE = SyntheticFootage()
 BEFORE = first_state(resting_may_move=False)
 FACTORY = ViewFactory(rig_inside(FOOTAGE.rig.world_frame(1.0), FOOTAGE.rig.cameras))
 PICTURE = PictureLoss(FACTORY, (0.0, 0.0, 0.0), 1.0, 0.0)

@@ -23,10 +23,10 @@ from scas4d_core.update.result import CameraFit, Updated
 from scas4d_core.update.stopping import Timed
 from scas4d_core.update.views import TrainingView, ViewFactory
 from scas4d_core.update.warm_start import Motion
-from studies.hard_frames.footage import MadeUp
+from studies.hard_frames.footage import SyntheticFootage
 from studies.hard_frames.scene import first_state, gone
 
-FOOTAGE = MadeUp()
+FOOTAGE = SyntheticFootage()
 RIG: Rig = FOOTAGE.rig
 BEFORE = first_state(resting_may_move=False)
 AFTER = gone(BEFORE, 0.05)

@@ -7,7 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
-from test_history import filled, same, state
+from histories import filled, same, state
 
 from scas4d_core.errors import message_of, without_paths
 from scas4d_core.storage.checkpoint import Checkpoints

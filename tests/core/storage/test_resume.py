@@ -15,10 +15,10 @@ from scas4d_core.captures.frame import Frame
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.storage.history import History
 from studies.hard_frames import frames
-from studies.hard_frames.footage import MadeUp
+from studies.hard_frames.footage import SyntheticFootage
 from studies.hard_frames.frames import Sent, each
 
-FOOTAGE = MadeUp()
+FOOTAGE = SyntheticFootage()
 AT = 2
 
 

@@ -7,17 +7,11 @@ import socket
 import time
 
 import pytest
-from peers import HOST, LARGE_MB, SHORT, Peer, refused, stub, until
-from test_headers import GET, drip
+from peers import GET, HOST, LARGE_MB, SHORT, Peer, drip, put, refused, stub, until
 
 from server.connections import guard
 from server.connections.connection import Connection
 from server.connections.guard import LINGER_S
-
-
-def put(path, length=None, *more):
-    kind = b"Transfer-Encoding: chunked" if length is None else b"Content-Length: %d" % length
-    return b"PUT %s HTTP/1.1\r\n" % path + HOST + b"".join(line + b"\r\n" for line in (kind, *more)) + b"\r\n"
 
 
 def chunk(data, extension=b""):

@@ -9,9 +9,7 @@ from contextlib import ExitStack, suppress
 
 import httpx
 import pytest
-from peers import HOST, Peer, refused, stub, until
-from test_bodies import put
-from test_headers import GET
+from peers import GET, HOST, Peer, put, refused, stub, until
 
 from server.connections import process
 from server.connections.guard import peer_key

@@ -6,10 +6,9 @@ import json
 import time
 
 import pytest
-from peers import HOST, SHORT, Peer, parsed, refused, until
+from peers import GET, HOST, SHORT, Peer, drip, parsed, refused, until
 
 LIMIT = SHORT["header_kb"] << 10
-GET = b"GET /echo HTTP/1.1\r\n" + HOST
 
 
 def line(size):
@@ -66,18 +65,6 @@ def test_a_half_sent_header_is_answered_in_time(app):
 def test_a_silent_connection_is_closed_without_a_word(app):
     with Peer(app.port) as peer:
         assert peer.rest() == b""
-
-
-def drip(peer, piece, most=20):
-    """Sends a piece every tenth of a second; seconds until the service had enough."""
-    began = time.monotonic()
-    while time.monotonic() - began < most:
-        try:
-            peer.send(piece)
-        except OSError:
-            break
-        time.sleep(0.1)
-    return time.monotonic() - began
 
 
 def test_a_header_that_drips_is_ended(app):

@@ -103,7 +103,7 @@ def test_a_client_of_a_proxy_on_this_machine_is_not_on_this_machine(tmp_path):
 
 
 def test_the_study_tells_a_service_that_holds_from_one_that_does_not():
-    good, bad = strangers.Side([1.0] * 99, 0, 100, [1.0]), strangers.Side([900.0] * 99, 3, 400, [1.5])
-    assert strangers.judge(strangers.Attack(), good, good, 20, 0, token=True).reached
-    found = strangers.judge(strangers.Attack(), good, bad, 70, 5, token=False)
+    good, bad = strangers.AttackTimes([1.0] * 99, 0, 100, [1.0]), strangers.AttackTimes([900.0] * 99, 3, 400, [1.5])
+    assert strangers.compare(strangers.Attack(), good, good, 20, 0, token=True).reached
+    found = strangers.compare(strangers.Attack(), good, bad, 70, 5, token=False)
     assert len(found.faults) == 5

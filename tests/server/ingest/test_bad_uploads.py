@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from running import HEIGHT, WIDTH, make_rig, picture, pictures, problem
-from test_service_frames import animated, declares
+from sending import animated, declares
 from websockets.sync.client import connect
 
 from client.wire import FRAME_MEDIA_TYPE, RigModel, frame_chunks

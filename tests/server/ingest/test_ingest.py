@@ -10,57 +10,14 @@ import time
 import fakes
 import pytest
 from running import make_rig, picture, pictures, problem
+from sending import FRAMED, finished, framed, put_camera, status, wait_for
+from sending import put_framed as put
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from client.wire import FRAME_MEDIA_TYPE, RigModel, frame_chunks
+from client.wire import FRAME_MEDIA_TYPE
 from server.ingest import acknowledge
 from server.ingest.pictures import largest_frame
-
-FRAMED = {"Content-Type": FRAME_MEDIA_TYPE}
-
-
-@pytest.fixture
-def make(http):
-    """Makes scenes with rules of ingest; deletes them."""
-    made = []
-
-    def scene(cameras=2, **ingest):
-        body = {"rig": RigModel.of(make_rig(cameras)).model_dump(mode="json"), "ingest": ingest}
-        answer = http.post("/v1/scenes", json={**body, "frames_per_second": 10})
-        assert answer.status_code == 201, answer.text
-        made.append(answer.json()["id"])
-        return made[-1]
-
-    yield scene
-    for id in made:
-        http.delete(f"/v1/scenes/{id}")
-
-
-def framed(index, images=None, masks=None, time=None, **more):
-    return b"".join(frame_chunks(index, pictures() if images is None else images, masks, time, **more))
-
-
-def put(http, id, index, images=None, **more):
-    return http.put(f"/v1/scenes/{id}/frames/{index}", content=framed(index, images, **more), headers=FRAMED)
-
-
-def put_camera(http, id, index, camera, data, **params):
-    return http.put(f"/v1/scenes/{id}/frames/{index}/cameras/{camera}", content=data, params=params)
-
-
-def status(http, id):
-    return http.get(f"/v1/scenes/{id}").json()
-
-
-def finished(http, id, index):
-    until = time.monotonic() + 30
-    while True:
-        report = http.get(f"/v1/scenes/{id}/frames/{index}").json()
-        if report.get("state") in ("committed", "set_aside", "missing", "skipped"):
-            return report
-        assert time.monotonic() < until, report
-        time.sleep(0.05)
 
 
 def test_a_form_and_framed_bytes_of_the_same_pictures_are_the_same_frame(http, make):
@@ -254,13 +211,6 @@ def test_what_a_scene_does_hides_neither_that_it_is_paused_nor_that_it_is_degrad
     finished(http, id, 2)
     wait_for(lambda: status(http, id)["state"] == "paused")
     assert (status(http, id)["degraded"], status(http, id)["error"]) == (False, None)
-
-
-def wait_for(condition):
-    until = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.05)
 
 
 def test_retention_deletes_pictures_and_states_and_says_so(http, make, service):

@@ -8,9 +8,8 @@ import time
 
 import pytest
 from running import picture, problem
-from test_ingest import finished, framed, make, put, put_camera, status, wait_for  # noqa: F401  (make is a fixture)
-from test_restart import create, serving
-from test_restart import put as put_form
+from sending import create, finished, framed, put_camera, put_form, serving, status, wait_for
+from sending import put_framed as put
 
 from client.wire import FRAME_MEDIA_TYPE
 from server.ingest import camera_files, receive
@@ -21,7 +20,7 @@ from server.storage.layout import SceneFolder
 from server.storage.recovery import recover
 
 
-def test_a_refused_sender_that_goes_in_the_middle_leaves_the_frame_free(http, make, service, monkeypatch):  # noqa: F811
+def test_a_refused_sender_that_goes_in_the_middle_leaves_the_frame_free(http, make, service, monkeypatch):
     monkeypatch.setattr(receive, "BATCH", 1)  # file by file: the first is refused while the third is on its way
     id = make(3)
     body = framed(0, {"c0": picture()[:-9], "c1": picture(), "c2": picture() + bytes(500_000)})
@@ -40,7 +39,7 @@ def on_the_loop(scene, coroutine):
 
 
 @pytest.mark.parametrize("part", [False, True])
-def test_a_request_cancelled_while_its_event_is_written_keeps_its_pictures(http, make, service, monkeypatch, part):  # noqa: F811
+def test_a_request_cancelled_while_its_event_is_written_keeps_its_pictures(http, make, service, monkeypatch, part):
     id = make(1)
     http.post(f"/v1/scenes/{id}/pause")
     scene = service.app.state.scenes[id]
@@ -68,7 +67,7 @@ def test_a_request_cancelled_while_its_event_is_written_keeps_its_pictures(http,
     assert finished(http, id, 0)["state"] == "committed"
 
 
-def test_a_frame_accepted_while_the_first_one_fails_does_not_wait_for_ever(http, make, service, monkeypatch):  # noqa: F811
+def test_a_frame_accepted_while_the_first_one_fails_does_not_wait_for_ever(http, make, service, monkeypatch):
     id = make(queue_frames=9)
     scene = service.app.state.scenes[id]
     real = Journal._write
@@ -142,7 +141,7 @@ def test_a_journal_that_cannot_be_written_costs_its_scene_only(tmp_path, monkeyp
         assert "Permission denied" in problem(http.get(f"/v1/scenes/{bad}"), 404)["detail"]
 
 
-def test_parts_again_after_retention_get_the_same_answer(http, make):  # noqa: F811
+def test_parts_again_after_retention_get_the_same_answer(http, make):
     id = make(2, queue_frames=8, keep_frames={"last": 0})
     first = []
     for index in range(4):

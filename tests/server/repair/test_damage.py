@@ -10,7 +10,8 @@ import fakes
 import httpx
 import pytest
 from running import Running, fake_settings, pictures, problem
-from test_restart import create, put, settled
+from sending import create, settled
+from sending import put_form as put
 
 from client.sdk import Client
 from scas4d_core.captures import open_capture

@@ -1,9 +1,6 @@
 from __future__ import annotations
 
-import io
-import struct
 import time
-import zlib
 
 import fakes
 import httpx
@@ -11,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from running import HEIGHT, WIDTH, picture, pictures, problem
+from sending import animated, declares
 
 
 def put(http, scene, index, images, masks=None, **data):
@@ -153,23 +151,10 @@ def test_a_picture_that_only_decoding_shows_to_be_damaged_drops_its_camera(sdk, 
     assert sdk.scene(scene).state == "degraded"
 
 
-def declares(width, height):
-    """A PNG whose header, checksum and all, declares another size."""
-    header = b"IHDR" + struct.pack(">II", width, height) + picture()[24:29]
-    return picture()[:12] + header + struct.pack(">I", zlib.crc32(header)) + picture()[33:]
-
-
 def turned():
     exif = Image.Exif()
     exif[0x0112] = 6
     return picture(format="JPEG", exif=exif)
-
-
-def animated():
-    first, second = (Image.new("RGB", (WIDTH, HEIGHT), (red, 0, 0)) for red in (0, 99))
-    file = io.BytesIO()
-    first.save(file, "PNG", save_all=True, append_images=[second])
-    return file.getvalue()
 
 
 BAD = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 import threading
 import time
@@ -12,44 +11,17 @@ import httpx
 import numpy as np
 import pytest
 from running import Running, fake_settings, make_rig, picture, pictures, problem
+from sending import create, serving, settled
+from sending import put_form as put
 
-from client.sdk import Client
 from client.wire import RigModel
 from scas4d_core.captures import InitialPoints
 from server.storage import recovery
 from server.storage.frame_table import LOST
 
 
-@contextlib.contextmanager
-def serving(folder):
-    running = Running(fake_settings(folder))
-    try:
-        with httpx.Client(base_url=running.url, timeout=30) as http, Client(running.url, patience=20) as sdk:
-            yield http, sdk
-    finally:
-        running.stop()
-
-
-def create(http, **ingest):
-    body = {"rig": RigModel.of(make_rig()).model_dump(mode="json"), "ingest": ingest, "name": "studio"}
-    return http.post("/v1/scenes", json={**body, "frames_per_second": 10}).json()["id"]
-
-
-def put(http, id, index, images=None):
-    files = {name: (name, data) for name, data in (images or pictures()).items()}
-    return http.put(f"/v1/scenes/{id}/frames/{index}", files=files)
-
-
 def without(document, *names):
     return {name: value for name, value in document.items() if name not in names}
-
-
-def settled(http, id):
-    until = time.monotonic() + 30
-    while (status := http.get(f"/v1/scenes/{id}").json())["queued"] and status["state"] != "paused":
-        assert time.monotonic() < until
-        time.sleep(0.05)
-    return status
 
 
 def test_everything_is_found_again(tmp_path):

@@ -10,7 +10,6 @@ import threading
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_ledger import identity
 
 from client.wire import Budget, FileKind, FrameState
 from server.storage.events import (
@@ -32,6 +31,10 @@ from server.storage.ledger import Ledger
 from server.storage.snapshot import events_of
 
 MADE = SceneCreated(definition={"id": "abc"})
+
+
+def identity(index):
+    return f"{index:064x}"
 
 
 def state_of(ledger):

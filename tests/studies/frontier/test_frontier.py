@@ -10,9 +10,11 @@ from made_frontier import made_psnr, made_row, made_seconds, made_study
 from PIL import Image
 from typer.testing import CliRunner
 
-from client.cli.main import app
+from client.cli.scores import Store
 from scas4d_core.captures import open_capture
 from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.metrics import evaluation as measures
+from studies.commands import app
 from studies.frontier import convergence, frontier, timing
 from studies.frontier.frontier import AXES, DEFAULT, Variant, measure_frontier, row_of, variants
 from studies.frontier.page import chosen, equal_table, equal_words, write_page
@@ -26,9 +28,7 @@ from studies.frontier.tradeoff import (
     spread,
     undominated,
 )
-from studies.quality import measure as measures
 from studies.quality.first_frame import first_frame_key, save_first_frame
-from studies.quality.store import Store
 
 FRAMES = 4
 
@@ -219,7 +219,7 @@ def test_the_page_has_its_plots_and_tables(tmp_path):
         json.dumps({"capture": "cloth", "updates": 5, "curves": curves})
     )
     page = tmp_path / "docs" / "page.md"
-    command = ["bench", "frontier", str(tmp_path / "robot"), str(tmp_path / "cloth"), "--out", str(tmp_path / "study")]
+    command = ["frontier", str(tmp_path / "robot"), str(tmp_path / "cloth"), "--out", str(tmp_path / "study")]
     done = CliRunner().invoke(app, [*command, "--only", "page", "--page", str(page)])
     assert done.exit_code == 0, done.output
     text = page.read_text()

@@ -10,7 +10,7 @@ import pytest
 
 from scas4d_core.guards import CONVENTIONS, GUARDS
 from studies.hard_cases import mutate, run
-from studies.hard_cases.case import HardCase, Outcome
+from studies.hard_cases.case import BackendResult, HardCase
 
 FAST = [(case, size) for case in run.CASES for size in case.sizes if not case.slow]
 
@@ -28,8 +28,8 @@ def test_there_are_sixty_cases_with_names_of_their_own() -> None:
 
 def test_what_does_not_hold_or_raises_is_told() -> None:
     class Wrong:
-        def run(self, backend: str) -> Outcome:
-            return Outcome({"value": np.array([np.nan])}, {}, {"folded": 2})
+        def run(self, backend: str) -> BackendResult:
+            return BackendResult({"value": np.array([np.nan])}, {}, {"folded": 2})
 
         def violations(self, outcomes: object) -> list[str]:
             return ["it is not so"]

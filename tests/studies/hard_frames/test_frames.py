@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 
 from studies.hard_frames import frames
-from studies.hard_frames.footage import MadeUp
+from studies.hard_frames.footage import SyntheticFootage
 from studies.hard_frames.frames import Footage, FrameCase, Sent
-from studies.hard_frames.study import FrameStudy, Line, table
+from studies.hard_frames.study import FrameCaseResult, FrameStudy, table
 
-FOOTAGE = MadeUp()
+FOOTAGE = SyntheticFootage()
 CASES = [(case, size) for case in frames.named(FOOTAGE) for size in case.sizes]
 
 
@@ -33,10 +33,10 @@ def test_the_undisturbed_run_follows(study: FrameStudy) -> None:
     assert all(study.undisturbed(index) > 30 for index in range(1, 9))
 
 
-def unjudged() -> MadeUp:
+def unjudged() -> SyntheticFootage:
     """The same footage with the judge off: what the cases are for."""
     settings = FOOTAGE.settings
-    return MadeUp(settings.model_copy(update={"update": settings.update.model_copy(update={"judge": False})}))
+    return SyntheticFootage(settings.model_copy(update={"update": settings.update.model_copy(update={"judge": False})}))
 
 
 @pytest.mark.parametrize("name", ["all black", "two cameras swapped", "a camera is bumped", "saturated noise"])
@@ -59,5 +59,5 @@ def test_what_a_footage_cannot_show_is_left_out(study: FrameStudy) -> None:
 
 
 def test_the_table_says_what_does_not_hold() -> None:
-    line = Line(frames.CASES[0], 3, ["held"], [-1.0, 0.2], ["it is black"])
+    line = FrameCaseResult(frames.CASES[0], 3, ["held"], [-1.0, 0.2], ["it is black"])
     assert "**no**: it is black" in table([line])

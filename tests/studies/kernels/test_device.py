@@ -6,9 +6,9 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from client.cli.main import app
 from scas4d_core.torch_backend import losses
 from scas4d_core.torch_backend.device import DeviceError
+from studies.commands import app
 from studies.kernels import device
 from studies.kernels.device import TOLERANCES, Bench, Stage, page
 
@@ -56,17 +56,17 @@ def test_without_a_gpu_the_command_says_so_and_fails(monkeypatch: pytest.MonkeyP
         raise DeviceError(f"device {name!r}: none")
 
     monkeypatch.setattr(device, "require_device", refuse)
-    result = CliRunner().invoke(app, ["bench", "device"])
+    result = CliRunner().invoke(app, ["device"])
     assert result.exit_code != 0
     assert isinstance(result.exception, DeviceError)  # `main` makes one line of it
 
 
 def test_the_command_fails_where_a_stage_does(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device, "run", lambda **_: ("the table", False))
-    result = CliRunner().invoke(app, ["bench", "device"])
+    result = CliRunner().invoke(app, ["device"])
     assert (result.exit_code, result.stdout.strip()) == (1, "the table")
     monkeypatch.setattr(device, "run", lambda **_: ("the table", True))
-    assert CliRunner().invoke(app, ["bench", "device"]).exit_code == 0
+    assert CliRunner().invoke(app, ["device"]).exit_code == 0
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")

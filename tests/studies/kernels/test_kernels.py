@@ -129,7 +129,7 @@ def test_the_page_says_what_was_measured():
 
 
 def test_too_short_a_run_is_refused(tmp_path):
-    from studies.quality.job import settings_of
+    from studies.quality.settings import settings_of
 
     with pytest.raises(ValueError, match="frames is 2; give at least 3"):
         kernels.study(tmp_path, settings_of("scas4d"), tmp_path, frames=2)

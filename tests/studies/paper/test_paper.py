@@ -4,7 +4,8 @@ import pytest
 from made_frontier import made_psnr, made_row, made_study
 from typer.testing import CliRunner
 
-from client.cli.main import app
+from client.cli.scores import Store
+from studies.commands import app
 from studies.frontier.frontier import DEFAULT
 from studies.frontier.tradeoff import read_points
 from studies.paper import figures
@@ -14,29 +15,28 @@ from studies.paper.paper import (
     BASE_2000,
     EXPERIMENTS,
     Claim,
+    ClaimSetting,
     Experiment,
-    Side,
+    compare,
     iteration_ratio,
-    judge,
     measured,
     variant,
 )
 from studies.quality.runs import RUNS
-from studies.quality.store import Store
 
 
 def gain(own: dict, paper: dict, expected=None):
     """The outcome of one comparison: figures of (first, second) by capture."""
     sides = (
-        Side("a", DEFAULT, {name: pair[0] for name, pair in paper.items()}),
-        Side("b", BASE_100, {name: pair[1] for name, pair in paper.items()}),
+        ClaimSetting("a", DEFAULT, {name: pair[0] for name, pair in paper.items()}),
+        ClaimSetting("b", BASE_100, {name: pair[1] for name, pair in paper.items()}),
     )
     experiment = Experiment("made", "nowhere", "psnr", "dB", sides, (Claim("better", "a", "b", expected),))
     ours = {
         (DEFAULT, "psnr"): {name: pair[0] for name, pair in own.items()},
         (BASE_100, "psnr"): {name: pair[1] for name, pair in own.items()},
     }
-    (outcome,) = judge(experiment, ours)
+    (outcome,) = compare(experiment, ours)
     return outcome
 
 
@@ -106,7 +106,7 @@ def test_every_experiment_compares_what_it_has():
     assert variant("separate covariance") in wanted
 
 
-def test_captures_without_rows_come_from_the_study_of_the_bars(tmp_path):
+def test_captures_without_rows_come_from_the_study_of_quality(tmp_path):
     made_study(tmp_path / "frontier", ("robot",), axes=("iterations",))
     store = Store(tmp_path / "quality")
     for name, psnr in (("scas4d", [29.0, 28.0, 26.0]), ("dynamic3dgs", [29.0, 25.0])):
@@ -125,7 +125,7 @@ def test_the_command_writes_every_experiment(tmp_path):
     captures = [str(tmp_path / name) for name in ("robot", "cloth")]
     page = tmp_path / "docs" / "paper.md"
     options = ["--out", str(tmp_path / "study"), "--no-measure", "--page", str(page)]
-    done = CliRunner().invoke(app, ["bench", "paper", *captures, *options])
+    done = CliRunner().invoke(app, ["paper", *captures, *options])
     assert done.exit_code == 0, done.output
     text = page.read_text()
     for experiment in EXPERIMENTS:

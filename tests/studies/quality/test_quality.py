@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from client.cli.scores import Store, digest, markdown
 from scas4d_core.cameras import Camera, WorldFrame
 from scas4d_core.captures import InitialPoints, open_capture
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.metrics import evaluation as measures
 from scas4d_core.query.parts import parts
 from scas4d_core.query.tracks import tracks_of_pixels, tracks_of_points
 from scas4d_core.storage.history import History
-from studies.quality import measure as measures
 from studies.quality import quality
 from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
-from studies.quality.store import Store, digest
-from studies.quality.table import markdown, with_means
+from studies.quality.quality import with_means
+from studies.quality.settings import settings_of
 
 FRAMES, WIDTH, HEIGHT = 4, 48, 40
 TRAIN, TEST = ("0", "1"), ("2", "3")
@@ -111,7 +112,7 @@ class Perfect:
     fitted = 0
 
     @classmethod
-    def start(cls, rig, frame, settings, *, points=None, progress=None, static=None):
+    def start(cls, rig, frame, settings, *, points=None, progress=None, static=None, history=None):
         self = cls()
         self.world, self.history = WorldFrame(np.zeros(3)), History()
         self._commit(0)
@@ -282,9 +283,9 @@ def test_frame_0_alone_without_help(capture_folder, tmp_path, stand_in):
 
 
 def test_changes_are_what_differs_from_the_preset(tmp_path):
-    job = quality.Job(tmp_path, "scas4d", quality.settings_of("scas4d", 300, 5, ["update.clusters=[64]"]), points=False)
+    job = quality.Job(tmp_path, "scas4d", settings_of("scas4d", 300, 5, ["update.clusters=[64]"]), points=False)
     assert job.changes == "update.clusters=[64], no points"
-    assert quality.Job(tmp_path, "scas4d", quality.settings_of("scas4d", 300, 5)).changes == ""
+    assert quality.Job(tmp_path, "scas4d", settings_of("scas4d", 300, 5)).changes == ""
     keys = {dataclasses.replace(job, **other).key for other in ({}, {"masks": False}, {"frames": 3}, {"lpips": True})}
     assert len(keys) == 4
 
@@ -319,38 +320,38 @@ def test_frame_0_comes_back_as_it_was_kept(tmp_path):
 
 
 def test_frame_0_is_shared_by_those_who_see_the_same(capture_folder):
-    settings = quality.settings_of("scas4d")
+    settings = settings_of("scas4d")
     capture = open_capture(capture_folder)
     name = first_frame_key(capture, settings)
     assert name.startswith("plates-")
     for same in (["update.clusters=[64]"], ["update.iterations=2000"]):
-        assert first_frame_key(capture, quality.settings_of("scas4d", overrides=same)) == name
-    assert first_frame_key(capture, quality.settings_of("dynamic3dgs", 300)) == name
+        assert first_frame_key(capture, settings_of("scas4d", changes=same)) == name
+    assert first_frame_key(capture, settings_of("dynamic3dgs", 300)) == name
     others = {
         name,
         first_frame_key(open_capture(capture_folder, use_masks=False), settings),
         first_frame_key(dataclasses.replace(capture, points=InitialPoints(plates(0), colours())), settings),
         first_frame_key(dataclasses.replace(capture, points=InitialPoints(plates(1), colours())), settings),
         first_frame_key(dataclasses.replace(capture, image_files=capture.image_files[1:]), settings),
-        first_frame_key(capture, quality.settings_of("scas4d", seed=1)),
-        first_frame_key(capture, quality.settings_of("scas4d", overrides=["static.iterations=5"])),
-        first_frame_key(capture, quality.settings_of("scas4d", overrides=["scene.image_scale=0.5"])),
+        first_frame_key(capture, settings_of("scas4d", seed=1)),
+        first_frame_key(capture, settings_of("scas4d", changes=["static.iterations=5"])),
+        first_frame_key(capture, settings_of("scas4d", changes=["scene.image_scale=0.5"])),
     }
     assert len(others) == 8
 
 
 def test_settings_are_the_preset_with_checked_changes():
-    settings = quality.settings_of("scas4d", 300, 5, ["update.clusters=[64]", "update.cluster_map=published"])
+    settings = settings_of("scas4d", 300, 5, ["update.clusters=[64]", "update.cluster_map=published"])
     assert settings.update.iterations == 300
     assert settings.update.seed == settings.static.seed == 5
     assert settings.update.clusters == (64,)
     assert settings.update.cluster_map == "published"
     with pytest.raises(ValueError, match="clasters"):
-        quality.settings_of("scas4d", overrides=["update.clasters=[64]"])
-    with pytest.raises(ValueError, match="no group of settings 'upd'"):
-        quality.settings_of("scas4d", overrides=["upd.clusters=[64]"])
-    with pytest.raises(ValueError, match="has no '='"):
-        quality.settings_of("scas4d", overrides=["update.iterations"])
+        settings_of("scas4d", changes=["update.clasters=[64]"])
+    with pytest.raises(ValueError, match="there is no setting of this name"):
+        settings_of("scas4d", changes=["upd.clusters=[64]"])
+    with pytest.raises(ValueError, match=r"write it as update\.iterations=200"):
+        settings_of("scas4d", changes=["update.iterations"])
 
 
 def test_the_table_has_means_of_complete_variants_only():

@@ -1,16 +1,26 @@
-"""The table of bars on rows made here: what is reached, missed, not measured, and over which updates."""
+"""The table of targets on rows made here: what is reached, missed, not measured, and over which updates."""
 
 import json
 
 import pytest
 from typer.testing import CliRunner
 
-from client.cli.main import app
+from client.cli.evaluate import Job
+from client.cli.scores import Store
+from studies.commands import app
 from studies.quality import runs
-from studies.quality.job import Job
 from studies.quality.runs import CAPTURES, RUNS, measure_runs, measured_runs
-from studies.quality.store import Store
-from studies.quality.targets import BARS, KERNELS, Bar, bar_table, count_words, judge, left_out, page, read_study
+from studies.quality.targets import (
+    KERNELS,
+    TARGETS,
+    Target,
+    compare,
+    count_words,
+    left_out,
+    page,
+    read_study,
+    target_table,
+)
 
 
 def made_row(name: str, capture: str, psnr: list[float], **more: object) -> dict:
@@ -40,53 +50,53 @@ def made_row(name: str, capture: str, psnr: list[float], **more: object) -> dict
 
 
 def the_one(verdicts, what: str, capture: str | None = None):
-    (found,) = [v for v in verdicts if v.bar.what == what and capture in (None, v.capture)]
+    (found,) = [v for v in verdicts if v.target.what == what and capture in (None, v.capture)]
     return found
 
 
-def test_a_bar_is_judged_as_measured_not_as_rounded():
+def test_a_bar_is_compared_as_measured_not_as_rounded():
     rows = {("scas4d", "robot"): made_row("scas4d", "robot", [36.0, 30.999, 30.9999])}
-    frame_0, updates = judge(rows, [BARS[0], Bar("updates", "scas4d", "psnr", ("robot",), "≥", 31.0)])
+    frame_0, updates = compare(rows, [TARGETS[0], Target("updates", "scas4d", "psnr", ("robot",), "≥", 31.0)])
     assert frame_0.reached is True
     assert frame_0.updates == "frame 0"
     assert updates.reached is False
     assert updates.updates == "2 of 4"
-    text = bar_table([frame_0, updates]).splitlines()
+    text = target_table([frame_0, updates]).splitlines()
     assert text[2] == "| frame 0, test cameras | robot | ≥ 36.00 dB | 36.00 | reached | frame 0 |"
     assert text[3] == "| updates | robot | ≥ 31.00 dB | 31.00 | **missed** | 2 of 4 |"
 
 
 def test_a_difference_is_over_the_updates_that_both_have():
-    bar = Bar("ahead", "scas4d", "psnr", ("robot",), ">", 0.0, over=("dynamic3dgs-2000",))
+    target = Target("ahead", "scas4d", "psnr", ("robot",), ">", 0.0, over=("dynamic3dgs-2000",))
     rows = {
         ("scas4d", "robot"): made_row("scas4d", "robot", [36.0, 30.0, 31.0, 20.0, 20.0]),
         ("dynamic3dgs-2000", "robot"): made_row("dynamic3dgs-2000", "robot", [36.0, 29.0, 29.0]),
     }
-    (verdict,) = judge(rows, [bar])
+    (verdict,) = compare(rows, [target])
     assert verdict.value == pytest.approx(1.5)  # over all updates it would be behind
     assert verdict.reached is True
     assert verdict.updates == "2 of 4"
-    assert "| +1.50 (30.50 against 29.00) | reached | 2 of 4 |" in bar_table([verdict])
+    assert "| +1.50 (30.50 against 29.00) | reached | 2 of 4 |" in target_table([verdict])
 
 
 def test_it_is_the_best_of_the_others_that_counts_and_all_must_be_there():
-    bar = the_one(judge({}), "three layers over the best single one (64, 320, 1280)", "cloth").bar
+    target = the_one(compare({}), "three layers over the best single one (64, 320, 1280)", "cloth").target
     rows = {("scas4d", "cloth"): made_row("scas4d", "cloth", [30.0, 29.0])}
     for name, psnr in (("clusters-64", 27.0), ("clusters-320", 29.5), ("clusters-1280", 28.0)):
-        verdict = next(v for v in judge(rows, [bar]) if v.capture == "cloth")
+        verdict = next(v for v in compare(rows, [target]) if v.capture == "cloth")
         assert (verdict.value, verdict.word) == (None, "not measured")
         rows[name, "cloth"] = made_row(name, "cloth", [30.0, psnr])
-    verdict = next(v for v in judge(rows, [bar]) if v.capture == "cloth")
+    verdict = next(v for v in compare(rows, [target]) if v.capture == "cloth")
     assert verdict.value == pytest.approx(-0.5)
     assert verdict.reached is False
 
 
 def test_a_mean_needs_every_capture_and_weighs_them_alike():
-    bar = Bar("mean", "scas4d", "psnr", ("robot", "wheel"), "≥", 30.5, mean=True)
+    target = Target("mean", "scas4d", "psnr", ("robot", "wheel"), "≥", 30.5, mean=True)
     rows = {("scas4d", "robot"): made_row("scas4d", "robot", [36.0, 33.0, 33.0, 33.0])}
-    assert judge(rows, [bar])[0].word == "not measured"
+    assert compare(rows, [target])[0].word == "not measured"
     rows["scas4d", "wheel"] = made_row("scas4d", "wheel", [34.0, 28.0])
-    (verdict,) = judge(rows, [bar])
+    (verdict,) = compare(rows, [target])
     assert verdict.capture == "mean of robot, wheel"
     assert verdict.value == pytest.approx(30.5)
     assert verdict.reached is True
@@ -95,7 +105,7 @@ def test_a_mean_needs_every_capture_and_weighs_them_alike():
 
 def test_losses_are_against_frame_0_of_the_same_row():
     row = made_row("scas4d", "basketball", [29.0, 28.9, 28.2, 28.6], psnr_changed=21.5)
-    verdicts = judge({("scas4d", "basketball"): row})
+    verdicts = compare({("scas4d", "basketball"): row})
     mean = the_one(verdicts, "mean loss of the updates against frame 0")
     worst = the_one(verdicts, "worst loss of an update against frame 0")
     assert mean.value == pytest.approx(29.0 - (28.9 + 28.2 + 28.6) / 3)
@@ -108,17 +118,17 @@ def test_losses_are_against_frame_0_of_the_same_row():
 
 def test_frame_0_alone_says_nothing_of_updates():
     rows = {("scas4d", "robot"): made_row("scas4d", "robot", [36.5])}
-    verdicts = judge(rows)
+    verdicts = compare(rows)
     assert the_one(verdicts, "frame 0, test cameras", "robot").reached is True
     assert the_one(verdicts, "updates", "robot").word == "not measured"
     assert the_one(verdicts, "3D tracks, median error", "robot").word == "not measured"
 
 
 def test_every_bar_names_a_run_that_is_made():
-    for bar in BARS:
-        for name in (bar.run, *bar.over):
-            assert name == KERNELS or set(bar.captures) <= set(RUNS[name].captures)
-        assert (bar.threshold is None) == (bar.sense == "")
+    for target in TARGETS:
+        for name in (target.run, *target.over):
+            assert name == KERNELS or set(target.captures) <= set(RUNS[name].captures)
+        assert (target.threshold is None) == (target.sense == "")
 
 
 def test_only_rows_of_todays_settings_count_and_the_longest_of_them(tmp_path):
@@ -178,7 +188,7 @@ def test_the_runs_are_measured_where_captures_are(tmp_path, monkeypatch):
     assert len(lines) == len(CAPTURES) - 1
     with pytest.raises(ValueError, match="run 'scas' is unknown"):
         measure_runs(tmp_path, tmp_path / "out", ["scas"])
-    with pytest.raises(ValueError, match="capture 'robots' has no bars"):
+    with pytest.raises(ValueError, match="capture 'robots' has no targets"):
         measure_runs(tmp_path, tmp_path / "out", only=["robots"])
     with pytest.raises(ValueError, match="holds none of the captures"):
         measure_runs(tmp_path, tmp_path / "out", only=["cloth"], report=lines.append)
@@ -195,12 +205,12 @@ def test_the_command_writes_the_page(tmp_path):
         "peak_mb": 900.0,
     }
     (study / "kernels.json").write_text(json.dumps(kernels))
-    done = CliRunner().invoke(app, ["bench", "table", str(study), "--out", str(tmp_path / "docs" / "quality.md")])
+    done = CliRunner().invoke(app, ["table", str(study), "--out", str(tmp_path / "docs" / "quality.md")])
     assert done.exit_code == 0, done.output
-    verdicts = judge(read_study(study))
+    verdicts = compare(read_study(study))
     assert sum(v.reached is True for v in verdicts) == 5  # frame 0, Gaussians, updates, rasterizer, memory
     assert sum(v.reached is False for v in verdicts) == 2
-    assert done.output == bar_table(verdicts) + "\n\n" + count_words(verdicts) + ".\n"
+    assert done.output == target_table(verdicts) + "\n\n" + count_words(verdicts) + ".\n"
     text = (tmp_path / "docs" / "quality.md").read_text()
     assert text == page(read_study(study))
     assert "- Measured: 2026-01-02." in text
@@ -211,6 +221,6 @@ def test_the_command_writes_the_page(tmp_path):
 
 
 def test_the_table_of_no_study_says_what_to_do(tmp_path):
-    done = CliRunner().invoke(app, ["bench", "table", str(tmp_path / "none")])
+    done = CliRunner().invoke(app, ["table", str(tmp_path / "none")])
     assert done.exit_code == 2
     assert "measure first" in done.output

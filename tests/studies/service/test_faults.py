@@ -38,22 +38,22 @@ def test_states_of_the_fake_depend_on_every_frame(expected):
 
 
 def test_kills(study, expected):
-    outcome = faults.kills(study, *expected, count=4, seed=1, told=lambda said: None)
+    outcome = faults.kills(study, *expected, count=4, seed=1, echo=lambda said: None)
     assert outcome.faults == []
 
 
 def test_cuts_and_flipped_bytes(study, expected):
-    outcome = faults.damaged_log(study, expected[0], cuts=1, flips=2, seed=0, told=lambda said: None)
+    outcome = faults.damaged_log(study, expected[0], cuts=1, flips=2, seed=0, echo=lambda said: None)
     assert outcome.faults == []
 
 
 def test_a_full_disk(study, expected):
-    assert faults.full_disk(study, expected[0], told=lambda said: None).faults == []
+    assert faults.full_disk(study, expected[0], echo=lambda said: None).faults == []
 
 
 def test_strangers(study):
     attack = Attack(header=5_000_000, halves=40, uploads=40)  # tests/server/http has it in full
-    found = strangers(study, attack, turns=1, seconds=1, token=False, told=lambda said: None)
+    found = strangers(study, attack, turns=1, seconds=1, token=False, echo=lambda said: None)
     # Times of a busy machine are not judged here.
     assert not [fault for fault in found.faults if "p99" not in fault and "times" not in fault]
 
@@ -62,7 +62,7 @@ def test_kills_with_the_method_itself(tmp_path):
     capture = open_capture(CAPTURE)
     study = of.Study(tmp_path, capture, of.encoded_frames(capture, 4), SHORT, {})
     expected, seconds = of.undisturbed(study)
-    assert faults.kills(study, expected, seconds, count=2, seed=3, told=lambda said: None).faults == []
+    assert faults.kills(study, expected, seconds, count=2, seed=3, echo=lambda said: None).faults == []
 
 
 def test_a_lost_frame_and_another_state_are_noticed():

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from studies.hard_frames.footage import MadeUp
+from studies.hard_frames.footage import SyntheticFootage
 from studies.service import hard_frames as stability
 
 CASES = ("all black", "swapped", "drop out", "jumps")
 
 
 def test_cases_through_the_service(tmp_path: Path) -> None:
-    lines, faults = stability.study(MadeUp(), tmp_path / "study", CASES, told=lambda said: None)
+    lines, faults = stability.study(SyntheticFootage(), tmp_path / "study", CASES, echo=lambda said: None)
     assert faults == []
     assert len(lines) == 8
     assert [(line.case.name, line.size, line.violations) for line in lines if line.violations] == []
@@ -21,7 +21,7 @@ def test_cases_through_the_service(tmp_path: Path) -> None:
 
 
 def test_a_footage_turns_round_at_both_ends() -> None:
-    footage = MadeUp()
+    footage = SyntheticFootage()
     endless = stability.BackAndForth(footage)
     last = footage.count - 1
     for index, inside in ((0, 0), (last, last), (last + 1, last - 1), (2 * last, 0), (2 * last + 3, 3)):

@@ -9,7 +9,7 @@ import pytest
 from running import make_rig, pictures
 
 from client.sdk import Client
-from studies.service.views import Load, Measured, table
+from studies.service.views import Load, ViewTimes, table
 
 
 @pytest.fixture(scope="module")
@@ -56,13 +56,13 @@ def test_views_without_an_answer_are_counted(address):
 
 
 def test_the_table_judges_the_bar():
-    good = Measured(5.0, idle=[10, 12, 14], loaded=[20, 22, 24], alone=[1.0, 1.0], together=[1.2, 1.2])
+    good = ViewTimes(5.0, idle=[10, 12, 14], loaded=[20, 22, 24], alone=[1.0, 1.0], together=[1.2, 1.2])
     assert good.latency == pytest.approx(22 / 12)
     assert good.slower == pytest.approx(0.2)
-    other = Measured(20.0, idle=[10], loaded=[90], alone=[1.0], together=[2.0])
+    other = ViewTimes(20.0, idle=[10], loaded=[90], alone=[1.0], together=[2.0])
     text = table([good, other])
     assert ": reached (1.83 times, +20 %)" in text
     assert len(text.split("\n\n")[0].splitlines()) == 4
     for change in ({"loaded": [30]}, {"together": [1.3]}, {"refused": 1}):
-        bad = Measured(**{"rate": 5.0, "idle": [12], "loaded": [22], "alone": [1.0], "together": [1.2]} | change)
+        bad = ViewTimes(**{"rate": 5.0, "idle": [12], "loaded": [22], "alone": [1.0], "together": [1.2]} | change)
         assert "**missed**" in table([bad])

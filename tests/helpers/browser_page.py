@@ -6,7 +6,7 @@ import base64
 import io
 
 import numpy as np
-from drawn import colours, make_rig, positions
+from browser_engine import colours, make_rig, positions
 from PIL import Image
 from running import picture
 

@@ -1,15 +1,65 @@
-"""Rows as a Markdown table."""
+"""Scores of reconstructions: rows on disk, one file a row, and as Markdown tables."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from studies.quality.store import Row
+Row = dict[str, Any]
+"""What was measured, JSON values by name; ``key`` names the row."""
 
-OBJECT_CAPTURES = ("robot", "wheel", "pendulums", "cloth", "spring")
-"""The captures whose mean is reported beside them."""
+
+class Store:
+    """The rows of one study: ``rows/<key>.json`` when done, ``frames/<key>.jsonl`` a line a frame as they come."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        for name in ("rows", "frames"):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+
+    def row(self, key: str) -> Row | None:
+        """A finished row; None where there is none, or where the last attempt failed."""
+        path = self.folder / "rows" / f"{key}.json"
+        if not path.exists():
+            return None
+        row: Row = json.loads(path.read_text())
+        return None if "error" in row else row
+
+    def rows(self) -> Iterator[Row]:
+        """Every row on disk, failed ones too (they hold ``error``), by key."""
+        for path in sorted((self.folder / "rows").glob("*.json")):
+            yield json.loads(path.read_text())
+
+    def put(self, row: Mapping[str, Any]) -> None:
+        """Writes a row; the file is whole or not there."""
+        path = self.folder / "rows" / f"{row['key']}.json"
+        beside = path.with_suffix(f".{os.getpid()}.part")
+        beside.write_text(json.dumps(row, indent=1))
+        beside.replace(path)
+
+    def start_frames(self, key: str) -> None:
+        """Begins the per-frame lines of a row anew."""
+        (self.folder / "frames" / f"{key}.jsonl").write_text("")
+
+    def put_frame(self, key: str, frame: Mapping[str, Any]) -> None:
+        """Adds one frame's line."""
+        with (self.folder / "frames" / f"{key}.jsonl").open("a") as file:
+            file.write(json.dumps(frame) + "\n")
+
+    def frames(self, key: str) -> list[Row]:
+        """The per-frame lines of a row."""
+        return [json.loads(line) for line in (self.folder / "frames" / f"{key}.jsonl").read_text().splitlines()]
+
+
+def digest(*parts: Any) -> str:
+    """Eight hexadecimal digits that change with any of the JSON values given."""
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
 @dataclass(frozen=True)
@@ -81,26 +131,3 @@ def stage_table(rows: Sequence[Row]) -> str:
         known = [row["capture"], row["preset"], str(row["iterations"]), f"{row['seconds_update']:.3f}"]
         lines.append("| " + " | ".join([*known, *cells]) + " |")
     return "\n".join(lines)
-
-
-def with_means(rows: Sequence[Row], over: Sequence[str] = OBJECT_CAPTURES, label: str = "mean of objects") -> list[Row]:
-    """The rows, and behind them the means of each variant that has all captures in ``over``.
-
-    A variant is what has the same ``variant`` value; only numbers that every row of it has are averaged.
-    """
-    result = list(rows)
-    for variant in dict.fromkeys(row["variant"] for row in rows if "error" not in row):
-        of = {row["capture"]: row for row in rows if row["variant"] == variant and "error" not in row}
-        if not all(name in of for name in over):
-            continue
-        chosen = [of[name] for name in over]
-        mean: Row = {"capture": label, "preset": chosen[0]["preset"], "iterations": chosen[0]["iterations"]}
-        mean["changes"] = chosen[0].get("changes")
-        for column in QUALITY:
-            values = [row.get(column.name) for row in chosen]
-            if column.name in ("psnr_worst", "peak_mb"):
-                continue
-            if column.form.endswith("f") and all(isinstance(v, int | float) for v in values):
-                mean[column.name] = sum(values) / len(values)  # type: ignore[arg-type]
-        result.append(mean)
-    return result

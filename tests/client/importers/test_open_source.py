@@ -1,4 +1,4 @@
-"""The door: layouts found, frames synchronized by name, and what a folder lacks said by name."""
+"""Captures opened: layouts found, frames synchronized by name, and what a folder lacks said by name."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def test_the_sample_goes_through_the_same_door(capture_folder):
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", ".", "colmap/sparse/0"])
 def test_a_colmap_model_is_found(tmp_path, place):
     pytest.importorskip("pycolmap")
-    from test_colmap import model
+    from rigs import colmap_model as model
 
     model(lenses("PINHOLE"), tmp_path / place, "PINHOLE", True)
     write_pictures(tmp_path / "images")

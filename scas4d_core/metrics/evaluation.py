@@ -1,4 +1,4 @@
-"""Measures a reconstruction against what a capture knows: pictures, tracks, parts.
+"""Scores of a reconstruction on a capture: pictures, tracks, parts and flicker on its test cameras and ground truth.
 
 Definitions, beside those in ``scas4d_core.metrics``:
 
@@ -16,16 +16,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from scas4d_core import metrics
 from scas4d_core.cameras import Camera
-from scas4d_core.captures import Capture, GroundTruth
+from scas4d_core.captures import Capture
 from scas4d_core.query.tracks import depth_tolerance
 
 if TYPE_CHECKING:
@@ -39,8 +37,6 @@ STILL_LEVELS = 6
 """Of 255: the true pictures' own noise; a pixel that stays within them in every channel does not change."""
 FEWEST_STILL = 500
 """Still pixels over all test cameras from which flicker is told; fewer are chance."""
-DIFFERENCE_GAIN = 4.0
-"""Differences are this much brighter in comparison pictures."""
 
 Scores = dict[str, float | None]
 
@@ -164,41 +160,6 @@ def moving_points(points: NDArray[np.float64], extent: float) -> NDArray[np.bool
     """[P] of [T, P, 3]: which points leave their place of the first frame by more than 1 % of the extent."""
     moving: NDArray[np.bool_] = np.linalg.norm(points - points[:1], axis=-1).max(axis=0) > MOVING_SHARE * extent
     return moving
-
-
-def save_comparison(reconstruction: Reconstruction, capture: Capture, index: int, folder: Path) -> list[Path]:
-    """Truth | render | difference (4 times brighter) of every test camera as PNG files; the paths."""
-    rig, truth = capture.test_rig, capture.test_frame(index)
-    assert rig is not None
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    for camera in rig.cameras:
-        true = truth.images[camera.name] / 255.0
-        colour = np.clip(reconstruction.render(camera, index).colour, 0, 1)
-        row = np.concatenate([true, colour, np.clip(DIFFERENCE_GAIN * np.abs(true - colour), 0, 1)], axis=1)
-        paths.append(folder / f"frame{index:04d}_camera{camera.name}.png")
-        Image.fromarray((row * 255 + 0.5).astype(np.uint8)).save(paths[-1])
-    return paths
-
-
-def save_parts(
-    reconstruction: Reconstruction, capture: Capture, index: int, labels: NDArray[Any], folder: Path
-) -> list[Path]:
-    """True | rendered part labels of every labelled test camera in colours, as PNG files; the paths."""
-    truth, rig = capture.ground_truth, capture.test_rig
-    assert isinstance(truth, GroundTruth)
-    assert rig is not None
-    folder.mkdir(parents=True, exist_ok=True)
-    palette = np.random.default_rng(1).integers(60, 256, size=(256, 3), dtype=np.uint8)
-    palette[0] = palette[255] = 0
-    paths = []
-    for camera in rig.cameras:
-        if camera.name in truth.label_cameras:
-            true = truth.labels(camera.name, index)
-            found = np.where(true > 0, render_parts(reconstruction, camera, index, labels), 0)
-            paths.append(folder / f"parts{index:04d}_camera{camera.name}.png")
-            Image.fromarray(palette[np.concatenate([true, found], axis=1)]).save(paths[-1])
-    return paths
 
 
 def mean_scores(of: Iterable[Scores]) -> Scores:

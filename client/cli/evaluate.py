@@ -1,0 +1,293 @@
+"""`scas4d evaluate`: a capture reconstructed and scored on its test cameras and ground truth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from client.cli import pictures
+from client.cli.progress import Bars
+from client.cli.reconstruct import compile_kernels, reconstruct_frames
+from client.cli.scores import Row, Store, digest, markdown, stage_table
+from scas4d_core.captures import Capture, CaptureError, open_capture
+from scas4d_core.presets import preset
+from scas4d_core.settings import Settings
+
+if TYPE_CHECKING:
+    from scas4d_core.first_frame.static_scene import StaticResult
+    from scas4d_core.reconstruction import Reconstruction
+
+Report = Callable[[str], None]
+"""Takes each line that is printed."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One row to be measured.
+
+    Attributes:
+        capture: folder.
+        preset: name, for the table.
+        settings: of the reconstruction, complete.
+        frames: only so many frames of the capture; None: all.
+        masks: whether the method gets the masks (they are always used to measure).
+        points: whether the method gets the initial cloud.
+        pictures: frames whose comparison pictures are saved; negative ones count from the end.
+        lpips: also LPIPS; loads torch.
+    """
+
+    capture: Path
+    preset: str
+    settings: Settings
+    frames: int | None = None
+    masks: bool = True
+    points: bool = True
+    pictures: tuple[int, ...] = (0, 1, -1)
+    lpips: bool = False
+
+    @property
+    def variant(self) -> str:
+        """Names the row without its capture: preset, iterations and a digest of everything else that is set."""
+        update = self.settings.update
+        given: Row = {"frames": self.frames, "masks": self.masks, "points": self.points}
+        if self.lpips:
+            given["lpips"] = True
+        return (
+            f"{self.preset}-{update.iterations}-s{update.seed}-{digest(self.settings.model_dump(mode='json'), given)}"
+        )
+
+    @property
+    def changes(self) -> str:
+        """Differences from the preset beside iterations and seed, and what is withheld, in words for the table."""
+        usual, own = preset(self.preset).model_dump(mode="json"), self.settings.model_dump(mode="json")
+        words = [
+            f"{name}={json.dumps(value, separators=(',', ':'))}"
+            for name, value in _flat(own)
+            if name not in ("update.iterations", "update.seed", "static.seed") and dict(_flat(usual)).get(name) != value
+        ]
+        return ", ".join(words + ["no masks"] * (not self.masks) + ["no points"] * (not self.points))
+
+    @property
+    def key(self) -> str:
+        """Names the row; another setting is another row."""
+        return f"{self.capture.resolve().name}-{self.variant}"
+
+
+def evaluate(
+    folder: Path,
+    out: Path,
+    *,
+    frames: int | None = None,
+    preset_name: str = "scas4d",
+    changes: Mapping[str, Any],
+    again: bool = False,
+    report: Report = print,
+) -> Row:
+    """Scores of a capture, printed as a table; `out` gets the row, a line a frame, pictures and table.md.
+
+    Args:
+        folder: of the capture, with test cameras.
+        out: folder; scores that it holds are printed without another reconstruction.
+        frames: only so many; all where None.
+        preset_name: named settings.
+        changes: what differs from the preset, nested.
+        again: measures anew what `out` holds.
+        report: takes the printed lines.
+
+    Raises:
+        CaptureError: the capture cannot be read, or has no test cameras.
+    """
+    job = Job(folder, preset_name, preset(preset_name, changes), frames)
+    check_test_cameras(open_capture(folder), folder)
+    store = Store(out)
+    row = None if again else store.row(job.key)
+    if row is None:
+        report(f"[1/1] {job.key}")
+        compile_kernels(job.settings)
+        _, row = measure(job, store, report)
+        store.put(row)
+    else:
+        report(f"[1/1] {job.key}: measured already")
+    table = page([row])
+    (out / "table.md").write_text(table + "\n")
+    report(table)
+    return row
+
+
+def check_test_cameras(capture: Capture, folder: Path) -> None:
+    """Refuses a capture that cannot be measured.
+
+    Raises:
+        CaptureError: it has no test cameras.
+    """
+    if capture.full_test_rig is None:
+        raise CaptureError(f"{folder}: no test cameras (test_meta.json) to measure on; `scas4d reconstruct` needs none")
+
+
+def page(rows: Sequence[Row], stages_of: Sequence[Row] | None = None) -> str:
+    """The table of scores, and the table of seconds by stage where there were updates; Markdown."""
+    table = markdown(rows)
+    if stages := stage_table(rows if stages_of is None else stages_of):
+        table += f"\n\nMedian seconds of an update by stage:\n\n{stages}"
+    return table
+
+
+def measure(
+    job: Job,
+    store: Store,
+    report: Report,
+    *,
+    static: tuple[StaticResult, float] | None = None,
+    fitted: Callable[[StaticResult, float], None] | None = None,
+) -> tuple[Reconstruction, Row]:
+    """Reconstructs one capture and scores it.
+
+    Seconds are those of the reconstruction alone, decoding included. Peak memory is this process's, measuring included.
+
+    Args:
+        job: what is measured, with which settings.
+        store: takes a line a frame, and the pictures.
+        report: takes the printed lines.
+        static: a frame 0 that was fitted before, and the seconds that it took.
+        fitted: called with frame 0 and its seconds once it is fitted here.
+    """
+    truth = open_capture(job.capture, image_scale=job.settings.scene.image_scale)
+    check_test_cameras(truth, job.capture)
+    given = open_capture(job.capture, use_masks=job.masks, use_points=job.points)
+    # These bring the kernels; the table and the command do not.
+    from scas4d_core.metrics.evaluation import measure_flicker, measure_parts, measure_pictures, measure_tracks
+
+    store.start_frames(job.key)
+    count = given.frame_count if job.frames is None else min(job.frames, given.frame_count)
+    lines: list[Row] = []
+    with Bars(Console(stderr=True)) as bars:
+        frames = reconstruct_frames(given, job.settings, count, static=static and static[0], progress=bars)
+        for reconstruction, done in frames:
+            index = done.index
+            line: Row = {"index": index, "seconds": done.seconds, "stages": {}}
+            if index == 0 and static is not None:
+                line["seconds"] = static[1]
+            elif index == 0 and fitted is not None and reconstruction.static is not None:
+                fitted(reconstruction.static, done.seconds)
+            if done.report is not None:
+                line["cpu_seconds"] = done.cpu_seconds
+                line["stages"] = {name: float(value) for name, value in done.report.seconds.items()}
+                line["moving"], line["gaussians"] = int(done.report.moving), int(done.report.gaussians)
+            scores, by_camera = measure_pictures(reconstruction, truth, index, with_lpips=job.lpips)
+            line |= scores
+            store.put_frame(job.key, {**line, "cameras": by_camera})
+            lines.append(line)
+            report(f"    frame {index:3d}/{count - 1}  {line['psnr']:6.2f} dB  {line['seconds']:6.2f} s")
+
+    indices = list(range(count))
+    row: Row = {
+        "key": job.key,
+        "variant": job.variant,
+        "capture": truth.name,
+        "preset": job.preset,
+        "iterations": job.settings.update.iterations,
+        "seed": job.settings.update.seed,
+        "changes": job.changes,
+        "settings": job.settings.model_dump(mode="json"),
+        "given": {"frames": count, "masks": job.masks, "points": job.points},
+        "capture_frames": given.frame_count,
+        "measured": datetime.now(UTC).isoformat(timespec="seconds"),
+        "gaussians": len(reconstruction.history.gaussians(0)),
+        "moving": int(reconstruction.history.gaussians(count - 1).moving.sum()),
+        "seconds_first": lines[0]["seconds"],
+        "psnr_first": lines[0]["psnr"],
+        **summary(lines),
+    }
+    if truth.ground_truth is not None and count > 1:
+        row |= measure_tracks(reconstruction, truth, indices)
+        row |= measure_parts(reconstruction, truth, indices)
+    if count > 1:
+        row |= measure_flicker(reconstruction, truth, indices)
+    row["peak_mb"] = peak_megabytes()
+    folder = store.folder / "pictures" / job.key
+    for index in sorted({range(count)[i] for i in job.pictures if -count <= i < count}):
+        save_comparisons(reconstruction, truth, index, folder)
+    if "parts_count" in row:
+        save_parts(reconstruction, truth, indices[-1], reconstruction.parts(int(row["parts_count"])), folder)
+    return reconstruction, row
+
+
+def summary(lines: Sequence[Row]) -> Row:
+    """Means of the per-frame lines over all updates (every frame but the first), for the table."""
+    updates = lines[1:]
+    if not updates:
+        return {"updates": 0}
+    from scas4d_core.metrics.evaluation import mean_scores
+
+    names = ("psnr", "psnr_foreground", "psnr_changed", "ssim", "flip", "lpips")
+    stages = dict.fromkeys(name for line in updates for name in line["stages"])
+    return {
+        "updates": len(updates),
+        **mean_scores({name: line.get(name) for name in names} for line in updates),
+        "psnr_worst": min(line["psnr"] for line in updates),
+        "psnr_last": updates[-1]["psnr"],
+        "psnr_by_frame": [round(line["psnr"], 3) for line in lines],
+        # The first update compiles or loads kernels; medians do not see it.
+        "seconds_update": float(np.median([line["seconds"] for line in updates])),
+        "cpu_seconds_update": float(np.median([line["cpu_seconds"] for line in updates])),
+        "seconds_stages": {
+            name: float(np.median([line["stages"].get(name, 0.0) for line in updates])) for name in stages
+        },
+    }
+
+
+def save_comparisons(reconstruction: Reconstruction, capture: Capture, index: int, folder: Path) -> None:
+    """Saves truth | render | difference of every test camera as PNG files."""
+    rig, truth = capture.test_rig, capture.test_frame(index)
+    assert rig is not None
+    for camera in rig.cameras:
+        render = pictures.eight_bit(reconstruction.render(camera, index).colour)
+        compared = pictures.comparison(truth.images[camera.name], render)
+        pictures.save(folder / f"frame{index:04d}_camera{camera.name}.png", compared)
+
+
+def save_parts(
+    reconstruction: Reconstruction, capture: Capture, index: int, labels: NDArray[Any], folder: Path
+) -> None:
+    """Saves true | rendered part labels of every labelled test camera, in colours, as PNG files."""
+    from scas4d_core.metrics.evaluation import render_parts
+
+    truth, rig = capture.ground_truth, capture.test_rig
+    assert truth is not None
+    assert rig is not None
+    for camera in rig.cameras:
+        if camera.name in truth.label_cameras:
+            true = truth.labels(camera.name, index)
+            found = np.where(true > 0, render_parts(reconstruction, camera, index, labels), 0)
+            shown = np.concatenate([true, found], axis=1).astype(np.uint8)
+            pictures.save(folder / f"parts{index:04d}_camera{camera.name}.png", pictures.coloured(shown))
+
+
+def peak_megabytes() -> float | None:
+    """Largest resident memory of this process so far, 10⁶ bytes; None where the system does not tell (Windows)."""
+    status = Path("/proc/self/status")
+    if status.exists():  # what `getrusage` tells on Linux is, in a child, at least what its parent had
+        peak = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
+        return int(peak.split()[1]) * 1024 / 1e6
+    try:
+        import resource
+    except ImportError:
+        return None
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
+def _flat(values: Mapping[str, Any], under: str = "") -> Iterator[tuple[str, Any]]:
+    """``{"update": {"iterations": 100}}`` as ``("update.iterations", 100)``."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{under}{name}.")
+        else:
+            yield f"{under}{name}", value

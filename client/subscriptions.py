@@ -1,0 +1,295 @@
+"""Subscriptions of a scene's stream, the events that come for them, and the session that holds both."""
+
+from __future__ import annotations
+
+import io
+import random
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+from websockets.exceptions import InvalidStatus
+from websockets.typing import Subprotocol
+
+from client.calls.call import wire_camera
+from client.errors import ServiceUnreachable, error_of_problem
+from client.wire import CameraModel, PartsModel, ProblemDetails, RenderRequest, TracksModel, TracksRequest
+from client.wire.base import Model
+from client.wire.stream import (
+    SERVER_MESSAGE,
+    STREAM_PROTOCOL,
+    BulkHead,
+    FrameMessage,
+    Gone,
+    NoRequest,
+    PartsSubscription,
+    SceneMessage,
+    StreamProblem,
+    Subscribe,
+    Topic,
+    Unsubscribe,
+    Update,
+    unpack,
+)
+from scas4d_core.cameras import Camera
+
+OUTAGE_S = 20.0
+FIRST_WAIT_S = 0.2
+LONGEST_WAIT_S = 5.0
+UNREAD_MESSAGES = 2
+"""Read ahead of the caller. Few: what the service holds back is replaced by what is newer."""
+RETRIED_STATUSES = (429, 502, 503, 504)
+
+
+@dataclass(frozen=True)
+class Bulk:
+    """A binary message of a subscription.
+
+    Attributes:
+        id: the subscription's. tag: of the request that this answers. missed: what it took the place of, unsent.
+        frame: the newest that it knows. media_type: of `body`. headers: as the same request over HTTP has them.
+    """
+
+    id: str
+    tag: int | None
+    missed: int
+    frame: int
+    media_type: str
+    headers: Mapping[str, str]
+    body: bytes
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Reads the body as the arrays of an npz; nothing is unpickled."""
+        with np.load(io.BytesIO(self.body), allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+
+
+@dataclass(frozen=True)
+class ViewEvent(Bulk):
+    """A rendered view."""
+
+    def picture(self) -> NDArray[Any]:
+        """Decodes the picture: [H, W, 3] uint8 for colour, else [H, W]."""
+        with Image.open(io.BytesIO(self.body)) as picture:
+            return np.array(picture)
+
+
+@dataclass(frozen=True)
+class TracksEvent(Bulk):
+    """Trajectories over the frames `first` to `frame`, which go on where the message before ended."""
+
+    first: int
+
+    def model(self) -> TracksModel:
+        """Of a request for JSON."""
+        return TracksModel.model_validate_json(self.body)
+
+
+@dataclass(frozen=True)
+class PartsEvent(Bulk):
+    """Part labels of all Gaussians."""
+
+    def model(self) -> PartsModel:
+        """Of a request for JSON."""
+        return PartsModel.model_validate_json(self.body)
+
+
+Event = SceneMessage | FrameMessage | ViewEvent | TracksEvent | PartsEvent
+
+
+@dataclass(frozen=True)
+class SubscriptionRequest:
+    """A topic and its request, to subscribe to; made by the functions below."""
+
+    topic: Topic
+    request: Model
+
+
+def scene_changes() -> SubscriptionRequest:
+    """Subscribes to the scene's state, progress and queue at every change.
+
+    >>> with Stream(url, scene) as stream:
+    ...     stream.subscribe("scene", scene_changes())
+    ...     event = stream.receive(timeout=20)
+    >>> event.status.committed
+    3
+    """
+    return SubscriptionRequest(Topic.SCENE, NoRequest())
+
+
+def finished_frames() -> SubscriptionRequest:
+    """Subscribes to the report of each finished frame, with its metrics.
+
+    >>> with Stream(url, scene) as stream:
+    ...     stream.subscribe("done", finished_frames())
+    ...     event = stream.receive(timeout=20)
+    >>> event.report.index
+    2
+    """
+    return SubscriptionRequest(Topic.FRAMES, NoRequest())
+
+
+def view(
+    camera: Camera | str,
+    frame: int | None = None,
+    *,
+    kind: str = "colour",
+    format: str = "jpeg",
+    background: tuple[float, float, float] | None = None,
+    parts: int | None = None,
+) -> SubscriptionRequest:
+    """Subscribes to a view of every new frame, or of a chosen one. Arguments as of `client.calls.render`.
+
+    >>> with Stream(url, scene) as stream:
+    ...     stream.subscribe("live", view(rig.cameras[0], format="png"))
+    ...     event = stream.receive(timeout=20)
+    >>> event.frame, event.picture().shape
+    (2, (16, 24, 3))
+    """
+    request = {"camera": wire_camera(camera), "frame": frame, "kinds": [kind], "format": format}
+    return SubscriptionRequest(
+        Topic.RENDER, RenderRequest.model_validate({**request, "background": background, "parts": parts})
+    )
+
+
+def tracks(
+    *,
+    ids: Sequence[int] | None = None,
+    pixels: ArrayLike | None = None,
+    camera: Camera | str | None = None,
+    points: ArrayLike | None = None,
+    at: int | None = None,
+    first: int | None = None,
+    project: Sequence[Camera | str] = (),
+    format: str = "json",
+) -> SubscriptionRequest:
+    """Subscribes to trajectories so far, then of each new frame. Arguments as of `client.calls.tracks`.
+
+    >>> with Stream(url, scene) as stream:
+    ...     stream.subscribe("two", tracks(ids=[0, 1]))
+    ...     event = stream.receive(timeout=20)
+    >>> event.first, event.frame, event.model().ids
+    (0, 2, [0, 1])
+    """
+    request = {
+        "ids": None if ids is None else [int(id) for id in ids],
+        "pixels": None if pixels is None else np.asarray(pixels, dtype=np.float64).tolist(),
+        "camera": None if camera is None else wire_camera(camera),
+        "points": None if points is None else np.asarray(points, dtype=np.float64).tolist(),
+        "at": at,
+        "first": first,
+        "project": [wire_camera(one) for one in project],
+        "format": format,
+    }
+    return SubscriptionRequest(Topic.TRACKS, TracksRequest.model_validate(request))
+
+
+def parts(count: int | None = None, *, every: int = 1) -> SubscriptionRequest:
+    """Subscribes to part labels of all Gaussians, found anew after every `every` frames.
+
+    >>> with Stream(url, scene) as stream:
+    ...     stream.subscribe("labels", parts(2))
+    ...     event = stream.receive(timeout=20)
+    >>> event.model().count
+    2
+    """
+    return SubscriptionRequest(Topic.PARTS, PartsSubscription(count=count, every=every))
+
+
+def event_of(head: BulkHead, body: bytes) -> ViewEvent | TracksEvent | PartsEvent:
+    """The event of a binary message."""
+    given = (head.id, head.tag, head.missed, head.frame, head.media_type, head.headers, body)
+    if head.type == "tracks":
+        return TracksEvent(*given, first=head.frame if head.first is None else head.first)
+    return ViewEvent(*given) if head.type == "render" else PartsEvent(*given)
+
+
+class StreamSession:
+    """Subscriptions of a stream, the messages that ask for them, and the events read from the answers."""
+
+    def __init__(self, url: str, scene: str, token: str | None, outage: float) -> None:
+        self.scene = scene
+        self.outage = outage
+        base = "ws" + url.rstrip("/").removeprefix("http")
+        self.address = f"{base}/v1/scenes/{quote(scene, safe='')}/stream"
+        self.arguments: dict[str, Any] = {
+            "subprotocols": [Subprotocol(STREAM_PROTOCOL)],
+            "additional_headers": {} if token is None else {"Authorization": f"Bearer {token}"},
+            "compression": None,  # bulk is compressed already
+            "max_size": None,  # the service is the one that was asked for bulk
+            "max_queue": UNREAD_MESSAGES,
+            "close_timeout": 2,
+        }
+        self.subscriptions: dict[str, Subscribe] = {}
+        self._failed_at: float | None = None
+        self._failures = 0
+
+    def subscribe(self, id: str, wanted: SubscriptionRequest, tag: int | None) -> str:
+        """Keeps a subscription; the message that asks for it."""
+        request = wanted.request.model_dump(mode="json", exclude_unset=True)
+        self.subscriptions[id] = Subscribe(id=id, topic=wanted.topic, request=request, tag=tag)
+        return self.subscriptions[id].model_dump_json()
+
+    def update(self, id: str, tag: int | None, changes: Mapping[str, Any]) -> str:
+        """Changes a kept subscription; the message that asks for the change."""
+        request = dict(changes)
+        if "camera" in request and not isinstance(request["camera"], str):
+            request["camera"] = CameraModel.of(request["camera"]).model_dump(mode="json")
+        known = self.subscriptions[id]
+        self.subscriptions[id] = known.model_copy(update={"request": known.request | request, "tag": tag})
+        return Update(id=id, request=request, tag=tag).model_dump_json()
+
+    def unsubscribe(self, id: str) -> str:
+        """Forgets a subscription; the message that ends it."""
+        self.subscriptions.pop(id)
+        return Unsubscribe(id=id).model_dump_json()
+
+    def read(self, data: str | bytes) -> Event | Gone | None:
+        """Reads a message; None for one that is of no interest to the caller.
+
+        Raises:
+            ServiceError: the service refused what was asked for.
+        """
+        if isinstance(data, bytes):
+            return event_of(*unpack(data))
+        message = SERVER_MESSAGE.validate_json(data)
+        if isinstance(message, StreamProblem):
+            raise error_of_problem(message.problem)
+        return message if isinstance(message, SceneMessage | FrameMessage | Gone) else None
+
+    def connected(self) -> None:
+        """Forgets earlier failures."""
+        self._failed_at, self._failures = None, 0
+
+    def wait_after(self, error: Exception) -> float:
+        """Seconds until the next try.
+
+        Raises:
+            ServiceError: the service answered, and refused.
+            ServiceUnreachable: it was tried for long enough.
+        """
+        if isinstance(error, InvalidStatus) and error.response.status_code not in RETRIED_STATUSES:
+            raise error_of_problem(_problem(error)) from error
+        now = time.monotonic()
+        self._failed_at = now if self._failed_at is None else self._failed_at
+        if now - self._failed_at >= self.outage:
+            if isinstance(error, InvalidStatus):
+                raise error_of_problem(_problem(error)) from error
+            raise ServiceUnreachable(f"{self.address} cannot be reached: {error}") from error
+        self._failures += 1
+        grown = min(LONGEST_WAIT_S, FIRST_WAIT_S * 2.0 ** min(self._failures - 1, 16))
+        return grown * random.uniform(0.5, 1.0)
+
+
+def _problem(error: InvalidStatus) -> ProblemDetails:
+    body = error.response.body or b""
+    try:
+        return ProblemDetails.model_validate_json(bytes(body))
+    except ValueError:
+        text = bytes(body)[:200].decode("utf-8", "replace")
+        return ProblemDetails(title="unexpected answer", status=error.response.status_code, detail=text or str(error))

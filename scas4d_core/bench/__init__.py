@@ -1,1 +1,0 @@
-"""Studies that measure the method; ``scripts/bench`` runs them."""

@@ -1,0 +1,106 @@
+"""`scripts/bench stability`: the catalogue of hard cases, hard frames, and the soak."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from studies.options import QUALITY
+
+
+def stability(
+    cases: Annotated[
+        list[str] | None, typer.Option(help="Only cases whose name holds this. May be repeated.", show_default=False)
+    ] = None,
+    fast: Annotated[bool, typer.Option("--fast", help="Leave out what takes long, as a million to cluster.")] = False,
+    mutate: Annotated[
+        bool, typer.Option("--mutate", help="Take away each guard in turn; goes on where it was interrupted.")
+    ] = False,
+    store: Annotated[Path, typer.Option(help="Folder of the mutations' results.")] = Path("out/stability"),
+    out: Annotated[Path | None, typer.Option(help="Write the tables here, between their marks.")] = None,
+    frames: Annotated[
+        bool,
+        typer.Option("--frames", help="The frame cases instead, and what the checks cost; synthetic, or --captures."),
+    ] = False,
+    captures: Annotated[
+        list[Path] | None, typer.Option(help="Frame cases on this capture with test cameras. May be repeated.")
+    ] = None,
+    service: Annotated[
+        bool, typer.Option("--service", help="The frame cases through a running service instead.")
+    ] = False,
+    soak: Annotated[
+        int | None, typer.Option(min=1, help="So many frames of a small scene instead; goes on where it was.")
+    ] = None,
+) -> None:
+    """Runs the catalogue of hard cases on every backend that is here, and counts what the guards did.
+
+    Examples: scripts/bench stability --cases NaN --cases fold; scripts/bench stability --captures captures/robot;
+    scripts/bench stability --service; scripts/bench stability --soak 10000
+    """
+    if frames or captures or service or soak is not None:
+        _frame_studies(captures or [], store, cases or [], service=service, soak=soak)
+        return
+    from studies.hard_cases import mutate as mutations
+    from studies.hard_cases import run
+
+    lines = run.run(cases, slow=not fast, echo=typer.echo)
+    failing = mutations.study(store, typer.echo) if mutate else mutations.known(store)
+    if out is not None:
+        if cases or fast:
+            raise typer.BadParameter("a page has all cases; leave out --cases and --fast, or --out")
+        run.write_page(out, run.page(lines, failing, *run.here()))
+    if any(line.violations for line in lines) or (mutate and not all((failing or {}).values())):
+        raise typer.Exit(1)
+
+
+def _frame_studies(
+    captures: Sequence[Path], store: Path, cases: Sequence[str], *, service: bool, soak: int | None
+) -> None:
+    """The soak, or the frame cases on the synthetic footage or on captures; ends with 1 where something does not hold.
+
+    Args:
+        store: folder; the soak goes on in it, the rest begins anew.
+    """
+    if soak is not None:
+        from studies.hard_frames.soak import Soak, table, violations
+
+        rows = Soak(store / "soak").run(soak, echo=lambda row: typer.echo(str(row)))
+        typer.echo(table(rows))
+        _end(violations(rows))
+        return
+    from scas4d_core.captures import open_capture
+    from studies.hard_frames.footage import AnyFootage, CapturedFootage, SyntheticFootage
+    from studies.quality.settings import settings_of
+
+    footages: list[AnyFootage] = [
+        CapturedFootage(open_capture(path), settings_of("scas4d"), QUALITY / "first") for path in captures
+    ]
+    failed: list[str] = []
+    for footage in footages or [SyntheticFootage()]:
+        if service:
+            from client.cli.extras import need_server
+            from studies.service import hard_frames as stability
+
+            need_server()
+            lines, faults = stability.study(footage, store / "service", cases, typer.echo)
+            typer.echo(stability.table(lines))
+            failed += faults + [line.case.name for line in lines if line.violations]
+        else:
+            from studies.hard_frames import study as frames_study
+            from studies.hard_frames.cost import cost, in_words
+
+            found = frames_study.study(footage, store / "frames", cases, typer.echo)
+            typer.echo(frames_study.table(found))
+            typer.echo(in_words(footage, cost(footage)))
+            failed += [line.case.name for line in found if line.violations]
+    _end(failed)
+
+
+def _end(failed: Sequence[str]) -> None:
+    for each in failed:
+        typer.echo(f"does not hold: {each}")
+    if failed:
+        raise typer.Exit(1)

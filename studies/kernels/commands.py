@@ -1,0 +1,48 @@
+"""`scripts/bench kernels` and `device`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from studies.options import QUALITY, Changes, Page, write_page
+
+
+def kernels(
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; the targets are for robot.")],
+    out: Page = None,
+    store: Annotated[Path, typer.Option(help="Folder of the study, for `scripts/bench table`.")] = QUALITY,
+    preset: Annotated[str, typer.Option(help="Preset of settings.")] = "scas4d",
+    frames: Annotated[int, typer.Option(min=3, help="Frames of the timed run; the first update does not count.")] = 8,
+    repeats: Annotated[int, typer.Option(min=1, help="Repeats of the rasterizer and of its arithmetic.")] = 9,
+    changes: Changes = None,
+) -> None:
+    """Measures the CPU kernels: rasterizer against its arithmetic, update against its passes, peak memory.
+
+    Leave the machine alone meanwhile; NUMBA_NUM_THREADS sets the threads. Frame 0 is fitted anew, for its memory.
+    """
+    from studies.kernels import kernels as study
+    from studies.quality.settings import settings_of
+
+    settings = settings_of(preset, changes=changes or ())
+    row = study.study(capture, settings, store, frames=frames, repeats=repeats)
+    write_page(out, study.page(row))
+
+
+def device(
+    gaussians: Annotated[int, typer.Option(min=100, help="Moving Gaussians; a quarter as many stand.")] = 8000,
+    size: Annotated[int, typer.Option(min=16, help="Side of the six pictures in pixels.")] = 384,
+    iterations: Annotated[int, typer.Option(min=1, help="Iterations of the update.")] = 20,
+    repeats: Annotated[int, typer.Option(min=1, help="Repeats of each stage, after a first call that compiles.")] = 5,
+    out: Page = None,
+) -> None:
+    """Compares the GPU with the CPU stage by stage, on a synthetic scene; fails where they disagree."""
+    from studies.kernels import device as study
+
+    text, agree = study.run(gaussians=gaussians, size=size, iterations=iterations, repeats=repeats)
+    typer.echo(text)
+    write_page(out, text)
+    if not agree:
+        raise typer.Exit(1)

@@ -1,0 +1,32 @@
+"""Options, output and folders that several studies share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Echo = Callable[[str], None]
+"""Takes each line that a study prints."""
+QUALITY = Path("out/quality")
+"""Folder of the study of quality, which other studies read."""
+FRONTIER = Path("out/frontier")
+"""Folder of the study of accuracy against time, which the paper's and the effort's studies share."""
+
+Capture = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture.")]
+Captures = Annotated[list[Path], typer.Argument(metavar="CAPTURE...", help="Folders of captures with test cameras.")]
+Page = Annotated[Path | None, typer.Option(help="Also write the result to this file, as Markdown.")]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NAME=VALUE", help="Change a setting, as update.iterations=20. May be repeated."),
+]
+Again = Annotated[bool, typer.Option("--again", help="Measure rows anew that are there (kept frames 0 are used).")]
+
+
+def write_page(out: Path | None, text: str) -> None:
+    """Writes the text to `out`, whose folder is made when missing; does nothing for None."""
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(text if text.endswith("\n") else text + "\n")

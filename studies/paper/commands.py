@@ -1,0 +1,40 @@
+"""`scripts/bench paper`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from studies.options import FRONTIER, QUALITY, Captures
+
+
+def paper(
+    captures: Captures,
+    out: Annotated[
+        Path, typer.Option(help="Folder of the study, shared with frontier. Run again to go on.")
+    ] = FRONTIER,
+    quality: Annotated[
+        Path | None, typer.Option(help="Folder of the study of quality, for captures that have rows there alone.")
+    ] = QUALITY,
+    updates: Annotated[int, typer.Option(min=1, help="Updates of each row.")] = 5,
+    measure: Annotated[
+        bool, typer.Option("--measure/--no-measure", help="Measure rows that are missing; else leave them out.")
+    ] = True,
+    page: Annotated[Path | None, typer.Option(help="The page, as Markdown. [OUT/paper.md]")] = None,
+) -> None:
+    """Reproduces the paper's experiments on captures, beside the paper's figures, and says where they agree.
+
+    A capture without rows in either study is measured, its cheapest rows first.
+
+    Example: scripts/bench paper captures/robot --page docs/paper-tables.md
+    """
+    from studies.frontier.frontier import measure_variants
+    from studies.paper.page import needed, write_paper_page
+
+    if measure and any("error" in row for row in measure_variants(captures, needed(), out, updates=updates)):
+        raise typer.Exit(1)
+    file = page or out / "paper.md"
+    write_paper_page(out, [capture.resolve().name for capture in captures], file, updates, quality)
+    print(f"wrote {file}")

@@ -1,0 +1,125 @@
+"""`scripts/bench quality`, `targets`, `table` and `processors`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from studies.options import QUALITY, Again, Captures, Changes, write_page
+
+Study = Annotated[Path, typer.Option(help="Folder of the study: rows, pictures, frames 0. Run again to go on.")]
+
+
+def quality(
+    captures: Captures,
+    out: Study = QUALITY,
+    preset: Annotated[
+        list[str] | None, typer.Option(help="Preset: scas4d (the default), adaptive or dynamic3dgs. May be repeated.")
+    ] = None,
+    iterations: Annotated[
+        list[int] | None,
+        typer.Option(min=1, help="Iterations of an update; the preset's when left out. May be repeated."),
+    ] = None,
+    seed: Annotated[
+        list[int] | None, typer.Option(min=0, help="Seed of frame 0 and the updates, default 0. May be repeated.")
+    ] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Only so many frames; 1 measures frame 0 alone.")] = None,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda; the preset's when left out.")] = None,
+    masks: Annotated[bool, typer.Option(help="Give the method the masks; they measure in any case.")] = True,
+    points: Annotated[bool, typer.Option(help="Give the method the initial cloud.")] = True,
+    lpips: Annotated[bool, typer.Option("--lpips", help="Also LPIPS, where its weights are installed.")] = False,
+    again: Again = False,
+    changes: Changes = None,
+) -> None:
+    """Measures pictures, tracks, parts and seconds of captures; prints a table.
+
+    Reconstructs every capture with every preset, number of iterations and seed, each row in a process of its own, and
+    measures it on the capture's test cameras and ground truth. Rows on disk are not measured again. Leaves table.md,
+    a JSON file a row, a line a frame, and pictures (truth | render | difference) in the study's folder.
+
+    Example: scripts/bench quality captures/robot --preset scas4d --preset dynamic3dgs --iterations 100
+    """
+    from studies.quality.quality import run
+
+    rows = run(
+        captures,
+        out,
+        preset or ["scas4d"],
+        iterations=iterations or (),
+        seeds=seed or (0,),
+        changes=changes or (),
+        device=device,
+        frames=frames,
+        masks=masks,
+        points=points,
+        lpips=lpips,
+        again=again,
+    )
+    if any("error" in row for row in rows):
+        raise typer.Exit(1)
+
+
+def targets(
+    captures: Annotated[Path, typer.Argument(metavar="CAPTURES", help="Folder that holds the captures' folders.")],
+    out: Study = QUALITY,
+    run: Annotated[
+        list[str] | None,
+        typer.Option(help="Only this run, as scas4d, clusters-64 or dynamic3dgs-2000. May be repeated."),
+    ] = None,
+    only: Annotated[list[str] | None, typer.Option(help="Only this capture, by name. May be repeated.")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Only so many frames; the table says how many.")] = None,
+    again: Again = False,
+) -> None:
+    """Measures every row that the targets need, or some of them; `scripts/bench table` compares them.
+
+    The costliest runs come last; dynamic3dgs-2000 takes 20 times as long as the others: --frames shortens it.
+    """
+    from studies.quality.runs import measure_runs
+
+    rows = measure_runs(captures, out, run or (), only=only or (), frames=frames, again=again)
+    if any("error" in row for row in rows):
+        raise typer.Exit(1)
+
+
+def table(
+    study: Annotated[Path, typer.Argument(help="Folder of the study.")] = QUALITY,
+    out: Annotated[
+        Path | None, typer.Option(help="Write the whole page here (commands, machine, targets, rows) as Markdown.")
+    ] = None,
+) -> None:
+    """Prints which targets the measured rows reach, as one Markdown table.
+
+    A row counts where its settings are exactly those of today's presets; of several, the one with most frames.
+    """
+    from studies.quality.targets import compare, count_words, left_out, page, read_study, target_table
+
+    if not study.is_dir():
+        raise typer.BadParameter(f"{study} is no folder; measure first: scripts/bench targets CAPTURES --out {study}")
+    rows = read_study(study)
+    outcomes = compare(rows)
+    print(target_table(outcomes))
+    print(f"\n{count_words(outcomes)}.")
+    if others := left_out(study, rows):
+        print(f"{others} rows of the study are not used: other settings than today's presets, or fewer frames.")
+    if out is not None:
+        write_page(out, page(rows))
+
+
+def processors(
+    captures: Captures,
+    out: Annotated[Path, typer.Option(help="Folder of the study. Run again to go on.")] = Path("out/processors"),
+    frames: Annotated[int, typer.Option(min=1, help="Updates of each run.")] = 5,
+    seeds: Annotated[int, typer.Option(min=1, help="Seeds of the updates, on this processor.")] = 4,
+    changes: Changes = None,
+) -> None:
+    """Compares a capture's result on this processor with that on lesser ones, beside the spread over seeds.
+
+    Kernels, numpy and BLAS compute as on a processor with AVX2 alone, and as on one of 2008 (x86-64). Ends with 1
+    where a state has other bits.
+    """
+    from studies.quality import processors as study
+
+    if not study.run(captures, out, frames=frames, seeds=seeds, changes=changes or ()):
+        raise typer.Exit(1)

@@ -1,0 +1,37 @@
+"""Settings of a study's row: a preset, its iterations and seed, and changes as text."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from client.cli.changes import parse_changes
+from scas4d_core.presets import preset
+from scas4d_core.settings import Settings
+
+
+def settings_of(
+    name: str,
+    iterations: int | None = None,
+    seed: int = 0,
+    changes: Sequence[str] = (),
+    device: str | None = None,
+) -> Settings:
+    """A preset with changes.
+
+    Args:
+        name: of the preset.
+        iterations: of an update; the preset's where None.
+        seed: of frame 0 and of the updates.
+        changes: as ``"update.clusters=[64]"``; they go over all else.
+        device: "cpu" or "cuda"; the preset's where None.
+
+    Raises:
+        ValueError: an unknown preset or setting, or a value out of range.
+    """
+    own: dict[str, Any] = {"static": {"seed": seed}, "update": {"seed": seed}}
+    if iterations is not None:
+        own["update"]["iterations"] = iterations
+    if device is not None:
+        own["device"] = device
+    return preset(name, own, parse_changes(changes))

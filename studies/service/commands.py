@@ -1,0 +1,135 @@
+"""`scripts/bench faults`, `ingest` and `views`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from studies.options import Changes, Page, write_page
+
+Repeated = Annotated[
+    Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; a short one is played back and forth.")
+]
+
+
+def faults(
+    capture: Repeated,
+    frames: Annotated[int, typer.Option(min=4, help="Frames sent in every scenario.")] = 20,
+    kills: Annotated[int, typer.Option(min=0, help="kill -9 of the worker or the service, at random moments.")] = 30,
+    cuts: Annotated[int, typer.Option(min=0, help="Files of the log that are cut.")] = 20,
+    flips: Annotated[int, typer.Option(min=0, help="Files of the log in which a bit is flipped.")] = 1,
+    bits: Annotated[
+        int, typer.Option(min=0, help="Bits flipped one by one in states, checkpoints, journal and frames.")
+    ] = 200,
+    turns: Annotated[
+        int, typer.Option(min=1, help="Turns without strangers and with them, each with a token and without.")
+    ] = 3,
+    part: Annotated[
+        list[str] | None, typer.Option(help="Only this: kills, log, disk, bits or strangers. May be repeated.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random moments and places.")] = 0,
+    work: Annotated[Path, typer.Option(help="Folder for data folders and logs; what is there goes.")] = Path(
+        "out/faults"
+    ),
+    out: Page = None,
+    changes: Changes = None,
+    engine: Annotated[str | None, typer.Option(help="module:function instead of the method itself.")] = None,
+) -> None:
+    """Kills the service and its workers, cuts and damages its files, fills its disk; compares with an undisturbed run.
+
+    Then strangers without a token hold it up: an endless header, half-sent headers, hanging uploads, during updates.
+
+    Example: scripts/bench faults samples/robot --set static.iterations=300 --set update.iterations=20
+    """
+    from client.cli.changes import parse_changes
+    from client.cli.extras import need_server
+    from scas4d_core.captures import open_capture
+    from studies.service import faults as of_faults
+    from studies.service.outcome import table
+    from studies.service.study import Study, encoded_frames
+
+    need_server()
+    if unknown := set(part or []) - set(of_faults.PARTS):
+        raise typer.BadParameter(f"there is no part {sorted(unknown)[0]!r}; the parts are {', '.join(of_faults.PARTS)}")
+    opened = open_capture(capture)
+    study = Study(
+        work.resolve(),
+        opened,
+        encoded_frames(opened, frames),
+        parse_changes(changes),
+        {} if engine is None else {"SCAS4D_ENGINE": engine},
+    )
+    parts = part or of_faults.PARTS
+    outcomes = of_faults.run(
+        study, moments=kills, cuts=cuts, flips=flips, bits=bits, seed=seed, turns=turns, parts=parts, echo=typer.echo
+    )
+    text = table(outcomes)
+    typer.echo(text)
+    write_page(out, text)
+    if not all(outcome.reached for outcome in outcomes):
+        raise typer.Exit(1)
+
+
+def ingest(
+    frames: Annotated[int, typer.Option(min=1, help="Frames sent in a round.")] = 20,
+    cameras: Annotated[int, typer.Option(min=1, help="Cameras of the rig.")] = 27,
+    megabytes: Annotated[float, typer.Option(min=0.01, help="Size of one JPEG.")] = 1.0,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds; each measures both ways.")] = 5,
+    senders: Annotated[int, typer.Option(min=1, help="Connections of the sending process.")] = 2,
+    work: Annotated[Path, typer.Option(help="Folder on the disk that is measured.")] = Path("out/ingest"),
+    out: Page = None,
+) -> None:
+    """Measures ingest over the loopback against plain fsynced writes of the same records, in turns."""
+    from client.cli.extras import need_server
+    from studies.service import ingest as of_ingest
+
+    need_server()
+
+    size = int(megabytes * 1e6)
+    measured = of_ingest.measure(
+        work.resolve(), frames=frames, cameras=cameras, size_bytes=size, rounds=rounds, senders=senders
+    )
+    text = of_ingest.page(measured, frames=frames, cameras=cameras, size_bytes=size, senders=senders)
+    typer.echo(text)
+    write_page(out, text)
+
+
+def views(
+    capture: Repeated,
+    rate: Annotated[
+        list[float] | None, typer.Option(min=0.1, help="Views a second, default 1, 5 and 20. May be repeated.")
+    ] = None,
+    updates: Annotated[int, typer.Option(min=1, help="Updates a turn, without views and with.")] = 8,
+    turns: Annotated[int, typer.Option(min=1, help="Turns of each rate.")] = 3,
+    width: Annotated[int, typer.Option(min=1, help="Width of a view in pixels.")] = 256,
+    work: Annotated[Path, typer.Option(help="Folder for the service's data; what is there goes.")] = Path("out/views"),
+    out: Page = None,
+    changes: Changes = None,
+    engine: Annotated[str | None, typer.Option(help="module:function instead of the method itself.")] = None,
+) -> None:
+    """Measures live views beside updates: latency under an open-loop load, and what it costs the updates.
+
+    Example: scripts/bench views captures/robot
+    """
+    from client.cli.changes import parse_changes
+    from client.cli.extras import need_server
+    from scas4d_core.captures import open_capture
+    from studies.service import views as of_views
+
+    need_server()
+    rows = of_views.measure(
+        open_capture(capture),
+        work.resolve(),
+        rates=rate or (1, 5, 20),
+        updates=updates,
+        turns=turns,
+        width=width,
+        settings=parse_changes(changes),
+        environment={} if engine is None else {"SCAS4D_ENGINE": engine},
+        echo=typer.echo,
+    )
+    text = of_views.page(rows, capture.name, width, updates, turns)
+    typer.echo(text)
+    write_page(out, text)

@@ -1,0 +1,58 @@
+"""`scas4d reconstruct` and `evaluate` on a tiny capture: what they leave, and that they can be run again."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from client.cli.evaluate import evaluate
+from client.cli.reconstruct import reconstruct
+from scas4d_core.captures import CaptureError
+from scas4d_core.query.ply import read_ply
+from scas4d_core.storage.history import History
+
+CHANGES = {"static": {"iterations": 2}, "update": {"iterations": 2}}
+
+
+def test_it_leaves_pictures_states_and_a_ply_each_time_it_is_run(capture_folder, tmp_path):
+    for frames in (3, 2):
+        reconstruct(capture_folder, tmp_path, frames=frames, preset="scas4d", changes=CHANGES)
+        history = History.load(tmp_path / "states")
+        assert history.indices == list(range(frames))  # of this run alone
+        assert len(read_ply(tmp_path / "last.ply")) == len(history.gaussians(0))
+    assert [path.name for path in sorted((tmp_path / "camera_2").iterdir())] == [f"{t:06d}.png" for t in range(3)]
+
+
+def test_scores_are_printed_and_not_measured_twice(capture_folder, tmp_path):
+    said: list[str] = []
+    row = evaluate(capture_folder, tmp_path, frames=2, changes=CHANGES, report=said.append)
+    assert (row["updates"], row["iterations"], row["capture"]) == (1, 2, capture_folder.name)
+    assert np.isfinite(row["psnr"])
+    assert re.fullmatch(r" +frame +1/1 +[\d.]+ dB +[\d.]+ s", said[2])
+    assert "Median seconds of an update by stage" in said[-1]
+    assert f"| {capture_folder.name} | scas4d | 2 | static.iterations=2 |" in said[-1]
+    assert (tmp_path / "table.md").read_text() == said[-1] + "\n"
+    pictures = tmp_path / "pictures" / row["key"]
+    assert sorted(path.name for path in pictures.iterdir())[0] == "frame0000_camera2.png"
+    with (
+        Image.open(pictures / "frame0000_camera2.png") as picture,
+        Image.open(capture_folder / "ims/2/000000.png") as truth,
+    ):
+        assert picture.size == (3 * truth.width, truth.height)
+    table = said[-1]
+    assert evaluate(capture_folder, tmp_path, frames=2, changes=CHANGES, report=said.append) == row
+    assert said[-2].endswith("measured already")
+    assert said[-1] == table
+
+
+def test_a_capture_without_test_cameras_is_refused(capture_folder, tmp_path):
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    for path in capture_folder.iterdir():
+        if path.name != "test_meta.json":
+            (folder / path.name).symlink_to(path)
+    with pytest.raises(CaptureError, match="no test cameras"):
+        evaluate(folder, tmp_path / "out", changes={})

@@ -1,0 +1,92 @@
+"""Requests to a service over plain HTTP, bodies that it refuses, and waiting for what follows."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import struct
+import time
+import zlib
+
+import httpx
+from PIL import Image
+from running import HEIGHT, WIDTH, Running, fake_settings, make_rig, picture, pictures
+
+from client.sdk import Client
+from client.wire import FRAME_MEDIA_TYPE, RigModel, frame_chunks
+
+FRAMED = {"Content-Type": FRAME_MEDIA_TYPE}
+
+
+@contextlib.contextmanager
+def serving(folder):
+    running = Running(fake_settings(folder))
+    try:
+        with httpx.Client(base_url=running.url, timeout=30) as http, Client(running.url, patience=20) as sdk:
+            yield http, sdk
+    finally:
+        running.stop()
+
+
+def create(http, **ingest):
+    body = {"rig": RigModel.of(make_rig()).model_dump(mode="json"), "ingest": ingest, "name": "studio"}
+    return http.post("/v1/scenes", json={**body, "frames_per_second": 10}).json()["id"]
+
+
+def put_form(http, id, index, images=None):
+    files = {name: (name, data) for name, data in (images or pictures()).items()}
+    return http.put(f"/v1/scenes/{id}/frames/{index}", files=files)
+
+
+def framed(index, images=None, masks=None, time=None, **more):
+    return b"".join(frame_chunks(index, pictures() if images is None else images, masks, time, **more))
+
+
+def put_framed(http, id, index, images=None, **more):
+    return http.put(f"/v1/scenes/{id}/frames/{index}", content=framed(index, images, **more), headers=FRAMED)
+
+
+def put_camera(http, id, index, camera, data, **params):
+    return http.put(f"/v1/scenes/{id}/frames/{index}/cameras/{camera}", content=data, params=params)
+
+
+def status(http, id):
+    return http.get(f"/v1/scenes/{id}").json()
+
+
+def finished(http, id, index):
+    until = time.monotonic() + 30
+    while True:
+        report = http.get(f"/v1/scenes/{id}/frames/{index}").json()
+        if report.get("state") in ("committed", "set_aside", "missing", "skipped"):
+            return report
+        assert time.monotonic() < until, report
+        time.sleep(0.05)
+
+
+def settled(http, id):
+    until = time.monotonic() + 30
+    while (status := http.get(f"/v1/scenes/{id}").json())["queued"] and status["state"] != "paused":
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    return status
+
+
+def wait_for(condition):
+    until = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def declares(width, height):
+    """A PNG whose header, checksum and all, declares another size."""
+    header = b"IHDR" + struct.pack(">II", width, height) + picture()[24:29]
+    return picture()[:12] + header + struct.pack(">I", zlib.crc32(header)) + picture()[33:]
+
+
+def animated():
+    first, second = (Image.new("RGB", (WIDTH, HEIGHT), (red, 0, 0)) for red in (0, 99))
+    file = io.BytesIO()
+    first.save(file, "PNG", save_all=True, append_images=[second])
+    return file.getvalue()
