@@ -2,18 +2,63 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 
 
+class Constant(NamedTuple):
+    """A former setting: the value that it has for good, and the dotted name of the constant that holds it.
+
+    ``place`` is empty where the feature went and only ``value``, which switched it off or was its default, is accepted.
+    """
+
+    value: Any
+    place: str = ""
+
+
 class Model(BaseModel):
-    """Settings do not change once read, and an unknown name is an error."""
+    """Base of all settings: they do not change once read, and an unknown name is an error.
+
+    Attributes:
+        constants: former settings by name. Stored settings and requests may still name them: at the constant's value
+            they are dropped, at any other the error (type ``constant``) names the value given, the constant's value and
+            its place. ``studies/constants.py`` varies one.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    constants: ClassVar[Mapping[str, Constant]] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _drop_constants(cls, given: Any) -> Any:
+        if not isinstance(given, Mapping) or not (named := given.keys() & cls.constants.keys()):
+            return given
+        wrong = [_refusal(name, given[name], cls.constants[name]) for name in sorted(named)]
+        if errors := [error for error in wrong if error is not None]:
+            raise ValidationError.from_exception_data(cls.__name__, errors)
+        return {name: value for name, value in given.items() if name not in named}
+
+
+def _refusal(name: str, given: Any, constant: Constant) -> InitErrorDetails | None:
+    """The error of a former setting that is given another value than its constant has; None: it has the same."""
+    value = list(constant.value) if isinstance(constant.value, tuple) else constant.value
+    if (list(given) if isinstance(given, tuple) else given) == value and isinstance(given, bool) == isinstance(
+        value, bool
+    ):
+        return None
+    now = f"it is the constant {constant.place} = {value} now" if constant.place else f"only {value} is accepted still"
+    error = PydanticCustomError(
+        "constant",
+        "{name} cannot be {given}: it is no setting any more, {now}",
+        {"name": name, "given": repr(given), "now": now, "remedy": f"leave {name} out"},
+    )
+    return InitErrorDetails(type=error, loc=(name,), input=given)
 
 
 class SceneSettings(Model):

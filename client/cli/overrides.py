@@ -39,6 +39,8 @@ def refusal(error: ValidationError) -> str:
     name = ".".join(str(part) for part in found[0]["loc"])
     if found[0]["type"] == "extra_forbidden":
         fault = "there is none of this name"
+    elif found[0]["type"] == "constant":
+        fault = found[0]["msg"]
     else:
         fault = f"it cannot be {found[0]['input']!r}: {found[0]['msg'].removeprefix('Value error, ')}"
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from pydantic import BaseModel, ValidationError
@@ -20,7 +22,7 @@ READERS = "\n".join(path.read_text() for path in CORE.rglob("*.py") if path.name
 HANGS_ON = {"Weights": r"weights", "Settings": r"settings", "SceneSettings": r"scene", "LayerRates": r"\w+"}
 
 
-def models() -> list[type[BaseModel]]:
+def models() -> list[type[module.Model]]:
     own = [value for value in vars(module).values() if isinstance(value, type) and issubclass(value, module.Model)]
     return [model for model in own if model.model_fields]
 
@@ -91,3 +93,47 @@ def test_right_values_are_taken() -> None:
     )
     assert read.update == UpdateSettings(clusters=(4,), weights=Weights(rigidity=0))
     assert read.scene.metres_per_unit == "auto"
+
+
+class Former(module.Model):
+    constants: ClassVar[Mapping[str, module.Constant]] = {
+        "length": module.Constant(0.02, "here.LENGTH"),
+        "starts": module.Constant((0.0, 0.2), "here.STARTS"),
+    }
+    kept: int = 1
+
+
+class Nested(module.Model):
+    inner: Former = Former()
+
+
+@pytest.mark.parametrize("given", [{}, {"length": 0.02}, {"starts": [0, 0.2]}, {"starts": (0.0, 0.2), "length": 0.02}])
+def test_a_former_setting_is_taken_at_the_value_of_its_constant_and_dropped(given: dict[str, Any]) -> None:
+    assert Nested.model_validate({"inner": {**given, "kept": 2}}) == Nested(inner=Former(kept=2))
+    assert "length" not in Nested.model_validate({"inner": given}).model_dump()["inner"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("length", 2.0, "length cannot be 2.0: it is no setting any more, it is the constant here.LENGTH = 0.02 now"),
+        ("length", True, "length cannot be True"),
+        ("starts", [0.0, 0.3], r"starts cannot be \[0.0, 0.3\]: .* here.STARTS = \[0.0, 0.2\] now"),
+    ],
+)
+def test_a_former_setting_with_another_value_is_refused_by_name(name: str, value: object, said: str) -> None:
+    with pytest.raises(ValidationError, match=said) as refused:
+        Nested.model_validate({"inner": {name: value, "other": 1}})
+    assert refused.value.errors()[0]["loc"] == ("inner", name)
+    assert refused.value.errors()[0]["type"] == "constant"
+
+
+CONSTANTS = [(model, name) for model in (module.Model, *models()) for name in model.constants]
+
+
+@pytest.mark.parametrize(("model", "name"), CONSTANTS, ids=lambda v: v if isinstance(v, str) else v.__name__)
+def test_the_constant_of_a_former_setting_is_where_it_is_said_to_be(model: type[module.Model], name: str) -> None:
+    constant = model.constants[name]
+    assert name not in model.model_fields
+    owner, _, attribute = constant.place.rpartition(".")
+    assert not owner or getattr(importlib.import_module(owner), attribute) == constant.value

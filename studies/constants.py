@@ -1,0 +1,38 @@
+"""Varies constants of the method: what only its author turns is a constant in the module that uses it, not a setting.
+
+``Model.constants`` in ``scas4d_core/settings.py`` lists the constants that were settings once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from typing import Any
+
+
+@contextmanager
+def varied(place: str, value: Any) -> Iterator[None]:
+    """Gives a module's constant another value for a while, in this process.
+
+    A constant that a compiled kernel reads keeps the value that the kernel was compiled with.
+
+    Args:
+        place: dotted name, as ``"scas4d_core.update.schedule.LAYER_STARTS"``. value: to be had within the block.
+
+    Raises:
+        AttributeError: the module has no such constant.
+
+    >>> from studies import machine
+    >>> with varied("studies.machine.__doc__", "another text"):
+    ...     machine.__doc__
+    'another text'
+    """
+    owner, _, name = place.rpartition(".")
+    module = import_module(owner)
+    before = getattr(module, name)
+    setattr(module, name, value)
+    try:
+        yield
+    finally:
+        setattr(module, name, before)
