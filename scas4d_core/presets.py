@@ -1,4 +1,4 @@
-"""Named settings."""
+"""Presets: settings by name."""
 
 from __future__ import annotations
 
@@ -49,6 +49,9 @@ PRESETS: dict[str, Settings] = {
 
 def preset(name: str) -> Settings:
     """The settings called ``name``.
+
+    >>> preset("adaptive").update.iterations
+    50
 
     Raises:
         ValueError: no such preset; the message lists those there are.

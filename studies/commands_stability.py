@@ -19,6 +19,9 @@ def frame_studies(
     Args:
         store: folder; the soak goes on in it, the rest begins anew.
     """
+    from scas4d_core.warm_up import warm_up_elsewhere
+
+    warm_up_elsewhere()
     if soak is not None:
         from studies.hard_frames.soak import Soak, table, violations
 

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from scas4d_core.captures.frame import Frame
 from scas4d_core.robust.outliers import Past
-from scas4d_core.robust.solve_frame import Outcome
 from scas4d_core.storage.error_text import told
 from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
 from scas4d_core.storage.history import NEWEST_KEPT
 from scas4d_core.storage.npz import read_npz, write_npz
+from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.views import TrainingView, ViewFactory
 from scas4d_core.update.warm_start import Motion
 
@@ -36,16 +36,16 @@ class CheckpointError(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
-    """What one update leaves to the next beside Θ.
+class CarryOver:
+    """All that one update leaves to the next beside Θ.
 
     Attributes:
         motion: that was found, or None where the next update starts cold.
-        labels: [N] what has been seen to move, in scenes without masks; None until something has.
+        labels: [N] Gaussians that have been seen to move, in scenes without masks; None until something has.
         seen: views of the last frame that was believed, in scenes without masks: the next are compared with them.
         structure: digest of the clusters and neighbours that the motion belongs to.
-        past: what is usual for the scene and its cameras.
-        shown: fingerprint of each picture of the last frame that was believed (``repeats``).
+        past: the usual figures of the scene and its cameras.
+        shown: fingerprint of each picture of the last frame that was believed (``picture_checks``).
     """
 
     motion: Motion | None = None
@@ -56,22 +56,26 @@ class Carried:
     shown: Mapping[str, int] = field(default_factory=dict)
 
     def after(
-        self, outcome: Outcome, time: float, views: Sequence[TrainingView] | None, shown: Mapping[str, int]
-    ) -> Carried:
-        """What the next frame leaves in turn; of pictures that were not believed nothing is kept.
+        self,
+        result: UpdateResult,
+        past: Past,
+        time: float,
+        views: Sequence[TrainingView] | None,
+        shown: Mapping[str, int],
+    ) -> CarryOver:
+        """The carry-over of the next frame; of pictures that were not believed nothing is kept.
 
         Args:
-            outcome: of that frame. time: its, seconds.
+            result: of that frame. past: after it. time: its, seconds.
             views: that it was updated with, or None in scenes with masks. shown: fingerprints of its pictures.
         """
-        learnt = outcome.fresh and not outcome.stood
-        past = replace(outcome.past, fitted=time) if learnt else outcome.past
-        carried = replace(self, motion=outcome.motion, past=past)
-        if not outcome.fresh:
+        carried = replace(
+            self, motion=result.motion, past=replace(past, fitted=time) if result.outcome.learnt else past
+        )
+        if result.outcome.held:
             return carried
-        if views is not None and outcome.exposure == 1.0:  # what another light changes has not moved
-            seen = [view for view in views if view.name not in outcome.updated.left_out]
-            carried = replace(carried, seen=seen)
+        if views is not None and result.exposure == 1.0:  # a change of another light has not moved
+            carried = replace(carried, seen=[view for view in views if view.name not in result.trace.left_out])
         return replace(carried, shown=shown)
 
 
@@ -81,7 +85,7 @@ class Checkpoints:
     def __init__(self, directory: Path) -> None:
         self.directory = directory
 
-    def save(self, index: int, carried: Carried) -> None:
+    def save(self, index: int, carried: CarryOver) -> None:
         """Writes what frame ``index`` leaves to the next; before the frame is committed.
 
         Without masks that includes the pictures of the frame, 3 bytes a pixel.
@@ -103,7 +107,7 @@ class Checkpoints:
         arrays["names"] = np.array(sorted(arrays))
         write_npz(self._file(index), arrays)
 
-    def load(self, index: int, factory: ViewFactory) -> Carried:
+    def load(self, index: int, factory: ViewFactory) -> CarryOver:
         """What frame ``index`` left.
 
         Args:
@@ -126,7 +130,7 @@ class Checkpoints:
             motion = _unpacked(arrays) if "motion.seconds" in arrays else None
             past = Past.of_arrays({name[5:]: array for name, array in arrays.items() if name.startswith("past.")})
             shown = dict(zip(arrays["shown.names"].tolist(), arrays["shown.prints"].tolist(), strict=True))
-            return Carried(motion, arrays.get("labels"), seen, int(arrays["structure"]), past, shown)
+            return CarryOver(motion, arrays.get("labels"), seen, int(arrays["structure"]), past, shown)
         except FileNotFoundError:
             raise CheckpointError(f"{file.name} is missing") from None
         except (ValueError, KeyError, TypeError) as error:

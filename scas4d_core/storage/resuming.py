@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from scas4d_core.storage.checkpoint import Carried, CheckpointError, Checkpoints
+from scas4d_core.storage.checkpoint import CarryOver, CheckpointError, Checkpoints
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.update.views import ViewFactory
 
@@ -34,7 +34,7 @@ class Resumed:
 
 def find_commit(
     history: History, checkpoints: Checkpoints, factory: ViewFactory, held: Callable[[int], bool]
-) -> tuple[int, Carried | None, list[str]]:
+) -> tuple[int, CarryOver | None, list[str]]:
     """The commit to go on from, what it left to the next update (None: a cold start), and what was found damaged.
 
     Args:
@@ -45,7 +45,7 @@ def find_commit(
     """
     faults = list(history.damaged.values())
     whole: list[int] = []
-    carried: Carried | None = None
+    carried: CarryOver | None = None
     for index in reversed(history.indices):
         try:
             history.gaussians(index)

@@ -32,7 +32,7 @@ from scas4d_core.torch_backend.deformation import (
     material_rotations,
 )
 from scas4d_core.update.schedule import Rates
-from scas4d_core.update.stopping import Pace, by_clock
+from scas4d_core.update.stopping import Stopping
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Render: TypeAlias = Callable[[Tensor, Tensor, Tensor, Tensor, CameraParams, Tensor, Limits], Rendered]
@@ -75,8 +75,8 @@ class DeltaArrays(NamedTuple):
     ds: Floats
 
 
-class TrainingView(NamedTuple):
-    """What one camera saw.
+class TorchView(NamedTuple):
+    """One camera's pictures of a frame.
 
     Attributes:
         camera: of the inside world, of the picture's size.
@@ -105,8 +105,8 @@ class TermWeights:
     floor: float = 0.0
 
 
-class Updated(NamedTuple):
-    """What one update found.
+class TorchResult(NamedTuple):
+    """The state and the parameters that one update found.
 
     Attributes:
         gaussians: Θ_t, float32.
@@ -170,22 +170,22 @@ class TorchUpdate:
 
     @property
     def on_cuda(self) -> bool:
-        """Whether gsplat rasterizes."""
+        """True where gsplat rasterizes."""
         return torch.device(self.device).type == "cuda"
 
     def run(
         self,
         gaussians: Gaussians,
-        views: Sequence[TrainingView],
+        views: Sequence[TorchView],
         order: Sequence[int | Sequence[int]],
         *,
         start: Sequence[ClusterArrays] | None = None,
         deltas: DeltaArrays | None = None,
         rows: Sequence[NDArray[np.int64]] | None = None,
         on_iteration: Callable[[int], None] | None = None,
-        pace: Pace | None = None,
+        stopping: Stopping | None = None,
         look: Callable[[Gaussians], float] | None = None,
-    ) -> Updated:
+    ) -> TorchResult:
         """Find the deformation from Θ_{t−1} to the pictures of frame t.
 
         Args:
@@ -197,8 +197,8 @@ class TorchUpdate:
             deltas: per-Gaussian parameters to start from; None: the identity.
             rows: per iteration the rows among the moving whose neighbours are looked at; None: all.
             on_iteration: called with the number of iterations done.
-            pace: how many of the order's are taken; None: all.
-            look: the error of a state, for a pace that looks at it.
+            stopping: decides how many of the order's are taken; None: all.
+            look: the error of a state, for a stopping rule that looks at it.
 
         Raises:
             IndexError: the order names a view that is not there.
@@ -210,9 +210,9 @@ class TorchUpdate:
         base = [(group["lr"], group["begins"]) for group in optimizer.param_groups]
         history: list[tuple[Tensor, Tensor]] = []
         for iteration, view in enumerate(order):
-            if self.on_cuda and by_clock(pace) and iteration % TIMED_EVERY == 0:
+            if self.on_cuda and stopping is not None and stopping.end is not None and iteration % TIMED_EVERY == 0:
                 torch.cuda.synchronize()  # the host runs ahead: its clock would not see the device's work
-            planned = len(order) if pace is None else pace.planned(iteration)
+            planned = len(order) if stopping is None else stopping.planned(iteration)
             if iteration >= planned:
                 break
             for group, (rate, begins) in zip(optimizer.param_groups, base, strict=True):
@@ -229,8 +229,8 @@ class TorchUpdate:
             history.append((loss.detach(), scene.psnr))
             if on_iteration is not None:
                 on_iteration(iteration + 1)
-            if pace is not None and look is not None and pace.looks(iteration + 1):
-                pace.saw(iteration + 1, look(scene.result(gaussians, [], []).gaussians))
+            if stopping is not None and look is not None and stopping.looks(iteration + 1):
+                stopping.saw(iteration + 1, look(scene.result(gaussians, [], []).gaussians))
         # The losses stay on the device until here: reading each would make the host wait for it.
         found = torch.stack([loss for loss, _ in history]).tolist() if history else []
         psnr = torch.cat([psnr for _, psnr in history]).tolist() if history else []
@@ -265,7 +265,7 @@ class _Scene:
         cls,
         update: TorchUpdate,
         gaussians: Gaussians,
-        views: Sequence[TrainingView],
+        views: Sequence[TorchView],
         start: Sequence[ClusterArrays] | None,
         deltas: DeltaArrays | None,
     ) -> _Scene:
@@ -331,7 +331,7 @@ class _Scene:
         return torch.as_tensor(rows, dtype=torch.int64, device=self.update.device)
 
     def parameter_groups(self, rates: Rates) -> list[dict[str, Any]]:
-        """What Adam moves; parameters of rate 0 are left out and need no gradient."""
+        """Adam's groups of parameters; those of rate 0 are left out and need no gradient."""
         groups: list[tuple[float, float, list[Tensor]]] = []
         for k, ((_, params), (rotation, translation, scaling)) in enumerate(
             zip(self.layers, rates.layers, strict=True)
@@ -417,7 +417,7 @@ class _Scene:
         return terms
 
     @torch.no_grad()
-    def result(self, gaussians: Gaussians, history: list[float], psnr: list[float]) -> Updated:
+    def result(self, gaussians: Gaussians, history: list[float], psnr: list[float]) -> TorchResult:
         """Θ_t and the parameters, as numpy."""
 
         def array(tensor: Tensor) -> NDArray[np.float32]:
@@ -434,4 +434,4 @@ class _Scene:
         )
         layers = [ClusterArrays(*(array(tensor) for tensor in layer.params)) for layer in self.layers]
         own = DeltaArrays(*(array(tensor) for tensor in self.deltas))
-        return Updated(state, array(now.turns), layers, own, history, psnr)
+        return TorchResult(state, array(now.turns), layers, own, history, psnr)

@@ -26,6 +26,7 @@ class Job:
         points: whether the method gets the initial cloud.
         pictures: frames whose comparison pictures are saved; negative ones count from the end.
         lpips: also LPIPS; loads torch.
+        constants: of the method, by dotted name, with another value (``studies.constants``).
     """
 
     capture: Path
@@ -36,6 +37,12 @@ class Job:
     points: bool = True
     pictures: tuple[int, ...] = (0, 1, -1)
     lpips: bool = False
+    constants: tuple[tuple[str, Any], ...] = ()
+
+    @property
+    def record(self) -> Row:
+        """The settings and constants as the row has them."""
+        return recorded(self.settings, self.constants)
 
     @property
     def variant(self) -> str:
@@ -44,14 +51,12 @@ class Job:
         given: Row = {"frames": self.frames, "masks": self.masks, "points": self.points}
         if self.lpips:
             given["lpips"] = True
-        return (
-            f"{self.preset}-{update.iterations}-s{update.seed}-{digest(self.settings.model_dump(mode='json'), given)}"
-        )
+        return f"{self.preset}-{update.iterations}-s{update.seed}-{digest(self.record, given)}"
 
     @property
     def changes(self) -> str:
         """What differs from the preset beside iterations and seed, and what is withheld, in words for the table."""
-        usual, own = preset(self.preset).model_dump(mode="json"), self.settings.model_dump(mode="json")
+        usual, own = preset(self.preset).model_dump(mode="json"), self.record
         words = [
             f"{name}={json.dumps(value, separators=(',', ':'))}"
             for name, value in _flat(own)
@@ -98,6 +103,11 @@ def settings_of(
         except json.JSONDecodeError:
             inner[last] = text.strip()
     return Settings.model_validate(values)
+
+
+def recorded(settings: Settings, constants: Sequence[tuple[str, Any]]) -> Row:
+    """Settings as JSON, with those constants of the method that have another value, where there are any."""
+    return settings.model_dump(mode="json") | ({"constants": dict(constants)} if constants else {})
 
 
 def _flat(values: Mapping[str, Any], under: str = "") -> Iterator[tuple[str, Any]]:

@@ -22,6 +22,7 @@ from rich.progress import Progress
 
 from scas4d_core.captures import open_capture
 from scas4d_core.warm_up import warm_up_elsewhere
+from studies.constants import all_varied
 from studies.machine import core_version, machine
 from studies.quality import measure as measures
 from studies.quality.job import Job, settings_of
@@ -118,6 +119,12 @@ def run_jobs(jobs: Sequence[Job], out: Path, *, again: bool = False, report: Rep
 
 
 def measure(job: Job, folder: Path, report: Report = print) -> Row:
+    """Reconstructs a job's capture with its settings and constants, see ``_measure``."""
+    with all_varied(job.constants):
+        return _measure(job, folder, report)
+
+
+def _measure(job: Job, folder: Path, report: Report) -> Row:
     """Reconstructs one capture and measures everything that it can be measured by.
 
     Seconds are those of ``step`` alone. Peak memory is this process's, measuring included.
@@ -179,7 +186,7 @@ def measure(job: Job, folder: Path, report: Report = print) -> Row:
         "iterations": job.settings.update.iterations,
         "seed": job.settings.update.seed,
         "changes": job.changes,
-        "settings": job.settings.model_dump(mode="json"),
+        "settings": job.record,
         "given": {"frames": count, "masks": job.masks, "points": job.points},
         "capture_frames": given.frame_count,
         "measured": datetime.now(UTC).isoformat(timespec="seconds"),
