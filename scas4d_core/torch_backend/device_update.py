@@ -20,15 +20,8 @@ from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import Hierarchy
 from scas4d_core.structure.neighbours import Neighbours
-from scas4d_core.torch_backend.update import (
-    ClusterArrays,
-    DeltaArrays,
-    Graph,
-    TermWeights,
-    TorchResult,
-    TorchUpdate,
-    TorchView,
-)
+from scas4d_core.torch_backend.arrays import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchResult, TorchView
+from scas4d_core.torch_backend.update import TorchUpdate
 from scas4d_core.update import deformation, schedule
 from scas4d_core.update.best_state import BestState, ProbeViews
 from scas4d_core.update.deformation import CpuDeformation, first_lengths, length_bounds

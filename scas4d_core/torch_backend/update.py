@@ -1,4 +1,4 @@
-"""One frame's update in plain torch: the CUDA path, and the twin of the fused loop on the CPU.
+"""Update of one frame in plain torch: the CUDA path, and the twin of the fused loop on the CPU.
 
 Θ_{t−1} and the pictures of frame t in, Θ_t out. The loop is the paper's: cascade, render one training view, image
 loss and neighbour terms, backward, Adam. Not yet run on a GPU.
@@ -8,19 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from scas4d_core.cameras import Camera
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.rasterize import cuda, twin
 from scas4d_core.rasterize.limits import DEFAULT, GSPLAT, Limits
 from scas4d_core.rasterize.twin import CameraParams, Rendered
 from scas4d_core.torch_backend import losses
+from scas4d_core.torch_backend.arrays import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchResult, TorchView
 from scas4d_core.torch_backend.deformation import (
     ClusterMap,
     ClusterParams,
@@ -42,87 +42,6 @@ ADAM_EPSILON = 1e-15
 
 TIMED_EVERY = 10
 """Iterations after which an update by the clock waits for the device."""
-
-
-class Graph(NamedTuple):
-    """Neighbours among the M moving Gaussians, as they were when the graph was built.
-
-    Attributes:
-        neighbours: [M, k] int64 rows among the moving.
-        weights: [M, k], exp(−falloff·d²).
-        distances: [M, k] metres.
-    """
-
-    neighbours: NDArray[np.int64]
-    weights: Floats
-    distances: Floats
-
-
-class ClusterArrays(NamedTuple):
-    """``ClusterParams`` as numpy: r [K, 3], t [K, 3] metres, c [K, 3] per metre, s [K]."""
-
-    r: Floats
-    t: Floats
-    c: Floats
-    s: Floats
-
-
-class DeltaArrays(NamedTuple):
-    """``Deltas`` as numpy: dp [M, 3] metres, dr [M, 3], ds [M, 3]."""
-
-    dp: Floats
-    dr: Floats
-    ds: Floats
-
-
-class TorchView(NamedTuple):
-    """One camera's pictures of a frame.
-
-    Attributes:
-        camera: of the inside world, of the picture's size.
-        image: [H, W, 3] in 0…1.
-        mask: [H, W] in 0…1, or None.
-        exposure: [3, 2] the camera's gain and offset of each colour; None: 1 and 0.
-    """
-
-    camera: Camera
-    image: Floats
-    mask: Floats | None
-    exposure: Floats | None = None
-
-
-@dataclass(frozen=True)
-class TermWeights:
-    """Weights of the terms; a term of weight 0 is not computed."""
-
-    image: float = 1.0
-    mask: float = 3.0
-    rigidity: float = 4.0
-    isometry: float = 2.0
-    rotation: float = 4.0
-    scale: float = 10.0
-    soft_colour: float = 0.01
-    floor: float = 0.0
-
-
-class TorchResult(NamedTuple):
-    """The state and the parameters that one update found.
-
-    Attributes:
-        gaussians: Θ_t, float32.
-        turns: [M, 4] unit quaternions with w ≥ 0, rotation of the moving Gaussians since Θ_{t−1}.
-        layers: cluster parameters at the end, coarse to fine; the next frame's warm start.
-        deltas: per Gaussian at the end.
-        losses: one weighted sum an iteration.
-        psnr: dB, of each view that was rendered, in order.
-    """
-
-    gaussians: Gaussians
-    turns: NDArray[np.float32]
-    layers: list[ClusterArrays]
-    deltas: DeltaArrays
-    losses: list[float]
-    psnr: list[float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,11 +79,9 @@ class TorchUpdate:
     dtype: torch.dtype = torch.float32
 
     def __post_init__(self) -> None:
-        if len(self.rates.layers) != len(self.labels):
-            raise ValueError(
-                f"rates.layers has {len(self.rates.layers)} entries for {len(self.labels)} layers of labels; "
-                "give one a layer"
-            )
+        found, wanted = len(self.rates.layers), len(self.labels)
+        if found != wanted:
+            raise ValueError(f"rates.layers has {found} entries for {wanted} layers of labels; give one a layer")
         if self.on_cuda and self.dtype != torch.float32:
             raise ValueError(f"dtype {self.dtype} on device {self.device!r}: gsplat knows torch.float32 only")
 
@@ -217,7 +134,7 @@ class TorchUpdate:
                 break
             for group, (rate, begins) in zip(optimizer.param_groups, base, strict=True):
                 group["lr"] = rate * self.rates.factor(iteration, planned, begins)
-            sampled = None if rows is None else scene.indices(rows[iteration])
+            sampled = None if rows is None else torch.as_tensor(rows[iteration], dtype=torch.int64, device=self.device)
             optimizer.zero_grad(set_to_none=True)
             loss = scene.loss(view, sampled)
             loss.backward()  # type: ignore[no-untyped-call]
@@ -325,10 +242,6 @@ class _Scene:
         """[N, 3] RGB now: of what moves and of what stands, which learn at rates of their own."""
         moving, standing = self.free_colours
         return self.previous_colours.index_copy(0, self.moving, moving).index_copy(0, self.standing, standing)
-
-    def indices(self, rows: NDArray[np.int64]) -> Tensor:
-        """Rows on the device."""
-        return torch.as_tensor(rows, dtype=torch.int64, device=self.update.device)
 
     def parameter_groups(self, rates: Rates) -> list[dict[str, Any]]:
         """Adam's groups of parameters; those of rate 0 are left out and need no gradient."""

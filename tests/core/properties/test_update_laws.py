@@ -21,7 +21,8 @@ from scas4d_core.cameras import Camera
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.torch_backend import deformation
 from scas4d_core.torch_backend import update as update_torch
-from scas4d_core.torch_backend.update import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchUpdate, TorchView
+from scas4d_core.torch_backend.arrays import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchView
+from scas4d_core.torch_backend.update import TorchUpdate
 from scas4d_core.update.schedule import Rates
 
 MOVING, STANDING, NEAREST = 24, 6, 4

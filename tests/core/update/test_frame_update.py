@@ -17,6 +17,7 @@ from scas4d_core.kernels import neighbour_terms
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours
+from scas4d_core.torch_backend import arrays
 from scas4d_core.torch_backend import update as update_torch
 from scas4d_core.update import frame_update as update_module
 from scas4d_core.update import schedule
@@ -205,7 +206,7 @@ def twin_iteration(fused: Iteration, settings: UpdateSettings, masks: bool) -> t
     update_of_twin = update_torch.TorchUpdate(
         moving=rows,
         labels=[labels.astype(np.int64) for labels in fused.hierarchy.labels],
-        graph=update_torch.Graph(
+        graph=arrays.Graph(
             fused.neighbours.index.astype(np.int64), fused.neighbours.weights, fused.neighbours.distances
         ),
         first_lengths=np.linalg.norm(BEFORE.factors[rows].astype(np.float64), axis=1),
@@ -217,7 +218,7 @@ def twin_iteration(fused: Iteration, settings: UpdateSettings, masks: bool) -> t
             colour=1,
             colour_standing=1,
         ),
-        weights=update_torch.TermWeights(**terms),
+        weights=arrays.TermWeights(**terms),
         max_scale=MAX_SCALE,
         cluster_map=settings.cluster_map,
         covariance=settings.covariance,
@@ -225,12 +226,12 @@ def twin_iteration(fused: Iteration, settings: UpdateSettings, masks: bool) -> t
     )
     frame = take_frame(1, 1.0, AFTER, RIG, masks)
     views = [
-        update_torch.TorchView(camera, frame.images[camera.name] / 255.0, frame.masks.get(camera.name))
+        arrays.TorchView(camera, frame.images[camera.name] / 255.0, frame.masks.get(camera.name))
         for camera in RIG.cameras
     ]
     *clusters, deltas, colours = fused.parameters
-    start = [update_torch.ClusterArrays(p[:, :3], p[:, 3:6], p[:, 6:9], p[:, 9]) for p in clusters]
-    own = update_torch.DeltaArrays(deltas[:, :3], deltas[:, 3:6], deltas[:, 6:])
+    start = [arrays.ClusterArrays(p[:, :3], p[:, 3:6], p[:, 6:9], p[:, 9]) for p in clusters]
+    own = arrays.DeltaArrays(deltas[:, :3], deltas[:, 3:6], deltas[:, 6:])
     scene = update_torch._Scene.of(update_of_twin, BEFORE, views, start, own)
     given = torch.tensor(colours, dtype=torch.float64)
     scene.free_colours = (given[scene.moving], given[scene.standing])
