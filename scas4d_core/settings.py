@@ -168,7 +168,7 @@ class Weights(Model):
     mask: NotNegative = Field(
         1.0,
         description="The same form on the rendered label, where masks are given and at least a tenth of the Gaussians "
-        "stands: it tells what moves from what does not.",
+        "stands: it tells moving from standing Gaussians.",
     )
     mask_alone: NotNegative = Field(
         0.3,
@@ -276,10 +276,11 @@ class UpdateSettings(Model):
     rate_position: Positive = Field(1.6e-4, description="Δp, per metre of scene radius.")
     rate_rotation: Positive = Field(0.002, description="ΔR, in units of tan(angle/2).")
     rate_scale: NotNegative = Field(0.001, description="Δs, log.")
-    rate_colour: NotNegative = Field(0.0025, description="RGB of what moves.")
+    rate_colour: NotNegative = Field(0.0025, description="RGB of the Gaussians that move.")
     rate_colour_standing: NotNegative = Field(
         0.01,
-        description="RGB of what stands: light and shadows wander over it, and no motion can be mistaken for them.",
+        description="RGB of the Gaussians that stand: light and shadows wander over them, and cannot be taken for a "
+        "motion.",
     )
     rate_end: float = Field(
         0.05, gt=0, le=1, description="All rates decay to this fraction over the frame (cosine); 1: constant."

@@ -40,7 +40,7 @@ def validated(
     """Hold what is not finite, bounded and plausible as it was before.
 
     Args:
-        before: Θ_{t−1}. result: of an attempt. rows: [M] what moves. radius: of the rig, metres.
+        before: Θ_{t−1}. result: of an attempt. rows: [M] the moving. radius: of the rig, metres.
         first: [N, 3] ``axis_lengths`` of frame 0; None: axes may have any length up to ``LONGEST``.
 
     Returns:

@@ -232,10 +232,13 @@ class FrameUpdate:
 
 
 def prepare(first: Gaussians, factory: ViewFactory, settings: Settings, world: WorldFrame) -> tuple[Updater, int]:
-    """The updater of ``settings.device`` for the hierarchy and the neighbour graph of what moves; the digest of both.
+    """The updater of ``settings.device``, with the hierarchy and the neighbour graph of the moving Gaussians.
 
     Args:
         first: Θ_0, with the labels to go by. factory: of the scene's views. world: user's to inside.
+
+    Returns:
+        The updater, and the digest of its clusters and neighbours.
     """
     update = settings.update
     hierarchy = build_hierarchy(first.means, first.moving, update.clusters, SMALLEST_CLUSTER, update.seed)

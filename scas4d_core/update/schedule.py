@@ -45,7 +45,7 @@ class Rates:
 
     Attributes:
         layers: (rotation r, translation t in metres, scaling c and s), one a layer, coarse to fine.
-        position, rotation, scale, colour: of Δp in metres, ΔR, Δs, RGB of what moves. colour_standing: RGB of the rest.
+        position, rotation, scale, colour: of Δp in metres, ΔR, Δs, RGB of moving. colour_standing: RGB of the rest.
         end: all rates fall to this fraction in the last iteration, along half a cosine; 1 keeps them.
         beta1, beta2: Adam's decays.
         starts: share of the iterations after which a layer begins, one a layer; what is missing begins at once.

@@ -51,7 +51,7 @@ def error(state: Gaussians, frame: Frame) -> float:
     return mean_error(found, list(found))
 
 
-def test_witnesses_are_spread_and_the_same_in_every_frame() -> None:
+def test_probe_views_are_spread_and_the_same_in_every_frame() -> None:
     names = list(FOOTAGE.rig.names)
     chosen = spread(FACTORY.rig, names)
     assert len(set(chosen)) == VIEWS
@@ -63,7 +63,7 @@ def test_witnesses_are_spread_and_the_same_in_every_frame() -> None:
     assert len(spread(FACTORY.rig, names[:2])) == 2
 
 
-def test_witnesses_tell_the_nearer_of_two_states() -> None:
+def test_probe_views_tell_the_nearer_of_two_states() -> None:
     frame = FOOTAGE.frame(3)
     errors = [error(gone(BEFORE, angle), frame) for angle in (0.0, 1.5 * ANGLE, 2.7 * ANGLE, 3 * ANGLE)]
     assert errors == sorted(errors, reverse=True)
