@@ -1,22 +1,23 @@
-"""How frame 0, or the update of a frame, went: what is committed beside its state."""
+"""Report of frame 0, or of the update of a frame: it is committed beside the state."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
 from itertools import pairwise
 from math import isfinite, nan
 from time import perf_counter
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
 from scas4d_core.captures.frame import Frame
 from scas4d_core.first_frame.static_scene import StaticResult
-from scas4d_core.robust import outliers as judge
-from scas4d_core.robust.solve_frame import Outcome
-from scas4d_core.update.probe_views import mean_error
-from scas4d_core.update.result import REPORT, CameraFit, Stopwatch
+from scas4d_core.frame_outcome import Candidate, FrameOutcome, degraded_text
+from scas4d_core.robust.outliers import health
+from scas4d_core.update.best_state import mean_error
+from scas4d_core.update.result import REPORT, CameraFit, Stopwatch, UpdateResult
 
 REPORTED_ITERATIONS = 24
 """The report's training loss is a mean over this many last iterations: about one round of a rig's cameras."""
@@ -28,7 +29,11 @@ CHECKPOINTS = 10
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a long task is."""
+    """Progress of a long task.
+
+    Attributes:
+        stage: in words. done, total: of its steps. detail: figures by name, as the loss.
+    """
 
     stage: str
     done: int
@@ -36,12 +41,12 @@ class Progress:
     detail: dict[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class CurvePoint:
-    """How far an update was: mean training loss of the iterations since the point before.
+class CurvePoint(TypedDict):
+    """A point of an update's curve, as it is on disk.
 
-    Attributes:
-        milliseconds: since the update began; decoding is before it.
+    Keys:
+        iterations: done. milliseconds: since the update began; decoding is before it. loss: mean training loss of the
+        iterations since the point before.
     """
 
     iterations: int
@@ -51,9 +56,10 @@ class CurvePoint:
 
 @dataclass(frozen=True)
 class FrameReport:
-    """How frame 0, or the update of a frame, went.
+    """Report of frame 0, or of the update of a frame.
 
     Attributes:
+        outcome: of the frame; ``frame_outcome.outcome_of`` reads it from a record of any version.
         seconds: by stage; ``report`` is what this report costs, and the writing of the one before.
         loss: each iteration's weighted sum; of frame 0 at most ``REPORTED_LOSSES`` means.
         psnr: dB, over the training views of the last iterations, each as it was rendered then; NaN where not measured.
@@ -61,15 +67,15 @@ class FrameReport:
         cameras: by name, how well each camera's picture was met when it was last rendered: a bumped camera shows.
         used: cameras whose pictures were learnt from; none of a frame that was held or stood. dropped: cameras left
             out, with the reason.
-        degraded: why the state is not the frame's, or only by half; None for a frame that went as it should.
-        attempts: how often and in which manner the update was tried, with what came of each.
+        degraded: for people, why the state is not the frame's, or only in part; None of a frame that went as it should.
+        attempts: each attempt at the frame, with what came of it.
         exposure: times that the frame was seen to be brighter than the light in which the colours are; of a frame that
             was not tried, as the mean brightness of its pictures says. A light that stays becomes that of the colours.
         held: Gaussians held one by one as they were before. guards: by name, how often each guard acted.
-        planned: (iteration, iterations in all) whenever the pace planned otherwise. curve: of the last attempt.
-        errors: mean image loss of the witnesses for the frame before ("still"), going on as before ("warm"), and the
-            end of the update ("end"), in pictures without what ``exposure`` says. kept: which of them the state is;
-            "still" where the frame was held.
+        planned: (iteration, iterations in all) whenever the stopping rule planned otherwise.
+        curve: of the last attempt.
+        errors: mean image loss on the probe views by candidate, in pictures without the gain of ``exposure``.
+            kept: the candidate that the state is; "still" where the frame was held.
     """
 
     index: int
@@ -83,6 +89,7 @@ class FrameReport:
     cameras: dict[str, CameraFit] = field(default_factory=dict)
     used: list[str] = field(default_factory=list)
     dropped: dict[str, str] = field(default_factory=dict)
+    outcome: FrameOutcome = FrameOutcome.UPDATED
     degraded: str | None = None
     attempts: list[str] = field(default_factory=list)
     exposure: float = 1.0
@@ -90,11 +97,11 @@ class FrameReport:
     guards: dict[str, int] = field(default_factory=dict)
     planned: list[tuple[int, int]] = field(default_factory=list)
     curve: list[CurvePoint] = field(default_factory=list)
-    errors: dict[str, float] = field(default_factory=dict)
-    kept: str = "end"
+    errors: dict[Candidate, float] = field(default_factory=dict)
+    kept: Candidate = Candidate.END
 
     def record(self) -> dict[str, Any]:
-        """The report as JSON: what is not finite is None."""
+        """The report as JSON: numbers that are not finite are None."""
         record: dict[str, Any] = _finite(asdict(self))
         return record
 
@@ -102,9 +109,11 @@ class FrameReport:
 def _finite(value: Any) -> Any:
     """The same, with None for numbers that JSON does not have."""
     if isinstance(value, dict):
-        return {name: _finite(inner) for name, inner in value.items()}
+        return {str(name): _finite(inner) for name, inner in value.items()}
     if isinstance(value, list | tuple):
         return [_finite(inner) for inner in value]
+    if isinstance(value, StrEnum):
+        return value.value
     return None if isinstance(value, float) and not isfinite(value) else value
 
 
@@ -139,8 +148,8 @@ def report_of_first(
 
 def report_of_update(
     frame: Frame,
-    outcome: Outcome,
-    look: judge.Look,
+    result: UpdateResult,
+    left_out: Mapping[str, str],
     names: Sequence[str],
     watch: Stopwatch,
     dropped: Mapping[str, str] | None,
@@ -148,42 +157,44 @@ def report_of_update(
     """The report of an update.
 
     Args:
-        outcome: what is committed. look: what the frame's pictures said. names: of the rig's cameras.
-        watch: with the stages "decode", "judge" and "update".
+        result: that is committed. left_out: cameras whose pictures were not believed at first sight, with the reason.
+        names: of the rig's cameras. watch: with the stages "decode", "judge" and "update".
         dropped: cameras that the caller has left out, with the reason.
     """
-    updated, gaussians = outcome.updated, outcome.gaussians
+    trace, gaussians = result.trace, result.gaussians
     began = perf_counter()
-    left_out = {**(dropped or {}), **look.left_out, **updated.left_out}
-    learnt = outcome.fresh and not outcome.stood
-    stages = {"decode": watch.seconds["decode"], **updated.seconds}
-    stages["judge"] = watch.seconds["judge"] + updated.seconds.get("judge", 0.0)
-    stages["other"] = max(0.0, watch.seconds["update"] - sum(updated.seconds.values()))
+    missing = {**(dropped or {}), **left_out, **trace.left_out}
+    used = [name for name in names if name in frame.images and name not in missing]
+    stages = {"decode": watch.seconds["decode"], **trace.seconds}
+    stages["judge"] = watch.seconds["judge"] + trace.seconds.get("judge", 0.0)
+    stages["other"] = max(0.0, watch.seconds["update"] - sum(trace.seconds.values()))
     report = FrameReport(
         index=frame.index,
         time=frame.time,
-        iterations=len(updated.losses),
+        iterations=trace.iterations,
         seconds=stages,
-        loss=updated.losses,
-        psnr=_last(updated.psnr),
+        loss=trace.losses,
+        psnr=_last(trace.psnr),
         moving=int(gaussians.moving.sum()),
         gaussians=len(gaussians),
         cameras={
-            name: replace(fit, health=judge.health(outcome.fits.get(name))) for name, fit in updated.cameras.items()
+            name: CameraFit(psnr=fit["psnr"], colour_shift=fit["colour_shift"], health=health(result.offsets.get(name)))
+            for name, fit in trace.cameras.items()
         },
-        used=[name for name in names if name in frame.images and name not in left_out] if learnt else [],
-        dropped=left_out,
-        degraded=outcome.degraded,
-        attempts=outcome.attempts,
-        exposure=outcome.exposure,
-        held=outcome.held,
-        guards={**updated.guards, "axis_bounds": outcome.bounded},
-        planned=updated.planned,
-        curve=curve(updated.losses, updated.moments),
-        errors={kind: mean_error(errors, list(errors)) for kind, errors in updated.errors.items()},
-        kept=updated.kept,
+        used=used if result.outcome.learnt else [],
+        dropped=missing,
+        outcome=result.outcome,
+        degraded=degraded_text(result.outcome, result.reason),
+        attempts=list(result.attempts),
+        exposure=result.exposure,
+        held=result.held,
+        guards={**trace.guards, "axis_bounds": result.bounded},
+        planned=trace.planned,
+        curve=curve(trace.losses, trace.moments),
+        errors={candidate: mean_error(errors, list(errors)) for candidate, errors in trace.errors.items()},
+        kept=trace.kept,
     )
-    stages[REPORT] = watch.seconds[REPORT] + updated.seconds.get(REPORT, 0.0) + perf_counter() - began
+    stages[REPORT] = watch.seconds[REPORT] + trace.seconds.get(REPORT, 0.0) + perf_counter() - began
     return report
 
 
@@ -201,6 +212,6 @@ def curve(losses: list[float], moments: list[float]) -> list[CurvePoint]:
     """The curve of an update from the loss of each iteration and the seconds at its end."""
     ends = np.unique(np.linspace(0, len(moments), CHECKPOINTS + 1).round().astype(int))
     return [
-        CurvePoint(int(end), 1000 * moments[end - 1], float(np.mean(losses[begin:end])))
+        CurvePoint(iterations=int(end), milliseconds=1000 * moments[end - 1], loss=float(np.mean(losses[begin:end])))
         for begin, end in pairwise(ends)
     ]

@@ -120,6 +120,8 @@ def _setting_error(error: ValidationError) -> SettingError:
         fault = "there is no setting of this name"
         if near := difflib.get_close_matches(setting, list(_names(Settings().model_dump())), 1):
             remedy = f"did you mean {near[0]}? {remedy}"
+    elif first["type"] == "constant":  # a former setting
+        fault, remedy = first["msg"], first["ctx"]["remedy"]
     else:
         fault = str(first["ctx"]["error"]) if first["type"] == "value_error" else first["msg"]
     return SettingError(setting, first["input"], f"{fault}{more}", remedy, error)

@@ -1,7 +1,7 @@
-"""A committed state that was damaged on disk, made again from the pictures of its frame.
+"""Remakes a committed state that was damaged on disk, from the pictures of its frame.
 
-It starts from the state before it, cold: it shows the same, but not with the same bits, and its report says
-``remade``. What comes after it was made from the state as it was, and stays.
+The remade state starts from the state before it, cold: it shows the same, but not with the same bits, and its report
+says ``remade``. The states after it were made from the state as it was, and stay.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from typing import Any
 
 from scas4d_core.cameras import Rig
 from scas4d_core.captures.frame import Frame
+from scas4d_core.frame_outcome import outcome_of
 from scas4d_core.reconstruction import Reconstruction, StepError
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import PER_FRAME, History
@@ -35,7 +36,8 @@ def remake(
     Args:
         rig: training cameras, user's world. settings: of the scene.
         history: of the scene, of the process that appends.
-        base: the committed frame before it. frame: its pictures. budget: that held for it (``Reconstruction.spend``).
+        base: the committed frame before it. frame: its pictures.
+        budget: that held for it (``Reconstruction.set_budget``).
         dropped, notes: see ``Reconstruction.step``.
 
     Returns:
@@ -46,10 +48,10 @@ def remake(
         StepError: the frame does not follow ``base``, or does not fit it.
     """
     aside = Reconstruction.aside(rig, settings, history, base)
-    aside.spend(**budget)
+    aside.set_budget(**budget)
     aside.step(frame, dropped=dropped, notes={**(notes or {}), REMADE: True})
     report = aside.history.report(frame.index)
-    if str(report["degraded"] or "").startswith("held"):  # nothing was learnt from the pictures
+    if outcome_of(report).held:  # nothing was learnt from the pictures
         raise StepError(f"frame {frame.index} does not fit the frame before it: {report['degraded']}")
     arrays = aside.history.gaussians(frame.index).arrays()
     history.replace(frame.index, frame.time, {name: arrays[name] for name in PER_FRAME}, report)

@@ -1,8 +1,8 @@
-"""What other numbers of iterations would cost and bring: the last frames of a scene, updated again in memory.
+"""Replays the last frames of a scene in memory, to measure the cost and the error of another number of iterations.
 
 Every budget starts from the same committed state, cold. The first frame warms it up and is not counted: after it, each
-update starts from a motion, as in the scene. What only the clock or a stop rule decides is switched off, so that a
-budget is what it says. Nothing on disk is touched.
+update starts from a motion, as in the scene. The clock and the stop rule are switched off, so that a budget has its
+iterations. Nothing on disk is touched.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ Decode = Callable[[], tuple[Frame, Mapping[str, str]]]
 
 @dataclass(frozen=True)
 class Replayed:
-    """What a frame costs with so many iterations, and what it brings.
+    """Cost and error of a frame with so many iterations.
 
     Attributes:
         milliseconds: a frame from decoding to the end of the update, the median; nothing is written.
-        error: mean image loss of the witnesses for what was kept; None where the settings judge nothing.
+        error: mean image loss on the probe views of the state that was kept; None where the settings judge nothing.
         psnr: dB, of training views as they were last rendered; None where not measured.
-        frames: that went into it.
+        frames: how many it is measured on.
     """
 
     iterations: int

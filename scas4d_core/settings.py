@@ -1,4 +1,8 @@
-"""Every number a user can set, with its unit, range and the reason for its default. Pydantic only."""
+"""Settings of a scene: every number that a user can set, with its unit, range and the reason for its default.
+
+Numbers that only the method's author would turn are constants beside their use; ``Model.constants`` lists those that
+were settings once.
+"""
 
 from __future__ import annotations
 
@@ -157,13 +161,17 @@ class LayerRates(Model):
 
 
 class Weights(Model):
-    """Weights of the terms. A term with weight 0 is not computed."""
+    """Weights of the terms, beside 1 for the image loss. A term with weight 0 is not computed."""
 
-    image: Positive = Field(1.0, description="0.8 L1 + 0.2 (1 − SSIM).")
+    constants: ClassVar[Mapping[str, Constant]] = {
+        "image": Constant(1.0, "scas4d_core.update.schedule.IMAGE_WEIGHT"),
+        "soft_colour": Constant(0.01, "scas4d_core.update.schedule.SOFT_COLOUR_WEIGHT"),
+    }
+
     mask: NotNegative = Field(
         1.0,
         description="The same form on the rendered label, where masks are given and at least a tenth of the Gaussians "
-        "stands: it tells what moves from what does not.",
+        "stands: it tells moving from standing Gaussians.",
     )
     mask_alone: NotNegative = Field(
         0.3,
@@ -177,11 +185,26 @@ class Weights(Model):
     rotation: NotNegative = Field(4.0, description="Likewise.")
     scale: NotNegative = Field(10.0, description="Likewise, the paper's 0.48 to 0.05.")
     floor: NotNegative = Field(2.0, description="Dynamic3DGaussians; only where the scene names a floor.")
-    soft_colour: NotNegative = Field(0.01, description="Dynamic3DGaussians; the paper does not give it.")
 
 
 class UpdateSettings(Model):
-    """One update: from Θ_{t−1} and the pictures of frame t to Θ_t."""
+    """One update: from Θ_{t−1} and the pictures of frame t to Θ_t.
+
+    >>> UpdateSettings(iterations=50, budget_ms=400).clusters
+    (64, 320, 1280)
+    """
+
+    constants: ClassVar[Mapping[str, Constant]] = {
+        "smallest_cluster": Constant(8, "scas4d_core.update.frame_update.SMALLEST_CLUSTER"),
+        "layer_starts": Constant((0.0, 0.2, 0.4), "scas4d_core.update.schedule.LAYER_STARTS"),
+        "coarse_until": Constant(0.0),
+        "coarse_scale": Constant(0.5),
+        "warm_start": Constant(1.0, "scas4d_core.update.warm_start.WARM_START"),
+        "neighbours": Constant(20, "scas4d_core.update.frame_update.NEIGHBOURS"),
+        "neighbour_falloff": Constant(2000.0, "scas4d_core.update.frame_update.NEIGHBOUR_FALLOFF"),
+        "neighbour_sample": Constant(4000, "scas4d_core.update.schedule.NEIGHBOUR_SAMPLE"),
+        "max_scale": Constant(0.02, "scas4d_core.update.deformation.MAX_SCALE"),
+    }
 
     iterations: int = Field(100, ge=1, description="Iterations a frame, each a step down the gradient.")
     views: int = Field(
@@ -223,7 +246,6 @@ class UpdateSettings(Model):
     clusters: tuple[int, ...] = Field(
         (64, 320, 1280), description="Clusters per layer, coarse to fine (the paper's); empty: each Gaussian alone."
     )
-    smallest_cluster: int = Field(8, ge=1, description="Layers are capped so that clusters hold this many on average.")
     cluster_map: Literal["centred", "published"] = Field(
         "centred", description="Scaling about the pivot (translation-equivariant) or about the world origin (paper)."
     )
@@ -241,15 +263,12 @@ class UpdateSettings(Model):
         min_length=1,
         description="One per layer, coarse to fine; with more layers the last is repeated.",
     )
-    layer_starts: tuple[Annotated[float, Field(ge=0, lt=1)], ...] = Field(
-        (0.0, 0.2, 0.4),
-        min_length=1,
-        description="Share of the iterations after which a layer begins to learn, one per layer, coarse to fine; with "
-        "more layers the last is repeated. The coarse motion is found first: all at once, the finer layers take a part "
-        "of it, each cluster another.",
-    )
     own_start: float = Field(
-        0.4, ge=0, lt=1, description="The same for what each Gaussian adds to its clusters: Δp, ΔR, Δs."
+        0.4,
+        ge=0,
+        lt=1,
+        description="Share of the iterations after which each Gaussian's own Δp, ΔR and Δs begin to learn; the layers "
+        "of clusters begin one after the other before.",
     )
     cold_longer: float = Field(
         1.0, gt=0, description="Factor on the iterations where there is no motion to start from."
@@ -260,15 +279,12 @@ class UpdateSettings(Model):
     rate_position: Positive = Field(1.6e-4, description="Δp, per metre of scene radius.")
     rate_rotation: Positive = Field(0.002, description="ΔR, in units of tan(angle/2).")
     rate_scale: NotNegative = Field(0.001, description="Δs, log.")
-    rate_colour: NotNegative = Field(0.0025, description="RGB of what moves.")
+    rate_colour: NotNegative = Field(0.0025, description="RGB of the Gaussians that move.")
     rate_colour_standing: NotNegative = Field(
         0.01,
-        description="RGB of what stands: light and shadows wander over it, and no motion can be mistaken for them.",
+        description="RGB of the Gaussians that stand: light and shadows wander over them, and cannot be taken for a "
+        "motion.",
     )
-    coarse_until: float = Field(
-        0.0, ge=0, le=1, description="Share of the iterations, at the start, that render coarser pictures."
-    )
-    coarse_scale: float = Field(0.5, gt=0, le=1, description="Their size: less to render, and a wider basin.")
     rate_end: float = Field(
         0.05, gt=0, le=1, description="All rates decay to this fraction over the frame (cosine); 1: constant."
     )
@@ -276,14 +292,9 @@ class UpdateSettings(Model):
     beta2: float = Field(
         0.95, ge=0, lt=1, description="Adam's second decay; 100 iterations are too few for the usual 0.999."
     )
-    warm_start: float = Field(1.0, ge=0, le=1, description="Share of the previous deformation that starts the next.")
     momentum: float = Field(
         0.0, ge=0, le=1, description="Share of what the layers leave of the previous motion that Δp starts from."
     )
-    neighbours: int = Field(20, ge=1, description="Neighbours of a Gaussian in the rigidity terms.")
-    neighbour_falloff: Positive = Field(2000.0, description="1/m²: weight exp(−falloff d²) of a neighbour at d.")
-    neighbour_sample: int = Field(4000, ge=1, description="Gaussians whose neighbours are looked at an iteration.")
-    max_scale: Positive = Field(0.02, description="Metres; longer axes are held at their length of frame 0.")
     weights: Weights = Field(default_factory=Weights)
     use_masks: bool = Field(True, description="Use the frame's masks where it has any.")
     seed: int = Field(0, ge=0, description="Seed of the order of views and of the sampled neighbours.")
@@ -299,7 +310,14 @@ class UpdateSettings(Model):
 
 
 class Settings(Model):
-    """All settings of one scene."""
+    """All settings of one scene.
+
+    >>> settings = Settings.model_validate({"scene": {"metres_per_unit": 0.01}, "update": {"iterations": 50}})
+    >>> settings.update.iterations, settings.static.iterations
+    (50, 3000)
+    >>> Settings.model_validate_json(settings.model_dump_json()) == settings
+    True
+    """
 
     scene: SceneSettings = Field(default_factory=SceneSettings)
     static: StaticSettings = Field(default_factory=StaticSettings)

@@ -1,4 +1,4 @@
-"""Every kernel that a scene needs, compiled or loaded from the cache, before the first picture comes."""
+"""Compiles or loads every kernel that a scene needs, before the first picture comes."""
 
 from __future__ import annotations
 
@@ -44,8 +44,9 @@ def marker() -> Path | None:
 def warm_up_elsewhere() -> None:
     """`warm_up` in a process of its own, unless the cache has the kernels already.
 
-    Compiling takes a minute and a few hundred megabytes that the process would keep. ``Reconstruction`` asks for this
-    before its first frame. Which process compiled a kernel changes no bit of what it computes.
+    Compiling takes a minute and a few hundred megabytes that the process would keep. A process calls this when it
+    starts, before its first ``Reconstruction``; without, kernels are compiled where they are first used. Which process
+    compiled a kernel changes no bit of its results.
     """
     global _settled
     if _settled:
@@ -82,8 +83,8 @@ def _alone(mark: Path | None) -> Iterator[None]:
 def warm_up(*, anew: bool = True) -> None:
     """Reconstructs two frames of a ball, 32x32 pixels and a few dozen iterations, once with masks and once without.
 
-    Kernels are compiled for types, not for sizes: what this leaves in the cache (`kernels.jit`) serves all scenes. A
-    separate covariance has kernels of its own. Processes that do so at a time wait for the first.
+    Kernels are compiled for types, not for sizes: those that this leaves in the cache (`kernels.jit`) serve all scenes.
+    A separate covariance has kernels of its own. Processes that do so at a time wait for the first.
 
     Args:
         anew: also where the cache has the kernels: to have this process load them.

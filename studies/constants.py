@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from typing import Any
 
@@ -36,3 +36,12 @@ def varied(place: str, value: Any) -> Iterator[None]:
         yield
     finally:
         setattr(module, name, before)
+
+
+@contextmanager
+def all_varied(constants: Iterable[tuple[str, Any]]) -> Iterator[None]:
+    """Gives several constants another value for a while, see ``varied``; each is its dotted name and the value."""
+    with ExitStack() as stack:
+        for place, value in constants:
+            stack.enter_context(varied(place, value))
+        yield

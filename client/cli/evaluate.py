@@ -42,6 +42,7 @@ class Job:
         points: whether the method gets the initial cloud.
         pictures: frames whose comparison pictures are saved; negative ones count from the end.
         lpips: also LPIPS; loads torch.
+        constants: of the method, by dotted name, to which a study gives another value; recorded with the row.
     """
 
     capture: Path
@@ -52,6 +53,12 @@ class Job:
     points: bool = True
     pictures: tuple[int, ...] = (0, 1, -1)
     lpips: bool = False
+    constants: tuple[tuple[str, Any], ...] = ()
+
+    @property
+    def record(self) -> Row:
+        """The settings and constants as the row has them."""
+        return recorded(self.settings, self.constants)
 
     @property
     def variant(self) -> str:
@@ -60,14 +67,12 @@ class Job:
         given: Row = {"frames": self.frames, "masks": self.masks, "points": self.points}
         if self.lpips:
             given["lpips"] = True
-        return (
-            f"{self.preset}-{update.iterations}-s{update.seed}-{digest(self.settings.model_dump(mode='json'), given)}"
-        )
+        return f"{self.preset}-{update.iterations}-s{update.seed}-{digest(self.record, given)}"
 
     @property
     def changes(self) -> str:
         """Differences from the preset beside iterations and seed, and what is withheld, in words for the table."""
-        usual, own = preset(self.preset).model_dump(mode="json"), self.settings.model_dump(mode="json")
+        usual, own = preset(self.preset).model_dump(mode="json"), self.record
         words = [
             f"{name}={json.dumps(value, separators=(',', ':'))}"
             for name, value in _flat(own)
@@ -79,6 +84,11 @@ class Job:
     def key(self) -> str:
         """Names the row; another setting is another row."""
         return f"{self.capture.resolve().name}-{self.variant}"
+
+
+def recorded(settings: Settings, constants: Sequence[tuple[str, Any]]) -> Row:
+    """Settings as JSON, with those constants of the method that have another value, where there are any."""
+    return settings.model_dump(mode="json") | ({"constants": dict(constants)} if constants else {})
 
 
 def evaluate(
@@ -196,7 +206,7 @@ def measure(
         "iterations": job.settings.update.iterations,
         "seed": job.settings.update.seed,
         "changes": job.changes,
-        "settings": job.settings.model_dump(mode="json"),
+        "settings": job.record,
         "given": {"frames": count, "masks": job.masks, "points": job.points},
         "capture_frames": given.frame_count,
         "measured": datetime.now(UTC).isoformat(timespec="seconds"),

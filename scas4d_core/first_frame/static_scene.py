@@ -24,7 +24,7 @@ from scas4d_core.kernels.adam import EVERY_ROW, adam
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.settings import SceneSettings, StaticSettings
 from scas4d_core.update.picture_loss import PictureLoss
-from scas4d_core.update.result import CameraFit
+from scas4d_core.update.result import CameraFit, camera_fit
 from scas4d_core.update.views import TrainingView, ViewFactory, view_order
 
 Array = NDArray[np.float32]
@@ -165,7 +165,7 @@ class StaticTrainer:
         gradients = self._loss.evaluate(self._means, self._factors, self._opacities, self._features, view)
         self.psnr.append(self._loss.psnr)
         if iteration >= self._last - len(self.views):
-            self.cameras[view.name] = CameraFit(self._loss.psnr, self._loss.colour_shift(view))
+            self.cameras[view.name] = camera_fit(self._loss.psnr, self._loss.colour_shift(view))
         activation.activate_backward(
             self.parameters, self._factors, self._opacities, self._features, gradients.means, gradients.factors,
             gradients.opacities, gradients.features, self._gradients,

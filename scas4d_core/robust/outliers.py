@@ -1,9 +1,9 @@
-"""Which pictures of a frame can be believed: a black frame is finite, and 100 iterations would paint the scene black.
+"""Outlying cameras and frames: each camera is compared with its own past and with the others of the frame.
 
-Each camera is held against its own past and against the others of the frame, with figures that an update has anyway:
-the mean brightness of its picture, and how well it was met when it was rendered first and last. One camera that fits
-much worse than the others did is left out; what all of them say is believed as long as the frame as a whole can be met.
-The thresholds were read off the captures: docs/stability.md has the distributions.
+The figures are those that an update has anyway: how well each camera was met when it was rendered first and last, and
+the mean brightness of its picture (``picture_checks``). One camera that fits much worse than the others is left out; a
+frame that all cameras agree on is believed as long as it can be met as a whole. The thresholds were read off the
+captures: docs/stability.md has the distributions.
 """
 
 from __future__ import annotations
@@ -15,17 +15,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-Float = NDArray[np.float64]
-
-EXPOSURE = 1.05
-"""Times brighter or darker, median over the cameras, from which a frame is exposed otherwise; clean captures: 1.04."""
-ENOUGH = 8
-"""Cameras that the exposure needs: an object that turns changes the brightness of one picture by a third."""
-UNUSABLE = 2.0
-"""Times brighter or darker, as above, from which the light is another and nothing is learnt from the frame."""
-BLIND = 0.05
-"""Share of its usual brightness, against the other cameras, below which a camera shows nothing."""
 
 FIRST_DB = -9.0
 """Against its usual place among the cameras when first rendered: such a camera is left out at once; clean: -6.1."""
@@ -57,40 +46,27 @@ OTHER_EFFORT = 1.5
 PLACE_RATE, LEVEL_RATE = 0.2, 0.3
 """How fast a camera's usual place and the usual level follow."""
 
-DARKEST = 1e-3
-"""Mean of a picture, 0…1, below which its brightness says nothing."""
-
-
-@dataclass(frozen=True)
-class CameraPast:
-    """What is usual for one camera.
-
-    Attributes:
-        place: dB of its last rendering, less the level of its frame; NaN where not known.
-        brightness: mean of its picture, 0…1, in the exposure of frame 0; NaN where not known.
-        out: frames in a row that it has been left out, 0 when it is believed.
-    """
-
-    place: float = nan
-    brightness: float = nan
-    out: int = 0
-
 
 @dataclass(frozen=True)
 class Past:
-    """What is usual for a scene; carried from commit to commit.
+    """The usual figures of a scene and its cameras; carried from commit to commit.
 
     Attributes:
-        cameras: by name. level: dB at the end of an update, see ``level_of``; NaN where not known.
+        places: by camera, dB of its last rendering, less the level of its frame; NaN where not known.
+        brightness: by camera, mean of its picture, 0…1, in the exposure of frame 0; NaN where not known.
+        out: by camera, frames in a row that it has been left out, 0 when it is believed.
+        level: dB at the end of an update, see ``level_of``; NaN where not known.
         updates: that went into it. held: frames in a row that were held although their pictures say something. fitted:
             seconds, time of the last frame that was learnt from. behind: frames since some were held or not moved, 0
             once they are met as usual again.
-        iterations: of the last update. error: usual at the end of an update, by witness view.
-        light: times that the last frame was brighter, ``Look.exposure``. lit: frames in a row that were brighter, or
-            that were darker.
+        iterations: of the last update. error: usual at the end of an update, by probe view.
+        light: times that the last frame was brighter, see ``picture_checks.check_brightness``. lit: frames in a row
+            that were brighter, or that were darker.
     """
 
-    cameras: Mapping[str, CameraPast] = field(default_factory=dict)
+    places: Mapping[str, float] = field(default_factory=dict)
+    brightness: Mapping[str, float] = field(default_factory=dict)
+    out: Mapping[str, int] = field(default_factory=dict)
     level: float = nan
     updates: int = 0
     held: int = 0
@@ -106,15 +82,15 @@ class Past:
         """After frame 0: how well its fit met each camera, dB, and how bright the pictures are."""
         psnr = _capped(psnr)
         level = float(np.median(list(psnr.values()))) if psnr else nan
-        cameras = {name: CameraPast(psnr.get(name, nan) - level, value) for name, value in bright.items()}
-        return cls(cameras, level)
+        places = {name: psnr.get(name, nan) - level for name in bright}
+        return cls(places, dict(bright), dict.fromkeys(bright, 0), level)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """As arrays, for a checkpoint."""
-        rows = [(past.place, past.brightness, past.out) for past in self.cameras.values()]
+        rows = [(place, self.brightness[name], self.out[name]) for name, place in self.places.items()]
         scene = [self.level, self.updates, self.held, self.fitted, self.behind, self.iterations, self.light, self.lit]
         return {
-            "names": np.array(list(self.cameras), np.str_),
+            "names": np.array(list(self.places), np.str_),
             "cameras": np.array(rows, np.float64).reshape(-1, 3),
             "scene": np.array(scene, np.float64),
             "witnesses": np.array(list(self.error), np.str_),
@@ -130,90 +106,42 @@ class Past:
         """
         if not arrays:
             return cls()
-        rows = zip(arrays["names"].tolist(), arrays["cameras"].tolist(), strict=True)
-        cameras = {name: CameraPast(place, bright, int(out)) for name, (place, bright, out) in rows}
+        rows = list(zip(arrays["names"].tolist(), arrays["cameras"].tolist(), strict=True))
+        places = {name: place for name, (place, _, _) in rows}
+        bright = {name: value for name, (_, value, _) in rows}
+        outs = {name: int(out) for name, (_, _, out) in rows}
         level, updates, held, fitted, behind, iterations, *light = arrays["scene"].tolist()
         light, lit = light or (1.0, 0)  # an older checkpoint knows nothing of the light
         error = dict(zip(arrays["witnesses"].tolist(), arrays["error"].tolist(), strict=True))
         return cls(
-            cameras, level, int(updates), int(held), fitted, int(behind), int(iterations), error, light, int(lit)
-        )
+            places, bright, outs, level,
+            int(updates), int(held), fitted, int(behind), int(iterations), error, light, int(lit),
+        )  # fmt: skip
 
-    def of(self, name: str) -> CameraPast:
-        """What is usual for a camera; nothing for one that is new."""
-        return self.cameras.get(name, CameraPast())
+    def place(self, name: str) -> float:
+        """Usual place of a camera, dB; NaN where not known."""
+        return self.places.get(name, nan)
 
-
-@dataclass(frozen=True)
-class Look:
-    """What the pictures themselves say, before anything is rendered.
-
-    Attributes:
-        exposure: times that the frame is brighter than the one before; 1 where it is not seen to differ.
-        left_out: by camera, why. held: why nothing can be learnt from the frame, or None.
-    """
-
-    exposure: float = 1.0
-    left_out: Mapping[str, str] = field(default_factory=dict)
-    held: str | None = None
-
-
-def brightness_of(picture: NDArray[np.uint8]) -> float:
-    """Mean of every fourth pixel of every fourth row of a picture [H, W, 3], 0…1."""
-    return float(picture[::4, ::4].mean()) / 255
-
-
-def brightness(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, float]:
-    """Of each camera's picture."""
-    return {name: brightness_of(picture) for name, picture in pictures.items()}
-
-
-def look(past: Past, bright: Mapping[str, float]) -> Look:
-    """Judge the pictures of a frame by their brightness; cameras that were left out before stay so (``settle``)."""
-    left_out = {
-        name: "it has not fitted the other cameras since it was left out" for name in bright if past.of(name).out
-    }
-    ratios = {
-        name: value / past.of(name).brightness for name, value in bright.items() if past.of(name).brightness > DARKEST
-    }
-    if not ratios:
-        return Look(left_out=_few(left_out, len(bright)))
-    common = float(np.median(list(ratios.values())))
-    enough = len(ratios) >= ENOUGH
-    if not 1 / UNUSABLE <= common <= UNUSABLE and (enough or common < BLIND or common > 1 / BLIND):
-        return Look(common, left_out, f"the pictures are {common:.2g} times as bright as they were")
-    for name, ratio in ratios.items():
-        if ratio < BLIND * common:
-            left_out[name] = f"it shows nothing: {ratio:.2g} times as bright as it was"
-    if not enough or 1 / EXPOSURE <= common <= EXPOSURE:
-        common = 1.0
-    return Look(common, _few(left_out, len(bright)))
-
-
-def lit(past: Past, seen: Look) -> Past:
-    """The past with the light of a frame: how long it has been brighter, or darker; darkness is none."""
-    light = seen.exposure
-    if light == 1.0 or not BLIND <= light <= 1 / BLIND:
-        return replace(past, light=1.0, lit=0)
-    same = past.lit > 0 and (light > 1) == (past.light > 1)
-    return replace(past, light=light, lit=past.lit + 1 if same else 1)
+    def is_out(self, name: str) -> bool:
+        """True for a camera that is left out."""
+        return self.out.get(name, 0) > 0
 
 
 def relit(past: Past, gain: float) -> Past:
-    """What is usual once a light is the usual one: a brighter one makes what is not met brighter, too."""
-    cameras = {name: replace(one, brightness=gain * one.brightness) for name, one in past.cameras.items()}
+    """The past once another light is the usual one: in a brighter light, errors are brighter, too."""
+    brightness = {name: gain * value for name, value in past.brightness.items()}
     level = past.level - max(0.0, 20 * log10(gain))
-    return replace(past, cameras=cameras, level=level, error={}, light=1.0, lit=0)
+    return replace(past, brightness=brightness, level=level, error={}, light=1.0, lit=0)
 
 
-def place(past: Past, psnr: Mapping[str, float]) -> dict[str, float]:
-    """DB by camera, above (+) or below where it usually is among the cameras."""
-    known = {name: value for name, value in _capped(psnr).items() if past.of(name).place == past.of(name).place}
+def offsets(past: Past, psnr: Mapping[str, float]) -> dict[str, float]:
+    """DB by camera, above (+) or below its usual place among the cameras; of those whose place is known."""
+    known = {name: value for name, value in _capped(psnr).items() if past.place(name) == past.place(name)}
     if not known:
         return {}
-    believed = [name for name in known if not past.of(name).out] or list(known)
-    shift = float(np.median([known[name] - past.of(name).place for name in believed]))
-    return {name: value - past.of(name).place - shift for name, value in known.items()}
+    believed = [name for name in known if not past.is_out(name)] or list(known)
+    shift = float(np.median([known[name] - past.place(name) for name in believed]))
+    return {name: value - past.place(name) - shift for name, value in known.items()}
 
 
 def misfits(past: Past, psnr: Mapping[str, float], limit: float) -> dict[str, str]:
@@ -226,10 +154,10 @@ def misfits(past: Past, psnr: Mapping[str, float], limit: float) -> dict[str, st
         limit += NEW_DB
     found = {
         name: f"its picture fits {-off:.1f} dB worse than usual beside the others"
-        for name, off in place(past, psnr).items()
+        for name, off in offsets(past, psnr).items()
         if off < limit
     }
-    return _few(found, len(psnr))
+    return few(found, len(psnr))
 
 
 def unmet(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | None:
@@ -263,45 +191,45 @@ def _shorter(past: Past, iterations: int) -> float:
 
 def level_of(past: Past, psnr: Mapping[str, float]) -> float:
     """DB, median over the cameras, each less its usual place: a short update renders a few of them; NaN of none."""
-    places = {name: past.of(name).place for name in psnr}
+    places = {name: past.place(name) for name in psnr}
     values = [value - (places[name] if isfinite(places[name]) else 0.0) for name, value in _capped(psnr).items()]
     return float(np.median(values)) if values else nan
 
 
 def health(off: float | None) -> float:
-    """0…1: 1 where a camera fits as usual or better, 0 from ``LAST_DB`` on. ``off``: see ``place``; None: not known."""
+    """0…1: 1 where a camera fits as usual or better, 0 from ``LAST_DB`` on; ``off`` is its offset, None: not known."""
     return 1.0 if off is None else float(np.clip(1 - off / LAST_DB, 0, 1))
 
 
 def settle(
     past: Past, psnr: Mapping[str, float], bright: Mapping[str, float], exposure: float, iterations: int = 0
 ) -> Past:
-    """What is usual after an update was committed.
+    """The past after an update was committed.
 
     Args:
         psnr: dB by camera, of those learnt from when last rendered, of those left out as the update ended.
         bright: of every picture of the frame. exposure: of the frame. iterations: of the update, 0: as many as before.
     """
     psnr = _capped(psnr)
-    off = place(past, psnr)
+    off = offsets(past, psnr)
     out = misfits(past, psnr, LAST_DB)
-    believed = {n: v for n, v in psnr.items() if n not in out and not past.of(n).out}
+    believed = {n: v for n, v in psnr.items() if n not in out and not past.is_out(n)}
     level = level_of(past, believed) if believed else past.level
-    cameras = dict(past.cameras)
+    places, brightness, outs = dict(past.places), dict(past.brightness), dict(past.out)
     for name, value in bright.items():
-        before = past.of(name)
-        now = before  # of a camera that was not learnt from: what it showed is no sign of what is usual
-        if before.out:
-            fits = off.get(name, -np.inf) > FITS_DB
-            now = replace(before, out=0) if fits else replace(before, out=before.out + 1)
+        # Of a camera that was not learnt from the figures stay: its picture is no sign of what is usual.
+        before = outs.setdefault(name, 0)
+        place = places.setdefault(name, nan)
+        brightness.setdefault(name, nan)
+        if before:
+            outs[name] = 0 if off.get(name, -np.inf) > FITS_DB else before + 1
         elif name in out:
-            now = replace(before, out=1)
+            outs[name] = 1
         elif name in psnr:
             here = psnr[name] - level
-            known = before.place == before.place and past.updates > 0
-            here = before.place + PLACE_RATE * (here - before.place) if known else here
-            now = replace(before, place=here, brightness=value / exposure)
-        cameras[name] = now
+            known = place == place and past.updates > 0
+            places[name] = place + PLACE_RATE * (here - place) if known else here
+            brightness[name] = value / exposure
     known = past.updates > 0
     later = past.behind + 1 if behind(past, believed, iterations) and past.behind < CATCH_UP else 0
     follows = LEVEL_RATE if later == 0 else 0.0
@@ -309,7 +237,9 @@ def settle(
         follows = 1.0
     return replace(
         past,
-        cameras=cameras,
+        places=places,
+        brightness=brightness,
+        out=outs,
         level=past.level + follows * (level - past.level) if known else level,
         updates=past.updates + 1,
         held=0,
@@ -319,10 +249,10 @@ def settle(
 
 
 def _capped(psnr: Mapping[str, float]) -> dict[str, float]:
-    """No more than ``CLEAN_DB`` each; what is not a number stays none."""
+    """No more than ``CLEAN_DB`` each; NaN stays NaN."""
     return {name: CLEAN_DB if value > CLEAN_DB else value for name, value in psnr.items()}
 
 
-def _few(found: dict[str, str], count: int) -> dict[str, str]:
-    """What was found against cameras, unless it is found against most of them."""
+def few(found: dict[str, str], count: int) -> dict[str, str]:
+    """The faults found of cameras, by name; none where most of ``count`` cameras have one."""
     return found if len(found) <= MOST_OUT * count else {}

@@ -1,14 +1,13 @@
-"""Where an object is that jumped: the update follows what moves by less than itself, and finds nothing beyond.
+"""Relocates an object after a large jump: the update follows motions of less than the object's size, and none beyond.
 
-Each camera compares its picture with the scene without what moves: what differs is the object. The rays through the
-middle of the object now, and through the middle of what was rendered of it, meet in two points; their difference is how
-far it went. Turns are left to the update that follows.
+Each camera compares its picture with the scene without its moving Gaussians: pixels that differ show the object. The
+rays through the middle of the object now, and through the middle of its rendering before, meet in two points; their
+difference is how far it went. Turns are left to the update that follows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from scas4d_core.update.views import LABEL, TrainingView
 Float = NDArray[np.float64]
 
 DIFFERENT = 0.1
-"""Of a colour channel, 0…1, from which a pixel shows what moves and not what stands."""
+"""Of a colour channel, 0…1, from which a pixel shows the moving object and not the scene behind."""
 SMALLEST_AREA = 0.25
 """Of the object's area in a picture that has to be seen now for the camera to have a say; at most its inverse."""
 CAMERAS = 3
@@ -30,21 +29,8 @@ AGREE = 0.25
 """Of the distance found that the rays may miss each other by, root mean square: else they saw different things."""
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
-    """Where the object went.
-
-    Attributes:
-        shift: [3] metres. cameras: that saw it there. miss: metres by which their rays miss each other.
-    """
-
-    shift: Float
-    cameras: int
-    miss: float
-
-
-def reacquire(gaussians: Gaussians, views: Sequence[TrainingView], picture: PictureLoss, rig: Rig) -> Found | None:
-    """Find how far what moves has jumped; None where the cameras do not agree on it.
+def find_jump(gaussians: Gaussians, views: Sequence[TrainingView], picture: PictureLoss, rig: Rig) -> Float | None:
+    """[3] metres, how far the moving Gaussians have jumped; None where the cameras do not agree on it.
 
     Args:
         gaussians: Θ_{t−1}. views: of frame t. picture: renders. rig: the cameras inside.
@@ -76,11 +62,11 @@ def reacquire(gaussians: Gaussians, views: Sequence[TrainingView], picture: Pict
     shift = end - start
     if miss > AGREE * float(np.linalg.norm(shift)):
         return None
-    return Found(shift, len(rays_now), miss)
+    return shift
 
 
 def shifted(gaussians: Gaussians, shift: Float) -> Gaussians:
-    """What moves, moved as a whole."""
+    """The state with its moving Gaussians shifted by [3] metres."""
     means = gaussians.means.copy()
     means[gaussians.moving] += shift.astype(np.float32)
     return gaussians.replace(means=means)

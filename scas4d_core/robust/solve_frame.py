@@ -1,8 +1,12 @@
-"""A frame tried until it can be committed: the update as set, the ladder, the search for what jumped, or held."""
+"""Solves one frame: the update as set, retries where it fails, a search for what jumped; else Θ_{t−1} stays.
+
+Whatever fails, the next attempt starts from the committed state. Where no attempt gives a state that is plausible
+(``validation``) and shows the frame (``outliers``), the state of the frame before stays, and the report says so.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from math import nan
@@ -11,37 +15,47 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.robust import outliers as judge
-from scas4d_core.robust.attempts import AS_SET, LADDER, SOUGHT, Checked, Course, Manner, checked
-from scas4d_core.robust.exposure import evened, gain_of, relit
-from scas4d_core.robust.outliers import Look, Past
-from scas4d_core.robust.relocation import reacquire, shifted
+from scas4d_core.robust import outliers
+from scas4d_core.robust.outliers import Past
+from scas4d_core.robust.picture_checks import EXPOSURE, evened, gain_of, relit
+from scas4d_core.robust.relocation import find_jump, shifted
+from scas4d_core.robust.validation import validated
 from scas4d_core.settings import UpdateSettings
 from scas4d_core.update.frame_update import Updater
 from scas4d_core.update.picture_loss import PictureLoss
-from scas4d_core.update.result import Updated
-from scas4d_core.update.stopping import PROBE, Counted, Pace, Timed, UntilMet
+from scas4d_core.update.result import AS_SET, AttemptOptions, UpdateResult, UpdateTrace
+from scas4d_core.update.schedule import all_begun
+from scas4d_core.update.stopping import MOST_TIMED, PROBE, Stopping
 from scas4d_core.update.views import TrainingView, ViewFactory
 from scas4d_core.update.warm_start import Motion
 
-ERROR_RISE = 1.02
-"""Times that the usual error of a witness rises at most in an update."""
+LADDER = (
+    AttemptOptions("smaller steps", rates=0.3, cold=True),
+    AttemptOptions("rigid layers only", rates=0.3, rigid=True, hold_colours=True, cold=True),
+)
+"""The attempts that follow one whose state is not plausible."""
 
-HELD = "held as it was: "
-"""How the reason begins that the report gives for a frame whose state is the one before."""
+SEARCH = AttemptOptions("sought again", cold=True, longer=5.0)
+"""From where the silhouettes say that the object is, or from where an update ended. Two of three frames of robot lost,
+the next is met at 33.5 dB with five times the iterations, at 32.1 dB with twice."""
+
+ERROR_RISE = 1.02
+"""Times that the usual error of a probe view rises at most in an update."""
 
 
 @dataclass(frozen=True, eq=False)
-class Given:
-    """What a frame starts from.
+class UpdateInput:
+    """All that the update of one frame starts from.
 
     Attributes:
         state: Θ_{t−1}. motion: that was found last, or None. seconds: since then. step: since the frame before.
-        views: of the frame, to learn from.
-        suspects: views of cameras that are left out. brightness: mean of each camera's picture. seed: of the update.
-        past: what is usual. look: what the pictures say. end: moment by which the last iteration has to be over.
-        each: seconds of an iteration in the updates before, or None. lengths: [N, 3] metres, of the axes in frame 0.
+        views: of the frame, to learn from. suspects: views of cameras that are left out.
+        brightness: mean of each camera's picture. seed: of the update. past: the usual figures.
+        lengths: [N, 3] metres, of the axes in frame 0.
+        exposure, left_out, unusable: by the brightness of the pictures, see ``picture_checks.check_brightness``.
+        end: moment by which the last iteration has to be over. each: seconds of an iteration in the updates before.
     """
 
     state: Gaussians
@@ -53,40 +67,20 @@ class Given:
     brightness: Mapping[str, float]
     seed: int
     past: Past
-    look: Look
+    lengths: NDArray[np.float32]
+    exposure: float = 1.0
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    unusable: str | None = None
     end: float | None = None
     each: float | None = None
-    lengths: NDArray[np.float32] | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """What is committed.
-
-    Attributes:
-        updated: of the attempt that is committed; where the frame is held, of the last one before anything is sought.
-        gaussians: Θ_t. motion: for the next update. past: what is usual now. fits: dB by camera above or below its
-            usual place. held: Gaussians held one by one. degraded, attempts: see ``FrameReport``. bounded: axes set to
-            the shortest or longest that they may be.
-        exposure: of the frame. fresh: whether the frame was believed. stood: whether Θ_{t−1} showed it already.
-    """
-
-    updated: Updated
-    gaussians: Gaussians
-    motion: Motion | None
-    past: Past
-    fits: Mapping[str, float]
-    held: int = 0
-    degraded: str | None = None
-    attempts: list[str] = field(default_factory=list)
-    exposure: float = 1.0
-    fresh: bool = True
-    stood: bool = False
-    bounded: int = 0
+Solved = tuple[UpdateResult, Past]
+"""The result of a frame, and the usual figures after it."""
 
 
-class Trial:
-    """Tries the frames of a scene.
+class FrameSolver:
+    """Solves the frames of a scene.
 
     Args:
         updater: of the scene. factory: of its views. picture: renders, with the settings' background and limits.
@@ -102,84 +96,95 @@ class Trial:
         self._settings = settings
         self.judging = 0.0
 
-    def run(self, given: Given) -> Outcome:
-        """Try a frame."""
-        if given.past.lit >= self._settings.patience and (outcome := self._relit(given)) is not None:
-            return outcome
-        if given.look.held:
-            return self._unseen(given, given.look.held)
+    def run(self, given: UpdateInput, repeated: bool = False) -> Solved:
+        """Solve a frame; where it is held, the state and the motion are those given.
+
+        Args:
+            repeated: its pictures are those of the last frame that was believed.
+        """
+        if repeated and given.unusable is None:
+            return _standing(given, UpdateTrace(kept=Candidate.STILL), given.exposure, "the same pictures again")
+        if given.past.lit >= self._settings.patience and (solved := self._relit(given)) is not None:
+            return solved
+        if given.unusable is not None:  # nothing is tried, and no patience is lost with it
+            past = replace(given.past, behind=max(1, given.past.behind))
+            nothing = UpdateTrace(kept=Candidate.STILL)
+            return self._held(given, FrameOutcome.HELD_UNUSABLE, nothing, past, [], given.unusable, given.exposure)
         settings, attempts = self._settings, list[str]()
         exposure = 1.0
-        if given.look.exposure != 1.0:
+        if given.exposure != 1.0:
             exposure, views, suspects = evened(self._factory, self._picture, given.state, given.views, given.suspects)
             given = replace(given, views=views, suspects=suspects)
-        updated, check = self._attempt(given, AS_SET, attempts)
-        for manner in LADDER:
-            if check.fault is None:
+        result, fault = self._attempt(given, AS_SET, attempts)
+        for options in LADDER:
+            if fault is None:
                 break
-            updated, check = self._attempt(given, manner, attempts)
-        if check.fault is not None:
-            return self._held(given, updated, attempts, check.fault, exposure)
-        degraded = attempts[-2] if len(attempts) > 1 else None
-        if not updated.losses:
-            return stood(given, updated, exposure, "not moved")
-        why = self._unmet(given, updated)
+            result, fault = self._attempt(given, options, attempts)
+        lost = replace(given.past, held=given.past.held + 1)  # patience ends
+        if fault is not None:
+            outcome = FrameOutcome.HELD_IMPLAUSIBLE
+            return self._held(given, outcome, result.trace, lost, attempts, fault, exposure)
+        if not result.trace.losses:
+            return _standing(given, result.trace, exposure, "not moved")
+        outcome, reason = FrameOutcome.UPDATED, ""
+        if len(attempts) > 1:
+            outcome, reason = FrameOutcome.RETRIED, attempts[-2]
+        why = self._unmet(given, result)
         if why is not None:
             attempts[-1] += f": {why}"
-            again = self._sought(given, updated, check.gaussians, attempts)
+            again = self._search(given, result, attempts)
             if again is not None:
-                updated, check = again
-                degraded = f"{why}; {attempts[-1]}"
-            elif given.past.held + 1 < settings.patience:
-                return self._held(given, updated, attempts, why, exposure)
+                result, outcome, reason = again, FrameOutcome.RELOCATED, f"{why}; {attempts[-1]}"
+            elif lost.held < settings.patience:
+                outcome = FrameOutcome.HELD_UNMET
+                return self._held(given, outcome, result.trace, lost, attempts, why, exposure)
             else:
-                degraded = f"{why}, for {settings.patience} frames: taken as it is from here on"
+                reason = f"{why}, for {settings.patience} frames: taken as it is from here on"
+                outcome = FrameOutcome.ACCEPTED
                 given = replace(given, past=replace(given.past, level=nan, updates=0))
-        elif degraded is None and (why := self._behind(given, updated)) is not None:
+        elif outcome is FrameOutcome.UPDATED and (why := self._behind(given, result)) is not None:
             attempts[-1] += f": {why}"
-            updated, check = self._longer(given, updated, check, attempts)
-        return self._committed(given, updated, check, degraded, attempts, exposure)
+            result = self._go_on(given, result, attempts)
+        result = replace(result, outcome=outcome, reason=reason, attempts=attempts, exposure=exposure)
+        return self._committed(given, result)
 
-    def _unseen(self, given: Given, why: str) -> Outcome:
-        """A frame whose pictures say nothing: the state stays, nothing is tried, and no patience is lost with it."""
-        nothing = Updated.nothing(given.state, given.motion)
-        past = replace(given.past, behind=max(1, given.past.behind))
-        return self._stays(given, nothing, past, [], why, given.look.exposure)
-
-    def _relit(self, given: Given) -> Outcome | None:
+    def _relit(self, given: UpdateInput) -> Solved | None:
         """A frame in a light that has stayed: the colours take it on; None where the cameras tell of no other light.
 
-        Where what is seen is as bright as it was, what is new makes the pictures brighter: no reason to hold them.
+        Where the scene is shown as bright as it was, something new makes the pictures brighter: no reason to hold them.
         """
         gain = gain_of(self._picture, given.state, given.views)
-        same = gain is not None and 1 / judge.EXPOSURE <= gain <= judge.EXPOSURE
-        if gain is None or (same and given.look.held is None):
+        same = gain is not None and 1 / EXPOSURE <= gain <= EXPOSURE
+        if gain is None or (same and given.unusable is None):
             return None
         gain, light = (1.0, "the same light") if same else (gain, f"{gain:.2g} times the light")
-        outcome = self.run(
-            replace(
-                given,
-                state=relit(given.state, gain),
-                past=judge.relit(given.past, gain),
-                look=replace(given.look, exposure=1.0, held=None),
-            )
+        in_light = replace(
+            given,
+            state=relit(given.state, gain),
+            past=outliers.relit(given.past, gain),
+            exposure=1.0,
+            unusable=None,
         )
-        if outcome.fresh:
-            return replace(outcome, attempts=[f"{light}, for good", *outcome.attempts])
-        why = f"in {light} {str(outcome.degraded).removeprefix(HELD)}"
-        return self._held(given, outcome.updated, outcome.attempts, why, given.look.exposure)
+        result, past = self.run(in_light)
+        if not result.outcome.held:
+            return replace(result, attempts=[f"{light}, for good", *result.attempts]), past
+        lost = replace(given.past, held=given.past.held + 1)
+        why = f"in {light} {result.reason}"
+        return self._held(given, result.outcome, result.trace, lost, result.attempts, why, given.exposure)
 
-    def _attempt(self, given: Given, manner: Manner, told: list[str]) -> tuple[Updated, Checked]:
-        motion = None if manner.cold else given.motion
-        course = self._course(given, manner)
-        updated = self._updater.run(given.state, given.views, motion, given.seconds, given.seed, course)
-        check = self._checked(given, given.state, updated)
-        told.append(manner.name if check.fault is None else f"{manner.name}: {check.fault}")
-        return updated, check
+    def _attempt(
+        self, given: UpdateInput, template: AttemptOptions, attempts: list[str]
+    ) -> tuple[UpdateResult, str | None]:
+        motion = None if template.cold else given.motion
+        options = self._options(given, template)
+        result = self._updater.run(given.state, given.views, motion, given.seconds, given.seed, options)
+        result, fault = self._validated(given, given.state, result)
+        attempts.append(options.name if fault is None else f"{options.name}: {fault}")
+        return result, fault
 
-    def _checked(self, given: Given, start: Gaussians, updated: Updated) -> Checked:
+    def _validated(self, given: UpdateInput, start: Gaussians, result: UpdateResult) -> tuple[UpdateResult, str | None]:
         with self._timed():
-            return checked(start, updated.gaussians, self._updater.hierarchy.rows, self._rig.radius, given.lengths)
+            return validated(start, result, self._updater.hierarchy.rows, self._rig.radius, given.lengths)
 
     @contextmanager
     def _timed(self) -> Iterator[None]:
@@ -187,140 +192,119 @@ class Trial:
         yield
         self.judging += perf_counter() - began
 
-    def _course(self, given: Given, manner: Manner) -> Course:
+    def _options(self, given: UpdateInput, template: AttemptOptions) -> AttemptOptions:
+        """The options of an attempt at a frame, in the manner of a template."""
         settings, past = self._settings, given.past
-        longer = max(manner.longer, settings.cold_longer if given.motion is None else 1.0)
-        iterations = round(longer * settings.iterations)
-        pace: Pace = Counted(iterations)
+        longer = max(template.longer, settings.cold_longer if given.motion is None else 1.0)
+        most, end = round(longer * settings.iterations), None
         if given.end is not None:
-            pace = Timed(self._until(given, manner, given.end), given.each)
-        if settings.stop_gain > 0:
-            pace = UntilMet(pace, settings.stop_gain, max(settings.own_start, *settings.layer_starts))
+            most, end = MOST_TIMED, self._until(given, template, given.end)
+        stopping = Stopping(most, end=end, each=given.each, gain=settings.stop_gain, first=all_begun(settings))
         enough = {name: (1 + settings.still) * error for name, error in past.error.items()}
-        return Course(
-            pace, manner,
-            gate=self._gate(given) if settings.judge else None,
-            witness=settings.judge or settings.stop_gain > 0,
-            enough=enough if settings.still > -1 and manner is AS_SET else None,
+        return replace(
+            template,
+            stopping=stopping,
+            gate=(lambda first: outliers.misfits(past, first, outliers.FIRST_DB)) if settings.judge else None,
+            compare=settings.judge or settings.stop_gain > 0,
+            enough=enough if settings.still > -1 and template is AS_SET else None,
             step=given.step if given.step < given.seconds else None,
-        )  # fmt: skip
+        )
 
-    def _until(self, given: Given, manner: Manner, end: float) -> float:
-        """The moment by which an attempt has to be over: after held frames half is kept for what may be sought."""
+    def _until(self, given: UpdateInput, template: AttemptOptions, end: float) -> float:
+        """The moment by which an attempt has to be over: after held frames half is kept for a search."""
         now = perf_counter()
-        return (now + end) / 2 if given.past.held and manner is AS_SET and now < end else end
+        return (now + end) / 2 if given.past.held and template is AS_SET and now < end else end
 
-    def _gate(self, given: Given) -> Callable[[Mapping[str, float]], Mapping[str, str]]:
-        return lambda first: judge.misfits(given.past, first, judge.FIRST_DB)
-
-    def _unmet(self, given: Given, updated: Updated) -> str | None:
+    def _unmet(self, given: UpdateInput, result: UpdateResult) -> str | None:
         if not self._settings.judge:
             return None
         with self._timed():
-            return judge.unmet(given.past, self._met(updated), len(updated.losses))
+            return outliers.unmet(given.past, _met(result), len(result.trace.losses))
 
-    def _behind(self, given: Given, updated: Updated) -> str | None:
+    def _behind(self, given: UpdateInput, result: UpdateResult) -> str | None:
         if not self._settings.judge or self._spent(given):
             return None
-        return judge.behind(given.past, self._met(updated), len(updated.losses))
+        return outliers.behind(given.past, _met(result), len(result.trace.losses))
 
-    def _spent(self, given: Given, more: int = 0) -> bool:
-        """Whether the budget has no time left for another attempt, and as long as so many iterations take before it."""
+    def _spent(self, given: UpdateInput, more: int = 0) -> bool:
+        """True where the budget has no time left for another attempt, with ``more`` iterations before it."""
         return given.end is not None and perf_counter() + (PROBE + more) * (given.each or 0.0) > given.end
 
-    def _met(self, updated: Updated) -> dict[str, float]:
-        """DB of the cameras that were learnt from to the end."""
-        return {name: fit.psnr for name, fit in updated.cameras.items() if name not in updated.left_out}
+    def _search(self, given: UpdateInput, tried: UpdateResult, attempts: list[str]) -> UpdateResult | None:
+        """Longer attempts, from where the silhouettes say that the object is, and from where ``tried`` ended.
 
-    def _sought(
-        self, given: Given, tried: Updated, ended: Gaussians, attempts: list[str]
-    ) -> tuple[Updated, Checked] | None:
-        """Longer, from where the silhouettes say that the object is, and from where the update ended; None: in vain.
-
-        Args:
-            ended: the end of ``tried`` as it might be committed: from a Gaussian that is not finite none comes back.
+        That is the validated end: from a Gaussian that is not finite none comes back. None: all were in vain.
         """
         if self._spent(given, len(given.views)):
             attempts.append("not sought: the budget is spent")
             return None
-        found = reacquire(given.state, given.views, self._picture, self._rig)
+        ended = tried.gaussians
         starts = [("sought from where the update ended", ended)]
-        if found is not None:
-            length = float(np.linalg.norm(found.shift))
-            starts.insert(0, (f"sought {length:.2f} m away", shifted(given.state, found.shift)))
+        jump = find_jump(given.state, given.views, self._picture, self._rig)
+        if jump is not None:
+            length = float(np.linalg.norm(jump))
+            starts.insert(0, (f"sought {length:.2f} m away", shifted(given.state, jump)))
         for name, start in starts:
             if self._spent(given):
                 attempts.append(f"not {name}: the budget is spent")
                 break
-            course = self._course(given, replace(SOUGHT, name=name))
-            updated = self._updater.run(start, given.views, None, given.seconds, given.seed, course)
-            check = self._checked(given, start, updated)
+            options = self._options(given, replace(SEARCH, name=name))
+            result = self._updater.run(start, given.views, None, given.seconds, given.seed, options)
+            result, fault = self._validated(given, start, result)
             # A few iterations more are no excuse for meeting it less well.
-            both = len(tried.losses) + len(updated.losses)
-            why = check.fault or judge.unmet(given.past, self._met(updated), both)
+            both = len(tried.trace.losses) + len(result.trace.losses)
+            why = fault or outliers.unmet(given.past, _met(result), both)
             attempts.append(name if why is None else f"{name}: {why}")
             if why is None:
-                return _told(updated if start is not ended else _after(updated, tried), tried), check
+                return _retold(result if start is not ended else _after(result, tried), tried)
         return None
 
-    def _longer(self, given: Given, tried: Updated, check: Checked, attempts: list[str]) -> tuple[Updated, Checked]:
+    def _go_on(self, given: UpdateInput, tried: UpdateResult, attempts: list[str]) -> UpdateResult:
         """On from where an update ended; the better of both."""
-        manner = replace(SOUGHT, name="on from where the update ended")
-        updated = self._updater.run(
-            check.gaussians, given.views, None, given.seconds, given.seed, self._course(given, manner)
-        )
-        again = self._checked(given, given.state, updated)
-        after, before = (judge.level_of(given.past, self._met(one)) for one in (updated, tried))
-        attempts.append(manner.name if again.fault is None else f"{manner.name}: {again.fault}")
-        better = again.fault is None and after > before
-        return (_told(_after(updated, tried), tried), again) if better else (tried, check)
+        options = self._options(given, replace(SEARCH, name="on from where the update ended"))
+        result = self._updater.run(tried.gaussians, given.views, None, given.seconds, given.seed, options)
+        result, fault = self._validated(given, given.state, result)
+        after, before = (outliers.level_of(given.past, _met(one)) for one in (result, tried))
+        attempts.append(options.name if fault is None else f"{options.name}: {fault}")
+        return _retold(_after(result, tried), tried) if fault is None and after > before else tried
 
-    def _held(self, given: Given, updated: Updated, attempts: list[str], why: str, exposure: float) -> Outcome:
-        """A frame that could not be met; patience ends."""
-        past = replace(given.past, held=given.past.held + 1)
-        return self._stays(given, updated, past, attempts, why, exposure)
-
-    def _stays(
-        self, given: Given, updated: Updated, past: Past, attempts: list[str], why: str, exposure: float
-    ) -> Outcome:
-        fits = judge.place(past, {name: fit.psnr for name, fit in updated.cameras.items()})
-        updated = replace(updated, kept="still")
-        return Outcome(updated, given.state, given.motion, past, fits, 0, HELD + why, attempts, exposure, fresh=False)
-
-    def _committed(
+    def _held(
         self,
-        given: Given,
-        updated: Updated,
-        check: Checked,
-        degraded: str | None,
-        attempts: list[str],
+        given: UpdateInput,
+        outcome: FrameOutcome,
+        trace: UpdateTrace,
+        past: Past,
+        attempts: Sequence[str],
+        reason: str,
         exposure: float,
-    ) -> Outcome:
-        psnr = {name: fit.psnr for name, fit in updated.cameras.items()}
-        with self._timed():
-            # Short updates render a camera long before their end: what does not fit is looked at once more.
-            off = judge.misfits(given.past, psnr, judge.LAST_DB)
-            again = [view for view in given.views if view.name in off]
-            psnr |= self._measured([*again, *given.suspects], check.gaussians)
-        fits = judge.place(given.past, psnr)
-        past = judge.settle(given.past, psnr, given.brightness, exposure, len(updated.losses))
-        if updated.errors.get("end"):
-            past = replace(past, error=_usual(given.past.error, updated.errors[updated.kept]))
-        motion = updated.motion if updated.motion.finite else None
-        return Outcome(
-            updated,
-            check.gaussians,
-            motion,
-            past,
-            fits,
-            check.held,
-            degraded,
-            attempts,
-            exposure,
-            bounded=check.bounded,
+    ) -> Solved:
+        """A frame that is not believed: state and motion stay."""
+        result = UpdateResult(
+            given.state,
+            given.motion,
+            replace(trace, kept=Candidate.STILL),
+            outcome=outcome,
+            reason=reason,
+            attempts=attempts,
+            exposure=exposure,
+            offsets=outliers.offsets(past, trace.fits),
         )
+        return result, past
 
-    def _measured(self, views: list[TrainingView], state: Gaussians) -> dict[str, float]:
+    def _committed(self, given: UpdateInput, result: UpdateResult) -> Solved:
+        trace, psnr = result.trace, result.trace.fits
+        with self._timed():
+            # Short updates render a camera long before their end: one that does not fit is looked at once more.
+            off = outliers.misfits(given.past, psnr, outliers.LAST_DB)
+            again = [view for view in given.views if view.name in off]
+            psnr |= self._measured([*again, *given.suspects], result.gaussians)
+        past = outliers.settle(given.past, psnr, given.brightness, result.exposure, len(trace.losses))
+        if trace.errors.get(Candidate.END):
+            past = replace(past, error=_usual(given.past.error, trace.errors[trace.kept]))
+        motion = result.motion if result.motion is not None and result.motion.finite else None
+        return replace(result, motion=motion, offsets=outliers.offsets(given.past, psnr)), past
+
+    def _measured(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
         """DB of cameras as a state shows them; those that are left out come back so, once they fit."""
         features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
         found = {}
@@ -330,28 +314,37 @@ class Trial:
         return found
 
 
-def stood(given: Given, updated: Updated, exposure: float, said: str) -> Outcome:
-    """Θ_{t−1} shows the frame: nothing was rendered that says how any camera fits, so what is usual stays as it was."""
+def _standing(given: UpdateInput, trace: UpdateTrace, exposure: float, said: str) -> Solved:
+    """Θ_{t−1} shows the frame: nothing was rendered that says how any camera fits, so the usual figures stay."""
     past = replace(given.past, held=0, behind=max(1, given.past.behind))  # it may go on from here, or from further away
-    return Outcome(updated, given.state, given.motion, past, {}, attempts=[said], exposure=exposure, stood=True)
+    outcome = FrameOutcome.STOOD
+    return UpdateResult(given.state, given.motion, trace, outcome=outcome, attempts=[said], exposure=exposure), past
 
 
-def _after(updated: Updated, first: Updated) -> Updated:
+def _met(result: UpdateResult) -> dict[str, float]:
+    """DB of the cameras that were learnt from to the end."""
+    return {name: psnr for name, psnr in result.trace.fits.items() if name not in result.trace.left_out}
+
+
+def _after(result: UpdateResult, first: UpdateResult) -> UpdateResult:
     """An update that went on from where another ended: its motion is that of both."""
-    return replace(updated, motion=updated.motion.after(first.motion))
+    if result.motion is None or first.motion is None:
+        return result
+    return replace(result, motion=result.motion.after(first.motion))
 
 
-def _told(updated: Updated, first: Updated) -> Updated:
-    """An update that was tried again: "still" and "warm" are those of the frame before, "end" is what is committed."""
-    errors = {kind: error for kind, error in first.errors.items() if kind != "end"}
-    if updated.errors:
-        errors["end"] = updated.errors[updated.kept]
-    return replace(updated, errors=errors, kept="end")
+def _retold(result: UpdateResult, first: UpdateResult) -> UpdateResult:
+    """A later attempt with the errors of the frame before and of the warm start as the first one found them."""
+    errors: dict[Candidate, dict[str, float]] = {**first.trace.errors}
+    errors.pop(Candidate.END, None)
+    if result.trace.errors:
+        errors[Candidate.END] = result.trace.errors[result.trace.kept]
+    return replace(result, trace=replace(result.trace, errors=errors, kept=Candidate.END))
 
 
 def _usual(before: Mapping[str, float], now: Mapping[str, float]) -> dict[str, float]:
     """The errors by view that are usual: they fall at once and rise slowly.
 
-    What a noisy frame was met with would else be enough for the next good one, which moved.
+    A noisy frame's error would else be enough for the next good one, which moved.
     """
     return {name: min(value, ERROR_RISE * before.get(name, value)) for name, value in now.items()}

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from scas4d_core.captures.frame import Frame
 from scas4d_core.errors import message_of
 from scas4d_core.robust.outliers import Past
-from scas4d_core.robust.solve_frame import Outcome
 from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
 from scas4d_core.storage.history import NEWEST_KEPT, History, HistoryError
 from scas4d_core.storage.npz import read_npz, write_npz
+from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.views import TrainingView, ViewFactory
 from scas4d_core.update.warm_start import Motion
 
@@ -47,7 +47,7 @@ class CarryOver:
         seen: views of the last frame that was not held, in scenes without masks; the next are compared with them.
         structure: digest of the clusters and neighbours that the motion belongs to.
         past: usual values of the scene and its cameras.
-        shown: fingerprint of each picture of the last frame that was not held (``repeats``).
+        shown: fingerprint of each picture of the last frame that was not held (``picture_checks``).
     """
 
     motion: Motion | None = None
@@ -58,23 +58,27 @@ class CarryOver:
     shown: Mapping[str, int] = field(default_factory=dict)
 
     def after(
-        self, outcome: Outcome, time: float, views: Sequence[TrainingView] | None, shown: Mapping[str, int]
+        self,
+        result: UpdateResult,
+        past: Past,
+        time: float,
+        views: Sequence[TrainingView] | None,
+        shown: Mapping[str, int],
     ) -> CarryOver:
-        """The state that the next frame passes on in turn; of rejected pictures nothing is kept.
+        """The carry-over of the next frame; of pictures that were not believed nothing is kept.
 
         Args:
-            outcome: of that frame. time: of that frame, seconds.
-            views: its training views, or None in scenes with masks. shown: fingerprints of its pictures.
+            result: of that frame. past: after it. time: its, seconds.
+            views: that it was updated with, or None in scenes with masks. shown: fingerprints of its pictures.
         """
-        learnt = outcome.fresh and not outcome.stood
-        past = replace(outcome.past, fitted=time) if learnt else outcome.past
-        carry_over = replace(self, motion=outcome.motion, past=past)
-        if not outcome.fresh:
-            return carry_over
-        if views is not None and outcome.exposure == 1.0:  # a change of light is no motion
-            seen = [view for view in views if view.name not in outcome.updated.left_out]
-            carry_over = replace(carry_over, seen=seen)
-        return replace(carry_over, shown=shown)
+        carried = replace(
+            self, motion=result.motion, past=replace(past, fitted=time) if result.outcome.learnt else past
+        )
+        if result.outcome.held:
+            return carried
+        if views is not None and result.exposure == 1.0:  # a change of another light has not moved
+            carried = replace(carried, seen=[view for view in views if view.name not in result.trace.left_out])
+        return replace(carried, shown=shown)
 
 
 class Checkpoints:

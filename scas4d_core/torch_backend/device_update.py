@@ -1,4 +1,4 @@
-"""One frame's update on a torch device: ``update_torch`` behind the interface of ``update.FrameUpdate``.
+"""Update of one frame on a torch device: ``TorchUpdate`` behind the interface of ``frame_update.Updater``.
 
 On "cuda" gsplat rasterizes; on "cpu" the dense twin does, which is slow and exact and there for tests. The order of
 views, the samples, the rates, the hierarchy and the warm start are those of the CPU. Not yet run on a GPU.
@@ -14,20 +14,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.rasterize.limits import scene_limits
-from scas4d_core.robust.attempts import Course
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import Hierarchy
 from scas4d_core.structure.neighbours import Neighbours
-from scas4d_core.torch_backend import update as update_torch
-from scas4d_core.torch_backend.update import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchUpdate
-from scas4d_core.update.best_state import Anytime
-from scas4d_core.update.deformation import CpuDeformation
+from scas4d_core.torch_backend.arrays import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchResult, TorchView
+from scas4d_core.torch_backend.update import TorchUpdate
+from scas4d_core.update import deformation, schedule
+from scas4d_core.update.best_state import BestState, ProbeViews
+from scas4d_core.update.deformation import CpuDeformation, first_lengths, length_bounds
 from scas4d_core.update.picture_loss import PictureLoss
-from scas4d_core.update.result import CameraFit, Stopwatch, Story, Updated
-from scas4d_core.update.schedule import Rates, ViewPlan, first_lengths, mask_weight, plan_samples
-from scas4d_core.update.stopping import Counted
+from scas4d_core.update.result import AS_SET, AttemptOptions, Stopwatch, UpdateResult, UpdateTrace, camera_fit
+from scas4d_core.update.schedule import Rates, ViewPlan, mask_weight, plan_samples
+from scas4d_core.update.stopping import Stopping
 from scas4d_core.update.views import LABEL, TrainingView, ViewFactory
 from scas4d_core.update.warm_start import Motion
 
@@ -36,20 +37,20 @@ Array = NDArray[np.float32]
 
 @dataclass(eq=False)
 class Tables:
-    """``warm_start.Parameters`` as ``update_torch`` gives and takes them."""
+    """``warm_start.Parameters`` as ``TorchUpdate`` takes and returns them."""
 
     hierarchy: Hierarchy
     clusters: list[Array]
     deltas: Array
 
     @classmethod
-    def of(cls, hierarchy: Hierarchy, found: update_torch.Updated) -> Tables:
-        """What an update found."""
+    def of(cls, hierarchy: Hierarchy, found: TorchResult) -> Tables:
+        """The parameters that an update found."""
         clusters = [np.concatenate([p.r, p.t, p.c, p.s[:, None]], axis=1) for p in found.layers]
         return cls(hierarchy, clusters, np.concatenate(found.deltas, axis=1))
 
     def split(self) -> tuple[list[ClusterArrays], DeltaArrays]:
-        """The same as ``update_torch`` takes it."""
+        """The same as ``TorchUpdate`` takes it."""
         layers = [ClusterArrays(v[:, :3], v[:, 3:6], v[:, 6:9], v[:, 9]) for v in self.clusters]
         return layers, DeltaArrays(self.deltas[:, :3], self.deltas[:, 3:6], self.deltas[:, 6:])
 
@@ -71,21 +72,19 @@ class DeviceUpdate:
         self.settings = settings
         self.hierarchy = hierarchy
         self._factory = factory
-        weights = settings.weights
         mask = mask_weight(settings, len(hierarchy.rows), len(first))
         limits = scene_limits(scene.near, factory.rig.radius)
-        self._picture = PictureLoss(factory, scene.background, weights.image, mask, limits=limits)
-        lengths = first_lengths(hierarchy, first)
-        bounds = np.maximum(lengths, np.float32(settings.max_scale))
+        self._picture = PictureLoss(factory, scene.background, schedule.IMAGE_WEIGHT, mask, limits=limits)
+        bounds = length_bounds(hierarchy, first)
         self._deformation = CpuDeformation(hierarchy, neighbours, bounds, settings.cluster_map, settings.covariance)
         self._update = TorchUpdate(
             moving=hierarchy.rows,
             labels=[labels.astype(np.int64) for labels in hierarchy.labels],
             graph=_graph(neighbours, len(hierarchy.rows)),
-            first_lengths=lengths,
+            first_lengths=first_lengths(hierarchy, first),
             rates=Rates.of(settings, len(hierarchy.sizes), factory.rig.radius),
             weights=_weights(settings, neighbours is not None, mask),
-            max_scale=settings.max_scale,
+            max_scale=deformation.MAX_SCALE,
             background=scene.background,
             cluster_map=settings.cluster_map,
             covariance=settings.covariance,
@@ -102,33 +101,32 @@ class DeviceUpdate:
         motion: Motion | None,
         seconds: float,
         seed: int,
-        course: Course | None = None,
-    ) -> Updated:
-        """Find D_t and apply it, see ``update.Updater.run``; no gate is asked.
+        options: AttemptOptions = AS_SET,
+    ) -> UpdateResult:
+        """Find D_t and apply it, see ``frame_update.Updater.run``; no gate is asked.
 
-        Start and end are compared on a few small pictures that the CPU renders, as for ``update.FrameUpdate``.
+        The candidates are compared on a few small pictures that the CPU renders, as in ``FrameUpdate``.
         """
-        settings, hierarchy = self.settings, self.hierarchy
-        course = course or Course(Counted(settings.iterations))
+        settings, hierarchy, deformation = self.settings, self.hierarchy, self._deformation
+        stopping = options.stopping or Stopping(settings.iterations)
+        most = stopping.most
         rng = np.random.default_rng([settings.seed, seed])
-        watch = Stopwatch()
-        deformation = self._deformation
+        watch, trace = Stopwatch(), UpdateTrace()
         deformation.start(previous)
-        anytime = Anytime.of(self._factory, self._picture, deformation, previous, views if course.witness else [])
-        seconds = anytime.start(motion, seconds, settings, course.step)
-        stands = anytime.stands(course.enough)
-        pace = Counted(0) if stands else course.pace
-        most = course.pace.most
-        plan = ViewPlan(self._factory, views, settings, most, rng)
-        pictures = [plan.take(iteration, settings.iterations) for iteration in range(0 if stands else most)]
-        samples = plan_samples(len(hierarchy.rows), settings.neighbour_sample, rng)
-        manner = course.manner
-        rates = self._update.rates.tried(manner.rates, manner.rigid, manner.hold_colours)
+        probes = ProbeViews(self._factory, self._picture, views if options.compare else [])
+        best = BestState(probes, deformation, previous, motion, seconds, settings.momentum)
+        best.start(options.step)
+        stands = best.stands(options.enough)
+        if stands:
+            stopping = Stopping(0)
+        plan = ViewPlan(views, settings.views, most, rng)
+        pictures = [plan.take() for _ in range(0 if stands else most)]
+        samples = plan_samples(len(hierarchy.rows), rng)
+        rates = self._update.rates.tried(options.rates, options.rigid, options.hold_colours)
         update = replace(self._update, rates=rates.hurried(settings.cold_start) if motion is None else rates)
         start, deltas = Tables(hierarchy, deformation.clusters, deformation.deltas).split()
         distinct = {id(view): view for seen in pictures for view in seen}
         place = {key: index for index, key in enumerate(distinct)}
-        story = Story(len(views))
         watch.lap("start")
         found = update.run(
             previous,
@@ -137,35 +135,34 @@ class DeviceUpdate:
             start=start,
             deltas=deltas,
             rows=[samples[iteration % len(samples)] for iteration in range(most)],
-            on_iteration=lambda _: story.moments.append(perf_counter() - watch.began),
-            pace=pace,
-            look=anytime.error_of,
+            on_iteration=lambda _: trace.moments.append(perf_counter() - watch.began),
+            stopping=stopping,
+            look=best.error_of,
         )
         watch.lap("iterations")
-        if story.moments:
-            story.moments[-1] = watch.total  # a device may be behind its host: it is through here
-        story.losses, story.psnr = found.losses, found.psnr
-        story.last = {view.name: CameraFit(psnr) for view, psnr in zip(chain(*pictures), found.psnr, strict=False)}
+        if trace.moments:
+            trace.moments[-1] = watch.total  # a device may be behind its host: it is through here
+        trace.losses, trace.psnr, trace.planned = found.losses, found.psnr, stopping.planned_so_far
+        trace.cameras = {view.name: camera_fit(psnr) for view, psnr in zip(chain(*pictures), found.psnr, strict=False)}
         _take(deformation, Tables.of(hierarchy, found))
-        kept = anytime.end(found.gaussians.colours, story)
+        trace.errors = best.errors
+        trace.kept = best.end(found.gaussians.colours, trace.iterations, {})
         watch.lap("end")
-        state = found.gaussians if kept == "end" else previous
-        if kept == "warm":
+        state = found.gaussians if trace.kept is Candidate.END else previous
+        if trace.kept is Candidate.WARM:
             start, deltas = Tables(hierarchy, deformation.clusters, deformation.deltas).split()
             state = update.run(previous, [], [], start=start, deltas=deltas).gaussians
-        updated = story.updated(state, Motion.of(deformation, seconds), pace, anytime.errors, kept)
+        motion_found = Motion.of(deformation, best.seconds)
         watch.lap("commit")
-        updated.seconds.update(watch.seconds)
-        return updated
+        trace.seconds = watch.seconds
+        return UpdateResult(state, motion_found, trace)
 
-    def _on_device(self, view: TrainingView) -> update_torch.TrainingView:
-        """The view as ``update_torch`` takes it; a picture smaller than its camera's is a coarse one."""
+    def _on_device(self, view: TrainingView) -> TorchView:
+        """The view as ``TorchUpdate`` takes it."""
         camera = self._factory.rig[view.name]
-        if (camera.width, camera.height) != (view.camera.width, view.camera.height):
-            camera = camera.scaled(self.settings.coarse_scale)
         target = np.moveaxis(view.target, 0, -1)
         mask = target[..., LABEL] if target.shape[-1] > LABEL else None
-        return update_torch.TrainingView(camera, target[..., :LABEL], mask, view.exposure[:LABEL])
+        return TorchView(camera, target[..., :LABEL], mask, view.exposure[:LABEL])
 
 
 def _take(deformation: CpuDeformation, tables: Tables) -> None:
@@ -186,12 +183,12 @@ def _weights(settings: UpdateSettings, tied: bool, mask: float) -> TermWeights:
     """The weights of the terms; those between neighbours only where there are any."""
     given = settings.weights
     return TermWeights(
-        image=given.image,
+        image=schedule.IMAGE_WEIGHT,
         mask=mask,
         rigidity=given.rigidity if tied else 0.0,
         isometry=given.isometry if tied else 0.0,
         rotation=given.rotation if tied else 0.0,
         scale=given.scale,
-        soft_colour=given.soft_colour,
+        soft_colour=schedule.SOFT_COLOUR_WEIGHT,
         floor=given.floor,
     )

@@ -1,4 +1,4 @@
-"""One frame's update in plain torch: the CUDA path, and the twin of the fused loop on the CPU.
+"""Update of one frame in plain torch: the CUDA path, and the twin of the fused loop on the CPU.
 
 Θ_{t−1} and the pictures of frame t in, Θ_t out. The loop is the paper's: cascade, render one training view, image
 loss and neighbour terms, backward, Adam. Not yet run on a GPU.
@@ -8,19 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from scas4d_core.cameras import Camera
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.rasterize import cuda, twin
 from scas4d_core.rasterize.limits import DEFAULT, GSPLAT, Limits
 from scas4d_core.rasterize.twin import CameraParams, Rendered
 from scas4d_core.torch_backend import losses
+from scas4d_core.torch_backend.arrays import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchResult, TorchView
 from scas4d_core.torch_backend.deformation import (
     ClusterMap,
     ClusterParams,
@@ -32,7 +32,7 @@ from scas4d_core.torch_backend.deformation import (
     material_rotations,
 )
 from scas4d_core.update.schedule import Rates
-from scas4d_core.update.stopping import Pace, by_clock
+from scas4d_core.update.stopping import Stopping
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Render: TypeAlias = Callable[[Tensor, Tensor, Tensor, Tensor, CameraParams, Tensor, Limits], Rendered]
@@ -42,87 +42,6 @@ ADAM_EPSILON = 1e-15
 
 TIMED_EVERY = 10
 """Iterations after which an update by the clock waits for the device."""
-
-
-class Graph(NamedTuple):
-    """Neighbours among the M moving Gaussians, as they were when the graph was built.
-
-    Attributes:
-        neighbours: [M, k] int64 rows among the moving.
-        weights: [M, k], exp(−falloff·d²).
-        distances: [M, k] metres.
-    """
-
-    neighbours: NDArray[np.int64]
-    weights: Floats
-    distances: Floats
-
-
-class ClusterArrays(NamedTuple):
-    """``ClusterParams`` as numpy: r [K, 3], t [K, 3] metres, c [K, 3] per metre, s [K]."""
-
-    r: Floats
-    t: Floats
-    c: Floats
-    s: Floats
-
-
-class DeltaArrays(NamedTuple):
-    """``Deltas`` as numpy: dp [M, 3] metres, dr [M, 3], ds [M, 3]."""
-
-    dp: Floats
-    dr: Floats
-    ds: Floats
-
-
-class TrainingView(NamedTuple):
-    """What one camera saw.
-
-    Attributes:
-        camera: of the inside world, of the picture's size.
-        image: [H, W, 3] in 0…1.
-        mask: [H, W] in 0…1, or None.
-        exposure: [3, 2] the camera's gain and offset of each colour; None: 1 and 0.
-    """
-
-    camera: Camera
-    image: Floats
-    mask: Floats | None
-    exposure: Floats | None = None
-
-
-@dataclass(frozen=True)
-class TermWeights:
-    """Weights of the terms; a term of weight 0 is not computed."""
-
-    image: float = 1.0
-    mask: float = 3.0
-    rigidity: float = 4.0
-    isometry: float = 2.0
-    rotation: float = 4.0
-    scale: float = 10.0
-    soft_colour: float = 0.01
-    floor: float = 0.0
-
-
-class Updated(NamedTuple):
-    """What one update found.
-
-    Attributes:
-        gaussians: Θ_t, float32.
-        turns: [M, 4] unit quaternions with w ≥ 0, rotation of the moving Gaussians since Θ_{t−1}.
-        layers: cluster parameters at the end, coarse to fine; the next frame's warm start.
-        deltas: per Gaussian at the end.
-        losses: one weighted sum an iteration.
-        psnr: dB, of each view that was rendered, in order.
-    """
-
-    gaussians: Gaussians
-    turns: NDArray[np.float32]
-    layers: list[ClusterArrays]
-    deltas: DeltaArrays
-    losses: list[float]
-    psnr: list[float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,32 +79,30 @@ class TorchUpdate:
     dtype: torch.dtype = torch.float32
 
     def __post_init__(self) -> None:
-        if len(self.rates.layers) != len(self.labels):
-            raise ValueError(
-                f"rates.layers has {len(self.rates.layers)} entries for {len(self.labels)} layers of labels; "
-                "give one a layer"
-            )
+        found, wanted = len(self.rates.layers), len(self.labels)
+        if found != wanted:
+            raise ValueError(f"rates.layers has {found} entries for {wanted} layers of labels; give one a layer")
         if self.on_cuda and self.dtype != torch.float32:
             raise ValueError(f"dtype {self.dtype} on device {self.device!r}: gsplat knows torch.float32 only")
 
     @property
     def on_cuda(self) -> bool:
-        """Whether gsplat rasterizes."""
+        """True where gsplat rasterizes."""
         return torch.device(self.device).type == "cuda"
 
     def run(
         self,
         gaussians: Gaussians,
-        views: Sequence[TrainingView],
+        views: Sequence[TorchView],
         order: Sequence[int | Sequence[int]],
         *,
         start: Sequence[ClusterArrays] | None = None,
         deltas: DeltaArrays | None = None,
         rows: Sequence[NDArray[np.int64]] | None = None,
         on_iteration: Callable[[int], None] | None = None,
-        pace: Pace | None = None,
+        stopping: Stopping | None = None,
         look: Callable[[Gaussians], float] | None = None,
-    ) -> Updated:
+    ) -> TorchResult:
         """Find the deformation from Θ_{t−1} to the pictures of frame t.
 
         Args:
@@ -197,8 +114,8 @@ class TorchUpdate:
             deltas: per-Gaussian parameters to start from; None: the identity.
             rows: per iteration the rows among the moving whose neighbours are looked at; None: all.
             on_iteration: called with the number of iterations done.
-            pace: how many of the order's are taken; None: all.
-            look: the error of a state, for a pace that looks at it.
+            stopping: decides how many of the order's are taken; None: all.
+            look: the error of a state, for a stopping rule that looks at it.
 
         Raises:
             IndexError: the order names a view that is not there.
@@ -210,14 +127,14 @@ class TorchUpdate:
         base = [(group["lr"], group["begins"]) for group in optimizer.param_groups]
         history: list[tuple[Tensor, Tensor]] = []
         for iteration, view in enumerate(order):
-            if self.on_cuda and by_clock(pace) and iteration % TIMED_EVERY == 0:
+            if self.on_cuda and stopping is not None and stopping.end is not None and iteration % TIMED_EVERY == 0:
                 torch.cuda.synchronize()  # the host runs ahead: its clock would not see the device's work
-            planned = len(order) if pace is None else pace.planned(iteration)
+            planned = len(order) if stopping is None else stopping.planned(iteration)
             if iteration >= planned:
                 break
             for group, (rate, begins) in zip(optimizer.param_groups, base, strict=True):
                 group["lr"] = rate * self.rates.factor(iteration, planned, begins)
-            sampled = None if rows is None else scene.indices(rows[iteration])
+            sampled = None if rows is None else torch.as_tensor(rows[iteration], dtype=torch.int64, device=self.device)
             optimizer.zero_grad(set_to_none=True)
             loss = scene.loss(view, sampled)
             loss.backward()  # type: ignore[no-untyped-call]
@@ -229,8 +146,8 @@ class TorchUpdate:
             history.append((loss.detach(), scene.psnr))
             if on_iteration is not None:
                 on_iteration(iteration + 1)
-            if pace is not None and look is not None and pace.looks(iteration + 1):
-                pace.saw(iteration + 1, look(scene.result(gaussians, [], []).gaussians))
+            if stopping is not None and look is not None and stopping.looks(iteration + 1):
+                stopping.saw(iteration + 1, look(scene.result(gaussians, [], []).gaussians))
         # The losses stay on the device until here: reading each would make the host wait for it.
         found = torch.stack([loss for loss, _ in history]).tolist() if history else []
         psnr = torch.cat([psnr for _, psnr in history]).tolist() if history else []
@@ -265,7 +182,7 @@ class _Scene:
         cls,
         update: TorchUpdate,
         gaussians: Gaussians,
-        views: Sequence[TrainingView],
+        views: Sequence[TorchView],
         start: Sequence[ClusterArrays] | None,
         deltas: DeltaArrays | None,
     ) -> _Scene:
@@ -326,12 +243,8 @@ class _Scene:
         moving, standing = self.free_colours
         return self.previous_colours.index_copy(0, self.moving, moving).index_copy(0, self.standing, standing)
 
-    def indices(self, rows: NDArray[np.int64]) -> Tensor:
-        """Rows on the device."""
-        return torch.as_tensor(rows, dtype=torch.int64, device=self.update.device)
-
     def parameter_groups(self, rates: Rates) -> list[dict[str, Any]]:
-        """What Adam moves; parameters of rate 0 are left out and need no gradient."""
+        """Adam's groups of parameters; those of rate 0 are left out and need no gradient."""
         groups: list[tuple[float, float, list[Tensor]]] = []
         for k, ((_, params), (rotation, translation, scaling)) in enumerate(
             zip(self.layers, rates.layers, strict=True)
@@ -417,7 +330,7 @@ class _Scene:
         return terms
 
     @torch.no_grad()
-    def result(self, gaussians: Gaussians, history: list[float], psnr: list[float]) -> Updated:
+    def result(self, gaussians: Gaussians, history: list[float], psnr: list[float]) -> TorchResult:
         """Θ_t and the parameters, as numpy."""
 
         def array(tensor: Tensor) -> NDArray[np.float32]:
@@ -434,4 +347,4 @@ class _Scene:
         )
         layers = [ClusterArrays(*(array(tensor) for tensor in layer.params)) for layer in self.layers]
         own = DeltaArrays(*(array(tensor) for tensor in self.deltas))
-        return Updated(state, array(now.turns), layers, own, history, psnr)
+        return TorchResult(state, array(now.turns), layers, own, history, psnr)

@@ -1,144 +1,191 @@
-"""An update may end at any moment: what it commits is never worse than not moving, or than going on as before.
+"""Comparison of the candidates for Θ_t on a few training views: the end of an update, its warm start, Θ_{t−1}.
 
-Judged on a few training views (``witness``), whose rendering is a part of the update's time.
+An update may end at any moment: what it commits is never worse than not moving, or than going on as before. The probe
+views are the same in every frame; rendering them is a part of the update's time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from math import nan
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.cameras import Rig
+from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.settings import UpdateSettings
 from scas4d_core.update.deformation import CpuDeformation
 from scas4d_core.update.picture_loss import PictureLoss
-from scas4d_core.update.probe_views import Witness, mean_error
-from scas4d_core.update.result import Story
 from scas4d_core.update.views import TrainingView, ViewFactory
 from scas4d_core.update.warm_start import Motion, warm_start
 
 Array = NDArray[np.float32]
 
+VIEWS = 4
+"""Probe views of a frame."""
+SCALE = 0.5
+"""Of their pictures: a quarter of the pixels tells as much about which state is better."""
 
-@dataclass
-class Anytime:
-    """The start of an update and its end, compared.
 
-    Attributes:
-        errors: by what was measured ("still", "warm", "end"), then by view.
+def spread(rig: Rig, names: Sequence[str], count: int = VIEWS) -> list[str]:
+    """So many of the cameras, as far apart as can be: each next one is the farthest from those taken."""
+    if not names:
+        return []
+    centres = np.array([rig[name].centre for name in names])
+    taken = [0]
+    while len(taken) < min(count, len(names)):
+        distances = np.linalg.norm(centres[:, None] - centres[None, taken], axis=-1).min(axis=1)
+        distances[taken] = -1
+        taken.append(int(distances.argmax()))
+    return [names[index] for index in taken]
+
+
+def mean_error(errors: Mapping[str, float], names: Sequence[str]) -> float:
+    """Mean over the named views that there are; NaN where there is none."""
+    values = [errors[name] for name in names if name in errors]
+    return float(np.mean(values)) if values else nan
+
+
+class ProbeViews:
+    """Fixed training views for comparing states.
+
+    Args:
+        factory: of the rig. picture: renders. views: of the frame; ``spread`` of them are taken; of none
+            nothing is compared.
     """
 
-    deformation: CpuDeformation
-    previous: Gaussians
-    witness: Witness
-    errors: dict[str, dict[str, float]] = field(default_factory=dict)
+    def __init__(self, factory: ViewFactory, picture: PictureLoss, views: Sequence[TrainingView]) -> None:
+        chosen = set(spread(factory.rig, [view.name for view in views]))
+        self._views = [factory.coarser(view, SCALE) for view in views if view.name in chosen]
+        self._picture = picture
 
-    @classmethod
-    def of(
-        cls,
-        factory: ViewFactory,
-        picture: PictureLoss,
+    def errors(self, means: Array, factors: Array, opacities: Array, features: Array) -> dict[str, float]:
+        """The image loss (``losses.image_loss``) of a state in each view, by the camera's name.
+
+        Args:
+            means, factors, opacities, features: [N, 3], [N, 3, 3], [N], [N, 4] float32.
+        """
+        found = {}
+        for view in self._views:
+            self._picture.measure(means, factors, opacities, features, view)
+            found[view.name] = self._picture.image_part
+        return found
+
+
+class BestState:
+    """Finds the best start of an update and the best state at its end.
+
+    Args:
+        probes: of the frame. deformation: has taken Θ_{t−1}. previous: Θ_{t−1}.
+        motion: of the update before, or None. seconds: since it was found. momentum: see ``UpdateSettings``.
+
+    Attributes:
+        errors: by candidate, then by probe view. seconds: that the motion is taken to have gone on for.
+    """
+
+    def __init__(
+        self,
+        probes: ProbeViews,
         deformation: CpuDeformation,
         previous: Gaussians,
-        views: Sequence[TrainingView],
-    ) -> Anytime:
-        """For a deformation that has taken Θ_{t−1}; without views nothing is compared."""
-        return cls(deformation, previous, Witness(factory, picture, views))
+        motion: Motion | None,
+        seconds: float,
+        momentum: float,
+    ) -> None:
+        self._probes, self._deformation, self._previous = probes, deformation, previous
+        self._motion, self._momentum = motion, momentum
+        self.seconds = seconds
+        self.errors: dict[Candidate, dict[str, float]] = {}
 
-    def start(
-        self, motion: Motion | None, seconds: float, settings: UpdateSettings, step: float | None = None
-    ) -> float:
+    def start(self, step: float | None = None) -> None:
         """Set the deformation to the motion before, or to none where that shows the frame better.
 
         Args:
-            seconds: since the motion before was found. step: since the frame before, where that was not moved: the
-                motion may have rested meanwhile. None: the same.
-
-        Returns:
-            The seconds that the motion is taken to have gone on for.
+            step: seconds since the frame before, where that was not moved: the motion may have rested meanwhile. None:
+                as long as since the motion was found.
         """
-        previous = self.previous
-        self._motion, self._seconds, self._settings = motion, seconds, settings
-        self._measure("still", previous.means, previous.factors, previous.colours)
+        previous, motion = self._previous, self._motion
+        self._measure(Candidate.STILL, previous.means, previous.factors, previous.colours)
         self._set(motion)
         if motion is not None and self.errors:
-            self.deformation.forward()
-            self._measure("warm", self.deformation.means, self.deformation.factors, previous.colours)
+            self._deformation.forward()
+            self._measure(Candidate.WARM, self._deformation.means, self._deformation.factors, previous.colours)
             if step is not None:
                 self._try_after_rest(motion, step)
-            if self._mean("still") < self._mean("warm"):
+            if self._mean(Candidate.STILL) < self._mean(Candidate.WARM):
                 self._set(None)
-        return self._seconds
 
     def _try_after_rest(self, motion: Motion, step: float) -> None:
         """The motion for the time since the frame before alone, kept where it shows the frame better."""
-        whole, errors = self._seconds, self.errors["warm"]
-        self._seconds = step
+        whole, errors = self.seconds, self.errors[Candidate.WARM]
+        self.seconds = step
         self._set(motion)
-        self.deformation.forward()
-        self._measure("warm", self.deformation.means, self.deformation.factors, self.previous.colours)
-        if mean_error(errors, list(errors)) <= self._mean("warm"):
-            self._seconds, self.errors["warm"] = whole, errors
+        self._deformation.forward()
+        self._measure(Candidate.WARM, self._deformation.means, self._deformation.factors, self._previous.colours)
+        if mean_error(errors, list(errors)) <= self._mean(Candidate.WARM):
+            self.seconds, self.errors[Candidate.WARM] = whole, errors
             self._set(motion)
 
     def stands(self, enough: Mapping[str, float] | None) -> bool:
-        """Whether the frame before shows this one as well as ``enough``, errors by view; None: never."""
-        still = self.errors.get("still")
-        if enough is None or still is None or self._mean("still") > self._mean("warm", self._mean("still")):
+        """True where Θ_{t−1} shows this frame as well as ``enough``, errors by view; None: never."""
+        still = self.errors.get(Candidate.STILL)
+        if (
+            enough is None
+            or still is None
+            or self._mean(Candidate.STILL) > self._mean(Candidate.WARM, otherwise=np.inf)
+        ):
             return False
         names = sorted(still.keys() & enough.keys())
         return bool(names) and mean_error(still, names) <= mean_error(enough, names)
 
     def error(self, colours: Array) -> float:
-        """Mean error of the witnesses for the deformation as it is set, with its cascade brought up to date."""
-        self.deformation.forward()
-        features = np.concatenate([colours, self.previous.foreground[:, None]], axis=1)
-        deformation = self.deformation
-        found = self.witness.errors(deformation.means, deformation.factors, self.previous.opacities, features)
+        """Mean error on the probe views of the deformation as it is set, with its cascade brought up to date."""
+        self._deformation.forward()
+        found = self._errors(self._deformation.means, self._deformation.factors, colours)
         return mean_error(found, list(found))
 
     def error_of(self, state: Gaussians) -> float:
-        """Mean error of the witnesses for a state."""
+        """Mean error on the probe views of a state."""
         features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
-        found = self.witness.errors(state.means, state.factors, state.opacities, features)
+        found = self._probes.errors(state.means, state.factors, state.opacities, features)
         return mean_error(found, list(found))
 
-    def end(self, colours: Array, story: Story) -> str:
-        """Which state is best of "still", "warm" and "end"; the deformation is set to it.
+    def end(self, colours: Array, iterations: int, left_out: Mapping[str, str]) -> Candidate:
+        """The best candidate; the deformation is set to it.
 
         Args:
-            colours: as the update leaves them. story: cameras that it left out have no say.
+            colours: as the update leaves them. iterations: that it had. left_out: cameras that have no say.
         """
         if not self.errors:
-            return "end"
-        if story.iterations:
-            self._measure("end", self.deformation.means, self.deformation.factors, colours)
-        names = [name for name in self.errors["still"] if name not in story.left_out]
-        order = ("end", "still", "warm")  # of equal ones the first
-        found = [kind for kind in order if kind in self.errors]
-        best = min(found, key=lambda kind: _or_last(mean_error(self.errors[kind], names)))
-        if best != "end":
-            self._set(self._motion if best == "warm" else None)
-            self.deformation.forward()
+            return Candidate.END
+        if iterations:
+            self._measure(Candidate.END, self._deformation.means, self._deformation.factors, colours)
+        names = [name for name in self.errors[Candidate.STILL] if name not in left_out]
+        found = [candidate for candidate in Candidate if candidate in self.errors]  # of equal ones the first
+        best = min(found, key=lambda candidate: _or_last(mean_error(self.errors[candidate], names)))
+        if best is not Candidate.END:
+            self._set(self._motion if best is Candidate.WARM else None)
+            self._deformation.forward()
         return best
 
     def _set(self, motion: Motion | None) -> None:
-        warm_start(self.deformation, motion, self._seconds, self._settings)
+        warm_start(self._deformation, motion, self.seconds, self._momentum)
 
-    def _measure(self, kind: str, means: Array, factors: Array, colours: Array) -> None:
-        features = np.concatenate([colours, self.previous.foreground[:, None]], axis=1)
-        errors = self.witness.errors(means, factors, self.previous.opacities, features)
+    def _measure(self, candidate: Candidate, means: Array, factors: Array, colours: Array) -> None:
+        errors = self._errors(means, factors, colours)
         if errors:
-            self.errors[kind] = errors
+            self.errors[candidate] = errors
 
-    def _mean(self, kind: str, otherwise: float = np.inf) -> float:
-        errors = self.errors.get(kind)
+    def _errors(self, means: Array, factors: Array, colours: Array) -> dict[str, float]:
+        features = np.concatenate([colours, self._previous.foreground[:, None]], axis=1)
+        return self._probes.errors(means, factors, self._previous.opacities, features)
+
+    def _mean(self, candidate: Candidate, otherwise: float = np.inf) -> float:
+        errors = self.errors.get(candidate)
         return otherwise if errors is None else mean_error(errors, list(errors))
 
 
 def _or_last(value: float) -> float:
-    """What is not a number comes last."""
+    """Not a number comes last."""
     return value if value == value else np.inf

@@ -25,12 +25,27 @@ from scas4d_core.structure.neighbours import Neighbours
 
 Array = NDArray[np.float32]
 
+MAX_SCALE = 0.02
+"""Metres; longer axes are held at their length of frame 0 (paper, scale loss)."""
+
+
+def first_lengths(hierarchy: Hierarchy, first: Gaussians) -> Array:
+    """[M, 3] metres, lengths of the moving Gaussians' axes at frame 0, which the scale loss lets them have."""
+    lengths: Array = np.sqrt(np.square(first.factors[hierarchy.rows]).sum(axis=1))
+    return lengths
+
+
+def length_bounds(hierarchy: Hierarchy, first: Gaussians) -> Array:
+    """[M, 3] metres, the length that each axis may have before the scale loss."""
+    bounds: Array = np.maximum(first_lengths(hierarchy, first), np.float32(MAX_SCALE))
+    return bounds
+
 
 class CpuDeformation:
     """The cascade of a hierarchy, what each Gaussian adds, and the terms that tie neighbours together.
 
     Args:
-        bounds: [M, 3] metres, the length each axis may have before the scale loss. cluster_map, covariance: see
+        bounds: [M, 3] metres, see ``length_bounds``. cluster_map, covariance: see
             ``deformation``.
 
     Attributes:

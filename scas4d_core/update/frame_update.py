@@ -1,32 +1,44 @@
-"""One frame: from Θ_{t−1} and the pictures of frame t to Θ_t (paper, algorithm 1). The loop is ``FrameUpdate.run``."""
+"""Update of one frame on the CPU: from Θ_{t−1} and the pictures of frame t to Θ_t (paper, algorithm 1).
+
+The loop is ``FrameUpdate.run``: deform, render and compare, tie neighbours, carry back, step.
+"""
 
 from __future__ import annotations
 
 from typing import Protocol
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.cameras import WorldFrame
+from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import summed
 from scas4d_core.rasterize.cpu import Gradients
 from scas4d_core.rasterize.limits import scene_limits
-from scas4d_core.robust.attempts import Course, Manner
-from scas4d_core.settings import SceneSettings, UpdateSettings
-from scas4d_core.structure.hierarchy import Hierarchy
-from scas4d_core.structure.neighbours import Neighbours
-from scas4d_core.update.adam import Adam
-from scas4d_core.update.best_state import Anytime
-from scas4d_core.update.deformation import CpuDeformation
-from scas4d_core.update.floor import floor_term
+from scas4d_core.settings import SceneSettings, Settings, UpdateSettings
+from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
+from scas4d_core.structure.neighbours import Neighbours, build_neighbours
+from scas4d_core.update import schedule
+from scas4d_core.update.best_state import BestState, ProbeViews
+from scas4d_core.update.deformation import CpuDeformation, length_bounds
+from scas4d_core.update.floor import floor_inside, floor_term
 from scas4d_core.update.picture_loss import PictureLoss
-from scas4d_core.update.result import REPORT, Stopwatch, Story, Updated
-from scas4d_core.update.schedule import Rates, ViewPlan, first_lengths, mask_weight, plan_samples
-from scas4d_core.update.stopping import Counted
+from scas4d_core.update.result import AS_SET, REPORT, AttemptOptions, Stopwatch, UpdateResult, UpdateTrace
+from scas4d_core.update.schedule import Adam, Rates, ViewPlan, mask_weight, plan_samples
+from scas4d_core.update.stopping import Stopping
 from scas4d_core.update.views import TrainingView, ViewFactory
 from scas4d_core.update.warm_start import Motion, quaternion_products
 
 Array = NDArray[np.float32]
+
+SMALLEST_CLUSTER = 8
+"""Gaussians of a cluster, on average, that the layers are capped to: the motion of fewer is noise."""
+NEIGHBOURS = 20
+"""Neighbours of a Gaussian in the terms that tie it to them (Dynamic3DGaussians)."""
+NEIGHBOUR_FALLOFF = 2000.0
+"""1/m²: the weight of a neighbour at a distance d is exp(−falloff d²) (Dynamic3DGaussians)."""
 
 
 class Updater(Protocol):
@@ -41,14 +53,14 @@ class Updater(Protocol):
         motion: Motion | None,
         seconds: float,
         seed: int,
-        course: Course | None = None,
-    ) -> Updated:
+        options: AttemptOptions = AS_SET,
+    ) -> UpdateResult:
         """Find D_t and apply it.
 
         Args:
-            previous: Θ_{t−1}. views: of frame t. motion: what the previous update left, or None.
+            previous: Θ_{t−1}. views: of frame t. motion: that the previous update found, or None.
             seconds: between the frames. seed: of the order of views and the sampled neighbourhoods.
-            course: how long and in which manner; None: the settings' iterations, as set.
+            options: of this attempt.
         """
 
 
@@ -56,7 +68,7 @@ class FrameUpdate:
     """The ``Updater`` of the CPU; buffers are kept from frame to frame.
 
     Attributes:
-        tells: whether what the report alone asks for is worked out; the state is the same without.
+        tells: whether figures that the report alone needs are worked out; the state is the same without.
     """
 
     tells = True
@@ -78,8 +90,8 @@ class FrameUpdate:
         self._floor = scene.floor if weights.floor > 0 else None
         mask = mask_weight(settings, len(hierarchy.rows), len(first))
         limits = scene_limits(scene.near, factory.rig.radius)
-        self._picture = PictureLoss(factory, scene.background, weights.image, mask, limits=limits)
-        bounds = np.maximum(first_lengths(hierarchy, first), np.float32(settings.max_scale))
+        self._picture = PictureLoss(factory, scene.background, schedule.IMAGE_WEIGHT, mask, limits=limits)
+        bounds = length_bounds(hierarchy, first)
         self._deformation = CpuDeformation(hierarchy, neighbours, bounds, settings.cluster_map, settings.covariance)
 
     def run(
@@ -89,73 +101,74 @@ class FrameUpdate:
         motion: Motion | None,
         seconds: float,
         seed: int,
-        course: Course | None = None,
-    ) -> Updated:
+        options: AttemptOptions = AS_SET,
+    ) -> UpdateResult:
         """Find D_t and apply it, see ``Updater.run``."""
         settings, deformation = self.settings, self._deformation
-        course = course or Course(Counted(settings.iterations))
+        stopping = options.stopping or Stopping(settings.iterations)
         rng = np.random.default_rng([settings.seed, seed])
-        watch = Stopwatch()
-        plan = ViewPlan(self._factory, views, settings, course.pace.most, rng)
-        samples = plan_samples(len(self.hierarchy.rows), settings.neighbour_sample, rng)
+        watch, trace = Stopwatch(), UpdateTrace()
+        plan = ViewPlan(views, settings.views, stopping.most, rng)
+        samples = plan_samples(len(self.hierarchy.rows), rng)
         features = np.concatenate([previous.colours, previous.foreground[:, None]], axis=1)
         colours = previous.colours.copy()
         counts = (deformation.guards, self._picture.rasterizer.guards)
         for guards in counts:
             guards.reset()
         deformation.start(previous)
-        anytime = Anytime.of(self._factory, self._picture, deformation, previous, views if course.witness else [])
-        seconds = anytime.start(motion, seconds, settings, course.step)
-        optimizers = self._optimizers(colours, course.manner, cold=motion is None)
-        soft = np.float32(settings.weights.soft_colour / max(colours.size, 1))  # of the mean absolute change of colour
-        pace = Counted(0) if anytime.stands(course.enough) else course.pace
-        story = Story(len(views), self.tells)
+        probes = ProbeViews(self._factory, self._picture, views if options.compare else [])
+        best = BestState(probes, deformation, previous, motion, seconds, settings.momentum)
+        best.start(options.step)
+        optimizers = self._optimizers(colours, options, cold=motion is None)
+        weights = settings.weights
+        soft = np.float32(schedule.SOFT_COLOUR_WEIGHT / max(colours.size, 1))  # of the mean absolute change of colour
+        if best.stands(options.enough):
+            stopping = Stopping(0)
         watch.lap("start")
-        while (iteration := story.iterations) < (planned := pace.planned(iteration)):
-            seen = plan.take(iteration, planned)
+        while (iteration := trace.iterations) < (planned := stopping.planned(iteration)):
             deformation.forward()
             features[:, :3] = colours
             watch.lap("cascade")
-            loss, gradients = self._pictures(seen, previous.opacities, features, story, watch)
+            met = len(trace.first)
+            loss, gradients = self._pictures(plan.take(), previous.opacities, features, trace, watch)
             loss += self._neighbour_terms(samples[iteration % len(samples)])
             if self._floor is not None:
-                loss += floor_term(
-                    self._floor, deformation.means, self.hierarchy.rows, settings.weights.floor, gradients.means
-                )
+                loss += floor_term(self._floor, deformation.means, self.hierarchy.rows, weights.floor, gradients.means)
             watch.lap("neighbours")
-            weight = settings.weights.scale
-            loss += weight * deformation.backward(gradients.means, gradients.factors, weight)
+            loss += weights.scale * deformation.backward(gradients.means, gradients.factors, weights.scale)
             watch.lap("cascade backward")
             change = colours - previous.colours
-            g_colours = gradients.features[:, :3] + soft * np.sign(change)
-            tables = [*deformation.cluster_gradients, deformation.delta_gradients, g_colours]
-            for optimizer, table in zip(optimizers, tables, strict=True):
-                optimizer.step(table, iteration, planned)
+            self._step(optimizers, gradients.features[:, :3] + soft * np.sign(change), iteration, planned)
             watch.lap("adam")
             if self.tells:
                 loss += float(soft * np.abs(change).sum(dtype=np.float64))
-            complete = story.end_iteration(loss, watch.total)
+            trace.losses.append(loss)
+            trace.moments.append(watch.total)
             watch.lap(REPORT)
-            if complete and course.gate is not None:
-                plan.leave_out(story.leave_out(course.gate(story.first)))
+            if options.gate is not None and met < len(trace.first) == len(views):  # each camera was rendered once
+                trace.left_out.update(options.gate(trace.first))
+                plan.leave_out(trace.left_out)
                 watch.lap("judge")
-            if pace.looks(story.iterations):
-                pace.saw(story.iterations, anytime.error(colours))
+            if stopping.looks(trace.iterations):
+                stopping.saw(trace.iterations, best.error(colours))
                 watch.lap("looks")
         deformation.forward()
-        kept = anytime.end(colours, story)
+        trace.planned, trace.errors = stopping.planned_so_far, best.errors
+        trace.kept = kept = best.end(colours, trace.iterations, trace.left_out)
         watch.lap("end")
-        state = previous if kept == "still" else self._commit(previous, colours if kept == "end" else previous.colours)
-        updated = story.updated(state, Motion.of(deformation, seconds), pace, anytime.errors, kept)
+        state = previous
+        if kept is not Candidate.STILL:
+            state = self._commit(previous, colours if kept is Candidate.END else previous.colours)
+        found = Motion.of(deformation, best.seconds)
         acted = summed([*counts, *(optimizer.guards for optimizer in optimizers)])
-        updated.guards.update({name: count for name, count in acted.items() if count})
+        trace.guards = {name: count for name, count in acted.items() if count}
         watch.lap("commit")
-        updated.seconds.update(watch.seconds)
-        return updated
+        trace.seconds = watch.seconds
+        return UpdateResult(state, found, trace)
 
-    def _optimizers(self, colours: Array, manner: Manner, cold: bool) -> list[Adam]:
+    def _optimizers(self, colours: Array, options: AttemptOptions, cold: bool) -> list[Adam]:
         """One per table: each layer of clusters, the Gaussians' own deltas, the colours. Moments start at zero."""
-        rates = self._rates.tried(manner.rates, manner.rigid, manner.hold_colours)
+        rates = self._rates.tried(options.rates, options.rigid, options.hold_colours)
         rates, deformation = rates.hurried(self.settings.cold_start if cold else 1.0), self._deformation
         columns = [[r] * 3 + [t] * 3 + [scaling] * 4 for r, t, scaling in rates.layers]
         columns.append([rates.position] * 3 + [rates.rotation] * 3 + [rates.scale] * 3)
@@ -168,8 +181,14 @@ class FrameUpdate:
         by_row[self.hierarchy.rows] = rates.colour
         return [*optimizers, Adam(colours, [1.0] * 3, rates, by_row=by_row)]
 
+    def _step(self, optimizers: list[Adam], g_colours: Array, iteration: int, planned: int) -> None:
+        """Adam's step of every table, in the order of ``_optimizers``."""
+        tables = [*self._deformation.cluster_gradients, self._deformation.delta_gradients, g_colours]
+        for optimizer, table in zip(optimizers, tables, strict=True):
+            optimizer.step(table, iteration, planned)
+
     def _pictures(
-        self, views: list[TrainingView], opacities: Array, features: Array, story: Story, watch: Stopwatch
+        self, views: list[TrainingView], opacities: Array, features: Array, trace: UpdateTrace, watch: Stopwatch
     ) -> tuple[float, Gradients]:
         """Image and mask loss, the mean over the views, and its gradients; a single view's are the rasterizer's own."""
         deformation, picture = self._deformation, self._picture
@@ -177,7 +196,7 @@ class FrameUpdate:
         for view in views:
             found = picture.evaluate(deformation.means, deformation.factors, opacities, features, view, watch.lap)
             loss += picture.image_part + picture.mask_part
-            story.see(view, picture)
+            trace.see(view, picture, self.tells)
             watch.lap(REPORT)
             if len(views) == 1:
                 return loss, found
@@ -210,3 +229,40 @@ class FrameUpdate:
             rotations=rotations,
             colours=colours,
         )
+
+
+def prepare(first: Gaussians, factory: ViewFactory, settings: Settings, world: WorldFrame) -> tuple[Updater, int]:
+    """The updater of ``settings.device``, with the hierarchy and the neighbour graph of the moving Gaussians.
+
+    Args:
+        first: Θ_0, with the labels to go by. factory: of the scene's views. world: user's to inside.
+
+    Returns:
+        The updater, and the digest of its clusters and neighbours.
+    """
+    update = settings.update
+    hierarchy = build_hierarchy(first.means, first.moving, update.clusters, SMALLEST_CLUSTER, update.seed)
+    weights = update.weights
+    tied = weights.rigidity + weights.isometry + weights.rotation > 0
+    neighbours = build_neighbours(first.means[hierarchy.rows], NEIGHBOURS, NEIGHBOUR_FALLOFF) if tied else None
+    structure = digest(hierarchy, neighbours)
+    scene = settings.scene
+    if scene.floor is not None:
+        scene = scene.model_copy(update={"floor": floor_inside(scene.floor, world)})
+    given = (factory, scene, update, hierarchy, neighbours, first)
+    if settings.device == "cpu":
+        return FrameUpdate(*given), structure
+    from scas4d_core.torch_backend.device_update import DeviceUpdate  # torch is loaded only where it is used
+
+    return DeviceUpdate(*given, device=settings.device), structure
+
+
+def digest(hierarchy: Hierarchy, neighbours: Neighbours | None) -> int:
+    """CRC-32 of the clusters and the neighbour graph."""
+    arrays = [hierarchy.rows, *hierarchy.labels, *hierarchy.starts]
+    if neighbours is not None:
+        arrays += [neighbours.index, neighbours.weights, neighbours.distances]
+    value = 0
+    for array in arrays:
+        value = crc32(np.ascontiguousarray(array).view(np.uint8).data, value)
+    return value

@@ -1,14 +1,16 @@
-"""What comes of an update, and the story of how: seconds by stage, losses, how each camera was met."""
+"""Options, trace and result of one attempt at an update, and the stopwatch that times its stages."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
+from typing import TypedDict
 
+from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.update.picture_loss import PictureLoss
-from scas4d_core.update.stopping import Pace
+from scas4d_core.update.stopping import Stopping
 from scas4d_core.update.views import TrainingView
 from scas4d_core.update.warm_start import Motion
 
@@ -17,13 +19,19 @@ REPORT = "report"
 colour shifts, and assembling, writing and publishing the record."""
 
 
-@dataclass
 class Stopwatch:
-    """Seconds by stage. What the timers take themselves is booked to ``REPORT``."""
+    """Seconds by stage. What the timers take themselves is booked to ``REPORT``.
 
-    seconds: dict[str, float] = field(default_factory=dict)
-    began: float = field(default_factory=perf_counter)
-    last: float = field(default_factory=perf_counter)
+    Args:
+        began: ``perf_counter`` at the start; None: now.
+
+    Attributes:
+        seconds: by stage. began, last: ``perf_counter`` at the start and at the last lap.
+    """
+
+    def __init__(self, began: float | None = None) -> None:
+        self.seconds: dict[str, float] = {}
+        self.began = self.last = perf_counter() if began is None else began
 
     @property
     def total(self) -> float:
@@ -44,100 +52,124 @@ class Stopwatch:
 
 
 @dataclass(frozen=True)
-class CameraFit:
-    """How well one camera's picture was met, when it was last rendered.
+class AttemptOptions:
+    """Options of one attempt at an update.
 
     Attributes:
+        name: as the report has it.
+        rates: factor on all of Adam's rates. rigid: clusters turn and shift, nothing else. hold_colours: colours stay.
+        cold: the motion of the update before is not used. longer: factor on the iterations.
+        stopping: decides how many iterations there are; None: those of the settings.
+        gate: called with each camera's first PSNR (dB) once all were rendered; returns the cameras to drop, with the
+            reason. None: all stay.
+        compare: whether the candidates for Θ_t are compared on the probe views (``best_state``).
+        enough: image loss by probe view at which Θ_{t−1} needs no iteration; None: there is always one.
+        step: seconds since the frame before, where nothing was learnt from that one (``BestState.start``); else None.
+    """
+
+    name: str = "as set"
+    rates: float = 1.0
+    rigid: bool = False
+    hold_colours: bool = False
+    cold: bool = False
+    longer: float = 1.0
+    stopping: Stopping | None = None
+    gate: Callable[[Mapping[str, float]], Mapping[str, str]] | None = None
+    compare: bool = False
+    enough: Mapping[str, float] | None = None
+    step: float | None = None
+
+
+AS_SET = AttemptOptions()
+"""The update as the settings have it."""
+
+
+class CameraFit(TypedDict):
+    """The fit of one camera, when it was last rendered; a row of the report, as it is on disk.
+
+    Keys:
         psnr: dB. colour_shift: [3] mean of the picture minus mean of the render, RGB in 0…1; None where not measured.
-        health: 0…1, 1 where it fits as usual beside the other cameras, 0 where it would be left out (``judge.health``).
+        health: 0…1, 1 where it fits as usual beside the other cameras, 0 where it would be left out
+        (``outliers.health``).
     """
 
     psnr: float
-    colour_shift: tuple[float, float, float] | None = None
-    health: float = 1.0
+    colour_shift: tuple[float, float, float] | None
+    health: float
 
 
-@dataclass(frozen=True, eq=False)
-class Updated:
-    """What an update leaves: Θ_t, the motion that warms the next start, and how it went.
+def camera_fit(psnr: float, colour_shift: tuple[float, float, float] | None = None) -> CameraFit:
+    """The fit of a camera of which nothing is known yet that it could be compared with."""
+    return {"psnr": psnr, "colour_shift": colour_shift, "health": 1.0}
+
+
+@dataclass(eq=False)
+class UpdateTrace:
+    """Record of one attempt, filled while it runs.
 
     Attributes:
         losses: each iteration's weighted sum. psnr: dB of each view as it was rendered, in order, as many an iteration
-            as the settings say. moments: seconds from the start of the update to the end of each iteration. seconds:
-            by stage.
-        cameras: how well each camera was met, by name. left_out: cameras that the gate left out, with the reason.
-        planned: what the pace planned, see ``pace.Pace.told``.
-        errors: image loss by witness view, of the frame before ("still"), the warm start ("warm") and the end ("end");
-            empty where nothing was compared. kept: which of them became Θ_t. guards: those that acted, how often.
+            as the settings say. moments: seconds from the start of the update to the end of each iteration.
+        seconds: by stage.
+        first: dB of each camera when first rendered. cameras: how well each was met when last rendered, by name.
+        left_out: cameras that the gate left out, with the reason.
+        planned: (iteration, iterations in all) whenever the stopping rule planned otherwise.
+        errors: image loss by candidate, then by probe view; empty where nothing was compared. kept: the candidate that
+            became Θ_t.
+        guards: those that acted, how often.
     """
 
-    gaussians: Gaussians
-    motion: Motion
-    losses: list[float]
-    psnr: list[float]
-    seconds: dict[str, float]
-    cameras: dict[str, CameraFit] = field(default_factory=dict)
+    losses: list[float] = field(default_factory=list)
+    psnr: list[float] = field(default_factory=list)
     moments: list[float] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+    first: dict[str, float] = field(default_factory=dict)
+    cameras: dict[str, CameraFit] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     planned: list[tuple[int, int]] = field(default_factory=list)
-    errors: dict[str, dict[str, float]] = field(default_factory=dict)
-    kept: str = "end"
+    errors: dict[Candidate, dict[str, float]] = field(default_factory=dict)
+    kept: Candidate = Candidate.END
     guards: dict[str, int] = field(default_factory=dict)
-
-    @classmethod
-    def nothing(cls, state: Gaussians, motion: Motion | None) -> Updated:
-        """What a frame leaves for which no iteration is run: the state, and the motion, if any, as they were."""
-        return cls(state, motion, [], [], {}, kept="still")  # type: ignore[arg-type]
-
-
-class Story:
-    """What happens in an update, iteration by iteration.
-
-    Args:
-        cameras: views of the frame. shifts: whether the colour shift of each camera is worked out for the report.
-
-    Attributes:
-        losses, psnr, moments, left_out: see ``Updated``. first, last: dB by camera when first and last rendered.
-    """
-
-    def __init__(self, cameras: int, shifts: bool = True) -> None:
-        self._cameras = cameras
-        self._shifts = shifts
-        self._complete = False
-        self.losses: list[float] = []
-        self.psnr: list[float] = []
-        self.moments: list[float] = []
-        self.first: dict[str, float] = {}
-        self.last: dict[str, CameraFit] = {}
-        self.left_out: dict[str, str] = {}
 
     @property
     def iterations(self) -> int:
-        """That are over."""
+        """Iterations that are over."""
         return len(self.losses)
 
-    def see(self, view: TrainingView, picture: PictureLoss) -> None:
-        """A view was rendered and compared."""
+    @property
+    def fits(self) -> dict[str, float]:
+        """DB by camera, when last rendered."""
+        return {name: fit["psnr"] for name, fit in self.cameras.items()}
+
+    def see(self, view: TrainingView, picture: PictureLoss, shifts: bool) -> None:
+        """Note a view that was rendered and compared; ``shifts``: with the colour shift, for the report alone."""
         self.psnr.append(picture.psnr)
         self.first.setdefault(view.name, picture.psnr)
-        self.last[view.name] = CameraFit(picture.psnr, picture.colour_shift(view) if self._shifts else None)
+        self.cameras[view.name] = camera_fit(picture.psnr, picture.colour_shift(view) if shifts else None)
 
-    def end_iteration(self, loss: float, moment: float) -> bool:
-        """An iteration is over; whether it is the one in which the last camera was rendered first."""
-        before, self._complete = self._complete, len(self.first) == self._cameras
-        self.losses.append(loss)
-        self.moments.append(moment)
-        return self._complete and not before
 
-    def leave_out(self, found: Mapping[str, str]) -> Mapping[str, str]:
-        """The gate's answer, kept and passed on."""
-        self.left_out.update(found)
-        return found
+@dataclass(frozen=True, eq=False)
+class UpdateResult:
+    """The end of an attempt, and of the frame that commits it.
 
-    def updated(
-        self, state: Gaussians, motion: Motion, pace: Pace, errors: dict[str, dict[str, float]], kept: str
-    ) -> Updated:
-        """The end of it."""
-        return Updated(
-            state, motion, self.losses, self.psnr, {}, self.last, self.moments, self.left_out, pace.told, errors, kept
-        )
+    Attributes:
+        gaussians: Θ_t. motion: for the next warm start; None: that starts cold. trace: how it went; of a frame that is
+            held, of the last attempt before any search.
+        held: Gaussians held one by one as they were before. bounded: axes set to the shortest or longest length that
+            they may have.
+        outcome: of the frame. reason: in words, where the outcome is a degraded one.
+        attempts: each attempt at the frame, with what came of it.
+        exposure: times that the frame is brighter than usual.
+        offsets: dB by camera above (+) or below its usual place among the cameras; empty where nothing was rendered.
+    """
+
+    gaussians: Gaussians
+    motion: Motion | None
+    trace: UpdateTrace
+    held: int = 0
+    bounded: int = 0
+    outcome: FrameOutcome = FrameOutcome.UPDATED
+    reason: str = ""
+    attempts: Sequence[str] = ()
+    exposure: float = 1.0
+    offsets: Mapping[str, float] = field(default_factory=dict)

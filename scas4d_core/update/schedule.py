@@ -1,4 +1,4 @@
-"""What each iteration of an update looks at, and how far it steps: the same on every device."""
+"""Schedule of an update, the same on every device: views, samples, weights and rates of each iteration; Adam's step."""
 
 from __future__ import annotations
 
@@ -9,13 +9,29 @@ from math import cos, pi
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.gaussians import Gaussians
+from scas4d_core.guards import GuardCounts
+from scas4d_core.kernels.adam import ACTED, EVERY_ROW, adam
 from scas4d_core.settings import UpdateSettings
-from scas4d_core.structure.hierarchy import Hierarchy
-from scas4d_core.update.views import TrainingView, ViewFactory, view_order
+from scas4d_core.update.views import TrainingView, view_order
+
+Array = NDArray[np.float32]
 
 STANDARD_RADIUS_M = 4.0
 """The scene radius for which the translation rates of the layers are given."""
+
+
+LAYER_STARTS = (0.0, 0.2, 0.4)
+"""Share of the iterations after which a layer begins to learn, coarse to fine; with more layers the last is repeated.
+The coarse motion is found first: all at once, the finer layers take a part of it, each cluster another."""
+
+NEIGHBOUR_SAMPLE = 4000
+"""Gaussians whose neighbours are looked at an iteration: what the neighbour terms cost does not grow with the scene."""
+
+IMAGE_WEIGHT = 1.0
+"""Weight of the image loss, 0.8 L1 + 0.2 (1 − SSIM); those of the other terms (``Weights``) are relative to it."""
+
+SOFT_COLOUR_WEIGHT = 0.01
+"""Weight of the mean absolute change of the colours (Dynamic3DGaussians; the paper does not give it)."""
 
 
 def first_iteration(start: float, iterations: int) -> int:
@@ -29,7 +45,7 @@ class Rates:
 
     Attributes:
         layers: (rotation r, translation t in metres, scaling c and s), one a layer, coarse to fine.
-        position, rotation, scale, colour: of Δp in metres, ΔR, Δs, RGB of what moves. colour_standing: RGB of the rest.
+        position, rotation, scale, colour: of Δp in metres, ΔR, Δs, RGB of moving. colour_standing: RGB of the rest.
         end: all rates fall to this fraction in the last iteration, along half a cosine; 1 keeps them.
         beta1, beta2: Adam's decays.
         starts: share of the iterations after which a layer begins, one a layer; what is missing begins at once.
@@ -93,32 +109,22 @@ class Rates:
             end=settings.rate_end,
             beta1=settings.beta1,
             beta2=settings.beta2,
-            starts=tuple(settings.layer_starts[min(k, len(settings.layer_starts) - 1)] for k in range(layers)),
+            starts=tuple(LAYER_STARTS[min(k, len(LAYER_STARTS) - 1)] for k in range(layers)),
             start=settings.own_start,
         )
 
 
 class ViewPlan:
-    """Which views each iteration trains: random rounds over all, coarser pictures first where the settings say so.
+    """The views that each iteration trains: random rounds over all.
 
     Args:
-        most: iterations there can be at most; the order of more begins again.
+        each: views of an iteration. most: iterations there can be at most; the order of more begins again.
     """
 
-    def __init__(
-        self,
-        factory: ViewFactory,
-        views: Sequence[TrainingView],
-        settings: UpdateSettings,
-        most: int,
-        rng: np.random.Generator,
-    ) -> None:
-        self._factory = factory
+    def __init__(self, views: Sequence[TrainingView], each: int, most: int, rng: np.random.Generator) -> None:
         self._views = views
-        self._order = view_order(len(views), most * settings.views, rng)
-        self._each = settings.views
-        self._until, self._scale = settings.coarse_until, settings.coarse_scale
-        self._small: dict[int, TrainingView] = {}
+        self._order = view_order(len(views), most * each, rng)
+        self._each = each
         self._next = 0
         self._left_out: set[str] = set()
 
@@ -128,31 +134,25 @@ class ViewPlan:
         if all(view.name in self._left_out for view in self._views):
             raise ValueError(f"all {len(self._views)} views are left out; an update needs one")
 
-    def take(self, iteration: int, iterations: int) -> list[TrainingView]:
-        """The next ``views`` views, for an iteration, counted from 0, of so many as are planned."""
-        coarse = iteration < round(self._until * iterations)
-        return [self._next_view(coarse) for _ in range(self._each)]
+    def take(self) -> list[TrainingView]:
+        """The views of the next iteration."""
+        return [self._next_view() for _ in range(self._each)]
 
-    def _next_view(self, coarse: bool) -> TrainingView:
+    def _next_view(self) -> TrainingView:
         while True:
-            index = self._order[self._next % len(self._order)]
+            view = self._views[self._order[self._next % len(self._order)]]
             self._next += 1
-            if self._views[index].name not in self._left_out:
-                break
-        if not coarse:
-            return self._views[index]
-        if index not in self._small:
-            self._small[index] = self._factory.coarser(self._views[index], self._scale)
-        return self._small[index]
+            if view.name not in self._left_out:
+                return view
 
 
-def plan_samples(count: int, size: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:
-    """Disjoint random sets of ``size`` of ``count`` Gaussians that cover all: each iteration takes the next.
+def plan_samples(count: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:
+    """Disjoint random sets of ``NEIGHBOUR_SAMPLE`` of ``count`` Gaussians; they cover all, an iteration takes the next.
 
     A rest of less than a quarter of that joins the set before it: alone, a few Gaussians would carry the whole weight.
     """
     order = rng.permutation(count)
-    size = min(size, max(count, 1))
+    size = min(NEIGHBOUR_SAMPLE, max(count, 1))
     cuts = list(range(size, count, size))
     if cuts and 4 * (count - cuts[-1]) < size:
         cuts.pop()
@@ -164,7 +164,38 @@ def mask_weight(settings: UpdateSettings, moving: int, count: int) -> float:
     return settings.weights.mask if moving < count else settings.weights.mask_alone
 
 
-def first_lengths(hierarchy: Hierarchy, first: Gaussians) -> NDArray[np.float32]:
-    """[M, 3] metres, lengths of the moving Gaussians' axes at frame 0, which the scale loss lets them have."""
-    lengths: NDArray[np.float32] = np.sqrt(np.square(first.factors[hierarchy.rows]).sum(axis=1))
-    return lengths
+def all_begun(settings: UpdateSettings) -> float:
+    """Share of the iterations after which every layer and the Gaussians' own deltas learn."""
+    return max(settings.own_start, *LAYER_STARTS)
+
+
+class Adam:
+    """Adam over one table of parameters, with a rate per column, times one per row where given.
+
+    It begins after a share ``start`` of the iterations and leaves the table alone before. ``guards`` counts how often
+    each guard of the step acted.
+    """
+
+    def __init__(
+        self, parameters: Array, columns: list[float], rates: Rates, start: float = 0.0, by_row: Array = EVERY_ROW
+    ) -> None:
+        self._parameters = parameters
+        self._by_row = by_row
+        self._first, self._second = np.zeros_like(parameters), np.zeros_like(parameters)
+        self._plan, self._start = rates, start
+        self._rates = np.array(columns, np.float32)
+        self._beta1, self._beta2 = np.float32(rates.beta1), np.float32(rates.beta2)
+        self._steps = 0
+        self.guards = GuardCounts(*ACTED)
+
+    def step(self, gradients: Array, iteration: int, iterations: int) -> None:
+        """Take the step of an iteration, counted from 0."""
+        factor = self._plan.factor(iteration, iterations, self._start)
+        if factor == 0:
+            return
+        self._steps += 1
+        acted = adam(
+            self._parameters, gradients, self._first, self._second, self._rates * np.float32(factor), self._by_row,
+            self._beta1, self._beta2, self._steps,
+        )  # fmt: skip
+        self.guards.add(ACTED, acted)

@@ -1,8 +1,8 @@
-"""Training views: what one iteration renders and compares with. CPU buffers, prepared once a frame."""
+"""Training views: the pictures that an iteration renders and compares with. CPU buffers, prepared once a frame."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -61,10 +61,15 @@ def means(planes: Array) -> NDArray[np.float64]:
 
 
 class ViewFactory:
-    """Makes the training views of each frame of a rig; keeps the cameras and the scratch of the image loss."""
+    """Makes the training views of each frame of a rig; keeps the cameras and the scratch of the image loss.
 
-    def __init__(self, rig: Rig) -> None:
+    Args:
+        rig: the cameras inside. source: the cameras as the pictures come in, where they are to be resized.
+    """
+
+    def __init__(self, rig: Rig, source: Rig | None = None) -> None:
         self.rig = rig
+        self._source = source
         self._scratch: dict[tuple[int, int, int], Array] = {}
 
     def scratch(self, channels: int, height: int, width: int) -> Array:
@@ -75,6 +80,24 @@ class ViewFactory:
                 (6, channels, height + 2 * image_loss.REACH, image_loss.stride(width)), np.float32
             )
         return self._scratch[key]
+
+    def scaled(self, frame: Frame) -> Frame:
+        """The frame with its pictures of the rig's cameras at the size that those have.
+
+        Raises:
+            ValueError: a picture or a mask is not of the size that it should come in.
+        """
+        if self._source is None:
+            return frame
+        images, masks = {}, {}
+        for camera in self.rig.cameras:
+            name, size = camera.name, (camera.width, camera.height)
+            if name in frame.images:
+                image, mask = pictures_of(frame, name, (self._source[name].width, self._source[name].height))
+                images[name] = resize_area(image, size)
+                if mask is not None:
+                    masks[name] = (resize_area(255 * mask, size) >= 128).astype(np.uint8)
+        return Frame(frame.index, frame.time, images, masks)
 
     def views(self, frame: Frame, exposures: dict[str, Array], use_masks: bool = True) -> list[TrainingView]:
         """The views of a frame, in the rig's order; cameras that the frame lacks are left out.
@@ -143,28 +166,8 @@ def pictures_of(
     return image, mask
 
 
-def scaled_to(rig: Rig, frame: Frame, sizes: Mapping[str, tuple[int, int]]) -> Frame:
-    """The frame with its pictures of the rig's cameras at the size that those have.
-
-    Args:
-        sizes: (width, height) that each camera's pictures come in.
-
-    Raises:
-        ValueError: a picture or a mask is of another size.
-    """
-    images, masks = {}, {}
-    for camera in rig.cameras:
-        name, size = camera.name, (camera.width, camera.height)
-        if name in frame.images:
-            image, mask = pictures_of(frame, name, sizes[name])
-            images[name] = resize_area(image, size)
-            if mask is not None:
-                masks[name] = (resize_area(255 * mask, size) >= 128).astype(np.uint8)
-    return Frame(frame.index, frame.time, images, masks)
-
-
 def view_order(count: int, iterations: int, rng: np.random.Generator) -> Sequence[int]:
-    """Which view each iteration trains: a new random order whenever all have been used."""
+    """The view that each iteration trains: a new random order whenever all have been used."""
     rounds = -(-iterations // count)
     order = np.concatenate([rng.permutation(count) for _ in range(rounds)])[:iterations]
     return [int(index) for index in order]

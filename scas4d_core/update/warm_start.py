@@ -12,12 +12,14 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.settings import UpdateSettings
 from scas4d_core.structure.hierarchy import Hierarchy
 
 Array = NDArray[np.float32]
 Float = NDArray[np.float64]
 
+
+WARM_START = 1.0
+"""Share of the previous deformation that starts the next (paper: all of it; without, 0.6 dB are lost on `robot`)."""
 
 LONGEST_PREDICTION = 3.0
 """Times the interval it was found in that a motion is carried on for: after a longer gap it says little."""
@@ -46,7 +48,11 @@ def rotate(r: NDArray[np.floating], vectors: NDArray[np.floating]) -> Float:
 
 
 class Parameters(Protocol):
-    """What a deformation learns, wherever: ``clusters`` per layer [K, 10], columns r, t, c, s; ``deltas`` [M, 9]."""
+    """The parameters of a deformation, on any device.
+
+    Attributes:
+        clusters: per layer [K, 10], columns r, t, c, s. deltas: [M, 9], columns Δp, Δr, Δs.
+    """
 
     hierarchy: Hierarchy
     clusters: list[Array]
@@ -55,7 +61,7 @@ class Parameters(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A motion that was found, to start the next from.
+    """The motion that an update found; the next one starts from it.
 
     Attributes:
         turns: per layer [K, 3] axis · tan(angle/2). shifts: per layer [K, 3] metres, relative to the layer above; both
@@ -71,7 +77,7 @@ class Motion:
 
     @property
     def finite(self) -> bool:
-        """Whether all of it is: else it would spoil the next start."""
+        """True where all of it is: else it would spoil the next start."""
         return all(np.isfinite(array).all() for array in (*self.turns, *self.shifts, self.rest, self.own_turns))
 
     def after(self, first: Motion) -> Motion:
@@ -108,15 +114,20 @@ class Motion:
         return cls(turns, shifts, rest, deformation.deltas[:, 3:6].astype(np.float64), seconds)
 
 
-def warm_start(deformation: Parameters, motion: Motion | None, seconds: float, settings: UpdateSettings) -> None:
-    """Set the parameters to the motion before, per unit of time; scaling (c, s) and Δs start at the identity."""
+def warm_start(deformation: Parameters, motion: Motion | None, seconds: float, momentum: float) -> None:
+    """Set the parameters to the motion before, per unit of time; scaling (c, s) and Δs start at the identity.
+
+    Args:
+        deformation: set in place. motion: of the update before; None: no motion. seconds: since it was found.
+        momentum: share of what the layers leave of it that Δp and ΔR start from.
+    """
     for values in [*deformation.clusters, deformation.deltas]:
         values[:] = 0
     if motion is None:
         return
-    share = settings.warm_start * min(seconds / motion.seconds, LONGEST_PREDICTION)
+    share = WARM_START * min(seconds / motion.seconds, LONGEST_PREDICTION)
     for values, turns, shifts in zip(deformation.clusters, motion.turns, motion.shifts, strict=True):
         values[:, :3] = share * turns
         values[:, 3:6] = share * shifts
-    deformation.deltas[:, :3] = share * settings.momentum * motion.rest
-    deformation.deltas[:, 3:6] = share * settings.momentum * motion.own_turns
+    deformation.deltas[:, :3] = share * momentum * motion.rest
+    deformation.deltas[:, 3:6] = share * momentum * motion.own_turns

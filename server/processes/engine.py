@@ -40,7 +40,7 @@ class Reconstruction(Protocol):
         `started`: `perf_counter` when the work on the frame began, from where a budget counts.
         """
 
-    def spend(
+    def set_budget(
         self,
         *,
         iterations: int | None = None,
@@ -160,6 +160,7 @@ class CoreEngine:
         started: float | None = None,
     ) -> Reconstruction:
         """`Reconstruction.start`."""
+        _compile_beside(settings)
         from scas4d_core.reconstruction import Reconstruction
 
         return Reconstruction.start(
@@ -171,6 +172,7 @@ class CoreEngine:
         self, rig: Rig, settings: Any, history: History, *, held: Callable[[int], bool] = lambda index: True
     ) -> Reconstruction:
         """`Reconstruction.resume`."""
+        _compile_beside(settings)
         from scas4d_core.reconstruction import Reconstruction
 
         return Reconstruction.resume(rig, settings, history, held=held)
@@ -194,6 +196,7 @@ class CoreEngine:
         """`scas4d_core.replay.replay`, on one thread: the others belong to the update."""
         from scas4d_core.replay import replay
 
+        _compile_beside(settings)
         _one_thread()
         return replay(rig, settings, history, base, frames, iterations, over)
 
@@ -224,6 +227,14 @@ class CoreEngine:
         world = rig.world_frame(settings.scene.metres_per_unit)
         limits = scene_limits(settings.scene.near, rig_inside(world, rig.cameras).radius)
         return CommittedScene(history, world, limits)
+
+
+def _compile_beside(settings: Any) -> None:
+    """Has the kernels compiled in another process where the cache lacks them: this one would keep the memory."""
+    from scas4d_core.warm_up import warm_up_elsewhere
+
+    if settings.device == "cpu":
+        warm_up_elsewhere()
 
 
 def _one_thread() -> None:

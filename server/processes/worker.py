@@ -223,7 +223,7 @@ class Worker:
             )
         else:
             if budget != self._budget:
-                self.reconstruction.spend(**budget.model_dump())
+                self.reconstruction.set_budget(**budget.model_dump())
                 self._budget = budget
             notes = {
                 "budget": budget.model_dump(),

@@ -194,7 +194,9 @@ def _each(report: Any) -> float:
     if len(points) < 2:
         return 0.0
     last, first = points[-1], points[0]
-    return float((last.milliseconds - first.milliseconds) / 1000 / max(1, last.iterations - first.iterations))
+    return float(
+        (last["milliseconds"] - first["milliseconds"]) / 1000 / max(1, last["iterations"] - first["iterations"])
+    )
 
 
 def changed(settings: Settings, **changes: Any) -> Settings:

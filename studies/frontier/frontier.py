@@ -13,11 +13,12 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from client.cli.evaluate import Job, Report
+from client.cli.evaluate import Job, Report, recorded
 from client.cli.scores import Row, Store
 from scas4d_core.presets import PRESETS
-from scas4d_core.settings import Settings
+from scas4d_core.settings import Settings, UpdateSettings
 from studies.quality.quality import run_jobs
 from studies.quality.runs import completed
 from studies.quality.settings import settings_of
@@ -42,6 +43,7 @@ class Variant:
         preset: name. iterations: of an update. changes: further settings, as ``"update.clusters=[64]"``.
         seed: of the updates alone: frame 0 is the same for all.
         whole: through all frames of the capture.
+        constants: of the method, by dotted name, with another value (``studies.constants``).
     """
 
     label: str
@@ -50,6 +52,7 @@ class Variant:
     changes: tuple[str, ...] = ()
     seed: int = 0
     whole: bool = False
+    constants: tuple[tuple[str, Any], ...] = ()
 
     @property
     def settings(self) -> Settings:
@@ -58,7 +61,13 @@ class Variant:
 
     def job(self, capture: Path, updates: int) -> Job:
         """The row of a capture over so many updates, or over all."""
-        return Job(capture, self.preset, self.settings, None if self.whole else updates + 1, pictures=(-1,))
+        frames = None if self.whole else updates + 1
+        return Job(capture, self.preset, self.settings, frames, pictures=(-1,), constants=self.constants)
+
+    @property
+    def record(self) -> Row:
+        """The settings and constants as a row has them."""
+        return recorded(self.settings, self.constants)
 
 
 def _changed(label: str, name: str, value: object, *more: str) -> Variant:
@@ -84,11 +93,6 @@ AXES: Mapping[str, tuple[Variant, ...]] = {
         _changed("K=5", "update.clusters", [64, 135, 285, 605, 1280]),
     ),
     "clusters": tuple(_changed(f"N={count}", "update.clusters", [count, 320, 1280]) for count in (16, 32, 48)),
-    "pyramid": (
-        _changed("½ size for 30 %", "update.coarse_until", 0.3),
-        _changed("½ size for 60 %", "update.coarse_until", 0.6),
-        _changed("¼ size for 30 %", "update.coarse_until", 0.3, "update.coarse_scale=0.25"),
-    ),
     "views": (
         _changed("2 views", "update.views", 2),
         _changed("4 views", "update.views", 4),
@@ -97,7 +101,7 @@ AXES: Mapping[str, tuple[Variant, ...]] = {
     "gaussians": tuple(
         _changed(f"{count:,} Gaussians", "static.max_gaussians", count) for count in (6_000, 12_000, 40_000)
     ),
-    "max-scale": (_changed("max_scale 2 m", "update.max_scale", 2.0),),
+    "max-scale": (Variant("max_scale 2 m", constants=((UpdateSettings.constants["max_scale"].place, 2.0),)),),
     "covariance": (_changed("separate covariance", "update.covariance", "separate", "update.own_start=0"),),
     "seeds": tuple(
         Variant(f"{name} {DEFAULT_ITERATIONS}, seed {seed}", name, seed=seed) for name in METHODS for seed in SEEDS[1:]
@@ -177,7 +181,7 @@ def row_of(rows: Iterable[Row], variant: Variant, capture: str, updates: int) ->
     A row belongs to a setting where its settings are, to the last number, those that the setting has today, and where
     it has exactly so many updates, or all of the capture.
     """
-    settings = variant.settings.model_dump(mode="json")
+    settings = variant.record
     for row in rows:
         if "error" in row or row["capture"] != capture or row["preset"] != variant.preset:
             continue

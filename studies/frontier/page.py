@@ -37,7 +37,6 @@ AXIS_WORDS: Mapping[str, str] = {
     "adaptive": "Other presets",
     "layers": "Layers",
     "clusters": "Clusters of the first layer",
-    "pyramid": "Image pyramid",
     "views": "Views per iteration",
     "gaussians": "Budget of Gaussians",
     "max-scale": "Largest scale",

@@ -25,7 +25,6 @@ MARKERS = dict(zip(METHODS, "os", strict=False))
 OTHER_AXES = {
     "layers": ("layers K", "s", OKABE_ITO[2]),
     "clusters": ("clusters of the first layer N", "D", OKABE_ITO[3]),
-    "pyramid": ("image pyramid", "^", OKABE_ITO[5]),
     "views": ("views per iteration", "X", "#882255"),
     "covariance": ("covariance", "P", "#661100"),
     "gaussians": ("budget of Gaussians", "v", OKABE_ITO[4]),

@@ -23,6 +23,7 @@ from client.cli.scores import Row
 from scas4d_core.captures import Capture, open_capture
 from scas4d_core.settings import Settings
 from scas4d_core.warm_up import warm_up_elsewhere
+from studies.constants import all_varied
 from studies.frontier.frontier import Variant
 from studies.machine import core_version, machine
 from studies.quality.runs import completed
@@ -46,7 +47,8 @@ class TimedVariant:
     def step(self, capture: Capture, index: int, *, counts: bool) -> float:
         """Reads a frame and updates to it; the seconds of both, noted where it ``counts``."""
         started, cpu = time.perf_counter(), time.process_time()
-        done = self.reconstruction.step(capture.frame(index))
+        with all_varied(self.variant.constants):
+            done = self.reconstruction.step(capture.frame(index))
         seconds = time.perf_counter() - started
         if counts:
             self.seconds.append(seconds)
@@ -84,7 +86,10 @@ def measure_times(
     turns = min(rounds + 1, capture.frame_count - 1)
     if turns < 2:
         raise ValueError(f"{folder} has {capture.frame_count} frame(s); timing needs at least 3")
-    timed = [TimedVariant(variant, started(capture, variant.settings, out)) for variant in _distinct(variants)]
+    timed = []
+    for variant in _distinct(variants):
+        with all_varied(variant.constants):
+            timed.append(TimedVariant(variant, started(capture, variant.settings, out)))
     ratios: list[list[float]] = [[] for _ in timed]
     for turn in range(turns):
         taken: dict[int, float] = {}
@@ -142,9 +147,9 @@ def _timed_before(before: Row | None, now: Sequence[Row]) -> list[Row]:
     ]
 
 
-def time_of(times: Row | None, settings: Settings) -> Row | None:
+def time_of(times: Row | None, variant: Variant) -> Row | None:
     """The entry of a setting, whatever its seeds; None where it was not timed."""
-    today = settings.model_dump(mode="json")
+    today = variant.record
     for entry in times["settings"] if times else ():
         if _unseeded(completed(entry["settings"], today)) == _unseeded(today):
             found: Row = entry
@@ -154,7 +159,7 @@ def time_of(times: Row | None, settings: Settings) -> Row | None:
 
 def _distinct(variants: Sequence[Variant]) -> list[Variant]:
     """One for each setting: seeds, and how many frames a row has, do not change the time of an update."""
-    by_settings = {json.dumps(_unseeded(v.settings.model_dump(mode="json")), sort_keys=True): v for v in variants[::-1]}
+    by_settings = {json.dumps(_unseeded(v.record), sort_keys=True): v for v in variants[::-1]}
     chosen = set(by_settings.values())
     return [variant for variant in variants if variant in chosen]
 
@@ -191,7 +196,7 @@ def _answer(one: TimedVariant, ratios: Sequence[float]) -> Row:
         "label": one.variant.label,
         "preset": one.variant.preset,
         "iterations": one.variant.iterations,
-        "settings": one.variant.settings.model_dump(mode="json"),
+        "settings": one.variant.record,
         "gaussians": len(one.reconstruction.history.gaussians(0)),
         "seconds": float(np.median(one.seconds)),
         "seconds_each": [round(value, 4) for value in one.seconds],

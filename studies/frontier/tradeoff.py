@@ -72,13 +72,13 @@ def read_points(out: Path, captures: Sequence[str], updates: int) -> list[Point]
     points = []
     for capture in captures:
         times = read_times(out, capture)
-        default, scale = time_of(times, DEFAULT.settings), 1.0
+        default, scale = time_of(times, DEFAULT), 1.0
         if default is not None and (row := row_of(rows, DEFAULT, capture, updates)) is not None:
             scale = default["seconds"] / _own_seconds(row)
         for variant in variants():
             row = row_of(rows, variant, capture, updates)
             if row is not None:
-                points.append(_point(variant, row, time_of(times, variant.settings), scale))
+                points.append(_point(variant, row, time_of(times, variant), scale))
     return points
 
 

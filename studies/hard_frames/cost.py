@@ -20,7 +20,7 @@ Share = tuple[float, float, float]
 def shares(reports: Sequence[FrameReport]) -> Share:
     """Medians over updates: seconds of one, share of the checks, share of comparing its start and its end.
 
-    The checks are the stage ``judge``: the light of the pictures, the gate, what is plausible, who fits, and views of
+    The checks are the stage ``judge``: the light of the pictures, the gate, plausibility, fits, and views of
     cameras that are left out. Start and end are compared on the probe views, which are a part of the update: it may
     end at any moment for them.
     """

@@ -17,6 +17,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings
 from scas4d_core.storage.history import History
+from studies.constants import all_varied
 from studies.hard_frames.scene import BALL, cameras, first_state, gone
 from studies.kernels.synthetic import photograph
 from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
@@ -42,12 +43,14 @@ class SyntheticFootage:
 
     name = "synthetic"
     count = 24
+    constants = (("scas4d_core.update.frame_update.NEIGHBOUR_FALLOFF", 200.0),)
+    """Of the method, with another value when a scene starts or is resumed: the Gaussians lie far apart."""
 
     def __init__(self, settings: Settings | None = None) -> None:
         self.settings = settings or Settings(
             scene=SceneSettings(metres_per_unit=1.0),
             static=StaticSettings(iterations=600, max_gaussians=1200),
-            update=UpdateSettings(iterations=60, clusters=(2, 12, 48), neighbour_falloff=200.0),
+            update=UpdateSettings(iterations=60, clusters=(2, 12, 48)),
         )
         self.rig = cameras(CAMERAS, SIZE)
         self._others = cameras(4, SIZE, turned=0.4, names="h")
@@ -80,10 +83,9 @@ class SyntheticFootage:
 
     def start(self, folder: Path) -> Reconstruction:
         """Frame 0 committed."""
-        history = History.open(folder)
-        return Reconstruction.start(
-            self.rig, self.frame(0), self.settings, history=history, static=StaticResult(self._fitted(), {}, [])
-        )
+        history, static = History.open(folder), StaticResult(self._fitted(), {}, [])
+        with all_varied(self.constants):
+            return Reconstruction.start(self.rig, self.frame(0), self.settings, history=history, static=static)
 
     def _fitted(self) -> Gaussians:
         """The truth of frame 0 as a fit would leave it: nearly."""
@@ -111,6 +113,8 @@ class CapturedFootage:
     Args:
         settings: of the scene. kept: folder for frames 0, as that of ``scripts/bench quality``.
     """
+
+    constants = ()
 
     def __init__(self, capture: Capture, settings: Settings, kept: Path) -> None:
         self._capture = capture

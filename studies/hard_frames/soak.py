@@ -22,6 +22,8 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings
 from scas4d_core.storage.history import History
+from studies.constants import all_varied
+from studies.hard_frames.footage import SyntheticFootage
 from studies.hard_frames.scene import cameras, first_state, gone, rows
 from studies.kernels.synthetic import photograph
 
@@ -37,7 +39,7 @@ RATE = 30.0
 SETTINGS = Settings(
     scene=SceneSettings(metres_per_unit=1.0),
     static=StaticSettings(iterations=1),
-    update=UpdateSettings(iterations=20, clusters=(2, 12, 48), neighbour_falloff=200.0),
+    update=UpdateSettings(iterations=20, clusters=(2, 12, 48)),
 )
 """Few iterations: what one of them leaves wrong has thousands of frames to add up."""
 
@@ -55,7 +57,7 @@ TREND = 1.5
 UNIT = 1e-5
 """Target: how far from 1 the norm of a rotation may be."""
 GROWTH = 10.5
-"""Target: times longer or shorter than in frame 0 that an axis may be; ``attempts.SHRUNK`` holds them."""
+"""Target: times longer or shorter than in frame 0 that an axis may be: ``validation.SHRUNK``, less rounding."""
 HALF = 10
 """Rows that a half needs for that."""
 MEMORY = 1.1
@@ -104,11 +106,12 @@ class Soak:
         self._goes, self._rests = rows()
         self._rig = cameras(6, SIZE)
         history = History.open(folder / "states")
-        if history.indices:
-            self.scene = Reconstruction.resume(self._rig, SETTINGS, history)
-        else:
-            static = StaticResult(self.first, {}, [])
-            self.scene = Reconstruction.start(self._rig, self.frame(0), SETTINGS, history=history, static=static)
+        with all_varied(SyntheticFootage.constants):
+            if history.indices:
+                self.scene = Reconstruction.resume(self._rig, SETTINGS, history)
+            else:
+                static = StaticResult(self.first, {}, [])
+                self.scene = Reconstruction.start(self._rig, self.frame(0), SETTINGS, history=history, static=static)
 
     @property
     def done(self) -> int:

@@ -14,6 +14,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import psnr
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.storage.history import History
+from studies.constants import all_varied
 from studies.hard_frames.footage import AnyFootage
 from studies.hard_frames.frames import FrameCase, FrameOutcome, Pictures, Sent, named, violations
 
@@ -99,7 +100,8 @@ class FrameStudy:
         folder = self.folder / name
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(self.folder / "before", folder)
-        return Reconstruction.resume(self.footage.rig, self.footage.settings, History.open(folder))
+        with all_varied(self.footage.constants):
+            return Reconstruction.resume(self.footage.rig, self.footage.settings, History.open(folder))
 
     def _measured(self, scene: Reconstruction, index: int, truth: Pictures) -> float:
         return float(

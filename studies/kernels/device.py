@@ -28,11 +28,10 @@ from scas4d_core.torch_backend import losses
 from scas4d_core.torch_backend.deformation import ClusterParams, Deltas, Layer, deform
 from scas4d_core.torch_backend.device import require_device
 from scas4d_core.torch_backend.device_update import DeviceUpdate
-from scas4d_core.update.deformation import CpuDeformation
-from scas4d_core.update.frame_update import FrameUpdate
+from scas4d_core.update.deformation import CpuDeformation, first_lengths
+from scas4d_core.update.frame_update import NEIGHBOURS, FrameUpdate
 from scas4d_core.update.picture_loss import PictureLoss
-from scas4d_core.update.result import Updated
-from scas4d_core.update.schedule import first_lengths
+from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.views import ViewFactory
 from scas4d_core.update.warm_start import Motion
 from studies.kernels import synthetic
@@ -91,12 +90,10 @@ class Bench:
         self.device, self.rig = device, synthetic.rig(size)
         self.before = synthetic.ball_on_a_floor(gaussians, rng)
         self.frame = synthetic.photograph(synthetic.moved(self.before), self.rig)
-        self.settings = settings = UpdateSettings(
-            iterations=iterations, clusters=(8, 64, 512), coarse_until=0.25, neighbour_falloff=200, rate_end=0.1
-        )
+        self.settings = settings = UpdateSettings(iterations=iterations, clusters=(8, 64, 512), rate_end=0.1)
         self.hierarchy = build_hierarchy(self.before.means, self.before.moving, settings.clusters, 8)
         rows = self.hierarchy.rows
-        self.neighbours = build_neighbours(self.before.means[rows], settings.neighbours, settings.neighbour_falloff)
+        self.neighbours = build_neighbours(self.before.means[rows], NEIGHBOURS, 200.0)
         self.features = np.concatenate([self.before.colours, self.before.foreground[:, None]], axis=1)
         self.picture_pull = rng.normal(size=(4, size, size)).astype(np.float32)
         self.mean_pull, self.factor_pull = (
@@ -253,7 +250,9 @@ class Bench:
 
     # Both sides.
 
-    def _updated(self, kind: type[FrameUpdate] | type[DeviceUpdate], motion: Motion | None, **options: Any) -> Updated:
+    def _updated(
+        self, kind: type[FrameUpdate] | type[DeviceUpdate], motion: Motion | None, **options: Any
+    ) -> UpdateResult:
         updater = kind(
             self.factory, SceneSettings(), self.settings, self.hierarchy, self.neighbours, self.before, **options
         )
@@ -263,7 +262,7 @@ class Bench:
         """An update that starts warm: a cold one stands on the kinks of the neighbour terms, where rounding decides."""
         found = self._updated(kind, self._motion, **options)
         rows = self.hierarchy.rows
-        return {"losses": np.array(found.losses), "motion": (found.gaussians.means - self.before.means)[rows]}
+        return {"losses": np.array(found.trace.losses), "motion": (found.gaussians.means - self.before.means)[rows]}
 
 
 def _timed(side: Callable[[], Arrays]) -> tuple[float, dict[str, NDArray[np.float64]]]:

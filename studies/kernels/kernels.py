@@ -32,6 +32,7 @@ from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
 from scas4d_core.rasterize.limits import DEFAULT, Limits, scene_limits
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
+from scas4d_core.warm_up import warm_up_elsewhere
 from studies.kernels.pairs import MicroKernel, blended_pairs
 from studies.machine import core_version, in_words, machine
 from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
@@ -68,6 +69,7 @@ def study(
     capture = open_capture(folder)
     first_file = store / "first" / f"{first_frame_key(capture, settings)}.npz"
     report(f"a run of {min(frames, capture.frame_count)} frames, frame 0 first, in a process of its own")
+    warm_up_elsewhere()
     timed = _run_apart(folder, settings, frames, first_file)
     kept = load_first_frame(first_file)
     assert kept is not None  # the run has left it there

@@ -107,7 +107,9 @@ def table(rows: Sequence[Row]) -> str:
 def measure(capture: Path, frames: int, seed: int, changes: Sequence[str]) -> Row:
     """Frame 0 and updates in this process: test cameras' mean PSNR of each update, and a digest of each state."""
     from scas4d_core.reconstruction import Reconstruction
+    from scas4d_core.warm_up import warm_up_elsewhere
 
+    warm_up_elsewhere()
     opened = open_capture(capture)
     if opened.test_rig is None:
         raise ValueError(f"{capture} has no test cameras, so there is nothing to measure on")

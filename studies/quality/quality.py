@@ -19,6 +19,7 @@ from client.cli.evaluate import Job, Report, check_test_cameras, page
 from client.cli.scores import QUALITY, Row, Store
 from scas4d_core.captures import open_capture
 from scas4d_core.warm_up import warm_up_elsewhere
+from studies.constants import all_varied
 from studies.machine import core_version, machine
 from studies.quality.settings import settings_of
 
@@ -126,9 +127,10 @@ def measure(job: Job, folder: Path, report: Report = print) -> Row:
     static = load_first_frame(first_file)
     if static is not None:
         report(f"    frame 0 from {first_file}")
-    _, row = evaluate.measure(
-        job, Store(folder), report, static=static, fitted=lambda *found: save_first_frame(first_file, *found)
-    )
+    with all_varied(job.constants):
+        _, row = evaluate.measure(
+            job, Store(folder), report, static=static, fitted=lambda *found: save_first_frame(first_file, *found)
+        )
     return row | {"core": core_version(), "machine": {**machine(), "threads": threads()}}
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from client.cli.evaluate import Job, Report
 from client.cli.scores import Row, Store
 from scas4d_core.presets import preset
-from scas4d_core.settings import Settings
+from scas4d_core.settings import Constant, Settings, StaticSettings, UpdateSettings, Weights
 from studies.quality.quality import OBJECT_CAPTURES, run_jobs
 from studies.quality.settings import settings_of
 
@@ -130,14 +130,40 @@ def measure_runs(
     return run_jobs(jobs, out, again=again, report=report)
 
 
+FORMER: Mapping[tuple[str, ...], Mapping[str, Constant]] = {
+    ("static",): StaticSettings.constants,
+    ("update",): UpdateSettings.constants,
+    ("update", "weights"): Weights.constants,
+}
+"""Settings that rows measured before name and that are constants today, by group."""
+
+
+FIRST_FRAME = "scas4d_core.first_frame."
+"""The room of the constants that frame 0 depends on."""
+
+
 def completed(settings: Mapping[str, Any], today: Mapping[str, Any]) -> dict[str, Any]:
-    """A row's settings with what came later, at the value that leaves all as it was. ``today``: those of its run."""
-    return {
+    """A row's settings as a row of today would have them. ``today``: those of its run.
+
+    Settings that came later have the value that leaves all as it was. Former settings are left out; one that had
+    another value than its constant has stands among the row's ``constants``.
+    """
+    told = {
         group: {**LATER.get(group, {}), **{name: today[group][name] for name in IDLE.get(group, ())}, **given}
         if isinstance(given, dict)
         else given
         for group, given in settings.items()
     }
+    varied = dict(told.get("constants", {}))
+    for path, constants in FORMER.items():
+        inner = told
+        for group in path:
+            inner[group] = inner = dict(inner.get(group, {}))
+        for name, constant in constants.items():
+            value = inner.pop(name, constant.value)
+            if (tuple(value) if isinstance(value, list) else value) != constant.value:
+                varied[constant.place or ".".join([*path, name])] = value
+    return told | ({"constants": varied} if varied else {})
 
 
 def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
@@ -157,6 +183,8 @@ def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
                 withheld = (given["masks"], given["points"])
                 filled = completed(row["settings"], settings)
                 same = all(filled.get(group) == settings[group] for group in groups)
+                varied = filled.get("constants", ())
+                same &= not any(run.frames != 1 or place.startswith(FIRST_FRAME) for place in varied)
                 if row["capture"] != capture or not same or withheld != (run.masks, run.points):
                     continue
                 best = found.get((name, capture))

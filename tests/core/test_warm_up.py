@@ -10,10 +10,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from scas4d_core import reconstruction, warm_up
+from scas4d_core import warm_up
 from scas4d_core.kernels import jit
 from scas4d_core.reconstruction import Reconstruction
-from scas4d_core.settings import Settings
 
 
 @pytest.mark.parametrize("there", [False, True])
@@ -60,26 +59,16 @@ def test_where_it_fails_the_scene_is_not_kept_from_starting(tmp_path, monkeypatc
         assert "could not be compiled" in caplog.text
 
 
-@pytest.mark.parametrize(("device", "asked"), [("cpu", 1), ("cuda", 0)])
-def test_a_scene_asks_before_its_first_frame_and_no_process_asks_twice(tmp_path, monkeypatch, device, asked):
+def test_no_process_asks_twice(tmp_path, monkeypatch):
     started = []
     monkeypatch.setattr(warm_up, "_settled", False)
     monkeypatch.setattr(warm_up, "marker", lambda: tmp_path / "warm")
     monkeypatch.setattr(
         subprocess, "run", lambda program, **_: started.append(program) or SimpleNamespace(returncode=0)
     )
-    monkeypatch.setattr(reconstruction, "require_device", lambda _: None)
-
-    def nothing_before(*_):
-        assert len(started) == asked
-        raise Reached
-
-    monkeypatch.setattr(reconstruction, "fit_first", nothing_before)
-    rig = warm_up._rig()
     for _ in range(2):
-        with pytest.raises(Reached):
-            Reconstruction.start(rig, warm_up._frame(rig, 0, True), Settings(device=device))
-    assert len(started) == asked
+        warm_up.warm_up_elsewhere()
+    assert len(started) == 1
 
 
 class Reached(Exception):

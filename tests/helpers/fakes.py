@@ -114,7 +114,7 @@ class FakeReconstruction:
         obey(frame)
         return self.commit(frame, dropped, notes)
 
-    def spend(self, *, iterations=None, budget_ms=None, stop_gain=None, still=None):
+    def set_budget(self, *, iterations=None, budget_ms=None, stop_gain=None, still=None):
         self.iterations = int(budget_ms / MS_EACH) if budget_ms else iterations or ITERATIONS
 
     def write_checkpoint(self, index):
@@ -192,7 +192,7 @@ class FakeEngine:
         copy.append(base, history.time(base), history.gaussians(base), history.report(base))
         points = history.gaussians(first).means - np.array([STEP_M * first, 0, 0])
         scene = FakeReconstruction(points, copy)
-        scene.spend(**budget)
+        scene.set_budget(**budget)
         scene.commit(frame, dropped, {**(notes or {}), "remade": True})
         report = copy.report(frame.index)
         history.replace(frame.index, frame.time, copy.gaussians(frame.index).arrays(), report)

@@ -22,7 +22,7 @@ def made_seconds(variant: Variant) -> float:
 def made_row(variant: Variant, capture: str, updates: int, **more: object) -> dict:
     frames = 24 if variant.whole else updates + 1
     psnr, seconds = made_psnr(variant), made_seconds(variant)
-    settings = variant.settings.model_dump(mode="json")
+    settings = variant.record
     return {
         "key": f"{capture}-{variant.preset}-{digest(settings, frames)}",
         "capture": capture,

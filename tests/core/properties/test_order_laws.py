@@ -5,6 +5,8 @@ Given the same clusters and sequence of views; where clusters are looked for ane
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 from box_scene import MOVING, RIG, make_box, moved, take_frame
@@ -16,7 +18,9 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.neighbours import build_neighbours
-from scas4d_core.update.frame_update import FrameUpdate, Updated
+from scas4d_core.update import schedule
+from scas4d_core.update.frame_update import SMALLEST_CLUSTER, FrameUpdate
+from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.schedule import ViewPlan
 from scas4d_core.update.views import TrainingView, ViewFactory
 
@@ -25,20 +29,29 @@ JITTER = np.random.default_rng(1).normal(0, 0.003, MADE.means.shape).astype(np.f
 BOX = MADE.replace(means=MADE.means + JITTER)
 """No two at one depth: ties go by row."""
 AFTER = moved(BOX)
-SETTINGS = UpdateSettings(
-    iterations=6, clusters=(2, 12, 48), neighbour_falloff=200.0, neighbours=6, neighbour_sample=150
-)
-HIERARCHY = build_hierarchy(BOX.means, BOX.moving, SETTINGS.clusters, SETTINGS.smallest_cluster)
-NEIGHBOURS = build_neighbours(BOX.means[HIERARCHY.rows], SETTINGS.neighbours, SETTINGS.neighbour_falloff)
+SETTINGS = UpdateSettings(iterations=6, clusters=(2, 12, 48))
+HIERARCHY = build_hierarchy(BOX.means, BOX.moving, SETTINGS.clusters, SMALLEST_CLUSTER)
+NEIGHBOURS = build_neighbours(BOX.means[HIERARCHY.rows], 6, 200.0)
 FRAME = take_frame(1, 1.0, AFTER, RIG)
 SEQUENCE = ["0a", "2b", "1b", "3a", "0b", "1a"]
 
 
-def updated(state: Gaussians, hierarchy: Hierarchy, rig: Rig, monkeypatch: pytest.MonkeyPatch) -> Updated:
+@pytest.fixture(scope="module", autouse=True)
+def sample() -> Iterator[None]:
+    """Fewer Gaussians than the box has: an iteration looks at some."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(schedule, "NEIGHBOUR_SAMPLE", 150)
+        yield
+
+
+def updated(state: Gaussians, hierarchy: Hierarchy, rig: Rig, monkeypatch: pytest.MonkeyPatch) -> UpdateResult:
     """An update that looks at the views of SEQUENCE, whatever the order of the rig's cameras."""
 
-    def take(plan: ViewPlan, iteration: int, iterations: int) -> list[TrainingView]:
-        return [view for view in plan._views if view.name == SEQUENCE[iteration]]
+    sequence = iter(SEQUENCE)
+
+    def take(plan: ViewPlan) -> list[TrainingView]:
+        name = next(sequence)
+        return [view for view in plan._views if view.name == name]
 
     monkeypatch.setattr(ViewPlan, "take", take)
     factory = ViewFactory(rig)
@@ -47,7 +60,7 @@ def updated(state: Gaussians, hierarchy: Hierarchy, rig: Rig, monkeypatch: pytes
 
 
 @pytest.fixture(scope="module")
-def plain() -> Updated:
+def plain() -> UpdateResult:
     with pytest.MonkeyPatch.context() as patch:
         return updated(BOX, HIERARCHY, RIG, patch)
 
@@ -56,14 +69,14 @@ def taken(state: Gaussians, order: np.ndarray) -> Gaussians:
     return Gaussians(**{name: array[order] for name, array in state.arrays().items()})
 
 
-def assert_same(found: Updated, wanted: Updated, order: np.ndarray) -> None:
+def assert_same(found: UpdateResult, wanted: UpdateResult, order: np.ndarray) -> None:
     for name, array in wanted.gaussians.arrays().items():
         np.testing.assert_array_equal(getattr(found.gaussians, name), array[order], err_msg=name)
 
 
 @law(5)
 @given(seeds)
-def test_the_order_of_gaussians_changes_no_bit(plain: Updated, seed: int) -> None:
+def test_the_order_of_gaussians_changes_no_bit(plain: UpdateResult, seed: int) -> None:
     order = np.random.default_rng(seed).permutation(len(BOX))
     row_of = np.argsort(order)
     hierarchy = Hierarchy(row_of[HIERARCHY.rows], HIERARCHY.labels, HIERARCHY.starts)
@@ -74,14 +87,14 @@ def test_the_order_of_gaussians_changes_no_bit(plain: Updated, seed: int) -> Non
 
 @law(5)
 @given(seeds)
-def test_the_order_of_cameras_changes_no_bit(plain: Updated, seed: int) -> None:
+def test_the_order_of_cameras_changes_no_bit(plain: UpdateResult, seed: int) -> None:
     cameras = [RIG.cameras[k] for k in np.random.default_rng(seed).permutation(len(RIG))]
     with pytest.MonkeyPatch.context() as patch:
         found = updated(BOX, HIERARCHY, Rig(tuple(cameras)), patch)
     assert_same(found, plain, np.arange(len(BOX)))
-    assert found.losses == plain.losses
-    assert found.cameras == plain.cameras
+    assert found.trace.losses == plain.trace.losses
+    assert found.trace.cameras == plain.trace.cameras
 
 
-def test_the_plain_update_moves(plain: Updated) -> None:
+def test_the_plain_update_moves(plain: UpdateResult) -> None:
     assert np.median(np.linalg.norm(plain.gaussians.means - BOX.means, axis=1)[:MOVING]) > 1e-3

@@ -21,7 +21,8 @@ from scas4d_core.cameras import Camera
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.torch_backend import deformation
 from scas4d_core.torch_backend import update as update_torch
-from scas4d_core.torch_backend.update import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchUpdate, TrainingView
+from scas4d_core.torch_backend.arrays import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchView
+from scas4d_core.torch_backend.update import TorchUpdate
 from scas4d_core.update.schedule import Rates
 
 MOVING, STANDING, NEAREST = 24, 6, 4
@@ -48,7 +49,7 @@ class Case:
 
     update: TorchUpdate
     state: Gaussians
-    views: list[TrainingView]
+    views: list[TorchView]
     start: list[ClusterArrays]
     deltas: DeltaArrays
     rows: np.ndarray
@@ -85,7 +86,7 @@ def some_case(seed: int) -> Case:
         pose = np.eye(4)
         pose[:3, :3], pose[2, 3] = some_rotation(seed + index), 1.5
         camera = Camera(str(index), np.array([[24.0, 0, 8], [0, 24, 6], [0, 0, 1]]), pose, 16, 12)
-        views.append(TrainingView(camera, rng.uniform(0, 1, (12, 16, 3)), (rng.uniform(size=(12, 16)) > 0.5) * 1.0))
+        views.append(TorchView(camera, rng.uniform(0, 1, (12, 16, 3)), (rng.uniform(size=(12, 16)) > 0.5) * 1.0))
     scale = np.repeat([0.05, 0.02, 0.2, 0.05], [3, 3, 3, 1])
     tables = [scale * rng.normal(size=(size, 10)) for size in (2, 6)]
     start = [ClusterArrays(p[:, :3], p[:, 3:6], p[:, 6:9], p[:, 9]) for p in tables]
@@ -96,7 +97,7 @@ def some_case(seed: int) -> Case:
 def placed(case: Case, turn: np.ndarray, shift: np.ndarray) -> Case:
     """The same world and rig elsewhere: x → turn x + shift."""
 
-    def camera(view: TrainingView) -> TrainingView:
+    def camera(view: TorchView) -> TorchView:
         pose = view.camera.world_to_camera.copy()
         pose[:3, :3] = view.camera.rotation @ turn.T
         pose[:3, 3] = view.camera.translation - pose[:3, :3] @ shift

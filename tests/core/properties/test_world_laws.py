@@ -29,7 +29,7 @@ POINTS = InitialPoints(BOX.means.astype(np.float64), BOX.colours, BOX.foreground
 FLOOR = (0.0, 1.0, 0.0, -0.375)
 QUICK = Settings(
     static=StaticSettings(iterations=12, max_gaussians=500),
-    update=UpdateSettings(iterations=8, clusters=(2, 12, 48), neighbour_falloff=200.0, neighbour_sample=150),
+    update=UpdateSettings(iterations=8, clusters=(2, 12, 48)),
 )
 SAMPLE = Path(__file__).parents[3] / "samples" / "robot"
 SAME_DB = 0.2

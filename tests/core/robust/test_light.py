@@ -9,11 +9,12 @@ import pytest
 
 from scas4d_core.captures.frame import Frame
 from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.metrics import psnr
 from scas4d_core.reconstruction import Reconstruction
-from scas4d_core.robust import outliers as judge
-from scas4d_core.robust.outliers import Look, Past
+from scas4d_core.robust.outliers import Past
+from scas4d_core.robust.picture_checks import lit as with_light
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 from studies.hard_frames import footage as frames_footage
@@ -86,17 +87,17 @@ def test_a_light_that_flickers_is_not_taken_on() -> None:
     """Nor is darkness; saturated pictures make a light seem less at first, it may change a while."""
     past = Past()
     for light in (1.3, 0.8, 1.3, 1.3, 1.31, 1.0):
-        past = judge.lit(past, Look(light))
+        past = with_light(past, light)
     assert past.lit == 0
     counts = []
     for light in (1.3, 0.8, 1.3, 1.3, 1.33, 2.4, 2.5, 0.02, 0.0):
-        past = judge.lit(past, Look(light))
+        past = with_light(past, light)
         counts.append(past.lit)
     assert counts == [1, 1, 1, 2, 3, 4, 5, 0, 0]
 
 
 def test_the_light_is_part_of_what_is_carried_on() -> None:
-    past = judge.lit(judge.lit(Past(), Look(1.4)), Look(1.41))
+    past = with_light(with_light(Past(), 1.4), 1.41)
     again = Past.of_arrays(past.arrays())
     assert (again.light, again.lit) == (1.41, 2)
     older = {name: array[:6] if name == "scene" else array for name, array in past.arrays().items()}
@@ -108,12 +109,15 @@ def test_frames_that_were_held_or_stood_are_told_as_they_are() -> None:
     moved = scene.step(sent(1, 1.0, True))
     again = scene.step(replace(sent(1, 1.0, True), index=2, time=2 / 30))
     dark = scene.step(sent(3, 0.02, True))
+    outcomes = [report.outcome for report in (moved, again, dark)]
+    assert outcomes == [FrameOutcome.UPDATED, FrameOutcome.STOOD, FrameOutcome.HELD_UNUSABLE]
     assert (moved.used, moved.kept) == (list(FOOTAGE.rig.names), "end")
     assert (again.used, again.iterations, again.kept, again.exposure) == ([], 0, "still", 1.0)
     assert (dark.used, dark.iterations, dark.kept, dark.errors) == ([], 0, "still", {})
     assert dark.exposure == pytest.approx(0.02, abs=0.01)
     upside_down = {name: image[::-1].copy() for name, image in sent(4, 1.2, True).images.items()}
     held = scene.step(replace(sent(4, 1.0, True), images=upside_down))
-    assert (held.used, held.kept, str(held.degraded)[:15]) == ([], "still", "held as it was:")
+    assert (held.used, held.kept, held.outcome) == ([], "still", FrameOutcome.HELD_UNMET)
+    assert str(held.degraded).startswith("held as it was: ")
     assert held.exposure > 1.0
-    assert held.errors["end"] < held.errors["still"]
+    assert held.errors[Candidate.END] < held.errors[Candidate.STILL]

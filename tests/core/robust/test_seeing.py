@@ -1,7 +1,8 @@
-"""What is seen of a frame beside its update: witnesses, the better of start and end, the light, and what jumped."""
+"""Probe views, the better of start and end, the light, and the relocation of an object that jumped."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -9,17 +10,17 @@ import pytest
 
 from scas4d_core.cameras import rig_inside
 from scas4d_core.captures.frame import Frame
+from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.robust.attempts import Course
-from scas4d_core.robust.exposure import evened, gain_of, relit
-from scas4d_core.robust.relocation import reacquire, shifted
+from scas4d_core.robust.picture_checks import evened, gain_of, relit
+from scas4d_core.robust.relocation import find_jump, shifted
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
-from scas4d_core.update.best_state import Anytime
+from scas4d_core.update.best_state import VIEWS, BestState, ProbeViews, mean_error, spread
 from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.picture_loss import PictureLoss
-from scas4d_core.update.probe_views import VIEWS, Witness, mean_error, spread
-from scas4d_core.update.stopping import Counted
+from scas4d_core.update.result import AttemptOptions
+from scas4d_core.update.stopping import Stopping
 from scas4d_core.update.views import TrainingView, ViewFactory
 from studies.hard_frames.footage import ANGLE, SyntheticFootage
 from studies.hard_frames.scene import BALL, GOES, first_state, gone
@@ -28,12 +29,16 @@ FOOTAGE = SyntheticFootage()
 BEFORE = first_state(resting_may_move=False)
 FACTORY = ViewFactory(rig_inside(FOOTAGE.rig.world_frame(1.0), FOOTAGE.rig.cameras))
 PICTURE = PictureLoss(FACTORY, (0.0, 0.0, 0.0), 1.0, 0.0)
-SETTINGS = UpdateSettings(iterations=30, clusters=(2, 12), neighbour_falloff=200.0)
+SETTINGS = UpdateSettings(iterations=30, clusters=(2, 12))
 
 
 def updater(settings: UpdateSettings = SETTINGS) -> FrameUpdate:
     hierarchy = build_hierarchy(BEFORE.means, BEFORE.moving, settings.clusters, 8)
     return FrameUpdate(FACTORY, SceneSettings(metres_per_unit=1.0), settings, hierarchy, None, BEFORE)
+
+
+def compared(iterations: int, enough: Mapping[str, float] | None = None) -> AttemptOptions:
+    return AttemptOptions(stopping=Stopping(iterations), compare=True, enough=enough)
 
 
 def views(frame: Frame) -> list[TrainingView]:
@@ -42,11 +47,11 @@ def views(frame: Frame) -> list[TrainingView]:
 
 def error(state: Gaussians, frame: Frame) -> float:
     features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
-    found = Witness(FACTORY, PICTURE, views(frame)).errors(state.means, state.factors, state.opacities, features)
+    found = ProbeViews(FACTORY, PICTURE, views(frame)).errors(state.means, state.factors, state.opacities, features)
     return mean_error(found, list(found))
 
 
-def test_witnesses_are_spread_and_the_same_in_every_frame() -> None:
+def test_probe_views_are_spread_and_the_same_in_every_frame() -> None:
     names = list(FOOTAGE.rig.names)
     chosen = spread(FACTORY.rig, names)
     assert len(set(chosen)) == VIEWS
@@ -58,7 +63,7 @@ def test_witnesses_are_spread_and_the_same_in_every_frame() -> None:
     assert len(spread(FACTORY.rig, names[:2])) == 2
 
 
-def test_witnesses_tell_the_nearer_of_two_states() -> None:
+def test_probe_views_tell_the_nearer_of_two_states() -> None:
     frame = FOOTAGE.frame(3)
     errors = [error(gone(BEFORE, angle), frame) for angle in (0.0, 1.5 * ANGLE, 2.7 * ANGLE, 3 * ANGLE)]
     assert errors == sorted(errors, reverse=True)
@@ -69,38 +74,57 @@ def test_witnesses_tell_the_nearer_of_two_states() -> None:
 def test_an_update_is_never_worse_than_standing_or_going_on(iterations: int, index: int) -> None:
     settings = SETTINGS.model_copy(update={"cold_start": 8.0})  # few steps of this size only do harm
     update, frame = updater(settings), FOOTAGE.frame(index)
-    moved = update.run(BEFORE, views(FOOTAGE.frame(1)), None, 0.1, 0, Course(Counted(30), witness=True))
+    moved = update.run(BEFORE, views(FOOTAGE.frame(1)), None, 0.1, 0, compared(30))
     for motion in (None, moved.motion):
-        found = update.run(BEFORE, views(frame), motion, 0.1, 0, Course(Counted(iterations), witness=True))
+        found = update.run(BEFORE, views(frame), motion, 0.1, 0, compared(iterations))
         here = error(found.gaussians, frame)
         assert here <= error(BEFORE, frame) + 1e-6
-        assert here <= min(mean_error(errors, list(errors)) for errors in found.errors.values()) + 1e-6
-        assert found.kept in found.errors
-        if found.kept == "still":
+        assert here <= min(mean_error(errors, list(errors)) for errors in found.trace.errors.values()) + 1e-6
+        assert found.trace.kept in found.trace.errors
+        if found.trace.kept == "still":
             assert found.gaussians is BEFORE
 
 
 def test_a_motion_that_ended_is_not_gone_on_with() -> None:
     update = updater()
-    moved = update.run(BEFORE, views(FOOTAGE.frame(1)), None, 0.1, 0, Course(Counted(30), witness=True))
-    again = update.run(moved.gaussians, views(FOOTAGE.frame(1)), moved.motion, 0.1, 0, Course(Counted(1), witness=True))
-    still, warm = (mean_error(again.errors[kind], list(again.errors[kind])) for kind in ("still", "warm"))
+    moved = update.run(BEFORE, views(FOOTAGE.frame(1)), None, 0.1, 0, compared(30))
+    again = update.run(
+        moved.gaussians,
+        views(FOOTAGE.frame(1)),
+        moved.motion,
+        0.1,
+        0,
+        compared(1),
+    )
+    still, warm = (mean_error(again.trace.errors[kind], list(again.trace.errors[kind])) for kind in list(Candidate)[1:])
     assert still < warm
     assert error(again.gaussians, FOOTAGE.frame(1)) <= still + 1e-6
 
 
 def test_a_frame_that_stands_needs_no_iteration() -> None:
     update, frame = updater(), FOOTAGE.frame(0)
-    settled = update.run(BEFORE, views(frame), None, 0.1, 0, Course(Counted(30), witness=True))
-    enough = settled.errors[settled.kept]
-    stands = update.run(settled.gaussians, views(frame), None, 0.1, 1, Course(Counted(30), witness=True, enough=enough))
-    assert (stands.losses, stands.kept) == ([], "still")
+    settled = update.run(BEFORE, views(frame), None, 0.1, 0, compared(30))
+    enough = settled.trace.errors[settled.trace.kept]
+    stands = update.run(
+        settled.gaussians,
+        views(frame),
+        None,
+        0.1,
+        1,
+        compared(30, enough),
+    )
+    assert (stands.trace.losses, stands.trace.kept) == ([], "still")
     for later, expected in ((FOOTAGE.frame(1), 30), (frame, 30)):
         asked = enough if expected and later is not frame else None
         moves = update.run(
-            settled.gaussians, views(later), None, 0.1, 1, Course(Counted(30), witness=True, enough=asked)
+            settled.gaussians,
+            views(later),
+            None,
+            0.1,
+            1,
+            compared(30, asked),
         )
-        assert len(moves.losses) == expected
+        assert len(moves.trace.losses) == expected
 
 
 def test_cameras_that_were_left_out_have_no_say_in_what_is_best() -> None:
@@ -108,10 +132,10 @@ def test_cameras_that_were_left_out_have_no_say_in_what_is_best() -> None:
     assert mean_error({"c0": 1.0, "c1": 3.0}, ["c1", "c7"]) == 3.0
     deformation = updater()._deformation
     deformation.start(BEFORE)
-    anytime = Anytime.of(FACTORY, PICTURE, deformation, BEFORE, [])
-    anytime.start(None, 0.1, SETTINGS)
-    assert not anytime.stands({"c0": 9.0})
-    assert anytime.errors == {}
+    best = BestState(ProbeViews(FACTORY, PICTURE, []), deformation, BEFORE, None, 0.1, SETTINGS.momentum)
+    best.start()
+    assert not best.stands({"c0": 9.0})
+    assert best.errors == {}
 
 
 @pytest.mark.parametrize("gain", [0.7, 1.3, 1.6])
@@ -151,14 +175,12 @@ def test_a_state_in_another_light_is_no_brighter_than_white() -> None:
 @pytest.mark.parametrize("sizes", [0.5, 1.0, 2.0])
 def test_a_jump_is_found(sizes: float) -> None:
     frame, _ = FOOTAGE.jumped(0, sizes)
-    found = reacquire(BEFORE, views(frame), PICTURE, FACTORY.rig)
+    found = find_jump(BEFORE, views(frame), PICTURE, FACTORY.rig)
     assert found is not None
     true = np.array([-0.8, 0.0, -0.6]) * sizes * 2 * BALL
-    assert np.linalg.norm(found.shift - true) < 0.4 * BALL
-    assert found.cameras >= 3
-    assert found.miss < 0.1
-    moved = shifted(BEFORE, found.shift)
-    np.testing.assert_allclose(moved.means[:GOES], BEFORE.means[:GOES] + found.shift, atol=1e-6)
+    assert np.linalg.norm(found - true) < 0.4 * BALL
+    moved = shifted(BEFORE, found)
+    np.testing.assert_allclose(moved.means[:GOES], BEFORE.means[:GOES] + found, atol=1e-6)
     np.testing.assert_array_equal(moved.means[GOES:], BEFORE.means[GOES:])
 
 
@@ -174,21 +196,21 @@ def test_a_camera_that_did_not_see_the_object_has_no_say_in_where_it_went() -> N
         shown = PICTURE.rasterizer.planes[:3, : view.camera.height, : view.camera.width]
         images[view.name] = np.rint(255 * shown.clip(0, 1)).astype(np.uint8).transpose(1, 2, 0).copy()
         images[view.name][0, 0] = 255 - images[view.name][0, 0]
-    assert reacquire(unseen, views(replace(frame, images=images)), PICTURE, FACTORY.rig) is None
+    assert find_jump(unseen, views(replace(frame, images=images)), PICTURE, FACTORY.rig) is None
 
 
 def test_cameras_that_disagree_find_no_jump() -> None:
     jumped = [FOOTAGE.jumped(index, sizes)[0] for index, sizes in ((0, 1.0), (0, -1.0))]
     mixed = {name: jumped[k % 2].images[name] for k, name in enumerate(FOOTAGE.rig.names)}
-    assert reacquire(BEFORE, views(replace(jumped[0], images=mixed)), PICTURE, FACTORY.rig) is None
+    assert find_jump(BEFORE, views(replace(jumped[0], images=mixed)), PICTURE, FACTORY.rig) is None
 
 
 def test_an_object_that_is_gone_or_does_not_exist_is_not_found() -> None:
     frame = FOOTAGE.frame(0)
     standing = BEFORE.replace(foreground=np.zeros(len(BEFORE), np.float32))
-    assert reacquire(standing, views(frame), PICTURE, FACTORY.rig) is None
+    assert find_jump(standing, views(frame), PICTURE, FACTORY.rig) is None
     rng = np.random.default_rng(0)
     noise = {name: rng.integers(0, 256, picture.shape, np.uint8) for name, picture in frame.images.items()}
-    assert reacquire(BEFORE, views(replace(frame, images=noise)), PICTURE, FACTORY.rig) is None
+    assert find_jump(BEFORE, views(replace(frame, images=noise)), PICTURE, FACTORY.rig) is None
     few = {name: frame.images[name] for name in FOOTAGE.rig.names[:2]}
-    assert reacquire(BEFORE, FACTORY.views(Frame(0, 0.0, few, {}), {}), PICTURE, FACTORY.rig) is None
+    assert find_jump(BEFORE, FACTORY.views(Frame(0, 0.0, few, {}), {}), PICTURE, FACTORY.rig) is None

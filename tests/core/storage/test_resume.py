@@ -1,10 +1,10 @@
-"""What is usual goes through a checkpoint: after a held frame, and with a camera left out, a scene taken up again goes
+"""The past goes through a checkpoint: after a held frame, and with a camera left out, a scene taken up again goes
 on with the same bits."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +14,20 @@ import pytest
 from scas4d_core.captures.frame import Frame
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.storage.history import History
+from studies.constants import all_varied
 from studies.hard_frames import frames
 from studies.hard_frames.footage import SyntheticFootage
 from studies.hard_frames.frames import Sent, each
 
 FOOTAGE = SyntheticFootage()
 AT = 2
+
+
+@pytest.fixture(scope="module", autouse=True)
+def constants() -> Iterator[None]:
+    """Those of the footage hold when a scene is resumed, too."""
+    with all_varied(SyntheticFootage.constants):
+        yield
 
 
 def shown(sent: Sequence[Sent]) -> list[Frame]:

@@ -14,7 +14,7 @@ from scas4d_core.structure.motion_mask import changed_pixels, with_reliable_labe
 
 RIG = make_rig()
 BOX = make_box()
-SETTINGS = Settings(update=UpdateSettings(iterations=20, clusters=(2, 12, 48), neighbour_falloff=200.0))
+SETTINGS = Settings(update=UpdateSettings(iterations=20, clusters=(2, 12, 48)))
 
 
 def start() -> Reconstruction:

@@ -11,8 +11,10 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.rasterize import twin
 from scas4d_core.rasterize.twin import CameraParams
 from scas4d_core.torch_backend import losses
+from scas4d_core.torch_backend.arrays import Graph, TermWeights, TorchResult, TorchView
 from scas4d_core.torch_backend.deformation import quaternion_matrices, quaternion_product, rotation_quaternions
-from scas4d_core.torch_backend.update import Graph, Rates, TermWeights, TorchUpdate, TrainingView, Updated
+from scas4d_core.torch_backend.update import TorchUpdate
+from scas4d_core.update.schedule import Rates
 
 MOVING, STANDING = 40, 8
 SHIFT = np.array([0.03, 0.02, -0.02])
@@ -54,7 +56,7 @@ def moved_truth(before: Gaussians) -> np.ndarray:
     return means
 
 
-def pictures(scene: Gaussians, means: np.ndarray, masks: bool) -> list[TrainingView]:
+def pictures(scene: Gaussians, means: np.ndarray, masks: bool) -> list[TorchView]:
     views = []
     for index, angle in enumerate((-0.6, 0.0, 0.7)):
         camera = look_at(str(index), angle)
@@ -62,7 +64,7 @@ def pictures(scene: Gaussians, means: np.ndarray, masks: bool) -> list[TrainingV
         arrays = (means, scene.factors, scene.opacities, features, np.zeros(4))
         m, f, o, c, b = (torch.tensor(array, dtype=torch.float64) for array in arrays)
         drawn = twin.render(m, f, o, c, CameraParams.of(camera), b).features.numpy()
-        views.append(TrainingView(camera, drawn[..., :3], drawn[..., 3] if masks else None))
+        views.append(TorchView(camera, drawn[..., :3], drawn[..., 3] if masks else None))
     return views
 
 
@@ -84,7 +86,7 @@ def toy_update(scene: Gaussians, **changes: object) -> TorchUpdate:
 
 
 @pytest.fixture(scope="module")
-def solved() -> tuple[Gaussians, np.ndarray, Updated]:
+def solved() -> tuple[Gaussians, np.ndarray, TorchResult]:
     before = ball_and_backdrop()
     truth = moved_truth(before)
     rng = np.random.default_rng(1)
@@ -93,7 +95,7 @@ def solved() -> tuple[Gaussians, np.ndarray, Updated]:
     return before, truth, toy_update(before).run(before, pictures(before, truth, masks=True), order, rows=rows)
 
 
-def test_finds_a_rigid_motion(solved: tuple[Gaussians, np.ndarray, Updated]) -> None:
+def test_finds_a_rigid_motion(solved: tuple[Gaussians, np.ndarray, TorchResult]) -> None:
     before, truth, after = solved
     assert len(after.losses) == 60
     assert np.mean(after.losses[-6:]) < 0.35 * np.mean(after.losses[:6])
@@ -104,7 +106,7 @@ def test_finds_a_rigid_motion(solved: tuple[Gaussians, np.ndarray, Updated]) -> 
     assert found == pytest.approx(TURN, abs=0.4 * TURN)
 
 
-def test_standing_gaussians_keep_all_but_their_colour(solved: tuple[Gaussians, np.ndarray, Updated]) -> None:
+def test_standing_gaussians_keep_all_but_their_colour(solved: tuple[Gaussians, np.ndarray, TorchResult]) -> None:
     before, _, after = solved
     for name in ("means", "factors", "rotations", "opacities", "foreground", "ids"):
         np.testing.assert_array_equal(getattr(after.gaussians, name)[MOVING:], getattr(before, name)[MOVING:])
@@ -112,14 +114,16 @@ def test_standing_gaussians_keep_all_but_their_colour(solved: tuple[Gaussians, n
     assert not np.shares_memory(after.gaussians.colours, before.colours)
 
 
-def test_material_rotation_is_the_turn_after_the_previous(solved: tuple[Gaussians, np.ndarray, Updated]) -> None:
+def test_material_rotation_is_the_turn_after_the_previous(solved: tuple[Gaussians, np.ndarray, TorchResult]) -> None:
     before, _, after = solved
     expected = quaternion_product(torch.tensor(after.turns), torch.tensor(before.rotations[:MOVING])).numpy()
     np.testing.assert_allclose(after.gaussians.rotations[:MOVING], expected, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(after.gaussians.rotations, axis=1), 1, atol=1e-6)
 
 
-def test_no_iterations_apply_the_start_and_none_is_the_identity(solved: tuple[Gaussians, np.ndarray, Updated]) -> None:
+def test_no_iterations_apply_the_start_and_none_is_the_identity(
+    solved: tuple[Gaussians, np.ndarray, TorchResult],
+) -> None:
     before, truth, after = solved
     views = pictures(before, truth, masks=False)
     same = toy_update(before).run(before, views, [])
@@ -130,7 +134,7 @@ def test_no_iterations_apply_the_start_and_none_is_the_identity(solved: tuple[Ga
     np.testing.assert_allclose(again.gaussians.factors, after.gaussians.factors, atol=1e-6)
 
 
-def test_warm_start_begins_lower(solved: tuple[Gaussians, np.ndarray, Updated]) -> None:
+def test_warm_start_begins_lower(solved: tuple[Gaussians, np.ndarray, TorchResult]) -> None:
     before, truth, after = solved
     views = pictures(before, truth, masks=True)
     cold = toy_update(before).run(before, views, [0])
@@ -175,7 +179,7 @@ def test_the_last_rate_is_the_one_asked_for() -> None:
 
 
 @pytest.mark.parametrize("term", ["mask", "rigidity", "isometry", "rotation", "scale", "soft_colour"])
-def test_each_term_counts_with_its_weight(term: str, solved: tuple[Gaussians, np.ndarray, Updated]) -> None:
+def test_each_term_counts_with_its_weight(term: str, solved: tuple[Gaussians, np.ndarray, TorchResult]) -> None:
     before, truth, after = solved
     views = pictures(before, truth, masks=True)
     # The deltas are stretched so that the scale term has something to say.

@@ -1,12 +1,10 @@
-"""How many iterations there are: counted, by a clock, and until nothing is gained."""
+"""The number of iterations: counted, by a clock, and until nothing is gained; the budget of a frame."""
 
 from __future__ import annotations
 
 import pytest
 
-from scas4d_core.update.budget import AFTER_S, RATE, Budget
-from scas4d_core.update.result import Updated
-from scas4d_core.update.stopping import COOLING, LOOK_EVERY, MOST_TIMED, PROBE, Counted, Pace, Timed, UntilMet
+from scas4d_core.update.stopping import AFTER_S, COOLING, LOOK_EVERY, MOST_TIMED, PROBE, RATE, Budget, Stopping
 
 
 class Clock:
@@ -19,7 +17,7 @@ class Clock:
         return self.now
 
 
-def iterate(pace: Pace, clock: Clock, each: float, falls: float = 1.0) -> int:
+def iterate(pace: Stopping, clock: Clock, each: float, falls: float = 1.0) -> int:
     """The loop of an update whose iterations take so long, its error falling by a factor each; how many there were."""
     done, error = 0, 1.0
     while done < pace.planned(done):
@@ -32,9 +30,9 @@ def iterate(pace: Pace, clock: Clock, each: float, falls: float = 1.0) -> int:
 
 
 def test_counted_is_told_once() -> None:
-    pace = Counted(7)
+    pace = Stopping(7)
     assert iterate(pace, Clock(), 1.0) == 7
-    assert pace.told == [(0, 7)]
+    assert pace.planned_so_far == [(0, 7)]
     assert pace.most == 7
 
 
@@ -43,7 +41,7 @@ def test_counted_is_told_once() -> None:
 def test_timed_ends_in_time_whatever_was_believed(each: float, believed: float | None) -> None:
     clock = Clock()
     end = clock.now + 1.0
-    count = iterate(Timed(end, believed, clock=clock), clock, each)
+    count = iterate(Stopping(end=end, each=believed, clock=clock), clock, each)
     assert clock.now <= end + 1e-9
     if believed is None or believed <= 0.1:
         assert count >= 0.9 / each - 1
@@ -51,65 +49,67 @@ def test_timed_ends_in_time_whatever_was_believed(each: float, believed: float |
 
 def test_timed_slows_down_with_the_machine() -> None:
     clock = Clock()
-    pace, end, done = Timed(clock.now + 1.0, 0.01, clock=clock), clock.now + 1.0, 0
+    pace, end, done = Stopping(end=clock.now + 1.0, each=0.01, clock=clock), clock.now + 1.0, 0
     while done < pace.planned(done):
         clock.now += 0.01 if done < 30 else 0.04
         done += 1
     assert clock.now <= end + 0.04
-    assert [total for _, total in pace.told][-1] < 100
+    assert [total for _, total in pace.planned_so_far][-1] < 100
 
 
 def test_timed_takes_one_iteration_even_without_time_and_never_too_many() -> None:
     clock = Clock()
-    assert iterate(Timed(clock.now - 5, 0.01, clock=clock), clock, 0.01) == 1
-    assert Timed(clock.now + 1e9, 1e-6, clock=clock).planned(0) == MOST_TIMED
+    assert iterate(Stopping(end=clock.now - 5, each=0.01, clock=clock), clock, 0.01) == 1
+    assert Stopping(end=clock.now + 1e9, each=1e-6, clock=clock).planned(0) == MOST_TIMED
     assert PROBE >= 1
 
 
 def test_until_met_cools_down_and_ends_where_nothing_is_gained() -> None:
-    flat = UntilMet(Counted(100), 0.05)
+    flat = Stopping(100, gain=0.05)
     assert iterate(flat, Clock(), 1.0) == 2 * LOOK_EVERY + round(COOLING * 100)
-    falling = UntilMet(Counted(100), 0.05)
+    falling = Stopping(100, gain=0.05)
     assert iterate(falling, Clock(), 1.0, falls=0.98) == 100
     assert flat.most == falling.most == 100
 
 
 def test_until_met_waits_for_what_begins_late() -> None:
-    assert iterate(UntilMet(Counted(100), 0.05, first=0.5), Clock(), 1.0) == 50 + round(COOLING * 100)
-    assert iterate(UntilMet(Counted(30), 0.05, first=0.9), Clock(), 1.0) == 30
+    assert iterate(Stopping(100, gain=0.05, first=0.5), Clock(), 1.0) == 50 + round(COOLING * 100)
+    assert iterate(Stopping(30, gain=0.05, first=0.9), Clock(), 1.0) == 30
 
 
 def test_what_was_decided_is_told() -> None:
     clock = Clock()
-    pace = UntilMet(Timed(clock.now + 1.0, 0.02, clock=clock), 0.05)
+    pace = Stopping(end=clock.now + 1.0, each=0.02, gain=0.05, clock=clock)
     count = iterate(pace, clock, 0.013)
-    assert [first for first, _ in pace.told] == sorted({first for first, _ in pace.told})
-    assert pace.told[-1][1] == count
+    assert [first for first, _ in pace.planned_so_far] == sorted({first for first, _ in pace.planned_so_far})
+    assert pace.planned_so_far[-1][1] == count
 
 
-def updated(iterations: int, each: float, start: float = 0.0, end: float = 0.0) -> Updated:
+def learn(
+    budget: Budget, iterations: int, each: float, start: float = 0.0, end: float = 0.0, commit: float = 0.02
+) -> None:
     moments = [start + (k + 1) * each for k in range(iterations)]
-    return Updated(None, None, [1.0] * iterations, [], {"start": start, "end": end}, moments=moments)  # type: ignore[arg-type]
+    budget.learn(moments, {"start": start, "end": end}, commit)
 
 
 def test_a_budget_learns_what_an_iteration_and_the_end_take() -> None:
     budget = Budget(500.0)
     assert budget.end(10.0) == pytest.approx(10.5 - AFTER_S)
-    budget.learn(updated(20, 0.01, start=0.1, end=0.03), commit=0.02)
+    learn(budget, 20, 0.01, start=0.1, end=0.03, commit=0.02)
     assert budget.each == pytest.approx(0.01)
     assert budget.after == pytest.approx(0.05)
-    budget.learn(updated(20, 0.02, start=0.1, end=0.03), commit=0.12)
+    learn(budget, 20, 0.02, start=0.1, end=0.03, commit=0.12)
     assert budget.each == pytest.approx(0.01 + RATE * 0.01)
     assert budget.after == pytest.approx(0.05 + RATE * 0.10)
     before = (budget.each, budget.after)
-    budget.learn(updated(0, 0.0), commit=9.0)
+    learn(budget, 0, 0.0, commit=9.0)
     assert (budget.each, budget.after) == before
 
 
 def test_one_slow_frame_costs_the_next_one_its_iterations_but_no_more() -> None:
     budget = Budget(500.0)
     for each in (0.01, 30.0, 0.01):
-        budget.learn(updated(20, each), commit=0.02)
+        learn(budget, 20, each, commit=0.02)
     assert budget.each == pytest.approx(0.01)
 
 

@@ -8,10 +8,10 @@ from box_scene import MOVING, make_box, moved
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.settings import UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.deformation import CpuDeformation
 from scas4d_core.update.warm_start import Motion, quaternion_products, rotate, warm_start
+from studies.constants import varied
 
 AXIS = np.array([0.6, 0.0, 0.8])
 CENTRE = np.array([0.5, -0.3, 0.1])
@@ -42,14 +42,12 @@ def set_turn(
 
 def begin(model: CpuDeformation, before: Gaussians) -> None:
     model.start(before)
-    warm_start(model, None, 1.0, UpdateSettings())
+    warm_start(model, None, 1.0, 0.0)
 
 
-def predicted(
-    model: CpuDeformation, now: Gaussians, motion: Motion | None, seconds: float, **changes: float
-) -> np.ndarray:
+def predicted(model: CpuDeformation, now: Gaussians, motion: Motion | None, seconds: float) -> np.ndarray:
     model.start(now)
-    warm_start(model, motion, seconds, UpdateSettings(**changes))  # type: ignore[arg-type]
+    warm_start(model, motion, seconds, 0.0)
     model.forward()
     return model.means.copy()
 
@@ -142,7 +140,9 @@ def test_share_zero_and_no_motion_are_the_identity() -> None:
     model.deltas[:] = 0.01
     model.forward()
     motion = Motion.of(model, 1.0)
-    for found in (predicted(model, box, None, 1.0), predicted(model, box, motion, 1.0, warm_start=0.0)):
+    with varied("scas4d_core.update.warm_start.WARM_START", 0.0):
+        nothing = predicted(model, box, motion, 1.0)
+    for found in (nothing, predicted(model, box, None, 1.0)):
         np.testing.assert_allclose(found, box.means, atol=1e-7)
         np.testing.assert_allclose(model.factors, box.factors, atol=1e-7)
 

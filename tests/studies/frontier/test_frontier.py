@@ -14,6 +14,7 @@ from client.cli.scores import Store
 from scas4d_core.captures import open_capture
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.metrics import evaluation as measures
+from scas4d_core.settings import UpdateSettings
 from studies.commands import app
 from studies.frontier import convergence, frontier, timing
 from studies.frontier.frontier import AXES, DEFAULT, Variant, measure_frontier, row_of, variants
@@ -71,7 +72,7 @@ def with_frame_0(box_capture, tmp_path):
 def test_every_setting_is_another_and_the_default_comes_first():
     everything = variants()
     assert everything[0] == DEFAULT
-    settings = [(v.settings.model_dump_json(), v.whole) for v in everything]
+    settings = [(json.dumps(v.record, sort_keys=True), v.whole) for v in everything]
     assert len(set(settings)) == len(settings)
     assert {len(v.settings.update.clusters) for v in AXES["layers"]} == {1, 2, 4, 5}  # the default has three
     assert [v.settings.update.clusters[0] for v in AXES["clusters"]] == [16, 32, 48]
@@ -116,6 +117,19 @@ def test_only_what_is_missing_is_measured_the_cheapest_first(tmp_path, monkeypat
         ("dynamic3dgs", 100, 6),
     ]
     assert lines == ["8 rows, 1 of them measured already"]
+
+
+def test_a_constant_that_was_a_setting_makes_no_row_stale():
+    (varied,) = AXES["max-scale"]
+    place = UpdateSettings.constants["max_scale"].place
+    assert varied.record["constants"] == {place: 2.0}
+    rows = [made_row(DEFAULT, "robot", 5), made_row(varied, "robot", 5)]
+    assert (row_of(rows, DEFAULT, "robot", 5), row_of(rows, varied, "robot", 5)) == (rows[0], rows[1])
+    for row, value in zip(rows, (0.02, 2.0), strict=True):  # as they were written before
+        row["settings"].pop("constants", None)
+        row["settings"]["update"] |= {"max_scale": value, "layer_starts": [0.0, 0.2, 0.4], "coarse_until": 0.0}
+        row["settings"]["update"]["weights"] |= {"image": 1.0}
+    assert (row_of(rows, DEFAULT, "robot", 5), row_of(rows, varied, "robot", 5)) == (rows[0], rows[1])
 
 
 def test_a_whole_capture_is_another_row_than_its_first_updates():
@@ -277,8 +291,8 @@ def test_settings_are_timed_in_turns_and_the_first_round_does_not_count(box_capt
     one, other = row["settings"]
     assert (one["seconds_each"], one["seconds"], one["ratio"]) == ([2.0, 3.0], 2.5, 1.0)
     assert (other["seconds_each"], other["ratio"], other["gaussians"]) == ([6.0], 3.0, 7)
-    assert timing.time_of(row, seeded.settings)["label"] == "short"
-    assert timing.time_of(row, DEFAULT.settings) is None
+    assert timing.time_of(row, seeded)["label"] == "short"
+    assert timing.time_of(row, DEFAULT) is None
     paces[short.settings.update.iterations] = 2.0  # a busier machine
     alone = timing.measure_times(box_capture, [short], tmp_path, rounds=5, report=lambda line: None)
     kept = alone["settings"][1]

@@ -1,4 +1,4 @@
-"""What may be committed: rows that are wrong are held alone, too many fail the attempt, axes stay in their bounds."""
+"""States that may be committed: wrong rows are held alone, too many fail the attempt, axes stay in their bounds."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.robust.attempts import BRIGHTEST, FARTHEST, FEW, LONGEST, SHRUNK, STRETCHED, axis_lengths, checked
+from scas4d_core.robust.validation import BRIGHTEST, FARTHEST, FEW, LONGEST, SHRUNK, STRETCHED, axis_lengths, validated
+from scas4d_core.update.result import UpdateResult, UpdateTrace
 from studies.hard_frames.scene import first_state, gone
 
 BEFORE = first_state(resting_may_move=True)
@@ -16,6 +17,11 @@ AFTER = gone(BEFORE, 0.05)
 ROWS = np.flatnonzero(BEFORE.moving)
 RADIUS = 1.5
 ROW = 17
+
+
+def checked(state: Gaussians, radius: float, first: np.ndarray | None = None) -> tuple[UpdateResult, str | None]:
+    return validated(BEFORE, UpdateResult(state, None, UpdateTrace()), ROWS, radius, first)
+
 
 Spoil = Callable[[Gaussians], None]
 
@@ -57,8 +63,8 @@ SPOILS = {
 
 @pytest.mark.parametrize("kind", SPOILS)
 def test_a_wrong_row_is_held_alone(kind: str) -> None:
-    check = checked(BEFORE, spoilt(ROW, by=SPOILS[kind]), ROWS, RADIUS)
-    assert (check.held, check.fault) == (1, None)
+    check, fault = checked(spoilt(ROW, by=SPOILS[kind]), RADIUS)
+    assert (check.held, fault) == (1, None)
     for name, array in check.gaussians.arrays().items():
         np.testing.assert_array_equal(array[ROW], BEFORE.arrays()[name][ROW])
         np.testing.assert_array_equal(np.delete(array, ROW, 0), np.delete(AFTER.arrays()[name], ROW, 0))
@@ -67,31 +73,31 @@ def test_a_wrong_row_is_held_alone(kind: str) -> None:
 @pytest.mark.parametrize("kind", SPOILS)
 def test_too_many_wrong_rows_fail_the_attempt(kind: str) -> None:
     many = ROWS[: int(FEW * len(ROWS)) + 2]
-    check = checked(BEFORE, spoilt(*many, by=SPOILS[kind]), ROWS, RADIUS)
-    assert check.fault is not None
-    assert f"{len(many)} of {len(ROWS)}" in check.fault
+    check, fault = checked(spoilt(*many, by=SPOILS[kind]), RADIUS)
+    assert fault is not None
+    assert f"{len(many)} of {len(ROWS)}" in fault
     assert check.gaussians is BEFORE
 
 
 def test_a_wrong_colour_of_what_stands_is_held_too() -> None:
     row = int(np.flatnonzero(~BEFORE.moving)[0])
-    check = checked(BEFORE, spoilt(row, by=SPOILS["colour is NaN"]), ROWS, RADIUS)
-    assert (check.held, check.fault) == (1, None)
+    check, fault = checked(spoilt(row, by=SPOILS["colour is NaN"]), RADIUS)
+    assert (check.held, fault) == (1, None)
     np.testing.assert_array_equal(check.gaussians.colours[row], BEFORE.colours[row])
 
 
 def test_what_is_plausible_is_passed_on_as_it_is() -> None:
-    check = checked(BEFORE, AFTER, ROWS, RADIUS, axis_lengths(BEFORE))
+    check, fault = checked(AFTER, RADIUS, axis_lengths(BEFORE))
     assert check.gaussians is AFTER
-    assert (check.held, check.fault, check.bounded) == (0, None, 0)
+    assert (check.held, fault, check.bounded) == (0, None, 0)
 
 
 @pytest.mark.parametrize(("factor", "bound"), [(SHRUNK / 5, SHRUNK), (STRETCHED * 2, STRETCHED)])
 def test_an_axis_stays_in_its_bounds_and_keeps_its_direction(factor: float, bound: float) -> None:
     state = spoilt(by=inside_out)
     state.factors[ROW, :, 1] *= factor
-    check = checked(BEFORE, state, ROWS, 100.0, axis_lengths(BEFORE))
-    assert (check.held, check.fault, check.bounded) == (0, None, 1)
+    check, fault = checked(state, 100.0, axis_lengths(BEFORE))
+    assert (check.held, fault, check.bounded) == (0, None, 1)
     expected = AFTER.factors.copy()
     expected[ROW, :, 1] *= bound
     np.testing.assert_allclose(check.gaussians.factors, expected, rtol=1e-5)
@@ -101,8 +107,8 @@ def test_an_axis_of_no_length_and_bounds_beside_a_held_row() -> None:
     state = spoilt(ROW, by=SPOILS["position is NaN"])
     state.factors[ROW + 1, :, 2] = 0
     state.factors[ROW + 2, :, 0] *= 1e-6
-    check = checked(BEFORE, state, ROWS, RADIUS, axis_lengths(BEFORE))
-    assert (check.held, check.fault) == (1, None)
+    check, fault = checked(state, RADIUS, axis_lengths(BEFORE))
+    assert (check.held, fault) == (1, None)
     assert np.isfinite(check.gaussians.factors).all()
     assert axis_lengths(check.gaussians)[ROW + 2, 0] == pytest.approx(
         SHRUNK * axis_lengths(BEFORE)[ROW + 2, 0], rel=1e-4

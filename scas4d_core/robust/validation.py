@@ -1,20 +1,17 @@
-"""An update is a transaction: how often it is tried, in which manner, and what a state must be to be committed.
+"""Validation of a state: one that is not finite, bounded and plausible is never committed.
 
-A state that is not finite, bounded and plausible is never committed. Single Gaussians that are not are held as they
-were before; where more than a few are, the whole attempt counts as failed and the next rung of the ladder is tried from
-the committed state. Where none holds, the state of the frame before stays, and the frame says so.
+Single Gaussians that are not are held as they were before; where more than a few are, the whole attempt has failed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.update.stopping import Pace
+from scas4d_core.update.result import UpdateResult
 
 Array = NDArray[np.float32]
 
@@ -31,83 +28,25 @@ FEW = 0.01
 """Share of the moving Gaussians that may be held one by one; more, and the update is not plausible."""
 
 
-@dataclass(frozen=True)
-class Manner:
-    """How an update is tried.
-
-    Attributes:
-        name: as the report says it. rates: factor on all of Adam's rates. rigid: clusters turn and shift, nothing else.
-        hold_colours: colours stay. cold: without the motion before. longer: factor on the iterations.
-    """
-
-    name: str = "as set"
-    rates: float = 1.0
-    rigid: bool = False
-    hold_colours: bool = False
-    cold: bool = False
-    longer: float = 1.0
-
-
-AS_SET = Manner()
-SMALLER = Manner("smaller steps", rates=0.3, cold=True)
-RIGID = Manner("rigid layers only", rates=0.3, rigid=True, hold_colours=True, cold=True)
-SOUGHT = Manner("sought again", cold=True, longer=5.0)
-"""After ``reacquire``: from where the silhouettes say that the object is, or from where an update ended. Two of three
-frames of robot lost, the next is met at 33.5 dB with five times the iterations, at 32.1 dB with twice."""
-
-LADDER = (SMALLER, RIGID)
-"""What follows an attempt that is not finite or not plausible."""
-
-
-@dataclass(frozen=True)
-class Course:
-    """What an updater is told of one attempt.
-
-    Attributes:
-        pace: how long. manner: how. gate: told each camera's first dB once all were rendered, it answers with those
-            to leave out from then on; None: all stay. witness: whether start and end are compared (``anytime``).
-        enough: errors of the witnesses, by view, at which the frame before needs no iteration; None: never.
-        step: seconds since the frame before, where nothing was learnt from that one, see ``Anytime.start``; else None.
-    """
-
-    pace: Pace
-    manner: Manner = AS_SET
-    gate: Callable[[Mapping[str, float]], Mapping[str, str]] | None = None
-    witness: bool = False
-    enough: Mapping[str, float] | None = None
-    step: float | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Checked:
-    """A state that may be committed, or why it may not.
-
-    Attributes:
-        gaussians: with what is implausible held. held: how many Gaussians are. fault: None where it may be committed.
-        bounded: axes that were set to the shortest or longest that they may be.
-    """
-
-    gaussians: Gaussians
-    held: int
-    fault: str | None
-    bounded: int = 0
-
-
 def axis_lengths(gaussians: Gaussians) -> Array:
     """[N, 3] metres."""
     lengths: Array = np.sqrt(np.square(gaussians.factors).sum(axis=1))
     return lengths
 
 
-def checked(
-    before: Gaussians, after: Gaussians, rows: NDArray[np.int64], radius: float, first: Array | None = None
-) -> Checked:
+def validated(
+    before: Gaussians, result: UpdateResult, rows: NDArray[np.int64], radius: float, first: Array | None = None
+) -> tuple[UpdateResult, str | None]:
     """Hold what is not finite, bounded and plausible as it was before.
 
     Args:
-        before, after: Θ_{t−1} and what an update makes of it. rows: [M] what moves. radius: of the rig, metres.
+        before: Θ_{t−1}. result: of an attempt. rows: [M] the moving. radius: of the rig, metres.
         first: [N, 3] ``axis_lengths`` of frame 0; None: axes may have any length up to ``LONGEST``.
+
+    Returns:
+        The result with a state that may be committed, and None; or with ``before``, and the fault of its state.
     """
+    after = result.gaussians
     bad = np.zeros(len(after), np.bool_)
     with np.errstate(over="ignore", invalid="ignore"):
         colours = np.abs(after.colours).max(axis=1, initial=0)
@@ -120,15 +59,16 @@ def checked(
         fine &= _oriented(before.factors[rows], after.factors[rows])
     bad[rows] |= ~fine
     count = int(bad.sum())
+    if count > max(1, FEW * len(rows)):
+        fault = f"{count} of {len(rows)} Gaussians are not finite, or moved or grew too far"
+        return replace(result, gaussians=before, held=count), fault
     bounded = 0
     if first is not None:
         after, bounded = _bounded(after, rows, squares, first)
-    if count == 0:
-        return Checked(after, 0, None, bounded)
-    if count > max(1, FEW * len(rows)):
-        return Checked(before, count, f"{count} of {len(rows)} Gaussians are not finite, or moved or grew too far")
-    arrays = {name: np.where(_like(bad, now), then, now) for name, then, now in _pairs(before, after)}
-    return Checked(after.replace(**arrays), count, None, bounded)
+    if count:
+        arrays = {name: np.where(_like(bad, now), then, now) for name, then, now in _pairs(before, after)}
+        after = after.replace(**arrays)
+    return replace(result, gaussians=after, held=count, bounded=bounded), None
 
 
 def _bounded(after: Gaussians, rows: NDArray[np.int64], squares: Array, first: Array) -> tuple[Gaussians, int]:

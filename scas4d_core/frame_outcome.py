@@ -1,0 +1,97 @@
+"""Outcomes of a frame, as enums: light enough for every process, with the texts that people read in one place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import Any
+
+HELD_TEXT = "held as it was: "
+"""The beginning of the text for a frame whose state is the one before."""
+
+
+class Candidate(StrEnum):
+    """A state that may become Θ_t; the better one on the probe views does. The values are those on disk."""
+
+    END = "end"
+    """The end of the update."""
+    STILL = "still"
+    """Θ_{t−1}, not moved."""
+    WARM = "warm"
+    """Θ_{t−1} moved on by the warm start alone."""
+
+
+class FrameOutcome(StrEnum):
+    """The outcome of a frame.
+
+    >>> FrameOutcome.HELD_UNMET.held, FrameOutcome.RELOCATED.degraded, FrameOutcome.STOOD.learnt
+    (True, True, False)
+    """
+
+    UPDATED = "updated"
+    """The update went as it should."""
+    STOOD = "stood"
+    """Θ_{t−1} shows the frame already; no iteration was needed, and nothing was learnt."""
+    RETRIED = "retried"
+    """Committed by a later attempt, with smaller steps or rigid layers: those before gave no plausible state."""
+    RELOCATED = "relocated"
+    """Committed after a longer search: the update as set had not met the frame."""
+    ACCEPTED = "accepted"
+    """Committed although it is not met: as many frames as the patience allows were held before it."""
+    HELD_UNUSABLE = "held_unusable"
+    """Θ_{t−1} stays: the pictures are too dark or too bright to learn from."""
+    HELD_IMPLAUSIBLE = "held_implausible"
+    """Θ_{t−1} stays: no attempt gave a finite, bounded and plausible state."""
+    HELD_UNMET = "held_unmet"
+    """Θ_{t−1} stays: no state was found that shows the frame."""
+
+    @property
+    def held(self) -> bool:
+        """True where the state of the frame before stays, because the frame was not believed."""
+        return self in (self.HELD_UNUSABLE, self.HELD_IMPLAUSIBLE, self.HELD_UNMET)
+
+    @property
+    def degraded(self) -> bool:
+        """True where the state is not the frame's, or only in part."""
+        return self not in (self.UPDATED, self.STOOD)
+
+    @property
+    def learnt(self) -> bool:
+        """True where the state was updated to the frame's pictures."""
+        return not self.held and self is not self.STOOD
+
+
+def degraded_text(outcome: FrameOutcome, reason: str) -> str | None:
+    """The sentence of a report for people; None of a frame that went as it should.
+
+    >>> degraded_text(FrameOutcome.HELD_UNMET, "the pictures are met at 12.0 dB")
+    'held as it was: the pictures are met at 12.0 dB'
+    """
+    if not outcome.degraded:
+        return None
+    return HELD_TEXT + reason if outcome.held else reason
+
+
+def outcome_of(record: Mapping[str, Any]) -> FrameOutcome:
+    """The outcome in a report as it was committed. Reports of earlier versions have the text alone, which is read here.
+
+    Args:
+        record: as ``History.report`` gives it.
+
+    >>> outcome_of({"degraded": "held as it was: the pictures are 0.01 times as bright as they were"})
+    <FrameOutcome.HELD_UNUSABLE: 'held_unusable'>
+    >>> outcome_of({"outcome": "stood", "degraded": None})
+    <FrameOutcome.STOOD: 'stood'>
+    """
+    if "outcome" in record:
+        return FrameOutcome(record["outcome"])
+    text = record.get("degraded")
+    if text is None:
+        return FrameOutcome.STOOD if record.get("iterations") == 0 else FrameOutcome.UPDATED
+    if text.startswith("held"):
+        if "less than usual" in text:
+            return FrameOutcome.HELD_UNMET
+        return FrameOutcome.HELD_IMPLAUSIBLE if "not finite" in text else FrameOutcome.HELD_UNUSABLE
+    if "taken as it is" in text:
+        return FrameOutcome.ACCEPTED
+    return FrameOutcome.RELOCATED if "less than usual" in text else FrameOutcome.RETRIED

@@ -1,0 +1,169 @@
+"""Checks of a frame's pictures before they are learnt from: black, repeated, or exposed otherwise than those before.
+
+A black frame is finite, and 100 iterations would paint the scene black. Lights flicker, and cameras that choose their
+own exposure do it together: learnt as colours, that would be unlearnt a frame later, so the gain is taken out of the
+pictures. It is read against the scene as it stood: the median over the pixels is that of the many in which nothing but
+the light changed. A light that stays is another one (``solve_frame``): then the scene's colours take the gain, and its
+pictures are as they are.
+
+A frame that shows the pictures of the one before comes from a camera at half the rate of its rig, or from a rig that
+sends its last frame while it waits. Nothing is learnt from it, and that nothing moved is not believed either: the next
+frame is looked for where the motion before them leads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from math import nan
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.robust.outliers import Past, few
+from scas4d_core.update.picture_loss import PictureLoss
+from scas4d_core.update.views import LABEL, TrainingView, ViewFactory
+
+Array = NDArray[np.float32]
+
+EXPOSURE = 1.05
+"""Times brighter or darker, median over the cameras, from which a frame is exposed otherwise; clean captures: 1.04."""
+ENOUGH = 8
+"""Cameras that the exposure needs: an object that turns changes the brightness of one picture by a third."""
+UNUSABLE = 2.0
+"""Times brighter or darker, as above, from which the light is another and nothing is learnt from the frame."""
+BLIND = 0.05
+"""Share of its usual brightness, against the other cameras, below which a camera shows nothing."""
+DARKEST = 1e-3
+"""Mean of a picture, 0…1, below which its brightness says nothing."""
+
+DARK = 0.05
+"""Of a channel, 0…1, from which it tells how bright the light is."""
+PIXELS = 100
+"""Of every other row and column that a camera needs to have a say."""
+SATURATED = 0.99
+"""Of a channel, 0…1, from which a pixel says only that it is at least so bright."""
+
+EVERY = 4
+"""Rows and columns apart of the pixels that fingerprints compare: pictures of a camera are never alike by chance."""
+
+
+def fingerprints(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, int]:
+    """CRC-32 of every fourth pixel of every fourth row of each camera's picture [H, W, 3]."""
+    return {name: crc32(picture[::EVERY, ::EVERY].tobytes()) for name, picture in pictures.items()}
+
+
+def brightness_of(picture: NDArray[np.uint8]) -> float:
+    """Mean of every fourth pixel of every fourth row of a picture [H, W, 3], 0…1."""
+    return float(picture[::4, ::4].mean()) / 255
+
+
+def brightness(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, float]:
+    """Of each camera's picture."""
+    return {name: brightness_of(picture) for name, picture in pictures.items()}
+
+
+def check_brightness(past: Past, bright: Mapping[str, float]) -> tuple[float, dict[str, str], str | None]:
+    """Compare the brightness of a frame's pictures with the usual one, before anything is rendered.
+
+    Args:
+        past: of the scene; cameras that were left out before stay so (``outliers.settle``). bright: by camera.
+
+    Returns:
+        Times that the frame is brighter than usual (1 where it is not seen to differ); the cameras to leave out, with
+        the reason; and the reason why nothing can be learnt from the frame, or None.
+    """
+    left_out = {
+        name: "it has not fitted the other cameras since it was left out" for name in bright if past.is_out(name)
+    }
+    usual = {name: past.brightness.get(name, nan) for name in bright}
+    ratios = {name: value / usual[name] for name, value in bright.items() if usual[name] > DARKEST}
+    if not ratios:
+        return 1.0, few(left_out, len(bright)), None
+    common = float(np.median(list(ratios.values())))
+    enough = len(ratios) >= ENOUGH
+    if not 1 / UNUSABLE <= common <= UNUSABLE and (enough or common < BLIND or common > 1 / BLIND):
+        return common, left_out, f"the pictures are {common:.2g} times as bright as they were"
+    for name, ratio in ratios.items():
+        if ratio < BLIND * common:
+            left_out[name] = f"it shows nothing: {ratio:.2g} times as bright as it was"
+    if not enough or 1 / EXPOSURE <= common <= EXPOSURE:
+        common = 1.0
+    return common, few(left_out, len(bright)), None
+
+
+def lit(past: Past, light: float) -> Past:
+    """The past with the light of a frame: for how many frames it has been brighter, or darker; darkness is none."""
+    if light == 1.0 or not BLIND <= light <= 1 / BLIND:
+        return replace(past, light=1.0, lit=0)
+    same = past.lit > 0 and (light > 1) == (past.light > 1)
+    return replace(past, light=light, lit=past.lit + 1 if same else 1)
+
+
+def evened(
+    factory: ViewFactory,
+    picture: PictureLoss,
+    state: Gaussians,
+    views: Sequence[TrainingView],
+    others: Sequence[TrainingView] = (),
+) -> tuple[float, list[TrainingView], list[TrainingView]]:
+    """Find how many times brighter than usual a frame is, and take that out of its views.
+
+    Args:
+        state: Θ_{t−1}, as the frame before shows it. views: of the frame. others: of the frame, without a say.
+
+    Returns:
+        1 and the views as they are, where they turn out not to differ.
+    """
+    shown = [_shown(picture, state, view) for view in views]
+    gain = _gain(views, shown)
+    if gain is None or 1 / EXPOSURE <= gain <= EXPOSURE:
+        return 1.0, list(views), list(others)
+    every = [*views, *others]
+    shown += [_shown(picture, state, view) for view in others]
+    without = [factory.retouched(view, _without(view, gain, now)) for view, now in zip(every, shown, strict=True)]
+    return gain, without[: len(views)], without[len(views) :]
+
+
+def gain_of(picture: PictureLoss, state: Gaussians, views: Sequence[TrainingView]) -> float | None:
+    """Times that a frame is brighter than Θ_{t−1} shows it; None where no camera can say."""
+    return _gain(views, [_shown(picture, state, view) for view in views])
+
+
+def relit(state: Gaussians, gain: float) -> Gaussians:
+    """The state in a light so many times as bright; colours beyond white are white."""
+    colours = state.colours
+    return state.replace(colours=np.minimum(np.float32(gain) * colours, np.maximum(colours, np.float32(1))))
+
+
+def _shown(picture: PictureLoss, state: Gaussians, view: TrainingView) -> Array:
+    """[3, H, W] the state as the view's camera would show it."""
+    features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
+    picture.measure(state.means, state.factors, state.opacities, features, view)
+    planes = picture.rasterizer.planes[:LABEL, : view.camera.height, : view.camera.width]
+    shown: Array = view.exposure[:LABEL, 0, None, None] * planes + view.exposure[:LABEL, 1, None, None]
+    return shown
+
+
+def _gain(views: Sequence[TrainingView], shown: Sequence[Array]) -> float | None:
+    """Median over the cameras that have a say; None where there is none."""
+    ratios = [ratio for view, now in zip(views, shown, strict=True) for ratio in _ratio(view.target[:LABEL], now)]
+    return float(np.median(ratios)) if ratios else None
+
+
+def _ratio(picture: Array, shown: Array) -> list[float]:
+    """Median over pixels and channels of how much brighter a picture is than what was shown; none of too few."""
+    here, there = picture[:, ::2, ::2], shown[:, ::2, ::2]
+    says = (there > DARK) & (there < SATURATED) & (here > DARK / 2) & (here < SATURATED)
+    return [float(np.median(here[says] / there[says]))] if says.sum() >= 3 * PIXELS else []
+
+
+def _without(view: TrainingView, gain: float, shown: Array) -> Array:
+    """The view's planes over the gain; saturated pixels are taken to be as bright as the scene says, or more."""
+    target = view.target.copy()
+    saturated = target[:LABEL] >= SATURATED
+    target[:LABEL] /= np.float32(gain)
+    np.copyto(target[:LABEL], np.maximum(target[:LABEL], shown), where=saturated)
+    return target
