@@ -26,7 +26,6 @@ from server.http.body_limit import BodyLimit
 from server.http.parameters import only_known
 from server.http.tickets import Tickets
 from server.problems import Problem
-from server.processes.local_placement import LocalPlacement
 from server.processes.placement import Placement
 from server.routes import (
     budget,
@@ -65,7 +64,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         settings.data.mkdir(parents=True, exist_ok=True)
         app.state.hub = Hub(settings.max_subscribers, settings.stream_questions)
-        where = placement or LocalPlacement()
+        where = placement or Placement()
         app.state.readiness = Readiness(settings, where)
         app.state.scenes = Scenes(settings, where, app.state.hub)
         await app.state.scenes.open()

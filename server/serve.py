@@ -17,7 +17,7 @@ from server.app import create_app
 from server.connections.config import guarded
 from server.connections.process import keep_freed_memory, room_for_connections
 from server.health import logs
-from server.processes.local_placement import LocalPlacement
+from server.processes.placement import Placement
 from server.scene.scenes import hold
 from server.settings import ServerSettings, unknown
 
@@ -63,7 +63,7 @@ def serve(settings: ServerSettings) -> None:
     sockets = listen(settings.host, settings.port)
     keep_freed_memory()
     config = guarded(
-        create_app(_with_files(settings), LocalPlacement(prepare)),
+        create_app(_with_files(settings), Placement(prepare)),
         log_config=None,
         access_log=False,
         timeout_graceful_shutdown=max(1, round(settings.stop_seconds)),

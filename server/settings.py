@@ -45,10 +45,6 @@ class ServerSettings(BaseSettings):
     model_config = SettingsConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True, env_prefix=PREFIX)
 
     data: Path = Field(default=Path("data"), description="Folder of the scenes; made when missing.")
-    engine: str = Field(
-        default="server.processes.engine:core_engine",
-        description="module:function that makes the engine of a scene, called once in each of its processes.",
-    )
 
     host: str = Field(
         default="127.0.0.1", description="Address to listen at. Beyond the loopback only together with a token."

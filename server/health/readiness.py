@@ -16,7 +16,6 @@ from typing import Any
 
 from scas4d_core.storage.error_text import told
 from server.problems import Problem
-from server.processes.engine import load_engine
 from server.processes.messages import Stop
 from server.processes.placement import Placement, Process
 from server.settings import ServerSettings
@@ -33,11 +32,13 @@ class WarmedUp:
     fault: str | None = None
 
 
-def main(engine: str, connection: Connection[Any, Any]) -> None:
+def main(spec: None, connection: Connection[Any, Any]) -> None:
     """The process: warms up, says so, ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        load_engine(engine).warm_up()
+        from scas4d_core.warm_up import warm_up  # in this process only: the service stays light
+
+        warm_up()
         connection.send(WarmedUp())
     except Exception as error:
         log.exception("the kernels could not be warmed up")
@@ -64,7 +65,7 @@ class Readiness:
         self._process: Process | None = None
         if settings.warm_up:
             log.info("warming up the kernels; the first time they are compiled, which takes about a minute")
-            self._process = placement.start(main, settings.engine, self._told, self._ended)
+            self._process = placement.start(main, None, self._told, self._ended)
         else:
             self.after = 0.0
 

@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 from client.wire import Budget, Retention
 from scas4d_core.cameras import Camera, Rig
+from scas4d_core.settings import Settings
 
 
 @dataclass(frozen=True, eq=False)
 class SceneSpec:
-    """What both processes of a scene are started with. `settings` is the engine's own object."""
+    """What the processes of a scene are started with."""
 
-    engine: str
     folder: Path
     rig: Rig
-    settings: Any
+    settings: Settings
     minimum_cameras: int = 1
     keep_states: Retention = field(default_factory=Retention)
 

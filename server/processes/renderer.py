@@ -9,17 +9,18 @@ import logging
 import os
 import signal
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from client.wire import parts_model
+from scas4d_core.cameras import rig_inside
+from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.storage.error_text import told
 from scas4d_core.storage.frame_files import frame_file
 from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFrameError
 from server.processes import encode, track_answers
-from server.processes.engine import Reader, load_engine
 from server.processes.messages import (
     Answer,
     Ask,
@@ -36,6 +37,10 @@ from server.processes.messages import (
     TracksQuery,
 )
 from server.processes.part_labels import PartLabels
+from server.processes.placement import use_one_thread
+
+if TYPE_CHECKING:
+    from scas4d_core.query.committed import Committed
 
 BULK_NICE = 10
 """Added to the niceness of the process for tracks, parts and exports: views and updates go ahead of them."""
@@ -83,10 +88,9 @@ class Renderer:
 
     def __init__(self, spec: SceneSpec) -> None:
         self.spec = spec
-        self.engine = load_engine(spec.engine)
         self._stale: set[int] | None = set()
         self._history: History | None = None
-        self._reader: Reader | None = None
+        self._reader: Committed | None = None
         self._parts = PartLabels(spec.folder / "parts")
 
     @property
@@ -104,11 +108,17 @@ class Renderer:
         self._stale = None if frames is None or self._stale is None else self._stale | set(frames)
 
     @property
-    def reader(self) -> Reader:
-        """The engine's reader of all that is committed."""
+    def reader(self) -> Committed:
+        """The views, tracks and parts of all that is committed. The core is imported here, not in the service."""
         history = self.history
         if self._reader is None:
-            self._reader = self.engine.reader(self.spec.rig, self.spec.settings, history)
+            from scas4d_core.query.committed import Committed
+
+            use_one_thread()
+            settings, rig = self.spec.settings.scene, self.spec.rig
+            world = rig.world_frame(settings.metres_per_unit)
+            limits = scene_limits(settings.near, rig_inside(world, rig.cameras).radius)
+            self._reader = Committed(history, world, limits)
         return self._reader
 
     def labels(self, count: int | None) -> NDArray[np.int64]:

@@ -10,7 +10,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,10 @@ from scas4d_core.cameras import Camera
 from scas4d_core.query.tapvid3d import tapvid3d
 from scas4d_core.storage.history import History
 from server.processes import encode
-from server.processes.engine import Reader
 from server.processes.messages import SceneSpec, TracksQuery
+
+if TYPE_CHECKING:
+    from scas4d_core.query.committed import Committed
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -45,7 +47,7 @@ def cameras_of(query: TracksQuery) -> list[Camera]:
     return own + [camera for camera in query.project if camera.name not in names]
 
 
-def find(reader: Reader, history: History, query: TracksQuery) -> Arrays:
+def find(reader: Committed, history: History, query: TracksQuery) -> Arrays:
     """What a reader finds: ``tracks_world`` [T, Q, 3], ``confidence`` [T, Q] and more, as docs/tracks.md has it."""
     frames = list(query.frames)
     if query.ids is not None:

@@ -6,11 +6,10 @@ import contextlib
 import logging
 import os
 import signal
-import threading
 import time
 from collections import deque
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from client.wire import Budget
 from scas4d_core.captures import Frame, InitialPoints
@@ -18,7 +17,6 @@ from scas4d_core.storage.error_text import told
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.storage.npz import read_npz
 from server.processes.decoding import decode, read
-from server.processes.engine import Reconstruction, load_engine
 from server.processes.messages import (
     Broken,
     Committed,
@@ -32,13 +30,16 @@ from server.processes.messages import (
     Stalled,
     Stop,
 )
+from server.processes.placement import end_with_parent
 from server.repair import repairs
 from server.repair.repairs import mend_at_start
 from server.storage.disk import FolderLock, no_room
 from server.storage.frame_store import FrameDamage, holds
 
+if TYPE_CHECKING:
+    from scas4d_core.reconstruction import Reconstruction
+
 PROGRESS_EVERY_S = 0.2
-PARENT_EVERY_S = 0.5
 NICE = 5
 """Added to the worker's niceness: requests and views go ahead of updates (docs/live-views.md: what that is worth)."""
 STALL_S, LONGEST_STALL_S = 1.0, 30.0
@@ -77,18 +78,6 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     os._exit(0)
 
 
-def end_with_parent() -> None:
-    """The process ends soon after the one that started it: for those that may be busy for long."""
-    parent = os.getppid()
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(PARENT_EVERY_S)
-        os._exit(0)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
 class _Stopped(Exception):
     """Told to stop while waiting for room on the disk."""
 
@@ -99,7 +88,6 @@ class Worker:
     def __init__(self, spec: SceneSpec, connection: Connection[Any, Any]) -> None:
         self.spec = spec
         self.connection = connection
-        self.engine = load_engine(spec.engine)
         self.states: History | None = None
         self.reconstruction: Reconstruction | None = None
         self._progress_at = 0.0
@@ -115,7 +103,9 @@ class Worker:
             undone: tuple[int, ...] = ()
             faults: tuple[str, ...] = ()
             if history.indices:
-                self.reconstruction = self.engine.resume(
+                from scas4d_core.reconstruction import Reconstruction  # in this process only: the service stays light
+
+                self.reconstruction = Reconstruction.resume(
                     self.spec.rig, self.spec.settings, history, held=lambda index: holds(self.spec.frames, index)
                 )
                 if self.reconstruction.resumed is not None:
@@ -182,7 +172,7 @@ class Worker:
             return self.reconstruct(frame, dropped, message.budget, began)
         except FrameDamage as error:
             return SetAside(message.index, f"its record in the frame log is damaged: {error}", dropped)
-        except Exception as error:  # whatever the engine raises, the service goes on and says so
+        except Exception as error:  # whatever the core raises, the service goes on and says so
             if no_room(error):
                 raise
             log.exception("scene %s, frame %d", self.spec.folder.name, message.index)
@@ -204,14 +194,16 @@ class Worker:
         def pictures() -> tuple[Frame, dict[str, str]]:
             return decode(self.spec.rig, frame, read(self.spec.frames, frame))
 
-        for mended in repairs.remake(self.engine, self.spec, self.states, message, pictures):
+        for mended in repairs.remake(self.spec, self.states, message, pictures):
             self.connection.send(mended)
 
     def reconstruct(self, frame: Frame, dropped: dict[str, str], budget: Budget, began: float) -> Committed:
         """Runs the first frame or an update, and commits. `began`: `perf_counter` before decoding."""
         assert self.states is not None
         if self.reconstruction is None:
-            self.reconstruction = self.engine.start(
+            from scas4d_core.reconstruction import Reconstruction
+
+            self.reconstruction = Reconstruction.start(
                 self.spec.rig,
                 frame,
                 self.spec.settings,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from scas4d_core.captures import Frame
 from scas4d_core.storage.error_text import told
@@ -19,9 +19,11 @@ from scas4d_core.storage.frame_files import (
     frame_of,
 )
 from scas4d_core.storage.history import NEWEST_KEPT, PER_FRAME, History
-from server.processes.engine import Engine, Reconstruction
 from server.processes.messages import Mend, Mended, MendOutcome, Remake, SceneSpec
 from server.storage.disk import no_room
+
+if TYPE_CHECKING:
+    from scas4d_core.reconstruction import Reconstruction
 
 Decode = Callable[[], tuple[Frame, dict[str, str]]]
 
@@ -104,7 +106,7 @@ def _report_of(files: FrameFiles, index: int) -> dict[str, Any] | None:
     return report
 
 
-def remake(engine: Engine, spec: SceneSpec, history: History, message: Remake, decode: Decode) -> Iterator[Mended]:
+def remake(spec: SceneSpec, history: History, message: Remake, decode: Decode) -> Iterator[Mended]:
     """Makes a state again from its pictures; whatever comes of it, the scene goes on as before.
 
     Damage often has neighbours: where the state before it is damaged too, and nobody has noticed, that comes first.
@@ -126,10 +128,12 @@ def remake(engine: Engine, spec: SceneSpec, history: History, message: Remake, d
                 case _:
                     yield Mended(name, MendOutcome.LOST, "the state before it is gone")
             return
-    yield _remade(engine, spec, history, message, decode)
+    yield _remade(spec, history, message, decode)
 
 
-def _remade(engine: Engine, spec: SceneSpec, history: History, message: Remake, decode: Decode) -> Mended:
+def _remade(spec: SceneSpec, history: History, message: Remake, decode: Decode) -> Mended:
+    from scas4d_core.remake import remake as remake_state  # in the worker only: the service stays light
+
     index = message.frame.index
     assert history.files is not None
     name = history.files.path(index).name
@@ -140,10 +144,10 @@ def _remade(engine: Engine, spec: SceneSpec, history: History, message: Remake, 
             return Mended(name, MendOutcome.LOST, reason)
         budget = message.frame.budget.model_dump()
         notes = {"budget": budget}
-        report = engine.remake(
+        report = remake_state(
             spec.rig, spec.settings, history, message.base, frame, budget, dropped=dropped, notes=notes
         )
         return Mended(name, MendOutcome.REMADE, report=report)
-    except Exception as error:  # whatever the engine raises, the service goes on and says so
+    except Exception as error:  # whatever the core raises, the service goes on and says so
         log.exception("scene %s, frame %d cannot be made again", spec.folder.name, index)
         return Mended(name, MendOutcome.NO_ROOM if no_room(error) else MendOutcome.LOST, told(error))

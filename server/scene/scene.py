@@ -86,9 +86,7 @@ class Scene:
         least = self.rules.minimum_cameras
         self.minimum_cameras = -(-len(self.rig) // 2) if least is None else min(least, len(self.rig))
         self.queue_limit = self.rules.queue_frames or server.queue_frames
-        self.spec = SceneSpec(
-            server.engine, folder, self.rig, definition.settings, self.minimum_cameras, self.rules.keep_states
-        )
+        self.spec = SceneSpec(folder, self.rig, definition.settings, self.minimum_cameras, self.rules.keep_states)
         self.ledger = found.ledger
         self.held = Held(found.sizes)
         self.damage = DamageLog(found.damage)
