@@ -63,7 +63,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         settings.data.mkdir(parents=True, exist_ok=True)
-        app.state.hub = Hub(settings.max_subscribers, settings.stream_questions)
+        app.state.hub = Hub(settings.max_subscribers)
         where = placement or Placement()
         app.state.readiness = Readiness(settings, where)
         app.state.scenes = Scenes(settings, where, app.state.hub)
@@ -81,7 +81,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     )
     app.state.settings = settings
     app.state.guard = Guard(Limits.of(settings))
-    app.state.tickets = Tickets(settings.ticket_seconds, settings.max_tickets)
+    app.state.tickets = Tickets()
     handlers.install(app)
     # The last one added is the first that a request meets.
     app.add_middleware(BodyLimit, limit=int(settings.max_body_mb * 1e6))

@@ -17,7 +17,7 @@ from server.app import create_app
 from server.connections.config import guarded
 from server.connections.process import keep_freed_memory, room_for_connections
 from server.health import logs
-from server.processes.placement import Placement
+from server.processes.placement import STOP_SECONDS, Placement
 from server.scene.scenes import hold
 from server.settings import ServerSettings, unknown
 
@@ -47,7 +47,7 @@ def serve(settings: ServerSettings) -> None:
     """Runs until SIGTERM or SIGINT.
 
     Then it takes no more connections, closes WebSockets (1012), answers what was asked, and asks the scenes' processes
-    to end: each has `stop_seconds`. What they do not finish is in the frame log, and is taken up at the next start.
+    to end: each has `STOP_SECONDS`. What they do not finish is in the frame log, and is taken up at the next start.
 
     Raises:
         RuntimeError: the address or the data folder is in use, or cannot be had.
@@ -66,7 +66,7 @@ def serve(settings: ServerSettings) -> None:
         create_app(_with_files(settings), Placement(prepare)),
         log_config=None,
         access_log=False,
-        timeout_graceful_shutdown=max(1, round(settings.stop_seconds)),
+        timeout_graceful_shutdown=max(1, round(STOP_SECONDS)),
     )
     # uvicorn ends gracefully and then raises the signal again, for whoever called it: here that is nobody, and the
     # process ends with status 0.

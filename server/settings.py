@@ -5,6 +5,7 @@ The first of these that names a setting decides. docs/operations.md has the tabl
 
 from __future__ import annotations
 
+import importlib
 import ipaddress
 import os
 import re
@@ -30,6 +31,27 @@ URL = "SCAS4D_URL"
 
 TOKEN = re.compile(r"[A-Za-z0-9._~+/=-]{16,512}")
 """What can stand behind `Authorization: Bearer` (RFC 6750), and is long enough not to be guessed."""
+
+FORMER = {
+    "engine": "server.settings:FORMER_ENGINE",
+    "ticket_seconds": "server.http.tickets:TICKET_SECONDS",
+    "max_tickets": "server.http.tickets:MOST_TICKETS",
+    "header_lines": "server.connections.limits:HEADER_LINES",
+    "max_ingest_sockets": "server.ingest.acknowledge:MOST_SOCKETS",
+    "max_points": "server.routes.points:MOST_POINTS",
+    "max_render_pixels": "server.routes.render:MOST_PIXELS",
+    "max_track_points": "server.routes.tracks:MOST_POINTS",
+    "max_track_json_points": "server.routes.tracks:MOST_JSON_POINTS",
+    "max_track_views": "server.routes.tracks:MOST_VIEWS",
+    "max_subscriptions": "server.stream.subscriber:MOST_SUBSCRIPTIONS",
+    "max_stream_message_kb": "server.stream.subscriber:MESSAGE_KB",
+    "stream_questions": "server.stream.shared_queries:QUERIES_AT_ONCE",
+    "waiting_questions": "server.processes.readers:MOST_WAITING",
+    "answer_seconds": "server.processes.readers:ANSWER_SECONDS",
+    "stop_seconds": "server.processes.placement:STOP_SECONDS",
+}
+"""Settings of earlier versions, and the constants that they became, as module:name."""
+FORMER_ENGINE = "server.engine:core_engine"
 
 Names = Annotated[tuple[str, ...], NoDecode]
 """Several names; in the environment with commas between."""
@@ -69,10 +91,6 @@ class ServerSettings(BaseSettings):
         description="Other sites whose pages may use the service, as `https://viewer.example`; pages of the service "
         "itself always may.",
     )
-    ticket_seconds: float = Field(
-        default=30.0, gt=0, le=3600, description="Life of a ticket for a browser's WebSocket; it is used once."
-    )
-    max_tickets: int = Field(default=1024, ge=1, description="Tickets that wait to be used; more get 429.")
 
     header_seconds: float = Field(
         default=10.0,
@@ -89,12 +107,6 @@ class ServerSettings(BaseSettings):
         description="Largest header of a request, with its address, in kB of 1024 bytes; more gets 431 or 414. "
         "Browsers send up to 16 with cookies of other services on this host; reading one takes time by the square of "
         "its size.",
-    )
-    header_lines: int = Field(
-        default=100,
-        ge=20,
-        le=120,
-        description="Lines of a header; more get 431. Proxies add some ten; WebSockets take 128 at most.",
     )
     body_seconds: float = Field(
         default=20.0,
@@ -163,49 +175,12 @@ class ServerSettings(BaseSettings):
         description="Largest request body: 64 cameras of 4 MB. One file, and a frame over a WebSocket, may have what "
         "pictures of the rig can have at most, where that is less.",
     )
-    max_ingest_sockets: int = Field(
-        default=64,
-        ge=1,
-        description="WebSockets that send frames to one scene: one a camera where each has a sender of its own.",
-    )
     max_image_pixels: int = Field(
         default=40_000_000,
         ge=1,
         description="Of one camera; a decoded picture takes 3 bytes a pixel, twice while decoding.",
     )
-    max_points: int = Field(default=2_000_000, ge=1, description="Of an initial cloud.")
-    max_render_pixels: int = Field(default=8_000_000, ge=1, description="Of one novel view.")
-    max_track_points: int = Field(default=1_000_000, ge=1, description="Points times frames of one track query.")
-    max_track_json_points: int = Field(
-        default=100_000, ge=1, description="The same where the answer is JSON, some 100 bytes each; npz takes more."
-    )
-    max_track_views: int = Field(
-        default=4096,
-        ge=1,
-        description="Cameras times frames of one track query in which visibility is asked: a depth picture each.",
-    )
     max_subscribers: int = Field(default=128, ge=1, description="Of the stream of one scene.")
-    max_subscriptions: int = Field(default=16, ge=1, description="Of one subscriber at a time.")
-    max_stream_message_kb: int = Field(
-        default=256, ge=1, description="Largest message of a subscriber: some 8000 pixels to track."
-    )
-    stream_questions: int = Field(
-        default=2,
-        ge=1,
-        description="Views, tracks and parts for subscribers that a scene's reader has before it at a time; more wait.",
-    )
-    waiting_questions: int = Field(
-        default=64,
-        ge=1,
-        description="Views, or other questions, that wait for a scene's reader; more get 503. Beyond a second or two "
-        "of views, waiting only makes it worse.",
-    )
-    answer_seconds: float = Field(
-        default=120.0, gt=0, description="A render, track or part query that takes longer gets 503."
-    )
-    stop_seconds: float = Field(
-        default=5.0, gt=0, description="Grace for a worker to end by itself at shutdown and delete."
-    )
     scrub_mb_per_second: float = Field(
         default=4.0,
         ge=0,
@@ -299,6 +274,7 @@ class ServerSettings(BaseSettings):
             written = {} if file is None else TomlConfigSettingsSource(cls, toml_file=Path(file))()
         except ValueError as error:  # tomllib's says line and column
             raise SettingsError(f"{CONFIG}: {file} is no TOML ({error})") from None
+        _refuse_former(environment, written)
         merged = {**written, **read, **{n: v for n, v in given.items() if v is not None}}
         try:
             return cls.model_validate(merged)
@@ -312,9 +288,35 @@ class ServerSettings(BaseSettings):
             raise SettingsError((f"setting {name}{value}: " if name else "") + fault + known) from None
 
 
+def _refuse_former(environment: Mapping[str, str], written: dict[str, Any]) -> None:
+    """Takes settings of earlier versions out of `written`, the settings of the file.
+
+    Raises:
+        SettingsError: one of them, there or in the environment, differs from the constant that it became.
+    """
+    of_environment = {name.upper(): value for name, value in environment.items()}
+    for name, place in FORMER.items():
+        variable = PREFIX + name.upper()
+        given = {variable: of_environment.get(variable), name: written.pop(name, None)}
+        for known_as, value in given.items():
+            if value is None:
+                continue
+            module, _, constant = place.partition(":")
+            fixed = getattr(importlib.import_module(module), constant)
+            try:
+                same = value == fixed if isinstance(fixed, str) else float(value) == fixed
+            except (TypeError, ValueError):
+                same = False
+            if not same:
+                raise SettingsError(
+                    f"setting {known_as} is {value!r}, and is no setting any more: it is always {fixed!r}; leave it "
+                    f"out, or change {constant} in {module.replace('.', '/')}.py"
+                )
+
+
 def unknown(environment: Mapping[str, str]) -> list[str]:
     """Names that look like settings and are none: misspelt, most likely."""
-    known = {f"{PREFIX}{name.upper()}" for name in ServerSettings.model_fields} | {CONFIG, URL}
+    known = {f"{PREFIX}{name.upper()}" for name in (*ServerSettings.model_fields, *FORMER)} | {CONFIG, URL}
     return sorted(name for name in environment if name.upper().startswith(PREFIX) and name.upper() not in known)
 
 

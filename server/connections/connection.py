@@ -13,6 +13,7 @@ from typing import Any, ClassVar, cast
 import httptools
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
+from server.connections import limits
 from server.connections.guard import Guard
 from server.connections.record import PROGRESS_BYTES, Phase
 from server.connections.refusals import Refusal, problem, response
@@ -139,7 +140,7 @@ class Connection(HttpToolsProtocol):
         """Takes a line of the header. Trailers are dropped: nobody reads them, and they must not pass for headers."""
         if self._record.phase is not Phase.HEAD:
             return
-        if len(self.headers) >= self.guard.limits.header_lines:
+        if len(self.headers) >= limits.HEADER_LINES:
             self._fault = self._fault or Refusal.HEAD_LINES
             return
         super().on_header(name, value)

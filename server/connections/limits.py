@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from server.connections.refusals import Refusal
 from server.settings import ServerSettings
 
+HEADER_LINES = 100
+"""Lines of a header; more get 431. Proxies add some ten to a browser's twenty; WebSockets take 128 at most."""
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -15,7 +18,6 @@ class Limits:
 
     header_seconds: float
     header_bytes: int
-    header_lines: int
     body_seconds: float
     keep_alive_seconds: float
     unread_seconds: float
@@ -29,7 +31,6 @@ class Limits:
         return cls(
             header_seconds=settings.header_seconds,
             header_bytes=settings.header_kb << 10,
-            header_lines=settings.header_lines,
             body_seconds=settings.body_seconds,
             keep_alive_seconds=settings.keep_alive_seconds,
             unread_seconds=settings.unread_seconds,
@@ -43,7 +44,7 @@ class Limits:
         return {
             Refusal.HEAD_SIZE: self.header_bytes / 1024,
             Refusal.URL_SIZE: self.header_bytes / 1024,
-            Refusal.HEAD_LINES: self.header_lines,
+            Refusal.HEAD_LINES: HEADER_LINES,
             Refusal.HEAD_TIME: self.header_seconds,
             Refusal.BODY_TIME: self.body_seconds,
             Refusal.PEER_CONNECTIONS: self.per_peer,

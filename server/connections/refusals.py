@@ -46,8 +46,7 @@ def problem(refusal: Refusal, limit: float = 0) -> Problem:
                 f"the header of the request {what} than {limit:g}{unit}",
                 field="path" if refusal is Refusal.URL_SIZE else "headers",
                 value=f"more than {limit:g}{unit}",
-                remedy="send fewer or shorter headers, or raise "
-                + ("SCAS4D_HEADER_LINES" if lines else "SCAS4D_HEADER_KB"),
+                remedy="send fewer headers" if lines else "send fewer or shorter headers, or raise SCAS4D_HEADER_KB",
             )
         case Refusal.HEAD_TIME:
             return Problem(

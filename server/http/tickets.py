@@ -15,19 +15,20 @@ from server.problems import Problem, counted
 
 SUBPROTOCOL = "scas4d.ticket."
 
+TICKET_SECONDS = 30.0
+"""Life of a ticket: a browser opens its WebSocket at once, on a slow link within seconds."""
+MOST_TICKETS = 1024
+"""Tickets that may wait to be used: some 100 bytes each, and no page needs more than a few."""
+
 
 class Tickets:
-    """Those that wait to be used.
+    """The tickets that wait to be used.
 
     Args:
-        seconds: each lives so long.
-        limit: so many may wait.
         clock: seconds that only rise.
     """
 
-    def __init__(self, seconds: float, limit: int, clock: Callable[[], float] = time.monotonic) -> None:
-        self.seconds = seconds
-        self.limit = limit
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._until: dict[bytes, float] = {}
 
@@ -39,17 +40,17 @@ class Tickets:
         """
         now = self._clock()
         self._until = {digest: until for digest, until in self._until.items() if until > now}
-        if len(self._until) >= self.limit:
+        if len(self._until) >= MOST_TICKETS:
             raise Problem(
                 429,
-                f"{counted(len(self._until), 'ticket')} of at most {self.limit} wait to be used",
-                field="SCAS4D_MAX_TICKETS",
-                value=self.limit,
-                remedy=f"use them, or wait {self.seconds:g} s",
-                headers={"Retry-After": str(max(1, round(self.seconds)))},
+                f"{counted(len(self._until), 'ticket')} of at most {MOST_TICKETS} wait to be used",
+                field="tickets",
+                value=MOST_TICKETS,
+                remedy=f"use them, or wait {TICKET_SECONDS:g} s",
+                headers={"Retry-After": str(max(1, round(TICKET_SECONDS)))},
             )
         ticket = secrets.token_urlsafe(24)
-        self._until[_digest(ticket)] = now + self.seconds
+        self._until[_digest(ticket)] = now + TICKET_SECONDS
         return ticket
 
     def redeem(self, ticket: str) -> bool:

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+MOST_SOCKETS = 64
+"""WebSockets that send frames to one scene: one a camera where each has a sender of its own."""
+
 
 class Ingest:
     """Takes frames into a scene's ledger, the journal first. One at a time; uploads come in side by side."""
@@ -40,14 +43,13 @@ class Ingest:
         Raises:
             Problem: 429, as many do as may.
         """
-        most = self._scene.server.max_ingest_sockets
-        if self._sockets >= most:
+        if self._sockets >= MOST_SOCKETS:
             raise Problem(
                 429,
                 f"{counted(self._sockets, 'WebSocket')} send frames to this scene already",
-                field="SCAS4D_MAX_INGEST_SOCKETS",
-                value=most,
-                remedy="close another one, send over HTTP, or raise the limit",
+                field="id",
+                value=self._scene.id,
+                remedy="close another one, or send over HTTP",
                 headers={"Retry-After": "5"},
             )
         self._sockets += 1

@@ -21,6 +21,8 @@ from server.processes.messages import Stop
 Entry = Callable[..., None]
 """Called in the process as entry(spec, connection); `connection` has recv and send of a multiprocessing Connection."""
 
+STOP_SECONDS = 5.0
+"""Grace for a process to end by itself when a scene or the service stops; an unfinished frame is taken up again."""
 PARENT_EVERY_S = 0.5
 """A process notices so late that the service has ended."""
 
@@ -98,7 +100,7 @@ class Process:
         """Posts a message and returns at once; messages to a process that has ended are dropped."""
         self._outbox.put(message)
 
-    async def stop(self, seconds: float) -> None:
+    async def stop(self, seconds: float = STOP_SECONDS) -> None:
         """Asks the process to end, waits for `seconds`, then kills it."""
         self._stopping = True
         self.send(Stop())

@@ -35,13 +35,16 @@ from server.processes.messages import (
     TracksQuery,
 )
 from server.processes.placement import Entry, Placement, Process
-from server.settings import ServerSettings
 
 GRACE_VIEWS_S, GRACE_BULK_S = 10.0, 1.0
 """How long a process may go on with a question that nobody waits for any more. Views are short, and a new process takes
 a second or two to start."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
 """Before a process that ended by itself is started again; twice as long after each further end without an answer."""
+MOST_WAITING = 64
+"""Queries before a process; more get 503. Beyond a second or two of views, waiting only makes it worse."""
+ANSWER_SECONDS = 120.0
+"""A query that takes longer gets 503: the longest that is let in takes about half of it."""
 COUNTS_KEPT = 8
 """Numbers of parts whose labels are kept."""
 
@@ -75,7 +78,6 @@ class Line:
         self,
         entry: Entry,
         spec: SceneSpec,
-        server: ServerSettings,
         placement: Placement,
         *,
         eager: bool,
@@ -84,7 +86,6 @@ class Line:
     ) -> None:
         self._entry = entry
         self._spec = spec
-        self._server = server
         self._placement = placement
         self._grace = grace
         self._damaged = damaged
@@ -106,12 +107,12 @@ class Line:
         Raises:
             Problem: 503, too many wait, or no answer within the time that the service allows.
         """
-        if len(self._waiting) >= self._server.waiting_questions:
+        if len(self._waiting) >= MOST_WAITING:
             raise Problem(
                 503,
                 f"{counted(len(self._waiting), 'question')} of this scene waiting for an answer already",
-                field="SCAS4D_WAITING_QUESTIONS",
-                value=self._server.waiting_questions,
+                field="id",
+                value=self._spec.folder.name,
                 remedy="ask less often, or subscribe (WS …/stream): it sends the newest only",
                 headers={"Retry-After": "1"},
             )
@@ -122,13 +123,13 @@ class Line:
         self._waiting.append(turn)
         self._next()
         try:
-            return await asyncio.wait_for(turn.answer, self._server.answer_seconds)
+            return await asyncio.wait_for(turn.answer, ANSWER_SECONDS)
         except TimeoutError:
             raise Problem(
                 503,
-                f"no answer within {self._server.answer_seconds:g} s",
-                field="SCAS4D_ANSWER_SECONDS",
-                value=self._server.answer_seconds,
+                f"no answer within {ANSWER_SECONDS:g} s",
+                field="id",
+                value=self._spec.folder.name,
                 remedy="ask for less at once, or again later",
                 headers={"Retry-After": "5"},
             ) from None
@@ -143,7 +144,7 @@ class Line:
         if self.process is not None:
             self.process.send(Refresh(frames))
 
-    async def stop(self, seconds: float) -> None:
+    async def stop(self) -> None:
         """Ends the process, at once where it is busy; whoever waits is refused, and whoever asks later."""
         self._closed = True
         if self._pause is not None:
@@ -152,7 +153,7 @@ class Line:
         process, self.process = self.process, None
         busy, self._at_work = self._at_work is not None, None
         if process is not None:
-            await process.stop(0 if busy else seconds)
+            await (process.stop(0) if busy else process.stop())
         await asyncio.gather(*self._ending)
         for turn in turns:
             _answer(turn, Refused(turn.number, "the scene has ended", status=503))
@@ -241,9 +242,9 @@ class Readers:
         views, bulk: the two processes.
     """
 
-    def __init__(self, spec: SceneSpec, server: ServerSettings, placement: Placement, damaged: Noticed) -> None:
+    def __init__(self, spec: SceneSpec, placement: Placement, damaged: Noticed) -> None:
         self._spec = spec
-        of_all = partial(Line, spec=spec, server=server, placement=placement, damaged=damaged)
+        of_all = partial(Line, spec=spec, placement=placement, damaged=damaged)
         self.views = of_all(renderer.views, eager=True, grace=GRACE_VIEWS_S)
         self.bulk = of_all(renderer.bulk, eager=False, grace=GRACE_BULK_S)
         self._commits = 0
@@ -273,11 +274,11 @@ class Readers:
         self.views.refresh(frames)
         self.bulk.refresh(frames)
 
-    async def stop(self, seconds: float) -> None:
+    async def stop(self) -> None:
         """Ends the processes; whoever waits is refused."""
         for task in self._finding.values():
             task.cancel()
-        await asyncio.gather(self.views.stop(seconds), self.bulk.stop(seconds))
+        await asyncio.gather(self.views.stop(), self.bulk.stop())
 
     async def _tracks(self, query: TracksQuery) -> Answer:
         """Trajectories; a long question in pieces, so that others come in between."""

@@ -15,8 +15,11 @@ from numpy.typing import NDArray
 from client.wire import PointsReceipt
 from scas4d_core.storage.npz import write_npz
 from server.problems import Problem, counted
-from server.routes.access import TheScene, TheSettings
+from server.routes.access import TheScene
 from server.storage.disk import full_disk, no_room
+
+MOST_POINTS = 2_000_000
+"""Of an initial cloud: twenty times the Gaussians that a scene can have, and 100 MB to check."""
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
@@ -29,7 +32,7 @@ BODY: dict[str, Any] = {
 
 
 @router.put("/{id}/points", openapi_extra=BODY)
-async def put(scene: TheScene, server: TheSettings, request: Request) -> PointsReceipt:
+async def put(scene: TheScene, request: Request) -> PointsReceipt:
     """Gives the cloud that frame 0 starts from, before frame 0.
 
     The body is an npz: `positions` [P, 3] in the rig's world and units, `colours` [P, 3] in 0…1, and optionally
@@ -37,7 +40,7 @@ async def put(scene: TheScene, server: TheSettings, request: Request) -> PointsR
     """
     body = await request.body()
     sha256 = hashlib.sha256(body).hexdigest()
-    arrays = await asyncio.to_thread(read_points, body, server.max_points)
+    arrays = await asyncio.to_thread(read_points, body, MOST_POINTS)
     receipt = PointsReceipt(points=len(arrays["positions"]), sha256=sha256)
     async with scene.door:
         if scene.points_sha256 == sha256:
@@ -72,7 +75,7 @@ def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
                 f"the cloud unpacks to {unpacked} bytes",
                 field="points",
                 value=unpacked,
-                remedy=f"give at most {limit} points, or raise SCAS4D_MAX_POINTS",
+                remedy=f"give at most {limit} points",
             )
         with np.load(io.BytesIO(body), allow_pickle=False) as file:
             arrays = {name: np.asarray(file[name]) for name in file.files if name in shapes}

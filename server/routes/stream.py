@@ -14,7 +14,6 @@ from server import problems
 from server.connections.websocket import limit_messages
 from server.problems import Problem
 from server.scene.scenes import Scenes
-from server.settings import ServerSettings
 from server.stream.hub import Hub
 from server.stream.subscriber import Subscriber
 
@@ -27,12 +26,11 @@ log = logging.getLogger("scas4d.server")
 async def stream(websocket: WebSocket, id: str) -> None:
     """Scene state, finished frames, live views, tracks and parts, as the client subscribes to them."""
     scenes: Scenes = websocket.app.state.scenes
-    server: ServerSettings = websocket.app.state.settings
     hub: Hub = websocket.app.state.hub
     try:
         scene = scenes[id]
         _require_protocol(websocket)
-        subscriber = hub.join(id, scene.ask, lambda room: Subscriber(scene, server, room))
+        subscriber = hub.join(id, scene.ask, lambda room: Subscriber(scene, room))
     except Problem as problem:  # the handshake is answered like any request: browsers see only that it failed
         await websocket.send_denial_response(problems.answer(problem.document, problem.headers))
         return

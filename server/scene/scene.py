@@ -110,7 +110,7 @@ class Scene:
         self._hub = hub
         self._files = reports.ReportFiles(self.spec.states)
         self.ingest = Ingest(self)
-        self._questions = Readers(self.spec, server, placement, lambda files: self.mending.noticed(files))
+        self._questions = Readers(self.spec, placement, lambda files: self.mending.noticed(files))
         self.replays = Replays(self, placement)
         self.mending = Mending(self.ledger, self.damage, self, found.remake)
         self._worker: Process
@@ -431,6 +431,5 @@ class Scene:
         self.ingest.stop()
         self.mending.stop()
         self._background.cancel()
-        seconds = self.server.stop_seconds
-        await asyncio.gather(self._worker.stop(seconds), self._questions.stop(seconds), self.replays.stop())
+        await asyncio.gather(self._worker.stop(), self._questions.stop(), self.replays.stop())
         await self.journal.close()

@@ -20,7 +20,6 @@ from server.problems import Problem
 from server.processes.messages import PartsQuery, Query, RenderQuery, TracksQuery
 from server.routes import render, tracks
 from server.scene.scenes import Scene
-from server.settings import ServerSettings
 from server.stream.outbox import Mailbox
 from server.stream.shared_queries import Desk, fingerprint
 
@@ -53,10 +52,9 @@ class Feed(ABC):
     request: Any
     tag: int | None
 
-    def __init__(self, id: str, scene: Scene, server: ServerSettings, desk: Desk, box: Mailbox) -> None:
+    def __init__(self, id: str, scene: Scene, desk: Desk, box: Mailbox) -> None:
         self.id = id
         self.scene = scene
-        self.server = server
         self._desk = desk
         self._mailbox = box
         self._changes = 0
@@ -143,7 +141,7 @@ class RenderFeed(Feed):
 
     def query(self) -> RenderQuery:
         """The view as the reader takes it."""
-        return render.query_of(self.scene, self.server, self.request)
+        return render.query_of(self.scene, self.request)
 
     def head(self, query: Query) -> BulkHead:
         """Names the frame."""
@@ -177,9 +175,7 @@ class TracksFeed(Feed):
         first = self.request.first if self._from is None else self._from
         if self._at is None:  # stays the same frame when the scene gives up its first ones
             self._at = self.scene.committed[0] if self.request.at is None else self.request.at
-        return tracks.query_of(
-            self.scene, self.server, self.request.model_copy(update={"first": first, "at": self._at})
-        )
+        return tracks.query_of(self.scene, self.request.model_copy(update={"first": first, "at": self._at}))
 
     def head(self, query: Query) -> BulkHead:
         """Names the frames."""

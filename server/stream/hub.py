@@ -51,9 +51,9 @@ L = TypeVar("L", bound=Listener)
 class Room:
     """The listeners of one scene, and the desk that asks its reader for them."""
 
-    def __init__(self, ask: Ask, turns: int) -> None:
+    def __init__(self, ask: Ask) -> None:
         self.listeners: list[Listener] = []
-        self.desk = Desk(ask, turns)
+        self.desk = Desk(ask)
         self._status: str | None = None
 
     def changed(self) -> None:
@@ -72,12 +72,10 @@ class Hub:
 
     Args:
         max_listeners: of one scene.
-        turns: questions of a scene's listeners that may be with its reader at a time.
     """
 
-    def __init__(self, max_listeners: int, turns: int) -> None:
+    def __init__(self, max_listeners: int) -> None:
         self.max_listeners = max_listeners
-        self.turns = turns
         self._rooms: dict[str, Room] = {}
 
     def join(self, scene: str, ask: Ask, make: Callable[[Room], L]) -> L:
@@ -86,7 +84,7 @@ class Hub:
         Raises:
             Problem: 429, as many listen as may.
         """
-        room = self._rooms.get(scene) or Room(ask, self.turns)
+        room = self._rooms.get(scene) or Room(ask)
         if len(room.listeners) >= self.max_listeners:
             raise Problem(
                 429,

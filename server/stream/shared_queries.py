@@ -12,6 +12,9 @@ import numpy as np
 
 from server.processes.messages import Answer, Query, RenderQuery
 
+QUERIES_AT_ONCE = 2
+"""Queries of a lane that a scene's reader has for subscribers: one at work and one that follows at once; the others are
+made up when their turn comes, for what is newest then."""
 KEPT_ANSWERS = 64
 KEPT_BYTES = 32_000_000
 
@@ -53,15 +56,15 @@ def lane(query: Query) -> str:
 
 
 class Desk:
-    """Asks the reader, `turns` questions of a lane at a time; keeps the last answers for those who come a moment later.
+    """Asks the reader, `QUERIES_AT_ONCE` of a lane at a time; keeps the last answers for those who come a moment later.
 
     Whoever waits for a turn makes up the question when the turn has come: a camera that was moved meanwhile is asked
     for where it is now. Turns are given in the order of waiting, so nobody is starved by one who asks faster.
     """
 
-    def __init__(self, ask: Ask, turns: int) -> None:
+    def __init__(self, ask: Ask) -> None:
         self._ask = ask
-        self._turns = {"views": asyncio.Semaphore(turns), "bulk": asyncio.Semaphore(turns)}
+        self._turns = {lane: asyncio.Semaphore(QUERIES_AT_ONCE) for lane in ("views", "bulk")}
         self._working: dict[Hashable, asyncio.Future[Answer]] = {}
         self._kept: OrderedDict[Hashable, Answer] = OrderedDict()
         self._bytes = 0

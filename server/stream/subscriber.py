@@ -28,13 +28,18 @@ from client.wire.stream import (
 )
 from server.http import validation
 from server.problems import Problem, counted
+from server.routes import render, tracks
 from server.scene.scenes import Scene
-from server.settings import ServerSettings
 from server.stream.feeds import Feed, PartsFeed, RenderFeed, TracksFeed
 from server.stream.hub import Event, FrameFinished, Room
 from server.stream.outbox import Mailbox
 
 T = TypeVar("T")
+
+MOST_SUBSCRIPTIONS = 16
+"""Of one subscriber at a time: a page with a view for each of some cameras. Another stream may be opened for more."""
+MESSAGE_KB = 256
+"""Largest message of a subscriber: some 8000 pixels to track."""
 
 WHERE = "docs/stream.md lists the messages"
 
@@ -44,9 +49,8 @@ FEEDS: dict[Topic, type[Feed]] = {Topic.RENDER: RenderFeed, Topic.TRACKS: Tracks
 class Subscriber:
     """Listens to a scene for one client. Its mailbox is emptied by whoever holds the connection."""
 
-    def __init__(self, scene: Scene, server: ServerSettings, room: Room) -> None:
+    def __init__(self, scene: Scene, room: Room) -> None:
         self.scene = scene
-        self.server = server
         self.mailbox = Mailbox()
         self._room = room
         self._topics: dict[str, Topic] = {}
@@ -55,10 +59,10 @@ class Subscriber:
     def limits(self) -> StreamLimits:
         """What the client is told."""
         return StreamLimits(
-            subscriptions=self.server.max_subscriptions,
-            message_bytes=self.server.max_stream_message_kb * 1000,
-            render_pixels=self.server.max_render_pixels,
-            track_points=self.server.max_track_points,
+            subscriptions=MOST_SUBSCRIPTIONS,
+            message_bytes=MESSAGE_KB * 1000,
+            render_pixels=render.MOST_PIXELS,
+            track_points=tracks.MOST_POINTS,
         )
 
     async def greet(self) -> None:
@@ -123,12 +127,12 @@ class Subscriber:
     def _begin(self, message: Subscribe) -> Model:
         wanted = REQUESTS[message.topic]
         request = _valid(wanted.model_validate, message.request, "request", wanted)
-        if message.id not in self._topics and len(self._topics) >= self.server.max_subscriptions:
+        if message.id not in self._topics and len(self._topics) >= MOST_SUBSCRIPTIONS:
             raise Problem(
                 429,
                 f"{counted(len(self._topics), 'subscription')} open already, and no more are taken",
-                field="SCAS4D_MAX_SUBSCRIPTIONS",
-                value=self.server.max_subscriptions,
+                field="subscriptions",
+                value=MOST_SUBSCRIPTIONS,
                 remedy="unsubscribe from another one, or open a second stream",
             )
         return request
@@ -143,7 +147,7 @@ class Subscriber:
                 newest = self.scene.frames[self.scene.committed[-1]].report
                 self._put_report(message.id, FrameFinished(newest))
         else:
-            feed = FEEDS[message.topic](message.id, self.scene, self.server, self._room.desk, self.mailbox)
+            feed = FEEDS[message.topic](message.id, self.scene, self._room.desk, self.mailbox)
             feed.ask_for(request, message.tag)
             self._feeds[message.id] = (feed, asyncio.create_task(feed.run()))
 

@@ -47,7 +47,7 @@ def page(chromium):
 @pytest.fixture(scope="session")
 def service(tmp_path_factory):
     folder = tmp_path_factory.mktemp("viewer")
-    running = Running(fake_settings(folder, max_render_pixels=2_000_000), core=drawn.install)
+    running = Running(fake_settings(folder), core=drawn.install)
     yield running
     running.stop()
 

@@ -55,18 +55,7 @@ class Running:
 
 def fake_settings(folder, **changes):
     """Small limits, so that tests reach them."""
-    given = dict(
-        data=folder,
-        queue_frames=2,
-        max_body_mb=2,
-        max_scenes=4,
-        max_points=1000,
-        max_track_points=5000,
-        max_track_json_points=4000,
-        max_track_views=60,
-        max_ingest_sockets=3,
-        warm_up=False,
-    )
+    given = dict(data=folder, queue_frames=2, max_body_mb=2, max_scenes=4, warm_up=False)
     return ServerSettings(**given | changes)
 
 

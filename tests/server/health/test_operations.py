@@ -65,7 +65,7 @@ def children(pid):
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="processes are counted in /proc")
 @pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT])
 def test_it_ends_gracefully_in_the_middle_of_an_update(tmp_path, ending):
-    with served(tmp_path, SCAS4D_STOP_SECONDS="10") as (process, url, log):
+    with served(tmp_path) as (process, url, log):
         with Client(url) as sdk:
             id = sdk.create_scene(make_rig()).id
             sdk.put_frame(id, 0, pictures())

@@ -15,6 +15,7 @@ from running import Running, fake_settings, make_rig, problem
 from client.wire import RigModel
 from client.wire.stream import STREAM_PROTOCOL
 from server.http import origin
+from server.http import tickets as tickets_module
 from server.http.auth import Door
 from server.http.tickets import SUBPROTOCOL, Tickets
 from server.settings import ServerSettings, SettingsError
@@ -31,7 +32,6 @@ def guarded(tmp_path_factory):
         token=TOKEN,
         allowed_hosts="studio.example, proxied.example:8443",
         allowed_origins="https://viewer.example",
-        max_tickets=3,
     )
     running = Running(settings)
     yield running
@@ -148,7 +148,7 @@ def test_without_a_token_only_this_machine_reaches_it():
         headers = [(b"host", b"localhost")] + ([(b"authorization", f"Bearer {token}".encode())] if token else [])
         scope = {"type": "http", "path": "/", "method": "GET", "headers": headers, "server": (address, 80)}
         answered.clear()
-        asyncio.run(Door(app, ServerSettings(token=token), Tickets(1, 1))(scope, None, send))
+        asyncio.run(Door(app, ServerSettings(token=token), Tickets())(scope, None, send))
         return answered[0]["status"]
 
     assert ask("10.0.0.7") == 403
@@ -260,7 +260,7 @@ def test_a_ticket_alone_is_echoed_so_that_browsers_accept_the_handshake():
     async def send(message):
         sent.append(message)
 
-    tickets = Tickets(30, 3)
+    tickets = Tickets()
     offered = SUBPROTOCOL + tickets.issue()
     scope = {
         "type": "websocket",
@@ -311,7 +311,7 @@ def test_a_server_that_cannot_answer_a_handshake_closes_it():
         sent.append(message)
 
     scope = {"type": "websocket", "path": "/", "headers": [(b"host", b"evil.example")]}
-    asyncio.run(Door(None, ServerSettings(), Tickets(1, 1))(scope, None, send))
+    asyncio.run(Door(None, ServerSettings(), Tickets())(scope, None, send))
     assert [(message["type"], message["code"]) for message in sent] == [("websocket.close", 1008)]
     assert "name" in sent[0]["reason"]
 
@@ -319,9 +319,10 @@ def test_a_server_that_cannot_answer_a_handshake_closes_it():
 # Tickets by themselves, and the settings.
 
 
-def test_tickets_expire_are_bounded_and_kept_hashed():
+def test_tickets_expire_are_bounded_and_kept_hashed(monkeypatch):
+    monkeypatch.setattr(tickets_module, "MOST_TICKETS", 2)
     now = [0.0]
-    tickets = Tickets(30, 2, clock=lambda: now[0])
+    tickets = Tickets(clock=lambda: now[0])
     first, second = tickets.issue(), tickets.issue()
     assert not any(first.encode() in digest for digest in tickets._until)
     with pytest.raises(Exception, match="2 tickets of at most 2 wait"):

@@ -14,6 +14,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from client.wire import FRAME_MEDIA_TYPE, RigModel, frame_chunks
+from server.ingest import acknowledge
 from server.ingest.pictures import largest_frame
 
 FRAMED = {"Content-Type": FRAME_MEDIA_TYPE}
@@ -333,16 +334,17 @@ def test_a_full_queue_says_over_a_websocket_when_to_come_again(http, make, servi
     assert full["retry_after"] == int(by_http.headers["Retry-After"]) >= 1
 
 
-def test_a_scene_has_only_so_many_sending_websockets(http, make, service):
+def test_a_scene_has_only_so_many_sending_websockets(http, make, service, monkeypatch):
     id = make()
     address = f"{service.url.replace('http', 'ws')}/v1/scenes/{id}/ingest"
-    most = service.app.state.settings.max_ingest_sockets
+    most = 3
+    monkeypatch.setattr(acknowledge, "MOST_SOCKETS", most)
     with contextlib.ExitStack() as stack:
         sockets = [stack.enter_context(connect(address)) for _ in range(most)]
         with pytest.raises(InvalidStatus) as refused:
             connect(address)
         document = json.loads(refused.value.response.body)
-        assert (document["status"], document["field"]) == (429, "SCAS4D_MAX_INGEST_SOCKETS")
+        assert (document["status"], document["field"]) == (429, "id")
         assert refused.value.response.headers["Retry-After"]
         sockets[0].close()
         stack.enter_context(retried(lambda: connect(address), InvalidStatus))  # there is room again

@@ -7,6 +7,7 @@ import contextlib
 import io
 import threading
 import time
+from unittest import mock
 
 import fakes
 import httpx
@@ -18,6 +19,7 @@ from running import HEIGHT, WIDTH, Running, fake_settings, make_rig, pictures, p
 from client.sdk import Client
 from client.wire import CameraModel, part_colour
 from server.processes import encode
+from server.processes import readers as readers_module
 
 PATIENCE_S = 30
 
@@ -25,10 +27,10 @@ PATIENCE_S = 30
 @pytest.fixture(scope="module")
 def impatient(tmp_path_factory):
     """A service that soon gives up waiting for an answer; long enough for a process to start on a busy machine."""
-    settings = fake_settings(tmp_path_factory.mktemp("data")).model_copy(update={"answer_seconds": 10.0})
-    running = Running(settings)
-    yield running
-    running.stop()
+    with mock.patch.object(readers_module, "ANSWER_SECONDS", 10.0):
+        running = Running(fake_settings(tmp_path_factory.mktemp("data")))
+        yield running
+        running.stop()
 
 
 @contextlib.contextmanager
@@ -138,9 +140,9 @@ def test_the_process_for_bulk_starts_with_the_first_question_and_yields_to_the_o
     assert nice(readers.bulk.process) == min(19, nice(readers.views.process) + 10)
 
 
-def test_too_many_questions_are_refused(scene):
+def test_too_many_questions_are_refused(scene, monkeypatch):
     id, readers, http = scene
-    readers.bulk._server = readers.bulk._server.model_copy(update={"waiting_questions": 1})
+    monkeypatch.setattr(readers_module, "MOST_WAITING", 1)
     hanging = in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}"))
     until(lambda: readers.bulk._at_work is not None)
     in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids=0"))

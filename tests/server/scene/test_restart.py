@@ -229,4 +229,4 @@ def _start_second(folder):
     from server.scene.scenes import Scenes
     from server.stream.hub import Hub
 
-    asyncio.run(Scenes(fake_settings(folder), Placement(), Hub(1, 1)).open())
+    asyncio.run(Scenes(fake_settings(folder), Placement(), Hub(1)).open())

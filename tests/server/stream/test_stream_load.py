@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from types import SimpleNamespace
+from unittest import mock
 
 import pytest
 from running import WIDTH, make_rig, pictures
@@ -14,7 +15,7 @@ from client.wire import CameraModel, RenderRequest
 from client.wire.stream import STREAM_PROTOCOL, Subscribed, unpack
 from server.problems import Problem
 from server.processes.messages import Answer, PartsQuery, RenderQuery
-from server.settings import ServerSettings
+from server.stream import shared_queries
 from server.stream.feeds import RenderFeed
 from server.stream.outbox import UNSENT_REPLIES, Mailbox
 from server.stream.shared_queries import Desk, fingerprint
@@ -51,6 +52,11 @@ class Reader:
         await settle()
 
 
+def one_at_once(ask):
+    with mock.patch.object(shared_queries, "QUERIES_AT_ONCE", 1):
+        return Desk(ask)
+
+
 def question(name):
     return lambda: SimpleNamespace(key=name, query=name)
 
@@ -58,7 +64,7 @@ def question(name):
 def test_many_who_ask_the_same_share_one_answer():
     async def test():
         reader = Reader()
-        desk = Desk(reader, 2)
+        desk = Desk(reader)
         tasks = [asyncio.create_task(desk.answer(question("a"))) for _ in range(100)]
         await settle()
         assert reader.asked == ["a"]
@@ -75,7 +81,7 @@ def test_many_who_ask_the_same_share_one_answer():
 def test_no_more_than_so_many_questions_are_with_the_reader_and_nobody_is_passed_over():
     async def test():
         reader = Reader()
-        desk = Desk(reader, 2)
+        desk = Desk(reader)
         tasks = [asyncio.create_task(desk.answer(question(name))) for name in "abcd"]
         for asked in (["a", "b"], ["a", "b", "c"], ["a", "b", "c", "d"], ["a", "b", "c", "d"]):
             await settle()
@@ -89,7 +95,7 @@ def test_no_more_than_so_many_questions_are_with_the_reader_and_nobody_is_passed
 def test_trajectories_and_parts_do_not_stand_before_views():
     async def test():
         reader = Reader()
-        desk = Desk(reader, 1)
+        desk = one_at_once(reader)
         camera = make_rig().cameras[0]
         view = RenderQuery(camera, 0, ("colour",), "png", (0.0, 0.0, 0.0))
         queries = [PartsQuery(2), PartsQuery(3), view]
@@ -112,7 +118,7 @@ def test_a_question_that_fails_gives_its_turn_back():
         async def refuses(query):
             raise Problem(503, "too slow")
 
-        desk = Desk(refuses, 1)
+        desk = one_at_once(refuses)
         for asked in (raises, question("a"), question("a"), raises):
             with pytest.raises(Problem):
                 await desk.answer(asked)
@@ -137,7 +143,7 @@ def feed_of(reader, mailbox):
         id="s", committed=[0], rig=rig, camera=rig.__getitem__, committed_frame=lambda index, field="frame": 0,
         spec=SimpleNamespace(settings=SimpleNamespace(scene=SimpleNamespace(background=(0.0, 0.0, 0.0)))),
     )  # fmt: skip
-    return RenderFeed("v", scene, ServerSettings(), Desk(reader, 1), mailbox)
+    return RenderFeed("v", scene, one_at_once(reader), mailbox)
 
 
 def test_a_dragged_camera_is_rendered_where_it_is_not_everywhere_it_was():
