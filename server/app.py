@@ -15,19 +15,16 @@ from starlette.routing import Route, WebSocketRoute
 
 from client import __version__
 from server import problems
-from server.connections.guard import Guard
-from server.connections.limits import Limits
+from server.connections.guard import Guard, Limits
 from server.connections.proxies import ClientLimit
-from server.health.logs import AccessLog
 from server.health.readiness import Readiness
 from server.http import handlers
-from server.http.auth import Door
-from server.http.body_limit import BodyLimit
-from server.http.parameters import only_known
+from server.http.middleware import AccessLog, AuthMiddleware, BodyLimit
 from server.http.tickets import Tickets
 from server.problems import Problem
 from server.processes.placement import Placement
 from server.routes import (
+    access,
     budget,
     estimate,
     frames,
@@ -93,7 +90,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
             allow_headers=["Authorization", "Content-Type"],
             expose_headers=["*"],
         )
-    app.add_middleware(Door, settings=settings, tickets=app.state.tickets)
+    app.add_middleware(AuthMiddleware, settings=settings, tickets=app.state.tickets)
     if settings.trusted_proxies:
         app.add_middleware(ClientLimit, guard=app.state.guard)
     app.add_middleware(AccessLog)
@@ -102,7 +99,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         *(estimate, tickets, health, metrics, viewer),
     )
     for resource in resources:
-        app.include_router(resource.router, dependencies=[] if resource is viewer else [Depends(only_known)])
+        app.include_router(resource.router, dependencies=[] if resource is viewer else [Depends(access.only_known)])
         _answer_plain_requests(app, resource.router)
     _keep_document(app)
     return app

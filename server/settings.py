@@ -10,6 +10,7 @@ import ipaddress
 import os
 import re
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -36,7 +37,7 @@ FORMER = {
     "engine": "server.settings:FORMER_ENGINE",
     "ticket_seconds": "server.http.tickets:TICKET_SECONDS",
     "max_tickets": "server.http.tickets:MOST_TICKETS",
-    "header_lines": "server.connections.limits:HEADER_LINES",
+    "header_lines": "server.connections.guard:HEADER_LINES",
     "max_ingest_sockets": "server.ingest.acknowledge:MOST_SOCKETS",
     "max_points": "server.routes.points:MOST_POINTS",
     "max_render_pixels": "server.routes.render:MOST_PIXELS",
@@ -320,8 +321,9 @@ def unknown(environment: Mapping[str, str]) -> list[str]:
     return sorted(name for name in environment if name.upper().startswith(PREFIX) and name.upper() not in known)
 
 
+@lru_cache(64)
 def is_loopback(host: str) -> bool:
-    """Whether nothing but this machine reaches the address."""
+    """Whether nothing but this machine reaches the address. Cached: every request asks for the same few."""
     try:
         return host.lower() == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:

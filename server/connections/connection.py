@@ -13,11 +13,11 @@ from typing import Any, ClassVar, cast
 import httptools
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from server.connections import limits
+from server.connections import guard as guard_module
 from server.connections.guard import Guard
 from server.connections.record import PROGRESS_BYTES, Phase
 from server.connections.refusals import Refusal, problem, response
-from server.http.auth import HEADERS
+from server.http.middleware import HEADERS
 
 END_OF_HEAD = b"\r\n\r\n"
 CHUNKED_BYTES = 64 << 10
@@ -140,7 +140,7 @@ class Connection(HttpToolsProtocol):
         """Takes a line of the header. Trailers are dropped: nobody reads them, and they must not pass for headers."""
         if self._record.phase is not Phase.HEAD:
             return
-        if len(self.headers) >= limits.HEADER_LINES:
+        if len(self.headers) >= guard_module.HEADER_LINES:
             self._fault = self._fault or Refusal.HEAD_LINES
             return
         super().on_header(name, value)

@@ -13,7 +13,7 @@ from websockets.http11 import Request
 from server.connections.guard import LINGER_LONGEST_S, Guard
 from server.connections.record import Phase
 from server.connections.refusals import Refusal, problem, response
-from server.http.auth import HEADERS
+from server.http.middleware import HEADERS
 
 EARLY_BYTES = 1 << 16
 """Largest message of a WebSocket before its handshake is answered: nobody has to send one then."""

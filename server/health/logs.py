@@ -9,18 +9,13 @@ import json
 import logging
 import re
 import sys
-import time
 from datetime import UTC, datetime
 from typing import Any, Literal
-
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 SECRETS = re.compile(r"(?i)(bearer\s+|scas4d\.ticket\.|(?:token|ticket)=)[^\s\"',;&]+")
 """What follows is hidden wherever it appears: it comes from clients, and may turn up in any message."""
 
 _PLAIN = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName"}
-
-access = logging.getLogger("scas4d.access")
 
 
 def hidden(text: str) -> str:
@@ -89,55 +84,3 @@ def configure(format: Literal["auto", "json", "text"] = "auto", level: str = "in
         logging.getLogger("uvicorn").setLevel(max(logging.WARNING, logging.getLogger("uvicorn").level))
     # uvicorn logs a WebSocket with its whole address; `AccessLog` logs it without what follows the question mark.
     logging.getLogger("uvicorn.error").addFilter(lambda record: '"WebSocket %s"' not in str(record.msg))
-
-
-class AccessLog:
-    """A line a request and a line a WebSocket: method, path (no query), status, seconds, bytes. No headers."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Passes the request on and logs how it ended."""
-        if scope["type"] not in ("http", "websocket") or not access.isEnabledFor(logging.INFO):
-            await self.app(scope, receive, send)
-            return
-        began = time.perf_counter()
-        status, taken, given = 0, 0, 0
-
-        async def receiving() -> Message:
-            nonlocal taken
-            message = await receive()
-            taken += len(message.get("body") or message.get("bytes") or message.get("text") or b"")
-            return message
-
-        async def sending(message: Message) -> None:
-            nonlocal status, given
-            if "status" in message:
-                status = message["status"]
-            elif message["type"] == "websocket.accept":
-                status = 101
-            given += len(message.get("body") or message.get("bytes") or message.get("text") or b"")
-            await send(message)
-
-        try:
-            await self.app(scope, receiving, sending)
-        finally:
-            method = scope.get("method", "WEBSOCKET")
-            # As it was sent: percent-encoded, so that no path breaks a line.
-            path = scope.get("raw_path", scope["path"].encode()).decode("latin-1")
-            access.info(
-                "%s %s %d",
-                method,
-                path,
-                status,
-                extra={
-                    "method": method,
-                    "path": path,
-                    "status": status,
-                    "seconds": round(time.perf_counter() - began, 4),
-                    "bytes_in": taken,
-                    "bytes_out": given,
-                    "client": (scope.get("client") or ("",))[0],
-                },
-            )

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import shutil
-import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from typing import Protocol
 
 from prometheus_client import CollectorRegistry, Counter, Histogram
@@ -13,7 +11,6 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 
 from client.wire import FrameReportModel, FrameState, SceneState, SceneStatus
 from server.connections.refusals import Refusal
-from server.processes.messages import Query
 from server.settings import ServerSettings
 from server.stream.hub import Hub
 
@@ -95,17 +92,6 @@ def finished(report: FrameReportModel) -> None:
             DEGRADED.labels("held" if report.degraded.startswith("held") else "in_part").inc()
     for stage, seconds in report.seconds.items():
         UPDATE_SECONDS.labels(stage).observe(seconds)
-
-
-@contextmanager
-def answering(query: Query) -> Iterator[None]:
-    """Times a question to a scene's reader."""
-    kind, began, outcome = type(query).__name__.removesuffix("Query").lower(), time.perf_counter(), "failed"
-    try:
-        yield
-        outcome = "answered"
-    finally:
-        ANSWER_SECONDS.labels(kind, outcome).observe(time.perf_counter() - began)
 
 
 class HasStatus(Protocol):

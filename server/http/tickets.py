@@ -11,6 +11,8 @@ import secrets
 import time
 from collections.abc import Callable
 
+from starlette.types import Message, Scope, Send
+
 from server.problems import Problem, counted
 
 SUBPROTOCOL = "scas4d.ticket."
@@ -61,3 +63,28 @@ class Tickets:
 
 def _digest(ticket: str) -> bytes:
     return hashlib.sha256(ticket.encode("utf-8", "surrogateescape")).digest()
+
+
+def take_offered(scope: Scope) -> list[str]:
+    """Takes the tickets out of the subprotocols that a WebSocket offers, and returns those subprotocols."""
+    offered = scope.get("subprotocols", [])
+    shown = [name for name in offered if name.startswith(SUBPROTOCOL)]
+    scope["subprotocols"] = [name for name in offered if name not in shown]
+    scope["headers"] = [(name, value) for name, value in scope["headers"] if name != b"sec-websocket-protocol"]
+    if scope["subprotocols"]:
+        scope["headers"].append((b"sec-websocket-protocol", ", ".join(scope["subprotocols"]).encode("latin-1")))
+    return shown
+
+
+def accepting(subprotocol: str, send: Send) -> Send:
+    """A sender that accepts the ticket's subprotocol where the application accepts none.
+
+    A browser gives up a WebSocket that accepts none of the subprotocols it offered.
+    """
+
+    async def sending(message: Message) -> None:
+        if message["type"] == "websocket.accept" and not message.get("subprotocol"):
+            message = {**message, "subprotocol": subprotocol}
+        await send(message)
+
+    return sending

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -254,6 +254,7 @@ class RenderQuery:
     `parts` is the number of parts where they are asked for and it is given; `labels` [N] are then the parts themselves.
     """
 
+    kind: ClassVar[str] = "render"
     camera: Camera
     frame: int
     kinds: tuple[str, ...]
@@ -271,6 +272,7 @@ class TracksQuery:
     `project` are the cameras into which the trajectories are projected, with visibility.
     """
 
+    kind: ClassVar[str] = "tracks"
     frames: tuple[int, ...]
     at: int
     ids: tuple[int, ...] | None = None
@@ -285,6 +287,7 @@ class TracksQuery:
 class PartsQuery:
     """Labels of all Gaussians."""
 
+    kind: ClassVar[str] = "parts"
     count: int | None
 
 
@@ -292,6 +295,7 @@ class PartsQuery:
 class LabelsQuery:
     """Labels of all Gaussians as little-endian int16, in the order of the states."""
 
+    kind: ClassVar[str] = "labels"
     count: int | None
 
 
@@ -299,6 +303,7 @@ class LabelsQuery:
 class PlyQuery:
     """A committed frame as a 3DGS .ply."""
 
+    kind: ClassVar[str] = "ply"
     frame: int
 
 

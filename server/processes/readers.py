@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -258,6 +259,15 @@ class Readers:
             Problem: 4xx where the question cannot be answered, 503 where it takes too long or too many wait, 500 for a
                 fault of the reader.
         """
+        began, outcome = time.perf_counter(), "failed"
+        try:
+            answer = await self._answer(query)
+            outcome = "answered"
+            return answer
+        finally:
+            metrics.ANSWER_SECONDS.labels(query.kind, outcome).observe(time.perf_counter() - began)
+
+    async def _answer(self, query: Query) -> Answer:
         if isinstance(query, TracksQuery):
             return await self._tracks(query)
         if not isinstance(query, RenderQuery):

@@ -5,22 +5,25 @@ Neither waits for an update; how questions come to them is told in ``readers``.
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import signal
+from collections.abc import Mapping, Sequence
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
-from client.wire import parts_model
+from client.wire import part_colour, parts_model
 from scas4d_core.cameras import rig_inside
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.storage.error_text import told
 from scas4d_core.storage.frame_files import frame_file
 from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFrameError
-from server.processes import encode, track_answers
+from server.processes import track_answers
 from server.processes.messages import (
     Answer,
     Ask,
@@ -40,7 +43,12 @@ from server.processes.part_labels import PartLabels
 from server.processes.placement import use_one_thread
 
 if TYPE_CHECKING:
-    from scas4d_core.query.committed import Committed
+    from scas4d_core.query.committed import Committed, View
+
+FLOAT32 = "application/octet-stream"
+QUALITY = 92
+"""Of JPEG and WebP where not asked for."""
+CHANNELS = {"colour": ("red", "green", "blue"), "depth": ("depth",), "alpha": ("alpha",), "parts": ("parts",)}
 
 BULK_NICE = 10
 """Added to the niceness of the process for tracks, parts and exports: views and updates go ahead of them."""
@@ -166,7 +174,7 @@ class Renderer:
         match query:
             case RenderQuery():
                 view = self.reader.render(query.camera, query.frame, background=query.background, labels=query.labels)
-                body, media_type, headers = encode.view(view, query.kinds, query.format, query.quality)
+                body, media_type, headers = encode_view(view, query.kinds, query.format, query.quality)
                 return Answer(number, body, media_type, {**headers, "X-Frame": str(query.frame)})
             case TracksQuery():
                 found = track_answers.find(self.reader, self.history, query)
@@ -184,3 +192,65 @@ class Renderer:
                 file = self.spec.folder / "splat.ply"
                 self.reader.write_ply(file, query.frame)
                 return Answer(number, file.read_bytes(), "application/octet-stream")
+
+
+def float32(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, str]]:
+    """Arrays [H, W] or [H, W, 3] by kind, one behind the other in the last axis, as little-endian float32; and headers.
+
+    X-Shape is "H,W,C", X-Channels names the C channels, X-Dtype is "<f4". Rows from the top, C fastest.
+    """
+    names = [channel for kind in arrays for channel in CHANNELS[kind]]
+    stack = np.concatenate([array[..., None] if array.ndim == 2 else array for array in arrays.values()], axis=-1)
+    body = np.ascontiguousarray(stack, "<f4")
+    headers = {"X-Shape": ",".join(map(str, body.shape)), "X-Channels": ",".join(names), "X-Dtype": "<f4"}
+    return body.tobytes(), headers
+
+
+def encode_view(
+    view: View, kinds: Sequence[str], format: str, quality: int | None = None
+) -> tuple[bytes, str, dict[str, str]]:
+    """A view as body, media type and headers; a picture holds one kind (the door sees to it).
+
+    Args:
+        view: what was rendered. kinds: of it.
+        format: png, jpeg, webp, npz or float32.
+        quality: 1…100, of JPEG and WebP.
+    """
+    arrays: dict[str, Any] = {kind: getattr(view, kind) for kind in kinds}
+    if format == "npz":
+        return track_answers.npz(arrays), track_answers.NPZ, {}
+    if format == "float32":
+        body, headers = float32(arrays)
+        return body, FLOAT32, headers
+    picture, headers = _picture(kinds[0], arrays[kinds[0]])
+    file = io.BytesIO()
+    if format == "jpeg":
+        picture.save(file, "JPEG", quality=quality or QUALITY, subsampling=0)
+    elif format == "webp":
+        # A live view: fast rather than small (method 0 takes a third of the time of the default).
+        picture.save(file, "WEBP", quality=quality or QUALITY, method=0)
+    else:
+        picture.save(file, "PNG", compress_level=1)
+    return file.getvalue(), f"image/{format}", headers
+
+
+def part_colours() -> list[int]:
+    """A palette, 256 × RGB: 0 black, then the colour of each label."""
+    return [0, 0, 0, *(channel for label in range(255) for channel in part_colour(label))]
+
+
+_PART_COLOURS = part_colours()
+
+
+def _picture(kind: str, array: NDArray[Any]) -> tuple[Image.Image, dict[str, str]]:
+    if kind == "depth":
+        met = np.isfinite(array)
+        near, far = (float(array[met].min()), float(array[met].max())) if met.any() else (0.0, 0.0)
+        steps = 1 + np.rint(65534 * (np.where(met, array, near) - near) / max(far - near, 1e-12))
+        levels = np.where(met, steps, 0).astype(np.uint16)
+        return Image.fromarray(levels), {"X-Depth-Near": repr(near), "X-Depth-Far": repr(far)}
+    if kind == "parts":
+        labels = Image.fromarray(array)  # pixels are the labels, and a browser shows their colours
+        labels.putpalette(_PART_COLOURS)
+        return labels, {}
+    return Image.fromarray(np.rint(255 * np.clip(array, 0, 1)).astype(np.uint8)), {}

@@ -7,7 +7,7 @@ together again. docs/tracks.md has the layout of the npz.
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,6 @@ from client.wire import tracks_model
 from scas4d_core.cameras import Camera
 from scas4d_core.query.tapvid3d import tapvid3d
 from scas4d_core.storage.history import History
-from server.processes import encode
 from server.processes.messages import SceneSpec, TracksQuery
 
 if TYPE_CHECKING:
@@ -27,12 +26,21 @@ if TYPE_CHECKING:
 
 Arrays = dict[str, NDArray[Any]]
 
+NPZ = "application/vnd.numpy.npz"
+
 PIECE_QUERIES = 2048
 """Points of one piece: some 0.3 s to find what carries them among 25,000 Gaussians."""
 PIECE_POINTS = 32_768
 """Points times frames of one piece: some 2 s."""
 PIECE_VIEWS = 64
 """Depth pictures of one piece, one a frame and camera in which visibility is asked: some 1 s at 256×256."""
+
+
+def npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """Arrays as npz without pickle."""
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **arrays)
+    return file.getvalue()
 
 
 def metres_per_unit(spec: SceneSpec) -> float:
@@ -76,7 +84,7 @@ def encoded(found: Arrays, query: TracksQuery, metres_per_unit: float) -> tuple[
     pixels = {camera.name: camera.project(found["tracks_world"])[0] for camera in cameras}
     if query.format == "npz":
         arrays = found | {f"pixels.{name}": uv for name, uv in pixels.items()}
-        return encode.npz(arrays | _layout(found, query, cameras, metres_per_unit)), encode.NPZ
+        return npz(arrays | _layout(found, query, cameras, metres_per_unit)), NPZ
     asked = [camera.name for camera in query.project]
     model = tracks_model(
         found["frames"].tolist(),

@@ -19,8 +19,7 @@ from client.wire import (
 from server.ingest.receive import take_camera, take_file, take_form, take_framed
 from server.problems import Problem
 from server.processes.messages import PlyQuery
-from server.routes.access import FrameIndex, TheScene
-from server.routes.asking import ask
+from server.routes.access import FrameIndex, TheScene, ask
 
 router = APIRouter(prefix="/v1/scenes", tags=["frames"])
 

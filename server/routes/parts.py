@@ -8,8 +8,7 @@ from fastapi import APIRouter, Query, Request, Response
 
 from client.wire import PartsModel
 from server.processes.messages import PartsQuery
-from server.routes.access import TheScene
-from server.routes.asking import ask
+from server.routes.access import TheScene, ask
 
 router = APIRouter(prefix="/v1/scenes", tags=["parts"])
 

@@ -10,8 +10,7 @@ from fastapi import APIRouter, Query, Request, Response
 from client.wire import MAX_PIXELS_A_SIDE, RenderFormat, RenderKind, RenderRequest
 from server.problems import Problem, counted
 from server.processes.messages import RenderQuery
-from server.routes.access import TheScene
-from server.routes.asking import ask
+from server.routes.access import TheScene, ask
 from server.scene.scenes import Scene
 
 MOST_PIXELS = 8_000_000

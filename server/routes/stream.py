@@ -30,7 +30,7 @@ async def stream(websocket: WebSocket, id: str) -> None:
     try:
         scene = scenes[id]
         _require_protocol(websocket)
-        subscriber = hub.join(id, scene.ask, lambda room: Subscriber(scene, room))
+        subscriber = hub.join(id, scene.readers.ask, lambda room: Subscriber(scene, room))
     except Problem as problem:  # the handshake is answered like any request: browsers see only that it failed
         await websocket.send_denial_response(problems.answer(problem.document, problem.headers))
         return

@@ -15,8 +15,7 @@ from server.problems import Problem, counted
 from server.processes import track_answers
 from server.processes.messages import TracksQuery
 from server.routes import render
-from server.routes.access import TheScene
-from server.routes.asking import ask
+from server.routes.access import TheScene, ask
 from server.scene.scenes import Scene
 
 router = APIRouter(prefix="/v1/scenes", tags=["tracks"])

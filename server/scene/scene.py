@@ -17,13 +17,11 @@ from server.health import metrics
 from server.ingest.acknowledge import Ingest
 from server.processes import worker
 from server.processes.messages import (
-    Answer,
     Broken,
     Committed,
     FrameReady,
     Mended,
     Progressed,
-    Query,
     Ready,
     SceneSpec,
     Stalled,
@@ -110,7 +108,7 @@ class Scene:
         self._hub = hub
         self._files = reports.ReportFiles(self.spec.states)
         self.ingest = Ingest(self)
-        self._questions = Readers(self.spec, placement, lambda files: self.mending.noticed(files))
+        self.readers = Readers(self.spec, placement, lambda files: self.mending.noticed(files))
         self.replays = Replays(self, placement)
         self.mending = Mending(self.ledger, self.damage, self, found.remake)
         self._worker: Process
@@ -179,11 +177,6 @@ class Scene:
         """What became of a frame, its numbers read from disk where they are not in memory; None: it is not known."""
         return await report_of(self, self._files, index)
 
-    async def ask(self, query: Query) -> Answer:
-        """The reader process's answer; see `Readers.ask`."""
-        with metrics.answering(query):
-            return await self._questions.ask(query)
-
     # The way of a frame.
 
     def finished(self, report: FrameReportModel) -> None:
@@ -250,7 +243,7 @@ class Scene:
             await self._write(*facts)
         if ready.indices and ready.report:
             self._fill(ready.indices[-1], ready.report)
-            self._questions.refresh()
+            self.readers.refresh()
             if ready.indices[-1] > newest:  # committed, and its worker was gone before it could say so
                 self._tell(FrameFinished(self.frames[ready.indices[-1]].report))
         self.trouble = self._last_trouble()
@@ -271,7 +264,7 @@ class Scene:
         self._fill(message.index, message.report)
         report = self.frames[message.index].report
         self.trouble = reports.trouble(report)
-        self._questions.refresh((message.index, *message.deleted))
+        self.readers.refresh((message.index, *message.deleted))
         self._tell(FrameFinished(report))
         self.work()
         if message.deleted:
@@ -349,7 +342,7 @@ class Scene:
     def states_changed(self, frames: tuple[int, ...]) -> None:
         """Files of states were written or lost."""
         if frames:
-            self._questions.refresh(frames)
+            self.readers.refresh(frames)
         self.work()
 
     def write_fact(self, fact: Fact) -> None:
@@ -431,5 +424,5 @@ class Scene:
         self.ingest.stop()
         self.mending.stop()
         self._background.cancel()
-        await asyncio.gather(self._worker.stop(), self._questions.stop(), self.replays.stop())
+        await asyncio.gather(self._worker.stop(), self.readers.stop(), self.replays.stop())
         await self.journal.close()

@@ -10,6 +10,7 @@ import os
 import sys
 import time
 from dataclasses import asdict, dataclass, field
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -243,6 +244,7 @@ def install(**others):
     }
     for name, members in of_core.items():
         module = ModuleType(name)
+        module.__spec__ = ModuleSpec(name, None)
         module.__dict__.update({member: others.get(member, fake) for member, fake in members.items()})
         sys.modules[name] = module
 

@@ -18,8 +18,8 @@ from running import HEIGHT, WIDTH, Running, fake_settings, make_rig, pictures, p
 
 from client.sdk import Client
 from client.wire import CameraModel, part_colour
-from server.processes import encode
 from server.processes import readers as readers_module
+from server.processes import renderer
 
 PATIENCE_S = 30
 
@@ -41,7 +41,7 @@ def two_frames(impatient):
         for index in range(2):
             sdk.put_frame(id, index, pictures())
         sdk.wait(id, 1)
-        yield id, impatient.app.state.scenes[id]._questions, http
+        yield id, impatient.app.state.scenes[id].readers, http
         sdk.delete_scene(id)
 
 
@@ -158,7 +158,7 @@ def test_deleting_a_scene_answers_whoever_waits(service):
         id = sdk.create_scene(make_rig()).id
         sdk.put_frame(id, 0, pictures())
         sdk.wait(id, 0)
-        readers = service.app.state.scenes[id]._questions
+        readers = service.app.state.scenes[id].readers
         hanging = in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}"))
         until(lambda: readers.bulk._at_work is not None)
         processes = [readers.views.process._process, readers.bulk.process._process]
@@ -249,7 +249,7 @@ def test_parts_are_labels_with_colours_that_stay(still):
     picture = Image.open(io.BytesIO(http.get(f"/v1/scenes/{id}/render?kind=parts&parts=2").content))
     assert picture.mode == "P"
     assert np.array(picture)[3, 3] == 2
-    palette = np.array(encode.part_colours()).reshape(256, 3)
+    palette = np.array(renderer.part_colours()).reshape(256, 3)
     assert palette[0].tolist() == [0, 0, 0]
     assert tuple(palette[2]) == part_colour(1)
     assert picture.convert("RGB").getpixel((3, 3)) == tuple(palette[2])

@@ -11,7 +11,7 @@ from client.calls import put_frame
 from client.sdk import ServiceError
 from client.wire import RigModel
 from scas4d_core.captures import InitialPoints
-from server.processes import encode
+from server.processes import track_answers
 
 
 def rig_json(count=2):
@@ -39,7 +39,7 @@ def test_a_scene_is_created_listed_and_deleted(http, service):
     url = created.headers["Location"]
     assert status["id"] in [scene["id"] for scene in http.get("/v1/scenes").json()["scenes"]]
     scene = service.app.state.scenes[status["id"]]
-    processes = [scene._worker._process, scene._questions.views.process._process]
+    processes = [scene._worker._process, scene.readers.views.process._process]
     assert http.delete(url).status_code == 204
     problem(http.get(url), 404)
     assert not scene.spec.folder.exists()
@@ -115,7 +115,7 @@ def test_more_scenes_than_the_limit_are_refused(sdk, http):
 
 
 def npz(**arrays):
-    return encode.npz(arrays)
+    return track_answers.npz(arrays)
 
 
 def test_points_come_before_the_first_frame(http, sdk, scene):
@@ -173,7 +173,7 @@ def test_a_reader_that_dies_is_replaced(sdk, scene, service):
     sdk.put_frame(scene, 0, pictures())
     sdk.wait(scene, 0)
     sdk.render(scene, "c0")
-    service.app.state.scenes[scene]._questions.views.process._process.kill()
+    service.app.state.scenes[scene].readers.views.process._process.kill()
     time.sleep(0.2)
     assert sdk.render(scene, "c0").shape == (HEIGHT, WIDTH, 3)
 
