@@ -283,7 +283,8 @@ class ServerSettings(BaseSettings):
             first = error.errors(include_input=False)[0]
             name = ".".join(str(part) for part in first["loc"])
             known = "" if first["type"] != "extra_forbidden" else f"; the settings are {', '.join(cls.model_fields)}"
-            fault = first["msg"].removeprefix("Value error, ")
+            ours = first["type"] == "value_error"
+            fault = str(first["ctx"]["error"] if ours else first["msg"])
             quotable = name in cls.model_fields and name != "token"
             value = f" is {merged[name]!r}, which cannot be" if quotable and name in merged else ""
             raise SettingsError((f"setting {name}{value}: " if name else "") + fault + known) from None

@@ -23,6 +23,7 @@ from pydantic import Field, FiniteFloat, ValidationError
 from client.wire.base import MAX_CAMERAS, CameraName, Model
 from client.wire.frames import FrameReceipt, PartReceipt
 from client.wire.service import ProblemDetails
+from scas4d_core.errors import InputError
 
 FRAME_MEDIA_TYPE = "application/vnd.scas4d.frame"
 MAGIC = b"S4DF"
@@ -32,7 +33,7 @@ MAX_HEAD = 1 << 20
 MAX_INDEX = 1_000_000_000
 
 
-class FramingError(ValueError):
+class FramingError(InputError):
     """Bytes that are no frame: the message names the fault and the remedy."""
 
 
@@ -106,14 +107,14 @@ def head_length(prefix: bytes | bytearray | memoryview) -> int:
         FramingError: they are not those of a frame.
     """
     if len(prefix) < PREFIX.size:
-        raise FramingError(f"ends after {len(prefix)} bytes, within its prefix; send the whole frame")
+        raise FramingError(f"ends after {len(prefix)} bytes, within its prefix", "send the whole frame")
     magic, length = PREFIX.unpack_from(prefix)
     if magic != MAGIC:
         raise FramingError(
-            f"begins with {bytes(magic).hex(' ')}, not with S4DF; send a frame as client.wire.framing does"
+            f"begins with {bytes(magic).hex(' ')}, not with S4DF", "send a frame as client.wire.framing does"
         )
     if length > MAX_HEAD:
-        raise FramingError(f"declares a head of {length} bytes; a head has at most {MAX_HEAD}")
+        raise FramingError(f"declares a head of {length} bytes", f"a head has at most {MAX_HEAD}")
     return int(length)
 
 
@@ -128,7 +129,7 @@ def parse_head(data: bytes | bytearray | memoryview) -> FrameHead:
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"])
-        raise FramingError(f"head{'.' + field if field else ''}: {first['msg']}; correct the head") from None
+        raise FramingError(f"head{'.' + field if field else ''}: {first['msg']}", "correct the head") from None
 
 
 def parse_frame(data: bytes | bytearray | memoryview) -> tuple[FrameHead, list[memoryview]]:
@@ -140,11 +141,11 @@ def parse_frame(data: bytes | bytearray | memoryview) -> tuple[FrameHead, list[m
     view = memoryview(data)
     at = PREFIX.size + head_length(view[: PREFIX.size])
     if at > len(view):
-        raise FramingError(f"ends after {len(view)} bytes, within its head; send the whole frame")
+        raise FramingError(f"ends after {len(view)} bytes, within its head", "send the whole frame")
     head = parse_head(view[PREFIX.size : at])
     expected = at + sum(file.size for file in head.files)
     if len(view) != expected:
-        raise FramingError(f"has {len(view)} bytes where its head says {expected}; send what the head says")
+        raise FramingError(f"has {len(view)} bytes where its head says {expected}", "send what the head says")
     pieces = []
     for file in head.files:
         pieces.append(view[at : at + file.size])

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
-from scas4d_core.storage.error_text import told
+from scas4d_core.errors import told
 from server.problems import Problem
 from server.processes.messages import Stop
 from server.processes.placement import Placement, Process

@@ -12,6 +12,7 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
+from scas4d_core.errors import InputError
 from server.problems import Problem, counted
 
 MISSING = "nothing"
@@ -57,7 +58,7 @@ def invalid(
         text: what was sent, where it may be broken JSON. schema: where all fields are listed.
     """
     loc = tuple(part for part in error["loc"] if isinstance(part, int) or not UNION.fullmatch(part))
-    fault = str(error["msg"]).removeprefix("Value error, ")
+    fault, ours = said_by(error)
     if error["type"] == "json_invalid":
         return _broken_json(error, loc, prefix, text)
     field = ".".join(str(part) for part in ((prefix,) if prefix else ()) + loc) or "message"
@@ -66,10 +67,10 @@ def invalid(
     more = f" (and {others} more)" if others else ""
     return Problem(
         422,
-        f"{field}: {_complaint(error, fault)}{more}",
+        f"{field}: {fault}{more}",
         field=field,
         value="null" if value is None else value,
-        remedy=_remedy(error, fault, field, fields_of(model, inner[:-1]), schema),
+        remedy=ours or _remedy(error, field, fields_of(model, inner[:-1]), schema),
     )
 
 
@@ -113,12 +114,15 @@ def _broken_json(error: Mapping[str, Any], loc: tuple[Any, ...], prefix: str, te
     )
 
 
-def _complaint(error: Mapping[str, Any], fault: str) -> str:
-    """Our own messages end in what to do, behind a semicolon."""
-    return (fault.rpartition("; ")[0] or fault) if error["type"] == "value_error" else fault
+def said_by(error: Mapping[str, Any]) -> tuple[str, str]:
+    """Fault and remedy of one error of a validation; no remedy where pydantic found it, not a validator of ours."""
+    raised = error.get("ctx", {}).get("error") if error["type"] == "value_error" else None
+    if isinstance(raised, InputError):
+        return raised.fault, raised.remedy
+    return str(error["msg"] if raised is None else raised), ""
 
 
-def _remedy(error: Mapping[str, Any], fault: str, field: str, known: list[str], schema: str) -> str:
+def _remedy(error: Mapping[str, Any], field: str, known: list[str], schema: str) -> str:
     kind, context = str(error["type"]), error.get("ctx", {})
     name = field.rpartition(".")[2]
     if kind == "missing":
@@ -142,7 +146,6 @@ def _remedy(error: Mapping[str, Any], fault: str, field: str, known: list[str], 
     if kind == "string_pattern_mismatch":
         return f"give text that matches {context['pattern']}"
     if kind == "value_error":
-        _, _, ours = fault.rpartition("; ")
-        return ours if ours != fault else f"give what {schema.removeprefix('the ')} asks for"
+        return f"give another value; {schema}"
     wanted = KINDS.get(kind.partition("_")[0])
     return f"give {wanted}" if wanted else f"send another value; {schema}"

@@ -171,12 +171,12 @@ async def receive_framed(
                 receiving = head_of(head)
             if len(view) > receiving.missing:
                 over = len(view) - receiving.missing
-                raise FramingError(f"goes on for {over} bytes and more behind its files; send none there")
+                raise FramingError(f"goes on for {over} bytes and more behind its files", "send none there")
             await receiving.take(view)
         if head is None or receiving is None:
-            raise FramingError(f"ends after {len(start)} bytes, within its head; send the whole frame")
+            raise FramingError(f"ends after {len(start)} bytes, within its head", "send the whole frame")
         if receiving.missing:
-            raise FramingError(f"ends {receiving.missing} bytes before its last file does; send the whole frame")
+            raise FramingError(f"ends {receiving.missing} bytes before its last file does", "send the whole frame")
         return head, receiving
     except BaseException as error:
         if receiving is not None:
@@ -197,14 +197,13 @@ def _fill(start: bytearray, view: memoryview, size: int) -> memoryview:
 
 def framing_problem(error: FramingError) -> Problem:
     """The answer to bytes that are no frame."""
-    fault, _, remedy = str(error).rpartition("; ")
-    return Problem(422, f"the frame {fault}", field="body", value=fault, remedy=remedy)
+    return Problem(422, f"the frame {error.fault}", field="body", value=error.fault, remedy=error.remedy)
 
 
 def _check_length(head: FrameHead, start: int, total: int | None) -> None:
     expected = start + sum(file.size for file in head.files)
     if total is not None and total != expected:
-        raise FramingError(f"has {total} bytes where its head says {expected}; send what the head says")
+        raise FramingError(f"has {total} bytes where its head says {expected}", "send what the head says")
 
 
 def in_batches(files: Sequence[FrameFile]) -> list[list[FrameFile]]:

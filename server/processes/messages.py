@@ -333,8 +333,9 @@ class Answer:
 
 @dataclass(frozen=True)
 class Refused:
-    """The query cannot be answered; `status` is that of the HTTP answer."""
+    """The query cannot be answered. `status` is that of the HTTP answer; `remedy` may be empty."""
 
     number: int
-    detail: str
+    fault: str
+    remedy: str = ""
     status: int = 422

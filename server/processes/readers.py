@@ -49,6 +49,13 @@ ANSWER_SECONDS = 120.0
 COUNTS_KEPT = 8
 """Numbers of parts whose labels are kept."""
 
+REMEDIES = {
+    404: "ask for a frame that the scene's status counts as committed",
+    500: "this is a fault of the service; its log has the traceback",
+    503: "ask again later",
+}
+"""Remedies by the status of an answer, where the process says none."""
+
 Noticed = Callable[[Mapping[str, str]], None]
 """Told of files of the states' folder that cannot be read, by name with the reason."""
 
@@ -190,10 +197,8 @@ class Line:
         """Ends the process if it is still busy with what nobody waits for."""
         if self._at_work is not turn or self.process is None:
             return
-        log.warning(
-            "scene %s: nobody waits for %s any more; its reader starts anew",
-            self._spec.folder.name, type(turn.query).__name__,
-        )  # fmt: skip
+        name, kind = self._spec.folder.name, turn.query.kind
+        log.warning("scene %s: nobody waits for its %s query any more; its reader starts anew", name, kind)
         task = asyncio.ensure_future(self.process.stop(0))
         self._ending.add(task)
         task.add_done_callback(self._ending.discard)
@@ -333,16 +338,11 @@ def _checked(answer: Answer | Refused, query: Query) -> Answer:
     if isinstance(answer, Answer):
         return answer
     if answer.status != 422:
-        remedies = {404: "ask for a frame that the scene's status counts as committed", 503: "ask again later"}
-        remedy = remedies.get(answer.status, "this is a fault of the service; its log has the traceback")
-        raise Problem(
-            answer.status, answer.detail, remedy=remedy, headers={"Retry-After": "1"} if answer.status == 503 else None
-        )
+        remedy = answer.remedy or REMEDIES[answer.status]
+        headers = {"Retry-After": "1"} if answer.status == 503 else None
+        raise Problem(answer.status, answer.fault, remedy=remedy, headers=headers)
     field, value = _asked(query)
-    fault, _, remedy = answer.detail.rpartition("; ")
-    raise Problem(
-        422, fault or answer.detail, field=field, value=value, remedy=remedy if fault else f"give another {field}"
-    )
+    raise Problem(422, answer.fault, field=field, value=value, remedy=answer.remedy or f"give another {field}")
 
 
 def _asked(query: Query) -> tuple[str, object]:

@@ -19,8 +19,8 @@ from PIL import Image
 
 from client.wire import part_colour, parts_model
 from scas4d_core.cameras import rig_inside
+from scas4d_core.errors import InputError, told, without_paths
 from scas4d_core.rasterize.limits import scene_limits
-from scas4d_core.storage.error_text import told
 from scas4d_core.storage.frame_files import frame_file
 from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFrameError
 from server.processes import track_answers
@@ -149,7 +149,7 @@ class Renderer:
 
     def answer(self, ask: Ask) -> Answer | Refused:
         """The encoded answer, or why there is none."""
-        asked = type(ask.query).__name__
+        asked = f"{ask.query.kind} query"
         for more in range(DAMAGED_AT_ONCE, -1, -1):
             try:
                 return self._answer(ask.number, ask.query)
@@ -157,11 +157,14 @@ class Renderer:
                 log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
                 if more and isinstance(ask.query, PartsQuery | LabelsQuery):  # found from all others
                     continue
-                return Refused(ask.number, f"{told(error)}; it is mended if it can be", status=503)
+                return Refused(ask.number, told(error), "ask again later: it is mended if it can be", status=503)
             except UnreadableFrameError as error:  # deleted since the door looked
                 log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
                 self._note_missing(ask.query)
                 return Refused(ask.number, told(error), status=404)
+            except InputError as error:
+                log.warning("scene %s refused %s: %s", self.spec.folder.name, asked, error)
+                return Refused(ask.number, without_paths(error.fault), without_paths(error.remedy))
             except ValueError as error:
                 log.warning("scene %s refused %s: %s", self.spec.folder.name, asked, error)
                 return Refused(ask.number, told(error))

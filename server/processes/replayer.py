@@ -10,7 +10,7 @@ from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
-from scas4d_core.storage.error_text import told
+from scas4d_core.errors import told
 from scas4d_core.storage.history import History
 from server.processes.decoding import decode, read
 from server.processes.messages import Damaged, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated

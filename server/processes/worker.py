@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from client.wire import Budget
 from scas4d_core.captures import Frame, InitialPoints
-from scas4d_core.storage.error_text import told
+from scas4d_core.errors import told
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.storage.npz import read_npz
 from server.processes.decoding import decode, read

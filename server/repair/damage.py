@@ -6,7 +6,7 @@ from collections import OrderedDict
 from collections.abc import Iterable
 from enum import StrEnum
 
-from scas4d_core.storage.error_text import without_paths
+from scas4d_core.errors import without_paths
 from server.health import metrics
 
 KEPT = 100

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from scas4d_core.captures import Frame
-from scas4d_core.storage.error_text import told
+from scas4d_core.errors import told
 from scas4d_core.storage.frame_files import (
     FIRST_COPY,
     FIXED_COPY,

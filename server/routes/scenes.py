@@ -51,8 +51,8 @@ def check_unit(request: SceneCreate, settings: Settings) -> None:
     try:
         request.rig.rig().world_frame(unit)
     except CameraError as error:
-        what, _, remedy = str(error).partition("; ")
-        raise Problem(422, what, field="settings.scene.metres_per_unit", value=unit, remedy=remedy) from None
+        field = "settings.scene.metres_per_unit"
+        raise Problem(422, error.fault, field=field, value=unit, remedy=error.remedy) from None
 
 
 @router.post("", status_code=201)

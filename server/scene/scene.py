@@ -12,7 +12,7 @@ from typing import Any
 
 from client.wire import FrameReportModel, FrameState, ProgressModel, SceneState, SceneStatus
 from scas4d_core.cameras import Camera
-from scas4d_core.storage.error_text import told
+from scas4d_core.errors import told
 from server.health import metrics
 from server.ingest.acknowledge import Ingest
 from server.processes import worker
