@@ -1,4 +1,4 @@
-"""Every error is a problem document (RFC 9457) that names the field, the value and the remedy."""
+"""Problem documents (RFC 9457): every error names the field, the value and the remedy."""
 
 from __future__ import annotations
 
@@ -17,17 +17,19 @@ from client.wire import ProblemDetails
 MEDIA_TYPE = "application/problem+json"
 VALUE_LENGTH = 200
 """A value quoted in an answer is cut here: it may be a whole cloud."""
+SERVICE_FAULT = "this is a fault of the service; its log has the traceback"
+"""The remedy where the service failed."""
 
 
 class Problem(HTTPException):
-    """An answer that says what was wrong.
+    """An error answer; `client.wire.ProblemDetails` has the fields of its document.
 
     Args:
         status: HTTP status, 400…599.
-        detail: one sentence for a person.
+        detail: the fault, one sentence for a person.
+        remedy: the action that helps, for a person.
         field: the parameter or field at fault.
-        value: what was given there; quoted, shortened.
-        remedy: what to send or do instead.
+        value: the value that was given there; it is quoted and shortened.
         headers: further headers of the answer.
         more: further members of the document, such as `expected`.
     """
@@ -37,9 +39,9 @@ class Problem(HTTPException):
         status: int,
         detail: str,
         *,
+        remedy: str,
         field: str | None = None,
         value: object = None,
-        remedy: str | None = None,
         headers: Mapping[str, str] | None = None,
         **more: Any,
     ) -> None:

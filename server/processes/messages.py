@@ -133,7 +133,7 @@ class Progressed:
 
 
 @dataclass(frozen=True)
-class Committed:
+class UpdateCommitted:
     """The frame's state is on disk, with `report` (as `History.report` gives it back).
 
     `deleted`: states that retention deleted after it.
@@ -145,7 +145,7 @@ class Committed:
 
 
 @dataclass(frozen=True)
-class SetAside:
+class UpdateSetAside:
     """The frame was not committed; the state is that of the frame before. `fatal`: the scene cannot go on."""
 
     index: int
@@ -311,7 +311,7 @@ Query = RenderQuery | TracksQuery | PartsQuery | LabelsQuery | PlyQuery
 
 
 @dataclass(frozen=True)
-class Ask:
+class AskedQuery:
     """A query with a number to find its answer by."""
 
     number: int

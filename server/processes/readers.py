@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.health import metrics
-from server.problems import Problem, counted
+from server.problems import SERVICE_FAULT, Problem, counted
 from server.processes import renderer, track_answers
 from server.processes.messages import (
     Answer,
-    Ask,
+    AskedQuery,
     Damaged,
     LabelsQuery,
     PartsQuery,
@@ -51,7 +51,7 @@ COUNTS_KEPT = 8
 
 REMEDIES = {
     404: "ask for a frame that the scene's status counts as committed",
-    500: "this is a fault of the service; its log has the traceback",
+    500: SERVICE_FAULT,
     503: "ask again later",
 }
 """Remedies by the status of an answer, where the process says none."""
@@ -63,7 +63,7 @@ log = logging.getLogger("scas4d.server")
 
 
 @dataclass(eq=False)
-class _Turn:
+class _WaitingQuery:
     """A question and who waits for its answer."""
 
     number: int
@@ -71,7 +71,7 @@ class _Turn:
     answer: asyncio.Future[Answer | Refused]
 
 
-class Line:
+class QueryQueue:
     """A process and the queue before it. One question is with the process; whoever leaves the queue is never begun.
 
     Args:
@@ -97,8 +97,8 @@ class Line:
         self._placement = placement
         self._grace = grace
         self._damaged = damaged
-        self._waiting: deque[_Turn] = deque()
-        self._at_work: _Turn | None = None
+        self._waiting: deque[_WaitingQuery] = deque()
+        self._at_work: _WaitingQuery | None = None
         self.process: Process | None = None
         self._life: object = None
         self._ending: set[asyncio.Task[None]] = set()
@@ -127,7 +127,7 @@ class Line:
         if self._closed:
             return Refused(0, "the scene has ended", status=503)
         self._asked += 1
-        turn = _Turn(self._asked, query, asyncio.get_running_loop().create_future())
+        turn = _WaitingQuery(self._asked, query, asyncio.get_running_loop().create_future())
         self._waiting.append(turn)
         self._next()
         try:
@@ -179,7 +179,7 @@ class Line:
             self._start()
         assert self.process is not None
         self._at_work = self._waiting.popleft()
-        self.process.send(Ask(self._at_work.number, self._at_work.query))
+        self.process.send(AskedQuery(self._at_work.number, self._at_work.query))
 
     def _answered(self, message: Answer | Refused | Damaged) -> None:
         if isinstance(message, Damaged):
@@ -193,7 +193,7 @@ class Line:
         _answer(turn, message)
         self._next()
 
-    def _give_up(self, turn: _Turn) -> None:
+    def _give_up(self, turn: _WaitingQuery) -> None:
         """Ends the process if it is still busy with what nobody waits for."""
         if self._at_work is not turn or self.process is None:
             return
@@ -223,7 +223,7 @@ class Line:
         self._next()
 
 
-def _answer(turn: _Turn, answer: Answer | Refused) -> None:
+def _answer(turn: _WaitingQuery, answer: Answer | Refused) -> None:
     if not turn.answer.done():
         turn.answer.set_result(answer)
 
@@ -250,7 +250,7 @@ class Readers:
 
     def __init__(self, spec: SceneSpec, placement: Placement, damaged: Noticed) -> None:
         self._spec = spec
-        of_all = partial(Line, spec=spec, placement=placement, damaged=damaged)
+        of_all = partial(QueryQueue, spec=spec, placement=placement, damaged=damaged)
         self.views = of_all(renderer.views, eager=True, grace=GRACE_VIEWS_S)
         self.bulk = of_all(renderer.bulk, eager=False, grace=GRACE_BULK_S)
         self._commits = 0

@@ -26,7 +26,7 @@ from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFr
 from server.processes import track_answers
 from server.processes.messages import (
     Answer,
-    Ask,
+    AskedQuery,
     Damaged,
     LabelsQuery,
     PartsQuery,
@@ -82,7 +82,7 @@ def _serve(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
             break
         if isinstance(message, Refresh):
             renderer.changed(message.frames)
-        elif isinstance(message, Ask):
+        elif isinstance(message, AskedQuery):
             answer = renderer.answer(message)
             if found := renderer.take_faults():  # before whoever was refused asks again
                 connection.send(Damaged(found))
@@ -147,7 +147,7 @@ class Renderer:
                 if index is not None and index not in known:
                     history.files.faults.setdefault(frame_file(index), f"{frame_file(index)} is gone")
 
-    def answer(self, ask: Ask) -> Answer | Refused:
+    def answer(self, ask: AskedQuery) -> Answer | Refused:
         """The encoded answer, or why there is none."""
         asked = f"{ask.query.kind} query"
         for more in range(DAMAGED_AT_ONCE, -1, -1):

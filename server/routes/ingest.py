@@ -23,7 +23,7 @@ from server.connections.websocket import limit_messages
 from server.ingest.pictures import largest_frame
 from server.ingest.receive import take_camera, take_framed
 from server.ingest.upload import framing_problem
-from server.problems import Problem
+from server.problems import SERVICE_FAULT, Problem
 from server.scene.scene import Scene
 from server.scene.scenes import Scenes
 from server.settings import ServerSettings
@@ -135,8 +135,7 @@ async def _take(scene: Scene, head: FrameHead | Problem, data: bytes) -> IngestA
     except Exception as error:
         log.exception("scene %s: a frame over the WebSocket failed", scene.id)
         detail = f"the service failed: {type(error).__name__}"
-        remedy = "this is a fault of the service; its log has the traceback"
-        return _refusal(head.index, Problem(500, detail, remedy=remedy))
+        return _refusal(head.index, Problem(500, detail, remedy=SERVICE_FAULT))
 
 
 def _refusal(index: int | None, problem: Problem) -> IngestAnswer:

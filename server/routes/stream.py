@@ -30,7 +30,7 @@ async def stream(websocket: WebSocket, id: str) -> None:
     try:
         scene = scenes[id]
         _require_protocol(websocket)
-        subscriber = hub.join(id, scene.readers.ask, lambda room: Subscriber(scene, room))
+        subscriber = hub.join(id, scene.readers.ask, lambda channel: Subscriber(scene, channel))
     except Problem as problem:  # the handshake is answered like any request: browsers see only that it failed
         await websocket.send_denial_response(problems.answer(problem.document, problem.headers))
         return
@@ -90,7 +90,7 @@ async def _write(websocket: WebSocket, subscriber: Subscriber) -> None:
         else:
             await websocket.send_bytes(message)
 
-    await subscriber.mailbox.empty_into(send)
+    await subscriber.outbox.empty_into(send)
     if websocket.application_state == WebSocketState.CONNECTED:
         with contextlib.suppress(RuntimeError):
             await websocket.close(SCENE_GONE, "the scene was deleted")

@@ -10,7 +10,7 @@ from typing import Protocol, TypeVar
 
 from client.wire import FrameReportModel, SceneStatus
 from server.problems import Problem
-from server.stream.shared_queries import Ask, Desk
+from server.stream.shared_queries import AskReaders, SharedQueries
 
 log = logging.getLogger("scas4d.server")
 
@@ -48,12 +48,12 @@ class Listener(Protocol):
 L = TypeVar("L", bound=Listener)
 
 
-class Room:
-    """The listeners of one scene, and the desk that asks its reader for them."""
+class Channel:
+    """The listeners of one scene, and the queries that asks its reader for them."""
 
-    def __init__(self, ask: Ask) -> None:
+    def __init__(self, ask: AskReaders) -> None:
         self.listeners: list[Listener] = []
-        self.desk = Desk(ask)
+        self.queries = SharedQueries(ask)
         self._status: str | None = None
 
     def changed(self) -> None:
@@ -68,7 +68,7 @@ class Room:
 
 
 class Hub:
-    """The rooms of all scenes, by scene id.
+    """The channels of all scenes, by scene id.
 
     Args:
         max_listeners: of one scene.
@@ -76,50 +76,50 @@ class Hub:
 
     def __init__(self, max_listeners: int) -> None:
         self.max_listeners = max_listeners
-        self._rooms: dict[str, Room] = {}
+        self._channels: dict[str, Channel] = {}
 
-    def join(self, scene: str, ask: Ask, make: Callable[[Room], L]) -> L:
+    def join(self, scene: str, ask: AskReaders, make: Callable[[Channel], L]) -> L:
         """Lets a listener in.
 
         Raises:
             Problem: 429, as many listen as may.
         """
-        room = self._rooms.get(scene) or Room(ask)
-        if len(room.listeners) >= self.max_listeners:
+        channel = self._channels.get(scene) or Channel(ask)
+        if len(channel.listeners) >= self.max_listeners:
             raise Problem(
                 429,
-                f"this scene has all the subscribers that it may have: {len(room.listeners)}",
+                f"this scene has all the subscribers that it may have: {len(channel.listeners)}",
                 field="SCAS4D_MAX_SUBSCRIBERS",
                 value=self.max_listeners,
                 remedy="close another subscriber of the scene, or raise the limit",
                 headers={"Retry-After": "5"},
             )
-        self._rooms[scene] = room
-        listener = make(room)
-        room.listeners.append(listener)
+        self._channels[scene] = channel
+        listener = make(channel)
+        channel.listeners.append(listener)
         return listener
 
     def leave(self, scene: str, listener: Listener) -> None:
-        """Lets a listener go; an empty room is given up."""
-        room = self._rooms.get(scene)
-        if room is None or listener not in room.listeners:
+        """Lets a listener go; an empty channel is given up."""
+        channel = self._channels.get(scene)
+        if channel is None or listener not in channel.listeners:
             return
-        room.listeners.remove(listener)
-        if not room.listeners:
-            del self._rooms[scene]
+        channel.listeners.remove(listener)
+        if not channel.listeners:
+            del self._channels[scene]
 
     def count(self, scene: str | None = None) -> int:
         """How many listen, to one scene or to all."""
-        rooms = self._rooms.values() if scene is None else filter(None, [self._rooms.get(scene)])
-        return sum(len(room.listeners) for room in rooms)
+        channels = self._channels.values() if scene is None else filter(None, [self._channels.get(scene)])
+        return sum(len(channel.listeners) for channel in channels)
 
     def publish(self, scene: str, event: Event) -> None:
         """Tells every listener of a scene. Never blocks, never raises: the scene's own work comes first."""
-        room = self._rooms.get(scene)
-        if room is None:
+        channel = self._channels.get(scene)
+        if channel is None:
             return
-        room.changed()
-        for listener in tuple(room.listeners):
+        channel.changed()
+        for listener in tuple(channel.listeners):
             try:
                 listener.told(event)
             except Exception:
@@ -127,6 +127,6 @@ class Hub:
 
     def close(self, scene: str, reason: str) -> None:
         """The scene is gone: every listener is told so and let go."""
-        room = self._rooms.pop(scene, None)
-        for listener in () if room is None else room.listeners:
+        channel = self._channels.pop(scene, None)
+        for listener in () if channel is None else channel.listeners:
             listener.gone(reason)

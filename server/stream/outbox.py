@@ -24,7 +24,7 @@ class _Slot:
     weight: int
 
 
-class Mailbox:
+class Outbox:
     """Bounded by the number of subscriptions, however slowly it is emptied. For one event loop."""
 
     def __init__(self) -> None:

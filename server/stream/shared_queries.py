@@ -18,7 +18,7 @@ made up when their turn comes, for what is newest then."""
 KEPT_ANSWERS = 64
 KEPT_BYTES = 32_000_000
 
-Ask = Callable[[Query], Awaitable[Answer]]
+AskReaders = Callable[[Query], Awaitable[Answer]]
 
 
 class Question(Protocol):
@@ -55,14 +55,14 @@ def lane(query: Query) -> str:
     return "views" if isinstance(query, RenderQuery) and "parts" not in query.kinds else "bulk"
 
 
-class Desk:
+class SharedQueries:
     """Asks the reader, `QUERIES_AT_ONCE` of a lane at a time; keeps the last answers for those who come a moment later.
 
     Whoever waits for a turn makes up the question when the turn has come: a camera that was moved meanwhile is asked
     for where it is now. Turns are given in the order of waiting, so nobody is starved by one who asks faster.
     """
 
-    def __init__(self, ask: Ask) -> None:
+    def __init__(self, ask: AskReaders) -> None:
         self._ask = ask
         self._turns = {lane: asyncio.Semaphore(QUERIES_AT_ONCE) for lane in ("views", "bulk")}
         self._working: dict[Hashable, asyncio.Future[Answer]] = {}

@@ -1,6 +1,6 @@
 """Subscriptions that cost the reader something: views, tracks, parts. Each has one question and one message under way.
 
-A feed asks only when its message before was sent, for what is newest at that moment: a slow reader costs less, and a
+A live asks only when its message before was sent, for what is newest at that moment: a slow reader costs less, and a
 camera that is dragged is rendered where it is, not everywhere it was.
 """
 
@@ -16,19 +16,19 @@ from typing import Any, Literal
 from client.wire import RenderRequest, TracksRequest
 from client.wire.base import Model
 from client.wire.stream import BulkHead, PartsSubscription, StreamProblem, pack
-from server.problems import Problem
+from server.problems import SERVICE_FAULT, Problem
 from server.processes.messages import PartsQuery, Query, RenderQuery, TracksQuery
 from server.routes import render, tracks
 from server.scene.scenes import Scene
-from server.stream.outbox import Mailbox
-from server.stream.shared_queries import Desk, fingerprint
+from server.stream.outbox import Outbox
+from server.stream.shared_queries import SharedQueries, fingerprint
 
 log = logging.getLogger("scas4d.server")
 
 
 @dataclass(frozen=True)
-class Asked:
-    """A question of a feed.
+class LiveQuestion:
+    """A question of a live.
 
     Attributes:
         key: the same for all who would get the same answer.
@@ -42,7 +42,7 @@ class Asked:
     changes: int
 
 
-class Feed(ABC):
+class LiveQuery(ABC):
     """One subscription.
 
     Attributes:
@@ -52,11 +52,11 @@ class Feed(ABC):
     request: Any
     tag: int | None
 
-    def __init__(self, id: str, scene: Scene, desk: Desk, box: Mailbox) -> None:
+    def __init__(self, id: str, scene: Scene, queries: SharedQueries, box: Outbox) -> None:
         self.id = id
         self.scene = scene
-        self._desk = desk
-        self._mailbox = box
+        self._queries = queries
+        self._outbox = box
         self._changes = 0
         self._changed = asyncio.Event()
         self._sent: Hashable = None
@@ -76,7 +76,7 @@ class Feed(ABC):
         """Until cancelled."""
         while True:
             await self._changed.wait()
-            await self._mailbox.sent(self.id)
+            await self._outbox.sent(self.id)
             self._changed.clear()
             if not (self.scene.committed and self.due()):
                 self._changes = 0
@@ -85,19 +85,19 @@ class Feed(ABC):
                 await self._send_newest()
             except Problem as problem:
                 self._changes = 0
-                await self._mailbox.reply(StreamProblem(id=self.id, tag=self.tag, problem=problem.document))
+                await self._outbox.reply(StreamProblem(id=self.id, tag=self.tag, problem=problem.document))
             except Exception:
                 log.exception("scene %s, subscription %r", self.scene.id, self.id)
-                fault = Problem(500, "the service failed", remedy="its log has the traceback")
-                await self._mailbox.reply(StreamProblem(id=self.id, tag=self.tag, problem=fault.document))
+                fault = Problem(500, "the service failed", remedy=SERVICE_FAULT)
+                await self._outbox.reply(StreamProblem(id=self.id, tag=self.tag, problem=fault.document))
 
     async def _send_newest(self) -> None:
         asked = self._ask()
         if (asked.key, asked.head.tag) != self._sent:
-            asked, answer = await self._desk.answer(self._ask)
+            asked, answer = await self._queries.answer(self._ask)
             headers = {name.lower(): value for name, value in answer.headers.items()}
             head = asked.head.model_copy(update={"media_type": answer.media_type, "headers": headers})
-            self._mailbox.put(
+            self._outbox.put(
                 self.id,
                 lambda missed: pack(head.model_copy(update={"missed": missed}), answer.body),
                 missed=asked.changes - 1,
@@ -106,12 +106,12 @@ class Feed(ABC):
             self.answered(head)
         self._changes -= asked.changes
 
-    def _ask(self) -> Asked:
+    def _ask(self) -> LiveQuestion:
         query = self.query()
         # Parts are found from the whole history: the same question has another answer after a commit.
         newest = self.scene.committed[-1] if self.of_all_history(query) else None
         head = self.head(query).model_copy(update={"id": self.id, "tag": self.tag})
-        return Asked((fingerprint(query), newest), query, head, self._changes)
+        return LiveQuestion((fingerprint(query), newest), query, head, self._changes)
 
     def due(self) -> bool:
         """Whether there is something to ask for now."""
@@ -134,7 +134,7 @@ class Feed(ABC):
         """Of the message that answers the query."""
 
 
-class RenderFeed(Feed):
+class LiveRender(LiveQuery):
     """A view of the newest frame, or of a chosen one, from a camera that may be moved."""
 
     request: RenderRequest
@@ -153,7 +153,7 @@ class RenderFeed(Feed):
         return isinstance(query, RenderQuery) and "parts" in query.kinds
 
 
-class TracksFeed(Feed):
+class LiveTracks(LiveQuery):
     """Trajectories: first over all frames asked for, then over those committed since, so that nothing is missed."""
 
     request: TracksRequest
@@ -187,7 +187,7 @@ class TracksFeed(Feed):
         self._from = head.frame + 1
 
 
-class PartsFeed(Feed):
+class LiveParts(LiveQuery):
     """Labels of all Gaussians."""
 
     request: PartsSubscription
