@@ -1,4 +1,4 @@
-"""The application factory."""
+"""The application factory: middlewares, routes, and the life of the service."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ from server.stream.hub import Hub
 
 
 def create_app(settings: ServerSettings | None = None, placement: Placement | None = None) -> FastAPI:
-    """The service.
+    """Makes the application of the service.
 
     `server.connections.config.guarded` runs it, as `scas4d serve` does. With
     `uvicorn --factory server.app:create_app` it works too, but nothing bounds what a peer may send before
@@ -106,7 +106,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
 
 
 def _keep_document(app: FastAPI) -> None:
-    """Answers /openapi.json from memory: whoever has no token may read it, and writing it anew takes milliseconds."""
+    """Answers /openapi.json from memory: it needs no token, and writing it anew takes milliseconds."""
     kept: list[bytes] = []
 
     async def openapi(request: Request) -> Response:
@@ -119,7 +119,7 @@ def _keep_document(app: FastAPI) -> None:
 
 
 def _answer_plain_requests(app: FastAPI, router: APIRouter) -> None:
-    """At the address of a WebSocket, a request without an upgrade is told so (426), not that there is nothing."""
+    """Answers 426 instead of 404 to a plain request at the address of a WebSocket."""
 
     async def upgrade(request: Request) -> Response:
         raise Problem(

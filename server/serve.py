@@ -1,4 +1,4 @@
-"""The service as a process: logs, signals, uvicorn."""
+"""Runs the service as a process: logs, signals, uvicorn."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ log = logging.getLogger("scas4d.server")
 
 
 class Server(uvicorn.Server):
-    """uvicorn's, which says in words where it is.
+    """uvicorn's server, which logs its address in a sentence.
 
     Args:
         config: of uvicorn.
@@ -68,7 +68,7 @@ def serve(settings: ServerSettings) -> None:
         access_log=False,
         timeout_graceful_shutdown=max(1, round(STOP_SECONDS)),
     )
-    # uvicorn ends gracefully and then raises the signal again, for whoever called it: here that is nobody, and the
+    # uvicorn ends gracefully and then raises the signal again, for its caller: here there is none, and the
     # process ends with status 0.
     for ending in (signal.SIGTERM, signal.SIGINT):
         signal.signal(ending, lambda *_: None)
@@ -78,7 +78,7 @@ def serve(settings: ServerSettings) -> None:
 
 
 def _with_files(settings: ServerSettings) -> ServerSettings:
-    """The settings with as many connections as files may be open for them."""
+    """Lowers the limit of connections to the number of files that may be open for them."""
     room = room_for_connections(settings.max_connections)
     if room < settings.max_connections:
         log.warning(
@@ -91,7 +91,7 @@ def _with_files(settings: ServerSettings) -> ServerSettings:
 
 
 def listen(host: str, port: int) -> list[socket.socket]:
-    """Sockets bound to every address of the host that this machine has, all at one port; uvicorn listens at them.
+    """Binds sockets to every address of the host that this machine has, all at one port; uvicorn listens at them.
 
     Raises:
         RuntimeError: there is no such address, or the port cannot be had.
@@ -143,6 +143,6 @@ def _bound(family: int, kind: int, protocol: int, where: tuple[Any, ...]) -> soc
 
 
 def address(host: str, sockets: list[socket.socket]) -> str:
-    """Where a browser on this machine finds the service."""
+    """Returns the address of the service for a browser on this machine."""
     name = "127.0.0.1" if host in ("0.0.0.0", "::", "") else host
     return f"http://{f'[{name}]' if ':' in name else name}:{sockets[0].getsockname()[1]}"

@@ -59,11 +59,11 @@ Names = Annotated[tuple[str, ...], NoDecode]
 
 
 class SettingsError(ValueError):
-    """A setting that cannot be: which, its value unless that may be a secret, and what to do."""
+    """A setting is refused: the text has its name, the remedy, and its value unless that may be a secret."""
 
 
 class ServerSettings(BaseSettings):
-    """What the one who runs the service may choose."""
+    """The settings of an operator."""
 
     model_config = SettingsConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True, env_prefix=PREFIX)
 
@@ -76,10 +76,10 @@ class ServerSettings(BaseSettings):
     token: SecretStr | None = Field(
         default=None,
         description="Every request but /health/live, the viewer's page and the API's description has to bear it "
-        "(Authorization: Bearer). None: whoever is on this machine may do everything.",
+        "(Authorization: Bearer). None: every user of this machine may do everything.",
     )
     token_file: Path | None = Field(
-        default=None, description="File with the token, for those who mount secrets; not together with `token`."
+        default=None, description="File with the token, as a mounted secret; not together with `token`."
     )
     allowed_hosts: Names = Field(
         default=(),
@@ -205,7 +205,7 @@ class ServerSettings(BaseSettings):
         dotenv_settings: PydanticBaseSettingsSource,
         file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """What is constructed here holds what is given; `from_environment` reads the environment and the file."""
+        """Keeps the constructor to its arguments; `from_environment` reads the environment and the file."""
         return (init_settings,)
 
     @field_validator("allowed_hosts", "allowed_origins", "trusted_proxies", mode="before")
@@ -259,7 +259,7 @@ class ServerSettings(BaseSettings):
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] | None = None, **given: object) -> ServerSettings:
-        """The defaults, overridden by the file, by the environment, by what is given (None counts as not given).
+        """Reads the settings: defaults, overridden by the file, the environment and arguments that are not None.
 
         Raises:
             SettingsError: names the setting and what to do.
@@ -317,14 +317,14 @@ def _refuse_former(environment: Mapping[str, str], written: dict[str, Any]) -> N
 
 
 def unknown(environment: Mapping[str, str]) -> list[str]:
-    """Names that look like settings and are none: misspelt, most likely."""
+    """Returns names that look like settings and are none: misspelt, most likely."""
     known = {f"{PREFIX}{name.upper()}" for name in (*ServerSettings.model_fields, *FORMER)} | {CONFIG, URL}
     return sorted(name for name in environment if name.upper().startswith(PREFIX) and name.upper() not in known)
 
 
 @lru_cache(64)
 def is_loopback(host: str) -> bool:
-    """Whether nothing but this machine reaches the address. Cached: every request asks for the same few."""
+    """Returns True if only this machine reaches the address. Cached: every request asks for the same few."""
     try:
         return host.lower() == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:

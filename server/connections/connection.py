@@ -33,8 +33,8 @@ DROPPED_BYTES = 1 << 20
 
 
 class Connection(HttpToolsProtocol):
-    """uvicorn's own, guarded, and without its two copies of a body: a frame is some 30 MB, and each costs as much as
-    reading it.
+    """uvicorn's HTTP connection, guarded, and without its two copies of a body: a frame is some 30 MB, and each copy
+    costs as much as reading it.
 
     `guard` is that of the service, set by `server.connections.config`.
     """
@@ -70,7 +70,7 @@ class Connection(HttpToolsProtocol):
 
     @property
     def waits_for_us(self) -> bool:
-        """Whether nothing can come because the service does not read now, or has yet to ask for the body."""
+        """True if nothing can come because the service does not read now, or has yet to ask for the body."""
         return self.flow.read_paused or (self._record.phase is Phase.BODY and self.cycle.waiting_for_100_continue)
 
     def data_received(self, data: bytes) -> None:
@@ -96,7 +96,7 @@ class Connection(HttpToolsProtocol):
             at += self._parse(data if whole else memoryview(data)[at:end])
 
     def _parse(self, piece: bytes | memoryview) -> int:
-        """Parses a piece, and says how much of it was taken."""
+        """Parses a piece; returns the bytes of it that were taken."""
         record, size = self._record, len(piece)
         self._delivered, in_head = 0, record.phase is Phase.HEAD
         taken = size

@@ -1,4 +1,4 @@
-"""What every open connection is at, and what ends it: deadlines, caps, answers that nobody reads.
+"""Ends connections that break the limits: deadlines, caps, and answers that the peer does not read.
 
 A connection costs no timer of its own: one sweep, about once a second, looks at all of them while there are any.
 """
@@ -28,7 +28,7 @@ LINGER_BYTES = 64 << 20
 """A body that goes on after its answer is read and dropped while `PROGRESS_BYTES` come in `LINGER_S`, so long in all,
 so far: closed at once, the connection would be reset, and the sender would lose the answer."""
 REFUSED_S = 2.0
-"""The same for a connection that was refused itself."""
+"""A connection that was refused is read and dropped for so long."""
 REFUSED_AT_ONCE = 64
 """Refused connections that wait for their peers to read why; the oldest go first."""
 CLOSING_SOCKET_S = 5.0
@@ -43,7 +43,7 @@ log = logging.getLogger("scas4d.server")
 
 @dataclass(frozen=True)
 class Limits:
-    """The settings of connections; seconds, bytes, counts."""
+    """The limits of connections: seconds, bytes, counts."""
 
     header_seconds: float
     header_bytes: int
@@ -56,7 +56,7 @@ class Limits:
 
     @classmethod
     def of(cls, settings: ServerSettings) -> Limits:
-        """Those of a service."""
+        """Takes the limits from the settings of a service."""
         return cls(
             header_seconds=settings.header_seconds,
             header_bytes=settings.header_kb << 10,
@@ -69,7 +69,7 @@ class Limits:
         )
 
     def of_refusal(self, refusal: Refusal) -> float:
-        """The limit that a refusal names, in the unit of its setting."""
+        """Returns the limit that a refusal names, in the unit of its setting."""
         return {
             Refusal.HEAD_SIZE: self.header_bytes / 1024,
             Refusal.URL_SIZE: self.header_bytes / 1024,
@@ -82,7 +82,7 @@ class Limits:
         }.get(refusal, 0)
 
     def is_proxy(self, address: str) -> bool:
-        """Whether the address is one of the trusted proxies."""
+        """Returns True if the address is one of the trusted proxies."""
         try:
             found = ipaddress.ip_address(address)
         except ValueError:
@@ -91,7 +91,7 @@ class Limits:
 
 
 def peer_key(address: str) -> str:
-    """Under which connections count as one peer's: an IPv6 address by its /64, all of which is one customer's."""
+    """Returns the key of a peer's connections: of an IPv6 address its /64, which belongs to one customer."""
     try:
         found = ipaddress.ip_address(address)
     except ValueError:
@@ -122,11 +122,11 @@ class Guard:
     def admit(
         self, handler: Handler, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop, address: str
     ) -> tuple[Record, Refusal | None]:
-        """A new connection: its record, and why it has to be refused where it has to be.
+        """Takes a new connection: returns its record, and the refusal if it has to be refused.
 
         Where a cap is reached it takes the place of the oldest connection that has not sent a whole header, is idle, or
-        has stopped sending its body: whoever hangs about must not keep out who has a request. Where all places are
-        taken, any peer's may give way: who has many addresses has few connections from each.
+        has stopped sending its body: an idle peer must not keep out one that has a request. Where all places are
+        taken, any peer's may give way: a peer with many addresses has few connections from each.
         """
         now = loop.time()
         proxy = self.limits.is_proxy(address)
@@ -150,7 +150,7 @@ class Guard:
         return record, refusal
 
     def enter(self, record: Record, phase: Phase, now: float) -> None:
-        """Takes note that a connection is in another phase, from `now` (loop time) on."""
+        """Notes that a connection is in another phase, from `now` (loop time) on."""
         if record.gone:
             return
         record.phase, record.since, record.entered, record.body, record.dropped = phase, now, now, 0, 0
@@ -177,7 +177,7 @@ class Guard:
                 oldest.transport.abort()
 
     def hand_over(self, transport: asyncio.BaseTransport, handler: Handler, now: float) -> Record:
-        """The record of a connection that is a WebSocket from now on."""
+        """Returns the record of a connection that is a WebSocket from now on."""
         record = self._records[transport]
         record.handler = handler
         self.enter(record, Phase.SOCKET, now)
@@ -197,7 +197,7 @@ class Guard:
         self._pending[refusal.value] += 1
 
     def counts(self) -> dict[str, int]:
-        """Open connections by kind."""
+        """Counts the open connections by kind."""
         found = dict.fromkeys(KINDS.values(), 0)
         for record in self._records.values():
             found[KINDS[record.phase]] += 1
@@ -258,11 +258,11 @@ class Guard:
             record
             for peer in peers
             for record in peer.bodies
-            if record.received == 0 and now - record.heard > QUIET_S and not record.handler.waits_for_us
+            if record.received == 0 and now - record.last_bytes_at > QUIET_S and not record.handler.waits_for_us
         ]
         if not quiet:
             return False
-        self._end(min(quiet, key=lambda record: record.heard), now)
+        self._end(min(quiet, key=lambda record: record.last_bytes_at), now)
         return True
 
     def _sweep(self, loop: asyncio.AbstractEventLoop) -> None:

@@ -1,4 +1,4 @@
-"""Logs on stderr from every process of the service: one JSON object a line, or in a terminal one that people read.
+"""Formats the logs of every process on stderr: one JSON object a line, or plain lines in a terminal.
 
 No secret is ever in one.
 """
@@ -13,21 +13,21 @@ from datetime import UTC, datetime
 from typing import Any, Literal
 
 SECRETS = re.compile(r"(?i)(bearer\s+|scas4d\.ticket\.|(?:token|ticket)=)[^\s\"',;&]+")
-"""What follows is hidden wherever it appears: it comes from clients, and may turn up in any message."""
+"""A secret follows these: it is hidden wherever it appears, because clients send it and any message may quote it."""
 
 _PLAIN = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName"}
 
 
 def hidden(text: str) -> str:
-    """The text without tokens and tickets."""
+    """Returns the text without tokens and tickets."""
     return SECRETS.sub(r"\1***", text)
 
 
 class JsonFormatter(logging.Formatter):
-    """time, level, logger, message, process, what was given as `extra`, and the traceback of an exception."""
+    """Formats records as JSON: time, level, logger, message, process, `extra`, and the traceback of an exception."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line."""
+        """Returns one line."""
         entry: dict[str, Any] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
@@ -42,13 +42,13 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """For people: the time of day, the level where it is no mere information, the message."""
+    """Formats records for people: the time of day, the level from warning on, the message."""
 
     def __init__(self) -> None:
         super().__init__("%(asctime)s %(message)s", datefmt="%H:%M:%S")
 
     def format(self, record: logging.LogRecord) -> str:
-        """A line, or several with a traceback."""
+        """Returns a line, or several with a traceback."""
         said = super().format(record)
         if record.levelno > logging.INFO:
             moment, _, message = said.partition(" ")
@@ -57,7 +57,7 @@ class TextFormatter(logging.Formatter):
 
 
 def told_to_people(record: logging.LogRecord) -> bool:
-    """Not the requests that only read and succeed: a viewer or a rig that waits asks several times a second."""
+    """Filters out requests that only read and succeed: a viewer or a waiting rig sends several a second."""
     return record.levelno > logging.INFO or not (
         getattr(record, "method", "") in ("GET", "HEAD") and getattr(record, "status", 500) < 400
     )

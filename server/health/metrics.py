@@ -1,4 +1,4 @@
-"""What Prometheus reads at /metrics. Counters are counted where the thing happens; gauges are read when asked."""
+"""Metrics for Prometheus. Counters are raised where the event happens; gauges are read on request."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from server.stream.hub import Hub
 SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 4, 8, 16, 32, 64, 128, 256)
 
 registry = CollectorRegistry()
-"""Of this process, without the interpreter's own metrics."""
+"""Metrics of this process, without the interpreter's own."""
 
 FRAMES = Counter(
     "scas4d_frames",
@@ -95,7 +95,7 @@ def finished(report: FrameReportModel) -> None:
 
 
 class HasStatus(Protocol):
-    """A scene, as far as it is looked at here."""
+    """A scene, as far as metrics read it."""
 
     def status(self) -> SceneStatus:
         """As it is now."""

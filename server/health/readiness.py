@@ -1,6 +1,6 @@
-"""Whether the service can work at once: its kernels are compiled, or loaded from the cache, in a process beside it.
+"""Readiness of the service: a process beside it compiles the kernels, or loads them from the cache.
 
-The door itself never loads them. What the process leaves in the kernel cache is what the workers of scenes find there.
+The process that answers requests never loads them. Workers find the compiled kernels in the cache.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ ENDS_S = 2.0
 
 @dataclass(frozen=True)
 class WarmedUp:
-    """The kernels are there; `fault` says why not."""
+    """The kernels are compiled; or not, for the reason in `fault`."""
 
     fault: str | None = None
 
 
 def main(spec: None, connection: Connection[Any, Any]) -> None:
-    """The process: warms up, says so, ends."""
+    """Runs the process: it warms up, reports, and ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         from scas4d_core.warm_up import warm_up  # in this process only: the service stays light
@@ -44,12 +44,12 @@ def main(spec: None, connection: Connection[Any, Any]) -> None:
         log.exception("the kernels could not be warmed up")
         connection.send(WarmedUp(f"{type(error).__name__}: {told(error)}"))
     with contextlib.suppress(EOFError, OSError):
-        connection.recv()  # until told to end, or until the service is gone: what was sent is read by then
+        connection.recv()  # until it is asked to end, or until the service is gone: by then the report is read
     os._exit(0)
 
 
 class Readiness:
-    """Begins when the service starts.
+    """Warms up the kernels from the start of the service on.
 
     Attributes:
         after: seconds from the start to being ready; None: not yet.
@@ -70,7 +70,7 @@ class Readiness:
             self.after = 0.0
 
     def check(self) -> float:
-        """Seconds from the start until it was ready.
+        """Returns the seconds from the start until the service was ready.
 
         Raises:
             Problem: 503, not ready; `warming_up` says that it will be, without anybody's doing.

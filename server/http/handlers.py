@@ -63,7 +63,7 @@ def install(app: FastAPI) -> None:
 
 
 def methods(app: FastAPI, path: str) -> list[str]:
-    """The methods that the document has for an address."""
+    """Returns the methods that the OpenAPI document has for an address."""
     return sorted(
         {
             method.upper()

@@ -27,7 +27,7 @@ from server.settings import ServerSettings, is_loopback
 OPEN = frozenset(
     {"/", "/viewer", "/favicon.ico", "/health/live", "/docs", "/docs/oauth2-redirect", "/redoc", "/openapi.json"}
 )
-"""What bears no data and can be read without a token: the page that asks for one, and the description of the API."""
+"""Paths that hold no data and need no token: the page that asks for one, and the description of the API."""
 OPEN_FOLDERS = ("/viewer/",)
 """Files of the viewer's page."""
 IN_URL = frozenset({"token", "access_token", "api_key", "ticket", "authorization"})
@@ -38,14 +38,14 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-"""Of every answer: nothing of the service is shown inside another site, nor guessed to be another kind of file."""
+"""Headers of every answer: no site shows the service in a frame, and no browser guesses another kind of file."""
 DEFAULT_PORTS = {"http": 80, "https": 443, "ws": 80, "wss": 443}
 
 access = logging.getLogger("scas4d.access")
 
 
 class AccessLog:
-    """A line a request and a line a WebSocket: method, path (no query), status, seconds, bytes. No headers."""
+    """Logs a line a request and a line a WebSocket: method, path (no query), status, seconds, bytes; no headers."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -130,7 +130,7 @@ class BodyLimit:
 
 
 class AuthMiddleware:
-    """Refuses with a problem document; a WebSocket's handshake too."""
+    """Authenticates requests and WebSockets; refuses others with a problem document."""
 
     def __init__(self, app: ASGIApp, settings: ServerSettings, tickets: Tickets) -> None:
         self.app = app
@@ -196,7 +196,7 @@ class AuthMiddleware:
         if scheme.lower() != "bearer" or not right:
             raise Problem(
                 401,
-                "the token is not the service's" if given else "the service asks for a token",
+                "the token is wrong" if given else "the service requires a token",
                 field="Authorization",
                 remedy="send `Authorization: Bearer` and the token that the service was started with",
                 headers={"WWW-Authenticate": 'Bearer realm="scas4d"' + (', error="invalid_token"' if given else "")},
@@ -210,7 +210,7 @@ class AuthMiddleware:
                 if not self.tickets.redeem(shown[0].removeprefix(SUBPROTOCOL)):
                     raise Problem(
                         401,
-                        "the ticket is used, too old, or none",
+                        "the ticket is used, too old, or was never issued",
                         field="Sec-WebSocket-Protocol",
                         remedy="fetch another with POST /v1/tickets and use it at once",
                         headers={"WWW-Authenticate": 'Bearer realm="scas4d"'},
@@ -236,7 +236,7 @@ def _with_headers(send: Send) -> Send:
 
 
 def _answering(scope: Scope, receive: Receive, send: Send) -> Send:
-    """A WebSocket that the application closes before accepting it (there is none at this path) gets a document."""
+    """Answers with a document if the application closes a WebSocket before accepting it: none is at the path."""
     accepted = False
 
     async def sending(message: Message) -> None:
@@ -255,7 +255,7 @@ def _answering(scope: Scope, receive: Receive, send: Send) -> Send:
 
 
 def check_origin(scope: Scope, allowed_hosts: Sequence[str], allowed_origins: Sequence[str]) -> None:
-    """Lets a request through.
+    """Checks Host and Origin of a request.
 
     Args:
         scope: of ASGI, http or websocket.
@@ -311,7 +311,7 @@ def _the_host(headers: Headers) -> str:
 
 
 def split(authority: str) -> tuple[str, int | None] | None:
-    """Host (lower case, IPv6 without brackets, no final dot) and port of `host[:port]`; None where it is neither."""
+    """Splits `host[:port]` into host (lower case, IPv6 without brackets, no final dot) and port, if it can."""
     try:
         parts = urlsplit(f"//{authority}")
         host, port = parts.hostname, parts.port
@@ -339,7 +339,7 @@ def _is_address(host: str) -> bool:
 
 
 def _same(origin: str, authority: str) -> bool:
-    """Whether the page comes from host and port that are asked; the scheme may differ behind a proxy that adds TLS."""
+    """Returns True if the page comes from the request's host and port; a proxy with TLS changes the scheme."""
     scheme, _, rest = origin.partition("://")
     page, asked = split(rest), split(authority)
     default = DEFAULT_PORTS.get(scheme.lower())

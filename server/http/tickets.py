@@ -35,7 +35,7 @@ class Tickets:
         self._until: dict[bytes, float] = {}
 
     def issue(self) -> str:
-        """A new ticket.
+        """Issues a new ticket.
 
         Raises:
             Problem: 429, as many wait as may.
@@ -56,7 +56,7 @@ class Tickets:
         return ticket
 
     def redeem(self, ticket: str) -> bool:
-        """Whether it was issued, is still alive and was not used; it is used now."""
+        """Uses a ticket; returns True if it was issued, is still alive and was not used before."""
         until = self._until.pop(_digest(ticket), None)
         return until is not None and until > self._clock()
 

@@ -1,6 +1,6 @@
-"""What pydantic finds wrong with a request, as a problem: which field, which value, and what to send instead.
+"""Turns validation errors of pydantic into problems: field, value, and the remedy.
 
-Its messages say what is wrong ("Input should be less than or equal to 100"); the remedies here say what to send.
+Pydantic's messages name the fault ("Input should be less than or equal to 100"); the remedies are made here.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ KINDS = {
     "model": "an object: {…}",
     "mapping": "an object: {…}",
 }
-"""What a type error asks for, by the first word of its name."""
+"""The right type for a type error, by the first word of the error's name."""
 
 
 def invalid(
@@ -49,7 +49,7 @@ def invalid(
     text: str | None = None,
     schema: str = "the schema is at /openapi.json",
 ) -> Problem:
-    """The answer to one error of a validation.
+    """Makes the problem for one error of a validation.
 
     Args:
         error: as in `ValidationError.errors()`.
@@ -75,13 +75,13 @@ def invalid(
 
 
 def first_of(error: ValidationError, *, model: object = None, prefix: str = "", text: str | None = None) -> Problem:
-    """The answer to the first error of a failed validation."""
+    """Makes the problem for the first error of a failed validation."""
     found = error.errors()
     return invalid(found[0], model=model, prefix=prefix, others=len(found) - 1, text=text)
 
 
 def fields_of(model: object, loc: tuple[int | str, ...] = ()) -> list[str]:
-    """Names of the fields of the model that lies at `loc` inside another; none where that is no model."""
+    """Returns the names of the fields of the model at `loc` inside another; none if there is no model."""
     here = list(_models(model))
     for part in loc:
         if isinstance(part, str):
@@ -91,7 +91,7 @@ def fields_of(model: object, loc: tuple[int | str, ...] = ()) -> list[str]:
 
 
 def _models(annotation: object) -> Iterator[type[BaseModel]]:
-    """The models that a type is made of."""
+    """Yields the models that a type is made of."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for inner in get_args(annotation):
@@ -115,7 +115,7 @@ def _broken_json(error: Mapping[str, Any], loc: tuple[Any, ...], prefix: str, te
 
 
 def said_by(error: Mapping[str, Any]) -> tuple[str, str]:
-    """Fault and remedy of one error of a validation; no remedy where pydantic found it, not a validator of ours."""
+    """Returns fault and remedy of one error; no remedy if pydantic found it and not a validator of this project."""
     raised = error.get("ctx", {}).get("error") if error["type"] == "value_error" else None
     if isinstance(raised, InputError):
         return raised.fault, raised.remedy

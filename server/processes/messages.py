@@ -1,4 +1,4 @@
-"""All that crosses the pipes between the service and the two processes of a scene. Small; bulk goes by file."""
+"""Messages between the service and the processes of a scene. They are small: pictures and states go by file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from scas4d_core.settings import Settings
 
 @dataclass(frozen=True, eq=False)
 class SceneSpec:
-    """What the processes of a scene are started with."""
+    """The scene as its processes are given it when they start."""
 
     folder: Path
     rig: Rig
@@ -37,7 +37,7 @@ class SceneSpec:
 
     @property
     def journal(self) -> Path:
-        """Of the scene's facts (`server.storage.journal`)."""
+        """The file of the scene's journal (`server.storage.journal`)."""
         return self.folder / "journal.log"
 
     @property
@@ -66,7 +66,7 @@ class FrameReady:
 
 @dataclass(frozen=True)
 class Mend:
-    """Files of the states' folder that were found damaged or gone: each is looked at, and written again if it can be.
+    """Asks the worker to check files of the states' folder, found damaged or gone, and to write them again if it can.
 
     `times` and `reports` of frames, as far as the service has them in memory.
     """
@@ -78,7 +78,7 @@ class Mend:
 
 @dataclass(frozen=True)
 class Remake:
-    """The state of a frame is made again from its pictures, starting from that of the committed frame `base`."""
+    """Asks the worker to compute a damaged state again, from its pictures and the committed frame `base`."""
 
     frame: FrameReady
     base: int
@@ -86,7 +86,7 @@ class Remake:
 
 @dataclass(frozen=True)
 class Stop:
-    """Finish what is at work and end."""
+    """Asks a process to finish its work and end."""
 
 
 # From the worker.
@@ -94,7 +94,7 @@ class Stop:
 
 @dataclass(frozen=True)
 class Ready:
-    """The worker takes frames. What it found committed: `indices`, those it could not read, and the newest's report.
+    """The worker takes frames. It found `indices` committed, could not read `damaged`, and sends the newest report.
 
     `undone`: frames whose commit was taken back, to be given again. `faults`: why, a sentence each.
     """
@@ -108,7 +108,7 @@ class Ready:
 
 @dataclass(frozen=True)
 class Broken:
-    """What is committed cannot be gone on from."""
+    """The worker cannot resume from the committed states."""
 
     reason: str
 
@@ -124,7 +124,7 @@ class Stalled:
 
 @dataclass(frozen=True)
 class Progressed:
-    """The first frame is this far."""
+    """Progress of the first frame."""
 
     stage: str
     done: int
@@ -155,14 +155,14 @@ class UpdateSetAside:
 
 
 class MendOutcome(StrEnum):
-    """What came of a file that was found damaged."""
+    """Outcomes for a file that was found damaged."""
 
     WHOLE = "whole"
     """It is not: it was written meanwhile, or the disk could not read it once."""
     WRITTEN = "written"
     """It was written again, the same bits."""
     REPORT_LOST = "report_lost"
-    """The state was written again, the same bits; its report was damaged, and nobody has it in memory."""
+    """The state was written again, the same bits; its report was damaged and is not in memory."""
     DAMAGED = "damaged"
     """It is, and nothing to write it from is in memory."""
     GONE = "gone"
@@ -179,7 +179,7 @@ class MendOutcome(StrEnum):
 
 @dataclass(frozen=True)
 class Mended:
-    """What came of one file (`Mend`) or of one state (`Remake`, with its new report)."""
+    """The outcome for one file (`Mend`) or for one state (`Remake`, with its new report)."""
 
     name: str
     outcome: MendOutcome
@@ -216,12 +216,12 @@ class ReplaySpec:
 
 @dataclass(frozen=True)
 class ReplayUpdated:
-    """One update is over."""
+    """One update of a replay is over."""
 
 
 @dataclass(frozen=True)
 class ReplayPoint:
-    """What one number of iterations costs and brings (`scas4d_core.replay.Replayed`)."""
+    """Cost and accuracy of one number of iterations (`scas4d_core.replay.Replayed`)."""
 
     iterations: int
     milliseconds: float
@@ -232,7 +232,7 @@ class ReplayPoint:
 
 @dataclass(frozen=True)
 class ReplayEnded:
-    """Nothing more comes; `fault` is None where all were measured."""
+    """The replay has ended; `fault` is None if all numbers of iterations were measured."""
 
     fault: str | None = None
 
@@ -242,7 +242,7 @@ class ReplayEnded:
 
 @dataclass(frozen=True)
 class Refresh:
-    """Frames were committed, deleted or taken back: these, or None where every file has to be looked at."""
+    """Frames were committed, deleted or taken back: these, or None if every file has to be checked."""
 
     frames: tuple[int, ...] | None = None
 

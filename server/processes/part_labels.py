@@ -1,4 +1,4 @@
-"""Part labels that last: each count's are kept beside the states, so that parts found later keep their labels.
+"""Part labels of a scene by number of parts, kept beside the states so that a part keeps its label.
 
 They are a derived thing: a lost or damaged file means that labels are numbered anew, by size.
 """
@@ -44,7 +44,7 @@ class PartLabels:
         self._known: dict[int | None, Known] = {}
 
     def of(self, reader: Committed, history: History, count: int | None) -> NDArray[np.int64]:
-        """[N] labels from all that is committed, found once for each newest frame.
+        """Returns [N] labels from all committed states; they are computed once for each newest frame.
 
         Raises:
             ValueError: as ``Committed.parts``.

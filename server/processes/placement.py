@@ -93,7 +93,7 @@ class Process:
 
     @property
     def pid(self) -> int | None:
-        """Of the operating system."""
+        """The process id of the operating system."""
         return self._process.pid
 
     def send(self, message: Any) -> None:

@@ -1,9 +1,9 @@
-"""The processes of a scene that answer from what is committed, and the queues before them.
+"""Answers queries about the committed states of a scene: its two reader processes and the queues before them.
 
 Views have a process of their own: a track query over a long history, or a search for parts, never stands before them.
-That other process starts with the first such question, runs at a lower priority, and is ended where nobody waits for
-what it is busy with any more: nothing in it can be interrupted in any other way, and it holds nothing that is not on
-disk. A process that ends by itself is started again, each time after a longer pause.
+That other process starts with its first query, runs at a lower priority, and is ended when its query was cancelled:
+nothing in it can be interrupted in any other way, and it holds nothing that is not on disk. A process that ends by
+itself is started again, each time after a longer pause.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from server.processes.messages import (
 from server.processes.placement import Entry, Placement, Process
 
 GRACE_VIEWS_S, GRACE_BULK_S = 10.0, 1.0
-"""How long a process may go on with a question that nobody waits for any more. Views are short, and a new process takes
-a second or two to start."""
+"""A process may go on for so long with a query that was cancelled. Views are short, and a new process takes a second or
+two to start."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
 """Before a process that ended by itself is started again; twice as long after each further end without an answer."""
 MOST_WAITING = 64
@@ -64,22 +64,26 @@ log = logging.getLogger("scas4d.server")
 
 @dataclass(eq=False)
 class _WaitingQuery:
-    """A question and who waits for its answer."""
+    """A query and the future of its answer."""
 
     number: int
     query: Query
     answer: asyncio.Future[Answer | Refused]
 
+    def end(self, answer: Answer | Refused) -> None:
+        if not self.answer.done():
+            self.answer.set_result(answer)
+
 
 class QueryQueue:
-    """A process and the queue before it. One question is with the process; whoever leaves the queue is never begun.
+    """A reader process and the queue before it. The process has one query at a time; cancelled ones are never started.
 
     Args:
-        entry: what runs in the process. eager: start it now, not with the first question.
-        grace: seconds, see above. damaged: told of files that the process found damaged.
+        entry: what runs in the process. eager: start it now, not with the first query.
+        grace: seconds, see above. damaged: called with the files that the process found damaged.
 
     Attributes:
-        process: or None, before the first question and while it rests.
+        process: or None, before the first query and while it rests.
     """
 
     def __init__(
@@ -110,7 +114,7 @@ class QueryQueue:
             self._start()
 
     async def ask(self, query: Query) -> Answer | Refused:
-        """Waits for a turn and for the answer.
+        """Queues a query and returns its answer.
 
         Raises:
             Problem: 503, too many wait, or no answer within the time that the service allows.
@@ -148,12 +152,12 @@ class QueryQueue:
                 asyncio.get_running_loop().call_later(self._grace, self._give_up, turn)
 
     def refresh(self, frames: tuple[int, ...] | None) -> None:
-        """There is more to read, or less."""
+        """Tells the process that frames were committed, deleted or taken back."""
         if self.process is not None:
             self.process.send(Refresh(frames))
 
     async def stop(self) -> None:
-        """Ends the process, at once where it is busy; whoever waits is refused, and whoever asks later."""
+        """Ends the process, at once if it is busy; queries that wait, and later ones, are refused."""
         self._closed = True
         if self._pause is not None:
             self._pause.cancel()
@@ -164,7 +168,7 @@ class QueryQueue:
             await (process.stop(0) if busy else process.stop())
         await asyncio.gather(*self._ending)
         for turn in turns:
-            _answer(turn, Refused(turn.number, "the scene has ended", status=503))
+            turn.end(Refused(turn.number, "the scene has ended", status=503))
 
     def _start(self) -> None:
         self._life = life = object()
@@ -172,7 +176,7 @@ class QueryQueue:
         self.process = self._placement.start(self._entry, self._spec, self._answered, ended)
 
     def _next(self) -> None:
-        """Gives the process the next question, where it is free."""
+        """Gives the process the next query, if it is free."""
         if self._at_work is not None or self._pause is not None or self._closed or not self._waiting:
             return
         if self.process is None:
@@ -190,15 +194,15 @@ class QueryQueue:
             return
         self._failures = 0
         self._at_work = None
-        _answer(turn, message)
+        turn.end(message)
         self._next()
 
     def _give_up(self, turn: _WaitingQuery) -> None:
-        """Ends the process if it is still busy with what nobody waits for."""
+        """Ends the process if it is still busy with a cancelled query."""
         if self._at_work is not turn or self.process is None:
             return
         name, kind = self._spec.folder.name, turn.query.kind
-        log.warning("scene %s: nobody waits for its %s query any more; its reader starts anew", name, kind)
+        log.warning("scene %s: its %s query was cancelled; its reader starts anew", name, kind)
         task = asyncio.ensure_future(self.process.stop(0))
         self._ending.add(task)
         task.add_done_callback(self._ending.discard)
@@ -214,8 +218,7 @@ class QueryQueue:
         self._failures += 1
         log.error("scene %s: a reader is gone (%s); the next in %g s", self._spec.folder.name, reason, pause)
         if turn is not None:
-            detail = f"the reader ended while it was busy with this: {reason}"
-            _answer(turn, Refused(turn.number, detail, status=500))
+            turn.end(Refused(turn.number, f"the reader ended while it was busy with this: {reason}", status=500))
         self._pause = asyncio.get_running_loop().call_later(pause, self._go_on)
 
     def _go_on(self) -> None:
@@ -223,17 +226,12 @@ class QueryQueue:
         self._next()
 
 
-def _answer(turn: _WaitingQuery, answer: Answer | Refused) -> None:
-    if not turn.answer.done():
-        turn.answer.set_result(answer)
-
-
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """Parts as they were found from the frames up to one.
+    """Part labels, computed from the frames up to one.
 
     Attributes:
-        commits: how many commits the reader had been told of. frame: the last one read, as text.
+        commits: commits that the reader knew of. frame: the last one read, as text.
     """
 
     commits: int
@@ -242,7 +240,7 @@ class Labels:
 
 
 class Readers:
-    """All that answers questions about a scene's committed frames.
+    """Answers queries about a scene's committed frames.
 
     Attributes:
         views, bulk: the two processes.
@@ -258,11 +256,10 @@ class Readers:
         self._finding: dict[int | None, asyncio.Task[Labels]] = {}
 
     async def ask(self, query: Query) -> Answer:
-        """The answer to a question. If the asker is cancelled, so is the question.
+        """Returns the answer to a query; cancelling this cancels the query.
 
         Raises:
-            Problem: 4xx where the question cannot be answered, 503 where it takes too long or too many wait, 500 for a
-                fault of the reader.
+            Problem: 4xx, it cannot be answered; 503, it takes too long or too many wait; 500, a fault of the reader.
         """
         began, outcome = time.perf_counter(), "failed"
         try:
@@ -284,19 +281,19 @@ class Readers:
         return replace(answer, headers={**answer.headers, "X-Parts-Frame": labels.frame})
 
     def refresh(self, frames: tuple[int, ...] | None = None) -> None:
-        """Frames were committed, deleted or taken back: these, or any where not told."""
+        """Tells the processes that frames were committed, deleted or taken back: these, or any of them for None."""
         self._commits += 1
         self.views.refresh(frames)
         self.bulk.refresh(frames)
 
     async def stop(self) -> None:
-        """Ends the processes; whoever waits is refused."""
+        """Ends the processes; queries that wait are refused."""
         for task in self._finding.values():
             task.cancel()
         await asyncio.gather(self.views.stop(), self.bulk.stop())
 
     async def _tracks(self, query: TracksQuery) -> Answer:
-        """Trajectories; a long question in pieces, so that others come in between."""
+        """Answers a track query; a long one in pieces, so that others come in between."""
         pieces = track_answers.pieces(query)
         if len(pieces) * len(pieces[0]) == 1:
             return _checked(await self.bulk.ask(query), query)
@@ -304,7 +301,7 @@ class Readers:
         return Answer(0, *await asyncio.to_thread(track_answers.together, answers, query, self._spec))
 
     async def _labels_of(self, count: int | None) -> Labels:
-        """The labels for a view: never waited for but the first time, then those found last.
+        """Returns the part labels for a view; only the first call waits, later ones get the labels found last.
 
         They are found from the whole history, which takes longer than a view. After a commit they are found anew while
         views go on with those before.
@@ -346,7 +343,7 @@ def _checked(answer: Answer | Refused, query: Query) -> Answer:
 
 
 def _asked(query: Query) -> tuple[str, object]:
-    """What of a question the reader can find wrong that the door cannot: its field and value."""
+    """Returns field and value of the part of a query that only the reader can check."""
     if isinstance(query, TracksQuery):
         return ("ids", list(query.ids)) if query.ids is not None else ("at", query.at)
     if isinstance(query, LabelsQuery | PartsQuery):

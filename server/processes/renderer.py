@@ -1,6 +1,6 @@
-"""The processes that answer from committed states: views, and in another one tracks, parts, exports.
+"""The reader processes of a scene: one renders views, the other one answers tracks, parts and exports.
 
-Neither waits for an update; how questions come to them is told in ``readers``.
+Neither waits for an update; ``server.processes.readers`` queues their queries.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 FLOAT32 = "application/octet-stream"
 QUALITY = 92
-"""Of JPEG and WebP where not asked for."""
+"""Quality of JPEG and WebP, 1…100, if the query names none."""
 CHANNELS = {"colour": ("red", "green", "blue"), "depth": ("depth",), "alpha": ("alpha",), "parts": ("parts",)}
 
 BULK_NICE = 10
@@ -60,12 +60,12 @@ log = logging.getLogger("scas4d.renderer")
 
 
 def views(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
-    """The process for views. Runs until told to stop, or until the service is gone."""
+    """Runs the process for views until it is asked to stop, or until the service is gone."""
     _serve(spec, connection)
 
 
 def bulk(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
-    """The process for all that may take long."""
+    """Runs the process for queries that may take long."""
     os.nice(BULK_NICE)
     _serve(spec, connection)
 
@@ -84,7 +84,7 @@ def _serve(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
             renderer.changed(message.frames)
         elif isinstance(message, AskedQuery):
             answer = renderer.answer(message)
-            if found := renderer.take_faults():  # before whoever was refused asks again
+            if found := renderer.take_faults():  # before a refused query is asked again
                 connection.send(Damaged(found))
             connection.send(answer)
     logging.shutdown()
@@ -92,7 +92,7 @@ def _serve(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
 
 
 class Renderer:
-    """Answers queries one after the other."""
+    """Answers queries about committed states, one after the other."""
 
     def __init__(self, spec: SceneSpec) -> None:
         self.spec = spec
@@ -103,7 +103,7 @@ class Renderer:
 
     @property
     def history(self) -> History:
-        """What is committed now: opened once, then kept up to date by what is new in its folder."""
+        """The committed states: opened once, then refreshed with the files that are new in their folder."""
         if self._history is None:
             self._history = History.load(self.spec.states)
         elif self._stale is None or self._stale:
@@ -112,7 +112,7 @@ class Renderer:
         return self._history
 
     def changed(self, frames: tuple[int, ...] | None) -> None:
-        """These frames were committed, deleted or taken back since; None: any may have been."""
+        """Notes frames that were committed, deleted or taken back; None: any may have been."""
         self._stale = None if frames is None or self._stale is None else self._stale | set(frames)
 
     @property
@@ -130,15 +130,15 @@ class Renderer:
         return self._reader
 
     def labels(self, count: int | None) -> NDArray[np.int64]:
-        """Part labels, found once for what is committed now."""
+        """Returns [N] part labels from all committed states."""
         return self._parts.of(self.reader, self.history, count)
 
     def take_faults(self) -> dict[str, str]:
-        """Files that were found damaged or gone since this was asked last, by name with the reason."""
+        """Returns files that were found damaged or gone since the last call, by name with the reason."""
         return {} if self._history is None else self._history.take_faults()
 
     def _note_missing(self, query: Query) -> None:
-        """Frames that the service takes for committed and that are not here: it knows whether they were deleted."""
+        """Notes frames that the service takes for committed and that are missing; it knows if they were deleted."""
         frames = query.frames if isinstance(query, TracksQuery) else (getattr(query, "frame", None),)
         history = self._history
         if history is not None and history.files is not None:
@@ -148,7 +148,7 @@ class Renderer:
                     history.files.faults.setdefault(frame_file(index), f"{frame_file(index)} is gone")
 
     def answer(self, ask: AskedQuery) -> Answer | Refused:
-        """The encoded answer, or why there is none."""
+        """Returns the encoded answer, or the reason for a refusal."""
         asked = f"{ask.query.kind} query"
         for more in range(DAMAGED_AT_ONCE, -1, -1):
             try:
@@ -158,7 +158,7 @@ class Renderer:
                 if more and isinstance(ask.query, PartsQuery | LabelsQuery):  # found from all others
                     continue
                 return Refused(ask.number, told(error), "ask again later: it is mended if it can be", status=503)
-            except UnreadableFrameError as error:  # deleted since the door looked
+            except UnreadableFrameError as error:  # deleted since the service checked
                 log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
                 self._note_missing(ask.query)
                 return Refused(ask.number, told(error), status=404)
@@ -198,7 +198,7 @@ class Renderer:
 
 
 def float32(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, str]]:
-    """Arrays [H, W] or [H, W, 3] by kind, one behind the other in the last axis, as little-endian float32; and headers.
+    """Joins arrays [H, W] or [H, W, 3] in the last axis, as little-endian float32; returns them with their headers.
 
     X-Shape is "H,W,C", X-Channels names the C channels, X-Dtype is "<f4". Rows from the top, C fastest.
     """
@@ -212,10 +212,10 @@ def float32(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, str]]:
 def encode_view(
     view: View, kinds: Sequence[str], format: str, quality: int | None = None
 ) -> tuple[bytes, str, dict[str, str]]:
-    """A view as body, media type and headers; a picture holds one kind (the door sees to it).
+    """Encodes a view: returns body, media type and headers. The route has checked that a picture holds one kind.
 
     Args:
-        view: what was rendered. kinds: of it.
+        view: the rendered arrays. kinds: those to encode.
         format: png, jpeg, webp, npz or float32.
         quality: 1…100, of JPEG and WebP.
     """
@@ -238,7 +238,7 @@ def encode_view(
 
 
 def part_colours() -> list[int]:
-    """A palette, 256 × RGB: 0 black, then the colour of each label."""
+    """Returns a palette, 256 × RGB: 0 is black, then the colour of each label."""
     return [0, 0, 0, *(channel for label in range(255) for channel in part_colour(label))]
 
 

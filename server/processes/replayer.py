@@ -1,4 +1,4 @@
-"""The process that updates a scene's last frames again, to measure other budgets; the scene's own worker goes first."""
+"""The replay process: updates a scene's last frames again, to measure other budgets, at a low priority."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ log = logging.getLogger("scas4d.replayer")
 
 
 def main(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
-    """Runs once through; the service ends it where nobody wants its answer any more."""
+    """Runs one replay; the service ends the process when its answer is not wanted any more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(NICE)
     end_with_parent()
@@ -38,7 +38,7 @@ def main(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
     with contextlib.suppress(EOFError, OSError):  # the service is gone
         connection.send(ReplayEnded(fault))
         logging.shutdown()
-        connection.recv()  # until it is told to stop: an end of its own would be taken for a fault
+        connection.recv()  # until it is asked to stop: an end of its own would be taken for a fault
     os._exit(0)
 
 

@@ -1,4 +1,4 @@
-"""The process that owns a scene's `Reconstruction`: takes it up again, decodes frames, steps, commits, reports."""
+"""The worker process owns a scene's `Reconstruction`: it resumes, decodes frames, updates, commits and reports."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ log = logging.getLogger("scas4d.worker")
 
 
 def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
-    """Runs until told to stop, or until the service is gone."""
+    """Runs the process until it is asked to stop, or until the service is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the service says when to stop
     os.nice(NICE)
     end_with_parent()
@@ -79,11 +79,11 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
 
 
 class _Stopped(Exception):
-    """Told to stop while waiting for room on the disk."""
+    """The worker was asked to stop while it waited for room on the disk."""
 
 
 class Worker:
-    """One scene. Every frame ends as `UpdateCommitted` or `UpdateSetAside`, or with the process."""
+    """Updates one scene. Every frame ends as `UpdateCommitted` or `UpdateSetAside`, or with the process."""
 
     def __init__(self, spec: SceneSpec, connection: Connection[Any, Any]) -> None:
         self.spec = spec
@@ -97,7 +97,7 @@ class Worker:
         self._later: deque[Any] = deque()
 
     def open(self) -> bool:
-        """Takes up what is committed and says so; False where it cannot be gone on from."""
+        """Resumes from the committed states and reports them; returns False if that cannot be done."""
         try:
             self.states = history = History.open(self.spec.states)
             undone: tuple[int, ...] = ()
@@ -121,7 +121,7 @@ class Worker:
         return True
 
     def take(self, message: FrameReady) -> None:
-        """Reconstructs one frame; where the disk is full, again until there is room."""
+        """Reconstructs one frame; while the disk is full, tries again until there is room."""
         stall = STALL_S
         while True:
             try:
@@ -139,14 +139,14 @@ class Worker:
             stall = min(2 * stall, LONGEST_STALL_S)
 
     def next(self) -> Any:
-        """The next message; those that came while a frame waited for room first."""
+        """Returns the next message; those that came while a frame waited for room go first."""
         return self._later.popleft() if self._later else self.connection.recv()
 
     def _await_room(self, seconds: float) -> None:
-        """Waits; only being told to stop ends it early, everything else is for later.
+        """Waits; only `Stop` ends this early, other messages are kept for later.
 
         Raises:
-            _Stopped: it was.
+            _Stopped: the service asked the worker to stop.
         """
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0 and self.connection.poll(left):
@@ -156,7 +156,7 @@ class Worker:
             self._later.append(message)
 
     def finish(self, message: FrameReady) -> UpdateCommitted | UpdateSetAside:
-        """Commits a frame, or says why not.
+        """Commits a frame, or returns the reason to set it aside.
 
         Raises:
             OSError: the disk is full; nothing is committed.
@@ -181,13 +181,13 @@ class Worker:
             return UpdateSetAside(message.index, f"{type(error).__name__}: {told(error)}", dropped, fatal=first)
 
     def mend(self, message: Mend) -> None:
-        """Looks at files that were found damaged, and says what came of each."""
+        """Checks files that were found damaged, and reports the outcome of each."""
         assert self.states is not None
         for mended in repairs.mend(self.states, self.reconstruction, message):
             self.connection.send(mended)
 
     def remake(self, message: Remake) -> None:
-        """Makes a state again from its pictures, and says whether it could be."""
+        """Computes a damaged state again from its pictures, and reports the outcome."""
         assert self.states is not None
         frame = message.frame
 
@@ -230,7 +230,7 @@ class Worker:
         return UpdateCommitted(frame.index, committed, tuple(self.retain()))
 
     def retain(self) -> list[int]:
-        """Deletes old states by the scene's rule; what cannot be deleted now is next time."""
+        """Deletes old states by the scene's rule and returns their indices; failures are tried again next time."""
         assert self.states is not None
         rule = self.spec.keep_states
         if rule.last is None and rule.bytes is None:
@@ -239,14 +239,14 @@ class Worker:
         return self.states.retain(last=last, size_bytes=size)
 
     def points(self) -> InitialPoints | None:
-        """The initial cloud that was put before the first frame."""
+        """Reads the initial cloud, if one was put before the first frame."""
         if not self.spec.points.exists():
             return None
         arrays = read_npz(self.spec.points)
         return InitialPoints(arrays["positions"], arrays["colours"], arrays.get("foreground"))
 
     def progress(self, progress: Any) -> None:
-        """Passes progress on, a few times a second at most, and the end of a stage always."""
+        """Sends progress a few times a second at most, and always at the end of a stage."""
         now = time.monotonic()
         if now - self._progress_at >= PROGRESS_EVERY_S or progress.done >= progress.total:
             self._progress_at = now

@@ -40,13 +40,13 @@ FrameIndex = Annotated[int, Path(ge=0, le=1_000_000_000)]
 
 
 def known(route: APIRoute) -> list[str]:
-    """The names that a route takes behind the question mark, in its own order."""
+    """Returns the names of a route's query parameters, in its own order."""
     fields = get_flat_params(route.dependant)
     return list(dict.fromkeys(field.alias for field in fields if isinstance(field.field_info, params.Query)))
 
 
 def only_known(connection: HTTPConnection) -> None:
-    """A dependency of every route.
+    """Refuses query parameters that the route does not know: a misspelt one is noticed.
 
     Raises:
         Problem: 422, names the parameter and those that there are.
@@ -66,10 +66,10 @@ def only_known(connection: HTTPConnection) -> None:
 
 
 async def ask(request: Request, scene: Scene, query: Query) -> Answer:
-    """The readers' answer; the request's body has been read.
+    """Asks the scene's readers; the query is cancelled if the client hangs up. The body has been read before.
 
     Raises:
-        Problem: as `Readers.ask`; 503 where nobody is left to read the answer.
+        Problem: as `Readers.ask`; 503, the client has hung up.
     """
     asking = asyncio.ensure_future(scene.readers.ask(query))
     leaving = asyncio.ensure_future(_hung_up(request))
@@ -82,7 +82,7 @@ async def ask(request: Request, scene: Scene, query: Query) -> Answer:
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError, Exception):
                 await task
-    raise Problem(503, "whoever asked has hung up", remedy="ask again")
+    raise Problem(503, "the client has hung up", remedy="ask again")
 
 
 async def _hung_up(request: Request) -> None:

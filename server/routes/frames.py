@@ -1,4 +1,4 @@
-"""Frames in, and what became of them."""
+"""Routes of frames: upload, reports, export."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ async def put(scene: TheScene, n: FrameIndex, request: Request) -> FrameReceipt:
         if kind == "multipart/form-data":
             return await take_form(scene, n, request)
     except ClientDisconnect:
-        raise Problem(400, "the sender went away", field="body", remedy="send the frame again") from None
+        raise Problem(400, "the sender closed the connection", field="body", remedy="send the frame again") from None
     raise Problem(
         415,
         f"a frame is {FRAME_MEDIA_TYPE} or multipart/form-data",
@@ -102,7 +102,7 @@ async def put_camera(
             return await take_camera(scene, n, c, _body(request), _length(request))
         return await take_file(scene, n, c, kind, time, _body(request), _length(request))
     except ClientDisconnect:
-        raise Problem(400, "the sender went away", field="body", remedy="send the picture again") from None
+        raise Problem(400, "the sender closed the connection", field="body", remedy="send the picture again") from None
 
 
 @router.post("/{id}/frames/{n}/close", status_code=202)
@@ -122,7 +122,7 @@ async def missing(scene: TheScene, n: FrameIndex, request: MissingRequest | None
 
 @router.get("/{id}/frames/{n}")
 async def report(scene: TheScene, n: FrameIndex) -> FrameReportModel:
-    """Where the frame is, and its numbers once it is committed."""
+    """Returns the state of a frame, and its numbers once it is committed."""
     found = await scene.report(n)
     if found is None:
         raise Problem(
@@ -141,7 +141,7 @@ async def report(scene: TheScene, n: FrameIndex) -> FrameReportModel:
     responses={200: {"content": {"application/octet-stream": {}}, "description": "A 3DGS .ply."}},
 )
 async def ply(scene: TheScene, n: FrameIndex, request: Request) -> Response:
-    """The committed frame in the file format of 3D Gaussian Splatting."""
+    """Exports a committed frame in the file format of 3D Gaussian Splatting."""
     answer = await ask(request, scene, PlyQuery(scene.committed_frame(n, "n")))
     return Response(answer.body, media_type=answer.media_type)
 
@@ -155,6 +155,6 @@ def _body(request: Request) -> AsyncIterator[bytes]:
 
 
 def _length(request: Request) -> int | None:
-    """Announced bytes of the body; the server has made sure that it is a number."""
+    """Returns the announced bytes of the body; the connection has checked that it is a number."""
     length = request.headers.get("content-length")
     return None if length is None or not length.isdigit() else int(length)

@@ -1,4 +1,4 @@
-"""The initial cloud."""
+"""Route of the initial cloud."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from server.routes.access import TheScene
 from server.storage.disk import full_disk, no_room
 
 MOST_POINTS = 2_000_000
-"""Of an initial cloud: twenty times the Gaussians that a scene can have, and 100 MB to check."""
+"""Points of an initial cloud: twenty times the Gaussians that a scene can have, and 100 MB to check."""
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
@@ -33,7 +33,7 @@ BODY: dict[str, Any] = {
 
 @router.put("/{id}/points", openapi_extra=BODY)
 async def put(scene: TheScene, request: Request) -> PointsReceipt:
-    """Gives the cloud that frame 0 starts from, before frame 0.
+    """Takes the cloud that frame 0 starts from; it has to come before frame 0.
 
     The body is an npz: `positions` [P, 3] in the rig's world and units, `colours` [P, 3] in 0…1, and optionally
     `foreground` [P] in 0…1. The same body again gets the same answer.
@@ -64,7 +64,7 @@ async def put(scene: TheScene, request: Request) -> PointsReceipt:
 
 
 def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
-    """The checked arrays of an npz cloud; nothing is unpickled, and nothing is unpacked before its size is known."""
+    """Reads and checks the arrays of an npz cloud; nothing is unpickled, and the size is checked before unpacking."""
     shapes = {"positions": (np.float64, 3), "colours": (np.float32, 3), "foreground": (np.float32, 0)}
     try:
         with zipfile.ZipFile(io.BytesIO(body)) as archive:

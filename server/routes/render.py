@@ -1,4 +1,4 @@
-"""Novel views."""
+"""Routes of novel views."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from server.routes.access import TheScene, ask
 from server.scene.scenes import Scene
 
 MOST_PIXELS = 8_000_000
-"""Of one view: 4K, some seconds on one core. A larger one would keep others waiting."""
+"""Pixels of one view: 4K, some seconds on one core. A larger one would keep others waiting."""
 
 router = APIRouter(prefix="/v1/scenes", tags=["views"])
 
@@ -31,7 +31,7 @@ LOSSY = (RenderFormat.JPEG, RenderFormat.WEBP)
 
 @router.post("/{id}/render", response_class=Response, responses=PICTURES)
 async def render(scene: TheScene, request: Request, view: RenderRequest) -> Response:
-    """Any camera at any committed frame, from the last committed state; an update at work is not waited for."""
+    """Renders a committed frame from any camera; this does not wait for an update at work."""
     return await _answer(scene, request, view)
 
 
@@ -48,7 +48,7 @@ async def render_by_name(
     background: Annotated[str | None, Query(max_length=64, description="Red, green, blue in 0…1, as 1,1,1.")] = None,
     parts: Annotated[int | None, Query(ge=1, le=254, description="How many; chosen by the scene if not given.")] = None,
 ) -> Response:
-    """The same for a camera of the rig, as an address: for an `<img>`, or to open."""
+    """Renders a committed frame from a camera of the rig; the address can stand in an `<img>`."""
     view = RenderRequest(
         camera=scene.rig.names[0] if camera is None else camera,
         frame=frame,
@@ -63,7 +63,7 @@ async def render_by_name(
 
 
 async def _answer(scene: Scene, request: Request, view: RenderRequest) -> Response:
-    """Checks what is asked for and asks the reader."""
+    """Checks the request and asks the reader."""
     found = await ask(request, scene, query_of(scene, view))
     # The last frame is another one in a moment; one that was named stays what it is.
     caching = "no-store" if view.frame is None else "private, max-age=60"
@@ -71,7 +71,7 @@ async def _answer(scene: Scene, request: Request, view: RenderRequest) -> Respon
 
 
 def query_of(scene: Scene, request: RenderRequest) -> RenderQuery:
-    """The request, checked, as the reader takes it; `server.routes.stream` asks it too."""
+    """Checks a request and returns it as the reader takes it; live views use it too."""
     camera = scene.camera(request.camera) if isinstance(request.camera, str) else request.camera.camera()
     if request.width is not None:
         camera = camera.scaled(request.width / camera.width)

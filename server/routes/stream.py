@@ -1,4 +1,4 @@
-"""Subscriptions over a WebSocket, protocol `scas4d.stream.v1` (docs/stream.md)."""
+"""Route of subscriptions over a WebSocket, protocol `scas4d.stream.v1` (docs/stream.md)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ log = logging.getLogger("scas4d.server")
 
 @router.websocket("/{id}/stream")
 async def stream(websocket: WebSocket, id: str) -> None:
-    """Scene state, finished frames, live views, tracks and parts, as the client subscribes to them."""
+    """Sends scene state, finished frames, live views, tracks and parts, as the client subscribes to them."""
     scenes: Scenes = websocket.app.state.scenes
     hub: Hub = websocket.app.state.hub
     try:
@@ -48,7 +48,7 @@ def _require_protocol(websocket: WebSocket) -> None:
     if STREAM_PROTOCOL not in offered:
         raise Problem(
             400,
-            "the client speaks no protocol that the service speaks",
+            "the client offers no subprotocol that the service knows",
             field="Sec-WebSocket-Protocol",
             value=", ".join(name for name in offered if not name.startswith("scas4d.ticket.")),
             remedy=f"offer {STREAM_PROTOCOL}",
@@ -56,7 +56,7 @@ def _require_protocol(websocket: WebSocket) -> None:
 
 
 async def _serve(websocket: WebSocket, subscriber: Subscriber) -> None:
-    """Until either side has enough."""
+    """Serves until the client or the service closes."""
     await subscriber.greet()
     reading = asyncio.create_task(_read(websocket, subscriber))
     writing = asyncio.create_task(_write(websocket, subscriber))

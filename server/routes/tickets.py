@@ -1,4 +1,4 @@
-"""Tickets for browsers' WebSockets."""
+"""Route of tickets for browsers' WebSockets."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ router = APIRouter(prefix="/v1/tickets", tags=["service"])
 
 @router.post("", status_code=201)
 async def issue(request: Request) -> Ticket:
-    """A ticket that opens one WebSocket within seconds; asked for with the token."""
+    """Issues a ticket that opens one WebSocket within seconds; the request bears the token."""
     tickets: Tickets = request.app.state.tickets
     ticket = tickets.issue()
     return Ticket(ticket=ticket, subprotocol=SUBPROTOCOL + ticket, seconds=TICKET_SECONDS)

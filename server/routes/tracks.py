@@ -1,4 +1,4 @@
-"""Point tracks. docs/tracks.md says what the answers mean."""
+"""Routes of point tracks; docs/tracks.md describes the answers."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ ANSWERS: dict[int | str, dict[str, Any]] = {
 
 @router.post("/{id}/tracks/query", response_class=Response, responses=ANSWERS)
 async def query(scene: TheScene, http: Request, request: TracksRequest) -> Response:
-    """Trajectories in the world of what is asked for by id, by pixel, or by 3D point; any number of them."""
+    """Returns trajectories in the world of Gaussians by id, of pixels, or of 3D points."""
     return await answer(http, scene, request)
 
 
@@ -58,7 +58,7 @@ async def tracks(
     project: Annotated[Many, Query(max_length=64, description="Cameras of the rig to project into.")] = None,
     format: Literal["json", "npz"] = "json",
 ) -> Response:
-    """The same for a few, as an address."""
+    """Returns a few trajectories; the query is in the address."""
     request = TracksRequest(
         ids=_ids(ids) if ids else None,
         pixels=_numbers(pixel, "pixel", 2) if pixel else None,
@@ -80,13 +80,13 @@ async def answer(http: Request, scene: Scene, request: TracksRequest) -> Respons
 
 
 def query_of(scene: Scene, request: TracksRequest) -> TracksQuery:
-    """The request, checked, as the reader takes it; `server.routes.stream` asks it too."""
+    """Checks a request and returns it as the reader takes it; live tracks use it too."""
     kinds = {"ids": request.ids, "pixels": request.pixels, "points": request.points}
     asked = [(name, value) for name, value in kinds.items() if value is not None]
     if len(asked) != 1:
         given = ", ".join(name for name, _ in asked) or "none"
         raise Problem(
-            422, f"asked by {given}", field="ids", value=given, remedy="give exactly one of ids, pixels, points"
+            422, f"the query has {given}", field="ids", value=given, remedy="give exactly one of ids, pixels, points"
         )
     scene.committed_frame(None, "from")
     start = scene.committed[0] if request.first is None else request.first
@@ -125,7 +125,7 @@ def query_of(scene: Scene, request: TracksRequest) -> TracksQuery:
     if request.pixels is not None and request.camera is None:
         raise Problem(
             422,
-            "pixels of which camera is not said",
+            "pixels need a camera, and none is named",
             field="camera",
             value="nothing",
             remedy=f"name one of {', '.join(scene.rig.names)}",
@@ -179,7 +179,7 @@ def _check_pixels(query: TracksQuery) -> None:
 
 
 def _different(cameras: list[Camera]) -> tuple[Camera, ...]:
-    """Answers go by the camera's name."""
+    """Checks that cameras of one name are the same: answers go by the name."""
     by_name: dict[str, Camera] = {}
     for camera in cameras:
         known = by_name.setdefault(camera.name, camera)

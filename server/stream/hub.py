@@ -1,4 +1,4 @@
-"""Who listens to which scene. Publishing puts an event before every listener and waits for none of them."""
+"""Channels of scenes and their listeners. Publishing hands an event to every listener and waits for none."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ log = logging.getLogger("scas4d.server")
 
 @dataclass(frozen=True)
 class SceneChanged:
-    """The scene's state, progress or queue is another."""
+    """The scene's state, progress or queue has changed."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ L = TypeVar("L", bound=Listener)
 
 
 class Channel:
-    """The listeners of one scene, and the queries that asks its reader for them."""
+    """The listeners of one scene, and the queries that they share."""
 
     def __init__(self, ask: AskReaders) -> None:
         self.listeners: list[Listener] = []
@@ -57,7 +57,7 @@ class Channel:
         self._status: str | None = None
 
     def changed(self) -> None:
-        """The status is another."""
+        """Notes that the status has changed."""
         self._status = None
 
     def status(self, read: Callable[[], SceneStatus]) -> str:
@@ -79,7 +79,7 @@ class Hub:
         self._channels: dict[str, Channel] = {}
 
     def join(self, scene: str, ask: AskReaders, make: Callable[[Channel], L]) -> L:
-        """Lets a listener in.
+        """Adds a listener to a scene's channel and returns it.
 
         Raises:
             Problem: 429, as many listen as may.
@@ -88,7 +88,7 @@ class Hub:
         if len(channel.listeners) >= self.max_listeners:
             raise Problem(
                 429,
-                f"this scene has all the subscribers that it may have: {len(channel.listeners)}",
+                f"this scene has its maximum of subscribers: {len(channel.listeners)}",
                 field="SCAS4D_MAX_SUBSCRIBERS",
                 value=self.max_listeners,
                 remedy="close another subscriber of the scene, or raise the limit",
@@ -100,7 +100,7 @@ class Hub:
         return listener
 
     def leave(self, scene: str, listener: Listener) -> None:
-        """Lets a listener go; an empty channel is given up."""
+        """Removes a listener; an empty channel is given up."""
         channel = self._channels.get(scene)
         if channel is None or listener not in channel.listeners:
             return
@@ -109,7 +109,7 @@ class Hub:
             del self._channels[scene]
 
     def count(self, scene: str | None = None) -> int:
-        """How many listen, to one scene or to all."""
+        """Counts the listeners of one scene, or of all."""
         channels = self._channels.values() if scene is None else filter(None, [self._channels.get(scene)])
         return sum(len(channel.listeners) for channel in channels)
 
@@ -123,10 +123,10 @@ class Hub:
             try:
                 listener.told(event)
             except Exception:
-                log.exception("scene %s: a subscriber could not be told of %s", scene, type(event).__name__)
+                log.exception("scene %s: a subscriber could not take the event %s", scene, type(event).__name__)
 
     def close(self, scene: str, reason: str) -> None:
-        """The scene is gone: every listener is told so and let go."""
+        """Closes the channel of a scene that is gone, and tells its listeners."""
         channel = self._channels.pop(scene, None)
         for listener in () if channel is None else channel.listeners:
             listener.gone(reason)

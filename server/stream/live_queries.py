@@ -1,7 +1,7 @@
-"""Subscriptions that cost the reader something: views, tracks, parts. Each has one question and one message under way.
+"""Subscriptions that query the readers: views, tracks, parts. Each has one query and one message under way.
 
-A live asks only when its message before was sent, for what is newest at that moment: a slow reader costs less, and a
-camera that is dragged is rendered where it is, not everywhere it was.
+A live query asks only when its message before was sent, for the newest frame at that moment: a slow client costs less,
+and a camera that is dragged is rendered where it is, not everywhere it was.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ log = logging.getLogger("scas4d.server")
 
 @dataclass(frozen=True)
 class LiveQuestion:
-    """A question of a live.
+    """A query of a subscription at one moment.
 
     Attributes:
         key: the same for all who would get the same answer.
@@ -43,7 +43,7 @@ class LiveQuestion:
 
 
 class LiveQuery(ABC):
-    """One subscription.
+    """One subscription to views, tracks or parts.
 
     Attributes:
         request: what the client asks for. tag: the client's, of that request; comes back with what is sent for it.
@@ -62,18 +62,18 @@ class LiveQuery(ABC):
         self._sent: Hashable = None
 
     def ask_for(self, request: Model, tag: int | None) -> None:
-        """Another question from now on."""
+        """Changes the request from now on."""
         self.request = request
         self.tag = tag
         self.change()
 
     def change(self) -> None:
-        """There may be something newer to send."""
+        """Notes that there may be something newer to send."""
         self._changes += 1
         self._changed.set()
 
     async def run(self) -> None:
-        """Until cancelled."""
+        """Asks and sends until it is cancelled."""
         while True:
             await self._changed.wait()
             await self._outbox.sent(self.id)
@@ -108,30 +108,30 @@ class LiveQuery(ABC):
 
     def _ask(self) -> LiveQuestion:
         query = self.query()
-        # Parts are found from the whole history: the same question has another answer after a commit.
+        # Parts are found from the whole history: the same query has another answer after a commit.
         newest = self.scene.committed[-1] if self.of_all_history(query) else None
         head = self.head(query).model_copy(update={"id": self.id, "tag": self.tag})
         return LiveQuestion((fingerprint(query), newest), query, head, self._changes)
 
     def due(self) -> bool:
-        """Whether there is something to ask for now."""
+        """Returns True if there is something to ask for now."""
         return True
 
     def of_all_history(self, query: Query) -> bool:
-        """Whether the answer depends on every committed frame."""
+        """Returns True if the answer depends on every committed frame."""
         return False
 
     def answered(self, head: BulkHead) -> None:
-        """The message with this head is on its way."""
+        """Notes that the message with this head is on its way."""
         return
 
     @abstractmethod
     def query(self) -> Query:
-        """What to ask now; raises `Problem` where that cannot be asked."""
+        """Returns the query to ask now; raises `Problem` if the request cannot be asked."""
 
     @abstractmethod
     def head(self, query: Query) -> BulkHead:
-        """Of the message that answers the query."""
+        """Returns the head of the message that answers the query."""
 
 
 class LiveRender(LiveQuery):
@@ -140,7 +140,7 @@ class LiveRender(LiveQuery):
     request: RenderRequest
 
     def query(self) -> RenderQuery:
-        """The view as the reader takes it."""
+        """Returns the view as the reader takes it."""
         return render.query_of(self.scene, self.request)
 
     def head(self, query: Query) -> BulkHead:
@@ -149,29 +149,29 @@ class LiveRender(LiveQuery):
         return _head("render", query.frame)
 
     def of_all_history(self, query: Query) -> bool:
-        """Parts are."""
+        """Returns True for parts."""
         return isinstance(query, RenderQuery) and "parts" in query.kinds
 
 
 class LiveTracks(LiveQuery):
-    """Trajectories: first over all frames asked for, then over those committed since, so that nothing is missed."""
+    """Trajectories: first over all frames asked for, then over those committed since; none is missed."""
 
     request: TracksRequest
     _from: int | None = None
     _at: int | None = None
 
     def ask_for(self, request: Model, tag: int | None) -> None:
-        """Trajectories of another question are sent from their beginning."""
+        """Changes the request; its trajectories are sent from their beginning."""
         self._from = self._at = None
         super().ask_for(request, tag)
 
     def due(self) -> bool:
-        """Whether there are frames that were not sent, within those asked for."""
+        """Returns True if frames within those asked for were not sent."""
         newest, last = self.scene.committed[-1], self.request.last
         return self._from is None or (self._from <= newest and (last is None or self._from <= last))
 
     def query(self) -> TracksQuery:
-        """The frames not yet sent."""
+        """Asks for the frames that were not sent yet."""
         first = self.request.first if self._from is None else self._from
         if self._at is None:  # stays the same frame when the scene gives up its first ones
             self._at = self.scene.committed[0] if self.request.at is None else self.request.at
@@ -194,16 +194,16 @@ class LiveParts(LiveQuery):
     _next: int | None = None
 
     def ask_for(self, request: Model, tag: int | None) -> None:
-        """Another question is answered at once."""
+        """Changes the request, which is answered at once."""
         self._next = None
         super().ask_for(request, tag)
 
     def due(self) -> bool:
-        """Whether enough frames came since."""
+        """Returns True if enough frames came since the last message."""
         return self._next is None or self.scene.committed[-1] >= self._next
 
     def query(self) -> PartsQuery:
-        """How many parts."""
+        """Returns the number of parts as the reader takes it."""
         return PartsQuery(self.request.count)
 
     def head(self, query: Query) -> BulkHead:
@@ -211,11 +211,11 @@ class LiveParts(LiveQuery):
         return _head("parts", self.scene.committed[-1])
 
     def of_all_history(self, query: Query) -> bool:
-        """They are."""
+        """Returns True: parts are found from all frames."""
         return True
 
     def answered(self, head: BulkHead) -> None:
-        """The next waits for more frames."""
+        """Waits for more frames before the next message."""
         self._next = head.frame + self.request.every
 
 

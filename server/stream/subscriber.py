@@ -1,4 +1,4 @@
-"""One client of a scene's stream: what it subscribed to, and what the scene's events mean for that."""
+"""One client of a scene's stream: its subscriptions, and the messages that the scene's events become."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ LIVE: dict[Topic, type[LiveQuery]] = {Topic.RENDER: LiveRender, Topic.TRACKS: Li
 
 
 class Subscriber:
-    """Listens to a scene for one client. Its outbox is emptied by whoever holds the connection."""
+    """Listens to a scene for one client. The route that holds the connection empties its outbox."""
 
     def __init__(self, scene: Scene, channel: Channel) -> None:
         self.scene = scene
@@ -57,7 +57,7 @@ class Subscriber:
         self._live: dict[str, tuple[LiveQuery, asyncio.Task[None]]] = {}
 
     def limits(self) -> StreamLimits:
-        """What the client is told."""
+        """Returns the limits that the client is sent."""
         return StreamLimits(
             subscriptions=MOST_SUBSCRIPTIONS,
             message_bytes=MESSAGE_KB * 1000,
@@ -66,11 +66,11 @@ class Subscriber:
         )
 
     async def greet(self) -> None:
-        """The first message."""
+        """Sends the first message."""
         await self.outbox.reply(Hello(protocol=STREAM_PROTOCOL, scene=self.scene.id, limits=self.limits()))
 
     async def take(self, text: str | None) -> None:
-        """A message of the client, None for a binary one; what is wrong with it is answered and changes nothing."""
+        """Takes a message of the client, None for a binary one; a wrong one is answered and changes nothing."""
         id: str | None = None
         tag: int | None = None
         try:
@@ -94,11 +94,11 @@ class Subscriber:
             await self.outbox.reply(StreamProblem(id=id, tag=tag, problem=problem.document))
 
     def close(self) -> None:
-        """The client has left."""
+        """Ends all subscriptions of a client that has left."""
         for id in list(self._topics):
             self._end(id)
 
-    # What the hub tells.
+    # Events of the hub.
 
     def told(self, event: Event) -> None:
         """Something happened in the scene."""
@@ -172,7 +172,7 @@ class Subscriber:
         self.outbox.drop(id)
 
     def _put_status(self, id: str) -> None:
-        # The status is read when it is sent: whoever is slow gets it as it is then.
+        # The status is read when it is sent: a slow subscriber gets it as it is then.
         def make(missed: int) -> str:
             return _text("scene", id, missed, "status", self._channel.status(self.scene.status))
 
