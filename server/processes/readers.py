@@ -201,8 +201,7 @@ class QueryQueue:
         """Ends the process if it is still busy with a cancelled query."""
         if self._at_work is not turn or self.process is None:
             return
-        name, kind = self._spec.folder.name, turn.query.kind
-        log.warning("scene %s: its %s query was cancelled; its reader starts anew", name, kind)
+        log.warning("scene %s: a %s query was cancelled; its reader restarts", self._spec.folder.name, turn.query.kind)
         task = asyncio.ensure_future(self.process.stop(0))
         self._ending.add(task)
         task.add_done_callback(self._ending.discard)

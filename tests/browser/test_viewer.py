@@ -156,7 +156,7 @@ def test_a_bumped_camera_shows(page, service, finished):
     row = page.locator("#cameras tr.bad")
     assert row.count() == 1
     assert row.locator("th").inner_text() == "c2"
-    assert "dB worse than before" in page.locator("#camera-summary").inner_text()
+    assert "dB lower than before" in page.locator("#camera-summary").inner_text()
     page.locator("#time").fill("3")  # before it was bumped
     until(page, "document.querySelectorAll('#cameras tr.bad').length === 0")
     assert page.faults == []

@@ -12,6 +12,7 @@ from client.sdk import ServiceError
 from client.wire import RigModel
 from scas4d_core.captures import InitialPoints
 from server.processes import track_answers
+from server.routes import points
 
 
 def rig_json(count=2):
@@ -147,7 +148,8 @@ BAD_POINTS = {
 
 
 @pytest.mark.parametrize("name", BAD_POINTS)
-def test_bad_points_are_refused_by_name(http, quiet_scene, name):
+def test_bad_points_are_refused_by_name(http, quiet_scene, monkeypatch, name):
+    monkeypatch.setattr(points, "MOST_POINTS", 1000)
     body, field = BAD_POINTS[name]
     assert problem(http.put(f"/v1/scenes/{quiet_scene}/points", content=body), 422)["field"] == field
 
@@ -163,7 +165,8 @@ def test_nothing_is_unpickled(http, quiet_scene, tmp_path):
     assert not (tmp_path / "sprung").exists()
 
 
-def test_a_cloud_that_unpacks_to_gigabytes_is_refused_unread(http, quiet_scene):
+def test_a_cloud_that_unpacks_to_gigabytes_is_refused_unread(http, quiet_scene, monkeypatch):
+    monkeypatch.setattr(points, "MOST_POINTS", 1000)
     body = io.BytesIO()
     np.savez_compressed(body, positions=np.zeros((100_000, 3)), colours=C)
     problem(http.put(f"/v1/scenes/{quiet_scene}/points", content=body.getvalue()), 413)

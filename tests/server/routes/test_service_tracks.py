@@ -131,7 +131,7 @@ def test_a_long_history_is_read_a_frame_at_a_time(tmp_path, monkeypatch):
         return stacked(self, name, indices, rows)
 
     monkeypatch.setattr(History, "stacked", noting)
-    reader = fakes.FakeReader(make_rig(), history)
+    reader = fakes.FakeCommitted(history, make_rig().world_frame(), None)
     query = TracksQuery(frames=tuple(range(30)), at=0, points=points)
     found = track_answers.find(reader, history, query)
     assert found["tracks_world"].shape == (30, 2, 3)
