@@ -29,18 +29,18 @@ class Server(uvicorn.Server):
 
     Args:
         config: of uvicorn.
-        told: the sentence, logged once requests are answered.
+        greeting: the sentence that is logged once requests are answered.
     """
 
-    def __init__(self, config: uvicorn.Config, told: str) -> None:
+    def __init__(self, config: uvicorn.Config, greeting: str) -> None:
         super().__init__(config)
-        self._told = told
+        self._greeting = greeting
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Starts the application and listens."""
         await super().startup(sockets)
         if self.started:
-            log.info(self._told)
+            log.info(self._greeting)
 
 
 def serve(settings: ServerSettings) -> None:
@@ -72,8 +72,10 @@ def serve(settings: ServerSettings) -> None:
     # process ends with status 0.
     for ending in (signal.SIGTERM, signal.SIGINT):
         signal.signal(ending, lambda *_: None)
-    told = f"listening; viewer at {address(settings.host, sockets)}, scenes in {settings.data}; Ctrl-C ends the service"
-    Server(config, told).run(sockets)
+    greeting = (
+        f"listening; viewer at {address(settings.host, sockets)}, scenes in {settings.data}; Ctrl-C ends the service"
+    )
+    Server(config, greeting).run(sockets)
     log.info("ended")
 
 

@@ -65,7 +65,7 @@ class Readiness:
         self._process: Process | None = None
         if settings.warm_up:
             log.info("warming up the kernels; the first time they are compiled, which takes about a minute")
-            self._process = placement.start(main, None, self._told, self._ended)
+            self._process = placement.start(main, None, self._received, self._ended)
         else:
             self.after = 0.0
 
@@ -103,7 +103,7 @@ class Readiness:
             process, self._process = self._process, None
             await process.stop(0.0 if self.after is None else ENDS_S)
 
-    def _told(self, message: WarmedUp) -> None:
+    def _received(self, message: WarmedUp) -> None:
         if message.fault is None:
             self.after = time.monotonic() - self._began
             log.info("ready after %.1f s", self.after, extra={"ready_after": round(self.after, 3)})

@@ -133,7 +133,7 @@ class Progressed:
 
 
 @dataclass(frozen=True)
-class UpdateCommitted:
+class FrameCommitted:
     """The frame's state is on disk, with `report` (as `History.report` gives it back).
 
     `deleted`: states that retention deleted after it.
@@ -145,7 +145,7 @@ class UpdateCommitted:
 
 
 @dataclass(frozen=True)
-class UpdateSetAside:
+class FrameFailed:
     """The frame was not committed; the state is that of the frame before. `fatal`: the scene cannot go on."""
 
     index: int

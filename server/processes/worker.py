@@ -19,6 +19,8 @@ from scas4d_core.storage.npz import read_npz
 from server.processes.decoding import decode, read
 from server.processes.messages import (
     Broken,
+    FrameCommitted,
+    FrameFailed,
     FrameReady,
     Mend,
     Progressed,
@@ -27,8 +29,6 @@ from server.processes.messages import (
     SceneSpec,
     Stalled,
     Stop,
-    UpdateCommitted,
-    UpdateSetAside,
 )
 from server.processes.placement import end_with_parent
 from server.repair import repairs
@@ -83,7 +83,7 @@ class _Stopped(Exception):
 
 
 class Worker:
-    """Updates one scene. Every frame ends as `UpdateCommitted` or `UpdateSetAside`, or with the process."""
+    """Updates one scene. Every frame ends as `FrameCommitted` or `FrameFailed`, or with the process."""
 
     def __init__(self, spec: SceneSpec, connection: Connection[Any, Any]) -> None:
         self.spec = spec
@@ -155,7 +155,7 @@ class Worker:
                 raise _Stopped
             self._later.append(message)
 
-    def finish(self, message: FrameReady) -> UpdateCommitted | UpdateSetAside:
+    def finish(self, message: FrameReady) -> FrameCommitted | FrameFailed:
         """Commits a frame, or returns the reason to set it aside.
 
         Raises:
@@ -168,17 +168,17 @@ class Worker:
             least = self.spec.minimum_cameras
             if len(frame.images) < least:
                 reason = f"{len(frame.images)} cameras' pictures are left, the scene's minimum is {least}"
-                return UpdateSetAside(message.index, reason, dropped)
+                return FrameFailed(message.index, reason, dropped)
             return self.reconstruct(frame, dropped, message.budget, began)
         except FrameDamage as error:
-            return UpdateSetAside(message.index, f"its record in the frame log is damaged: {error}", dropped)
+            return FrameFailed(message.index, f"its record in the frame log is damaged: {error}", dropped)
         except Exception as error:  # whatever the core raises, the service goes on and says so
             if no_room(error):
                 raise
             log.exception("scene %s, frame %d", self.spec.folder.name, message.index)
             # Without a first frame there is nothing to go on from.
             first = self.reconstruction is None
-            return UpdateSetAside(message.index, f"{type(error).__name__}: {told(error)}", dropped, fatal=first)
+            return FrameFailed(message.index, f"{type(error).__name__}: {told(error)}", dropped, fatal=first)
 
     def mend(self, message: Mend) -> None:
         """Checks files that were found damaged, and reports the outcome of each."""
@@ -197,7 +197,7 @@ class Worker:
         for mended in repairs.remake(self.spec, self.states, message, pictures):
             self.connection.send(mended)
 
-    def reconstruct(self, frame: Frame, dropped: dict[str, str], budget: Budget, began: float) -> UpdateCommitted:
+    def reconstruct(self, frame: Frame, dropped: dict[str, str], budget: Budget, began: float) -> FrameCommitted:
         """Runs the first frame or an update, and commits. `began`: `perf_counter` before decoding."""
         assert self.states is not None
         if self.reconstruction is None:
@@ -227,7 +227,7 @@ class Worker:
         ended = time.perf_counter()
         committed = self.states.report(frame.index)
         self._publish_seconds = time.perf_counter() - ended
-        return UpdateCommitted(frame.index, committed, tuple(self.retain()))
+        return FrameCommitted(frame.index, committed, tuple(self.retain()))
 
     def retain(self) -> list[int]:
         """Deletes old states by the scene's rule and returns their indices; failures are tried again next time."""

@@ -18,14 +18,14 @@ from server.ingest.acknowledge import Ingest
 from server.processes import worker
 from server.processes.messages import (
     Broken,
+    FrameCommitted,
+    FrameFailed,
     FrameReady,
     Mended,
     Progressed,
     Ready,
     SceneSpec,
     Stalled,
-    UpdateCommitted,
-    UpdateSetAside,
 )
 from server.processes.placement import Ended, Placement, Process
 from server.processes.readers import Readers
@@ -213,9 +213,9 @@ class Scene:
                 )
                 self.clock.progress(message.stage, message.done, message.total)
                 self._tell(SceneChanged())
-            case UpdateCommitted():
+            case FrameCommitted():
                 self.background(self._commit(message))
-            case UpdateSetAside():
+            case FrameFailed():
                 fact = SetAside(
                     index=message.index, reason=message.reason, dropped=message.dropped, fatal=message.fatal
                 )
@@ -256,7 +256,7 @@ class Scene:
         last = self.ledger.last_tried()
         return None if last is None else reports.trouble(self.frames[last].report)
 
-    async def _commit(self, message: UpdateCommitted) -> None:
+    async def _commit(self, message: FrameCommitted) -> None:
         self.supervision.committed()
         self.clock.end(committed=True)
         self._at_work, self.progress = None, None

@@ -38,10 +38,10 @@ Event = SceneChanged | FrameFinished
 class Listener(Protocol):
     """A subscriber, as the hub sees it. Both methods return at once."""
 
-    def told(self, event: Event) -> None:
+    def on_event(self, event: Event) -> None:
         """Something happened in the scene."""
 
-    def gone(self, reason: str) -> None:
+    def on_close(self, reason: str) -> None:
         """The scene is no more."""
 
 
@@ -121,7 +121,7 @@ class Hub:
         channel.changed()
         for listener in tuple(channel.listeners):
             try:
-                listener.told(event)
+                listener.on_event(event)
             except Exception:
                 log.exception("scene %s: a subscriber could not take the event %s", scene, type(event).__name__)
 
@@ -129,4 +129,4 @@ class Hub:
         """Closes the channel of a scene that is gone, and tells its listeners."""
         channel = self._channels.pop(scene, None)
         for listener in () if channel is None else channel.listeners:
-            listener.gone(reason)
+            listener.on_close(reason)

@@ -100,7 +100,7 @@ class Subscriber:
 
     # Events of the hub.
 
-    def told(self, event: Event) -> None:
+    def on_event(self, event: Event) -> None:
         """Something happened in the scene."""
         for id, topic in self._topics.items():
             if topic == Topic.SCENE:
@@ -111,7 +111,7 @@ class Subscriber:
             for live, _ in self._live.values():
                 live.change()
 
-    def gone(self, reason: str) -> None:
+    def on_close(self, reason: str) -> None:
         """The scene is no more."""
         self.outbox.close_with(Gone(reason=reason))
 
