@@ -118,5 +118,5 @@ RESPONSES: dict[int | str, dict[str, Any]] = {
     "5XX": {"description": "The service failed, or cannot answer now.", "model": ProblemDetails},
     422: {"description": "A field has a wrong value.", "model": ProblemDetails},
 }
-"""For the OpenAPI document."""
+"""Answers of every route in the OpenAPI document."""
 PROBLEM = {"$ref": "#/components/schemas/ProblemDetails"}

@@ -101,7 +101,7 @@ def listen(host: str, port: int) -> list[socket.socket]:
     sockets: list[socket.socket] = []
     try:
         for family, kind, protocol, _, where in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
-            # Where any port will do, all addresses get that of the first.
+            # With port 0 all addresses get the port of the first.
             free = sockets[0].getsockname()[1] if sockets else port
             with contextlib.suppress(_NotHere):
                 sockets.append(_bound(family, kind, protocol, (where[0], free, *where[2:])))

@@ -28,10 +28,10 @@ PREFIX = "SCAS4D_"
 CONFIG = "SCAS4D_CONFIG"
 """Names the TOML file; no setting itself."""
 URL = "SCAS4D_URL"
-"""Where clients find the service; it may be set for both."""
+"""The address of the service for clients; it may be set for both."""
 
 TOKEN = re.compile(r"[A-Za-z0-9._~+/=-]{16,512}")
-"""What can stand behind `Authorization: Bearer` (RFC 6750), and is long enough not to be guessed."""
+"""Tokens that fit behind `Authorization: Bearer` (RFC 6750) and are too long to be guessed."""
 
 FORMER = {
     "engine": "server.settings:FORMER_ENGINE",
@@ -97,24 +97,24 @@ class ServerSettings(BaseSettings):
         default=10.0,
         gt=0,
         le=600,
-        description="From the first byte of a request to the end of its header, and from opening a connection to that "
-        "byte, in seconds; later gets 408, or is closed where nothing has come. A header is one packet or two: ten "
-        "seconds are three times resent.",
+        description="Time from the first byte of a request to the end of its header, and from opening a connection to "
+        "that byte, in seconds; a later header gets 408, a connection without a byte is closed. A header is one or two "
+        "packets: ten seconds allow to send them three times again.",
     )
     header_kb: int = Field(
         default=64,
         ge=8,
         le=1024,
-        description="Largest header of a request, with its address, in kB of 1024 bytes; more gets 431 or 414. "
-        "Browsers send up to 16 with cookies of other services on this host; reading one takes time by the square of "
-        "its size.",
+        description="Largest header of a request, with its address, in kB of 1024 bytes; a larger one gets 431 or 414. "
+        "Browsers send up to 16 kB with cookies of other services on this host; the time to read a header grows with "
+        "the square of its size.",
     )
     body_seconds: float = Field(
         default=20.0,
         gt=0,
         le=3600,
         description="Time in which 16 kB of a body, or its end, have to come while the service reads, in seconds; else "
-        "408. A radio link that is lost for a moment comes back within; 0.8 kB/s could not send a picture.",
+        "408. A radio link that is lost for a moment comes back sooner; 0.8 kB/s could not send a picture.",
     )
     keep_alive_seconds: float = Field(
         default=15.0,
@@ -128,8 +128,8 @@ class ServerSettings(BaseSettings):
         default=30.0,
         gt=0,
         le=3600,
-        description="Time in which a peer has to read 16 kB of what waits for it, in seconds; else the connection is "
-        "ended, a WebSocket's too. What waits is held in memory.",
+        description="Time in which a peer has to read 16 kB of the data that waits for it, in seconds; else the "
+        "connection is ended, a WebSocket's too. That data is held in memory.",
     )
     max_connections: int = Field(
         default=1024,
@@ -140,8 +140,8 @@ class ServerSettings(BaseSettings):
     max_connections_per_peer: int = Field(
         default=256,
         ge=4,
-        description="The same for one address, or one client behind a trusted proxy: 64 cameras with a sender each, "
-        "and their viewers; else 429.",
+        description="Open connections of one address, or of one client behind a trusted proxy: enough for 64 cameras "
+        "with a sender each, and their viewers; more get 429.",
     )
     trusted_proxies: Names = Field(
         default=(),
@@ -159,13 +159,13 @@ class ServerSettings(BaseSettings):
     )
 
     max_scenes: int = Field(
-        default=8, ge=1, description="Each holds two or three processes and some hundred megabytes."
+        default=8, ge=1, description="Scenes at a time; each holds two or three processes and some hundred megabytes."
     )
     max_scene_memory_mb: float | None = Field(
         default=None,
         gt=0,
-        description="A scene that is estimated (POST /v1/estimate) to take more is refused; the machine's memory where "
-        "not given.",
+        description="Memory of a scene in MB: one whose estimate (POST /v1/estimate) is larger is refused. The default is "
+        "the machine's memory.",
     )
     queue_frames: int = Field(
         default=4, ge=1, description="Frames of a scene acknowledged and not finished; more get 429."
@@ -173,15 +173,15 @@ class ServerSettings(BaseSettings):
     max_body_mb: float = Field(
         default=256,
         gt=0,
-        description="Largest request body: 64 cameras of 4 MB. One file, and a frame over a WebSocket, may have what "
-        "pictures of the rig can have at most, where that is less.",
+        description="Largest request body: 64 cameras of 4 MB. One file, and a frame over a WebSocket, is "
+        "limited by the rig's pictures where that is less.",
     )
     max_image_pixels: int = Field(
         default=40_000_000,
         ge=1,
-        description="Of one camera; a decoded picture takes 3 bytes a pixel, twice while decoding.",
+        description="Pixels of one camera; a decoded picture takes 3 bytes a pixel, twice while decoding.",
     )
-    max_subscribers: int = Field(default=128, ge=1, description="Of the stream of one scene.")
+    max_subscribers: int = Field(default=128, ge=1, description="Subscribers of one scene's stream; more get 429.")
     scrub_mb_per_second: float = Field(
         default=4.0,
         ge=0,

@@ -25,7 +25,7 @@ def guarded(app: FastAPI, **more: Any) -> uvicorn.Config:
         "http": type("GuardedConnection", (Connection,), of_service),
         "ws": type("GuardedSocket", (Socket,), of_service),
         "server_header": False,
-        # What others say about themselves is not believed; uvicorn would believe FORWARDED_ALLOW_IPS and the loopback.
+        # Other peers' headers are not believed; uvicorn would believe FORWARDED_ALLOW_IPS and the loopback.
         "proxy_headers": bool(proxies),
         "forwarded_allow_ips": proxies,
         "timeout_keep_alive": guard.limits.keep_alive_seconds,

@@ -113,7 +113,7 @@ class Connection(HttpToolsProtocol):
             if self._head_bytes >= self.guard.limits.header_bytes:
                 self._fault = self._too_large()
         elif self._fault is None and not in_head and self._left is None:
-            # What was delivered pays for overhead, but does not add up: a large body must not buy an endless trailer,
+            # Delivered bytes pay for overhead, but do not add up: a large body must not buy an endless trailer,
             # which is joined in quadratic time as a header is.
             self._credit = min(OVERHEAD_BYTES, self._credit + self._delivered) - (size - self._delivered)
             if self._credit < 0:
@@ -137,7 +137,7 @@ class Connection(HttpToolsProtocol):
             self._begin_head()
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Takes a line of the header. Trailers are dropped: nobody reads them, and they must not pass for headers."""
+        """Takes a line of the header. Trailers are dropped: they are not used, and must not pass for headers."""
         if self._record.phase is not Phase.HEAD:
             return
         if len(self.headers) >= guard_module.HEADER_LINES:
@@ -209,7 +209,7 @@ class Connection(HttpToolsProtocol):
                 self.transport.close()
 
     def on_response_complete(self) -> None:
-        """Waits for the next request, or for the end of a body that nobody needs any more."""
+        """Waits for the next request, or for the end of a body that is not needed any more."""
         super().on_response_complete()
         record = self._record
         record.served = True

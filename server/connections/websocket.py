@@ -37,7 +37,7 @@ class Socket(WebSocketsSansIOProtocol):
         self._pong = b""
         """The answer to the newest ping, while the peer does not read."""
         self._fell_behind = False
-        """Whether more waited than the transport likes, at some time since the last ping was sent."""
+        """True if more waited than the transport likes, at some time since the last ping was sent."""
         self._record = self.guard.hand_over(transport, self, self.loop.time())
 
     def connection_lost(self, exc: Exception | None) -> None:

@@ -98,7 +98,7 @@ class HasStatus(Protocol):
     """A scene, as far as metrics read it."""
 
     def status(self) -> SceneStatus:
-        """As it is now."""
+        """Returns the status as it is now."""
 
 
 class State:
@@ -119,7 +119,7 @@ class State:
         self.connections = connections
 
     def collect(self) -> Iterator[Metric]:
-        """As it is now."""
+        """Yields the gauges as they are now."""
         statuses = [scene.status() for scene in list(self.scenes.values())]
         by_state = GaugeMetricFamily("scas4d_scenes", "Scenes by state.", labels=["state"])
         for state in SceneState:

@@ -135,7 +135,7 @@ class Process:
         with self._reaping:
             self._process.join()
             code = self._process.exitcode
-        self._outbox.put(None)  # nobody may ever call stop: the other thread ends with the process
+        self._outbox.put(None)  # stop may never be called: the other thread ends with the process
         self._call(self._on_end, Ended(code))
 
     def _call(self, function: Callable[[Any], None], argument: Any) -> None:

@@ -41,7 +41,7 @@ GRACE_VIEWS_S, GRACE_BULK_S = 10.0, 1.0
 """A process may go on for so long with a query that was cancelled. Views are short, and a new process takes a second or
 two to start."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
-"""Before a process that ended by itself is started again; twice as long after each further end without an answer."""
+"""Pause before a process that ended by itself is started again; it doubles with each end without an answer."""
 MOST_WAITING = 64
 """Queries before a process; more get 503. Beyond a second or two of views, waiting only makes it worse."""
 ANSWER_SECONDS = 120.0

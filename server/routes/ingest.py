@@ -95,7 +95,7 @@ async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:
     except WebSocketDisconnect:
         return
     finally:
-        # What was received whole is taken whole, whether or not somebody hears of it.
+        # A frame that was received whole is taken, even if its sender is gone.
         answering.cancel()
 
 

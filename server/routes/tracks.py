@@ -197,7 +197,7 @@ def _different(cameras: list[Camera]) -> tuple[Camera, ...]:
 def _camera(scene: Scene, camera: CameraModel | str) -> Camera:
     if isinstance(camera, str):
         return scene.camera(camera)
-    # Where a point can be seen is found from a rendered depth: the limit of views holds.
+    # Visibility is found from a rendered depth: the limit of views holds.
     if camera.width * camera.height > render.MOST_PIXELS:
         size = f"{camera.width}x{camera.height}"
         raise Problem(

@@ -37,7 +37,7 @@ from server.stream.outbox import Outbox
 T = TypeVar("T")
 
 MOST_SUBSCRIPTIONS = 16
-"""Of one subscriber at a time: a page with a view for each of some cameras. Another stream may be opened for more."""
+"""Subscriptions of one subscriber: enough for a page with views of some cameras. A second stream takes more."""
 MESSAGE_KB = 256
 """Largest message of a subscriber: some 8000 pixels to track."""
 
