@@ -164,7 +164,7 @@ class ServerSettings(BaseSettings):
     max_scene_memory_mb: float | None = Field(
         default=None,
         gt=0,
-        description="Memory of a scene in MB: one whose estimate (POST /v1/estimate) is larger is refused. The default is "
+        description="Memory of a scene in MB: one with a larger estimate (POST /v1/estimate) is refused. Default: "
         "the machine's memory.",
     )
     queue_frames: int = Field(
