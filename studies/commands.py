@@ -192,7 +192,6 @@ def faults(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="A setting of the scene, as update.iterations=20."),
     ] = None,
-    engine: Annotated[str | None, typer.Option(help="module:function instead of the method itself.")] = None,
 ) -> None:
     """Kills the service and its workers, cuts and damages its files, fills its disk; compares with an undisturbed run.
 
@@ -216,7 +215,7 @@ def faults(
         opened,
         encoded_frames(opened, frames),
         overrides(changes or []),
-        {} if engine is None else {"SCAS4D_ENGINE": engine},
+        {},
     )
     parts = part or of_faults.PARTS
     outcomes = of_faults.run(
@@ -273,7 +272,6 @@ def views(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="A setting of the scene, as static.iterations=500."),
     ] = None,
-    engine: Annotated[str | None, typer.Option(help="module:function instead of the method itself.")] = None,
 ) -> None:
     """Measures live views beside updates: latency under an open-loop load, and what it costs the updates.
 
@@ -293,7 +291,7 @@ def views(
         turns=turns,
         width=width,
         settings=overrides(changes or []),
-        environment={} if engine is None else {"SCAS4D_ENGINE": engine},
+        environment={},
         told=typer.echo,
     )
     text = of_views.page(rows, capture.name, width, updates, turns)

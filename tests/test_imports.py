@@ -15,7 +15,13 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("scas4d_core", "server", "client")
 HEAVY = ("torch", "numba", "scipy", "sklearn", "pycolmap", "fastapi", "uvicorn")
 
-LIGHT_ROOMS = ("scas4d_core.cameras", "scas4d_core.captures", "scas4d_core.settings", "scas4d_core.presets")
+LIGHT_ROOMS = (
+    "scas4d_core.errors",
+    "scas4d_core.cameras",
+    "scas4d_core.captures",
+    "scas4d_core.settings",
+    "scas4d_core.presets",
+)
 """What the client may import when it is imported; its heavy commands import the rest when they run."""
 
 NUMPY_ONLY = ("scas4d_core.cameras", "scas4d_core.gaussians", "scas4d_core.captures", "scas4d_core.settings")

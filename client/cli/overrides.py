@@ -40,6 +40,7 @@ def refusal(error: ValidationError) -> str:
     if found[0]["type"] == "extra_forbidden":
         fault = "there is none of this name"
     else:
-        fault = f"it cannot be {found[0]['input']!r}: {found[0]['msg'].removeprefix('Value error, ')}"
+        reason = found[0]["ctx"]["error"] if found[0]["type"] == "value_error" else found[0]["msg"]
+        fault = f"it cannot be {found[0]['input']!r}: {reason}"
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
     return f"setting {name}: {fault}{more}; docs/settings.md lists all"

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.captures.frame import Frame
+from scas4d_core.errors import told
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import Outcome
-from scas4d_core.storage.error_text import told
 from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
 from scas4d_core.storage.history import NEWEST_KEPT
 from scas4d_core.storage.npz import read_npz, write_npz

@@ -15,7 +15,7 @@ from enum import StrEnum
 from typing import Any
 
 from client.wire import FrameState
-from scas4d_core.storage.error_text import without_paths
+from scas4d_core.errors import without_paths
 from scas4d_core.storage.frame_files import checkpoint_of, frame_file, frame_of
 from server.health import metrics
 from server.processes.messages import FrameReady, Mend, Mended, MendOutcome, Remake

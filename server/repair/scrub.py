@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 from client.wire import FrameState
-from scas4d_core.storage.error_text import told
+from scas4d_core.errors import told
 from scas4d_core.storage.frame_files import (
     FIRST_COPY,
     FIXED_COPY,

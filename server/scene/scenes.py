@@ -10,8 +10,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from client.wire import SceneCreate
+from scas4d_core.errors import told
 from scas4d_core.settings import Settings
-from scas4d_core.storage.error_text import told
 from scas4d_core.storage.npz import read_npz, sync_folder
 from server.problems import Problem, counted
 from server.processes.placement import Placement

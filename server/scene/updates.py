@@ -301,9 +301,9 @@ class Updates:
             self._restart.cancel()
         self.mending.stop()
 
-    async def stop_worker(self, seconds: float) -> None:
+    async def stop_worker(self) -> None:
         """Ends the worker; an unfinished frame is updated again after the next start."""
-        await self._worker.stop(seconds)
+        await self._worker.stop()
 
 
 def trouble_of(report: FrameReportModel) -> str | None:

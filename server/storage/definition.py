@@ -10,8 +10,8 @@ from typing import Any
 from blake3 import blake3
 
 from client.wire import SceneCreate
+from scas4d_core.errors import told
 from scas4d_core.settings import Settings
-from scas4d_core.storage.error_text import told
 from scas4d_core.storage.npz import written_whole
 from server.storage.events import JournalEvent, SceneCreated
 from server.storage.journal import replay

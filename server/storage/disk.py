@@ -7,7 +7,7 @@ import fcntl
 import os
 from pathlib import Path
 
-from scas4d_core.storage.error_text import told
+from scas4d_core.errors import told
 from server.problems import Problem
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})

@@ -14,7 +14,7 @@ import numpy as np
 from blake3 import blake3
 
 from client.wire import Budget, FrameState, Retention
-from scas4d_core.storage.error_text import told
+from scas4d_core.errors import told
 from scas4d_core.storage.history import NEWEST_KEPT
 from server.storage.disk import full_disk, no_room
 from server.storage.events import (

@@ -31,7 +31,7 @@ class Service:
     """Started by `start`, killed by `kill`, as often as one likes, over the same data folder.
 
     Args:
-        data: its folder. environment: further variables, as SCAS4D_ENGINE.
+        data: its folder. environment: further variables, as SCAS4D_TOKEN.
     """
 
     def __init__(self, data: Path, environment: Mapping[str, str] | None = None) -> None:

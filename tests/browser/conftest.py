@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 
+import drawn
 import pytest
 from running import Running, fake_settings
 from stage import FRAMES, push, start_scene
@@ -46,7 +47,7 @@ def page(chromium):
 @pytest.fixture(scope="session")
 def service(tmp_path_factory):
     folder = tmp_path_factory.mktemp("viewer")
-    running = Running(fake_settings(folder, engine="drawn:engine", max_render_pixels=2_000_000))
+    running = Running(fake_settings(folder), core=drawn.install)
     yield running
     running.stop()
 

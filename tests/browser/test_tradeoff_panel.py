@@ -74,7 +74,7 @@ def test_a_budget_that_is_moved_holds_from_the_next_frame_on(page, service, ran)
     until(page, "document.getElementById('budget-words').innerText.includes('as fit into 20 ms')")
     assert sdk.budget(id).asked == Budget(budget_ms=20)
     page.select_option("#budget-kind", "")
-    until(page, "document.getElementById('budget-words').innerText.includes('as the scene was made')")
+    until(page, "document.getElementById('budget-words').innerText.includes('as the scene was created')")
     assert sdk.budget(id).asked == Budget()
     assert page.faults == []
 

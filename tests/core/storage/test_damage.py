@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from test_history import filled, same, state
 
+from scas4d_core.errors import told, without_paths
 from scas4d_core.storage.checkpoint import Checkpoints
-from scas4d_core.storage.error_text import told, without_paths
 from scas4d_core.storage.frame_files import FIRST_COPY, FIXED_COPY, FIXED_FILE, DamagedFrameError
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.storage.npz import read_npz, verify, write_npz
