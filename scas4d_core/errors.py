@@ -26,7 +26,7 @@ def without_paths(text: str) -> str:
     return _PATH.sub(_last_part, text)
 
 
-def told(error: BaseException) -> str:
+def message_of(error: BaseException) -> str:
     """What an error says; of an ``OSError`` what the system says, because its own text names the file with its path."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.captures.frame import Frame
-from scas4d_core.errors import told
+from scas4d_core.errors import message_of
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import Outcome
 from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
@@ -130,7 +130,7 @@ class Checkpoints:
         except FileNotFoundError:
             raise CheckpointError(f"{file.name} is missing") from None
         except (ValueError, KeyError, TypeError) as error:
-            raise CheckpointError(told(error)) from error
+            raise CheckpointError(message_of(error)) from error
 
     def clean(self, committed: Sequence[int]) -> None:
         """Removes the checkpoints of all but the newest commits; after a commit.

@@ -22,7 +22,7 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.errors import told
+from scas4d_core.errors import message_of
 
 DAMAGE = (
     OSError, ValueError, KeyError, EOFError, IndexError, TypeError, SyntaxError, TokenError, RuntimeError, MemoryError,
@@ -184,7 +184,7 @@ def _streamed(file: IO[bytes]) -> Generator[int, None, str]:
 
 
 def _damage(path: Path, error: BaseException) -> ValueError:
-    return ValueError(f"{path.name} is damaged, or no npz file ({type(error).__name__}: {told(error)})")
+    return ValueError(f"{path.name} is damaged, or no npz file ({type(error).__name__}: {message_of(error)})")
 
 
 def clear_parts(folder: Path) -> None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
-from scas4d_core.errors import told
+from scas4d_core.errors import message_of
 from server.problems import Problem
 from server.processes.messages import Stop
 from server.processes.placement import Placement, Process
@@ -42,7 +42,7 @@ def main(spec: None, connection: Connection[Any, Any]) -> None:
         connection.send(WarmedUp())
     except Exception as error:
         log.exception("the kernels could not be warmed up")
-        connection.send(WarmedUp(f"{type(error).__name__}: {told(error)}"))
+        connection.send(WarmedUp(f"{type(error).__name__}: {message_of(error)}"))
     with contextlib.suppress(EOFError, OSError):
         connection.recv()  # until it is asked to end, or until the service is gone: by then the report is read
     os._exit(0)

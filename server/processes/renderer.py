@@ -19,7 +19,7 @@ from PIL import Image
 
 from client.wire import part_colour, parts_model
 from scas4d_core.cameras import rig_inside
-from scas4d_core.errors import InputError, told, without_paths
+from scas4d_core.errors import InputError, message_of, without_paths
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.storage.frame_files import frame_file
 from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFrameError
@@ -157,20 +157,20 @@ class Renderer:
                 log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
                 if more and isinstance(ask.query, PartsQuery | LabelsQuery):  # found from all others
                     continue
-                return Refused(ask.number, told(error), "ask again later: it is mended if it can be", status=503)
+                return Refused(ask.number, message_of(error), "ask again later: it is mended if it can be", status=503)
             except UnreadableFrameError as error:  # deleted since the service checked
                 log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
                 self._note_missing(ask.query)
-                return Refused(ask.number, told(error), status=404)
+                return Refused(ask.number, message_of(error), status=404)
             except InputError as error:
                 log.warning("scene %s refused %s: %s", self.spec.folder.name, asked, error)
                 return Refused(ask.number, without_paths(error.fault), without_paths(error.remedy))
             except ValueError as error:
                 log.warning("scene %s refused %s: %s", self.spec.folder.name, asked, error)
-                return Refused(ask.number, told(error))
+                return Refused(ask.number, message_of(error))
             except Exception as error:
                 log.exception("scene %s, %s", self.spec.folder.name, asked)
-                return Refused(ask.number, f"{type(error).__name__}: {told(error)}", status=500)
+                return Refused(ask.number, f"{type(error).__name__}: {message_of(error)}", status=500)
         raise AssertionError("the last turn returns")
 
     def _answer(self, number: int, query: Query) -> Answer:

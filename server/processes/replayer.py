@@ -10,7 +10,7 @@ from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
-from scas4d_core.errors import told
+from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History
 from server.processes.decoding import decode, read
 from server.processes.messages import Damaged, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
@@ -34,7 +34,7 @@ def main(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
         _replay(spec, connection)
     except Exception as error:  # whatever the core raises, the service goes on and says so
         log.exception("scene %s: the replay failed", spec.scene.folder.name)
-        fault = f"{type(error).__name__}: {told(error)}"
+        fault = f"{type(error).__name__}: {message_of(error)}"
     with contextlib.suppress(EOFError, OSError):  # the service is gone
         connection.send(ReplayEnded(fault))
         logging.shutdown()

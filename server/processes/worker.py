@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from client.wire import Budget
 from scas4d_core.captures import Frame, InitialPoints
-from scas4d_core.errors import told
+from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.storage.npz import read_npz
 from server.processes.decoding import decode, read
@@ -116,7 +116,7 @@ class Worker:
             self.connection.send(Ready(tuple(history.indices), dict(history.damaged), report, undone, faults))
         except (HistoryError, ValueError) as error:  # what is damaged says so with a ValueError
             log.exception("scene %s cannot be taken up again", self.spec.folder.name)
-            self.connection.send(Broken(f"{type(error).__name__}: {told(error)}"))
+            self.connection.send(Broken(f"{type(error).__name__}: {message_of(error)}"))
             return False
         return True
 
@@ -134,7 +134,7 @@ class Worker:
                 if not no_room(error):
                     raise
                 log.warning("scene %s, frame %d: %s", self.spec.folder.name, message.index, error)
-                self.connection.send(Stalled(message.index, told(error), stall))
+                self.connection.send(Stalled(message.index, message_of(error), stall))
             self._await_room(stall)
             stall = min(2 * stall, LONGEST_STALL_S)
 
@@ -178,7 +178,7 @@ class Worker:
             log.exception("scene %s, frame %d", self.spec.folder.name, message.index)
             # Without a first frame there is nothing to go on from.
             first = self.reconstruction is None
-            return FrameFailed(message.index, f"{type(error).__name__}: {told(error)}", dropped, fatal=first)
+            return FrameFailed(message.index, f"{type(error).__name__}: {message_of(error)}", dropped, fatal=first)
 
     def mend(self, message: Mend) -> None:
         """Checks files that were found damaged, and reports the outcome of each."""

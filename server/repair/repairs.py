@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from scas4d_core.captures import Frame
-from scas4d_core.errors import told
+from scas4d_core.errors import message_of
 from scas4d_core.storage.frame_files import (
     FIRST_COPY,
     FIXED_COPY,
@@ -53,7 +53,7 @@ def mend(history: History, reconstruction: Reconstruction | None, message: Mend)
             outcome, reason = _mend(history, history.files, reconstruction, name, message)
         except Exception as error:
             log.exception("%s cannot be mended", name)
-            outcome, reason = MendOutcome.NO_ROOM if no_room(error) else MendOutcome.DAMAGED, told(error)
+            outcome, reason = MendOutcome.NO_ROOM if no_room(error) else MendOutcome.DAMAGED, message_of(error)
         yield Mended(name, outcome, reason)
 
 
@@ -150,4 +150,4 @@ def _remade(spec: SceneSpec, history: History, message: Remake, decode: Decode) 
         return Mended(name, MendOutcome.REMADE, report=report)
     except Exception as error:  # whatever the core raises, the service goes on and says so
         log.exception("scene %s, frame %d cannot be made again", spec.folder.name, index)
-        return Mended(name, MendOutcome.NO_ROOM if no_room(error) else MendOutcome.LOST, told(error))
+        return Mended(name, MendOutcome.NO_ROOM if no_room(error) else MendOutcome.LOST, message_of(error))

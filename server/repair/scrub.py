@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 from client.wire import FrameState
-from scas4d_core.errors import told
+from scas4d_core.errors import message_of
 from scas4d_core.storage.frame_files import (
     FIRST_COPY,
     FIXED_COPY,
@@ -108,7 +108,7 @@ class Scrub:
                 rate = self._bytes_per_second * (AT_WORK if self._at_work() else 1.0)
                 await asyncio.sleep(weight * size / rate)
         except (OSError, ValueError) as error:
-            return GONE if isinstance(error, FileNotFoundError) else told(error)
+            return GONE if isinstance(error, FileNotFoundError) else message_of(error)
         return None
 
     async def _scrub_definition(self) -> None:

@@ -9,7 +9,7 @@ from itertools import chain
 
 from client.wire import Budget, FrameReportModel, FrameState, SceneBudget, SceneState, SceneStatus
 from scas4d_core.cameras import Camera
-from scas4d_core.errors import told
+from scas4d_core.errors import message_of
 from server.health import metrics
 from server.ingest.acknowledge import Ingest, IngestRules, uncancelled
 from server.ingest.open_frames import OpenFrames
@@ -264,6 +264,6 @@ class Scene:
         self._tell(SceneChanged())
 
     def _failed(self, error: BaseException) -> None:
-        self.ledger.fatal = f"the service failed: {type(error).__name__}: {told(error)}"
+        self.ledger.fatal = f"the service failed: {type(error).__name__}: {message_of(error)}"
         log.error("scene %s", self.id, exc_info=error)
         self._tell(SceneChanged())

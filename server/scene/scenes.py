@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from client.wire import SceneCreate
-from scas4d_core.errors import told
+from scas4d_core.errors import message_of
 from scas4d_core.settings import Settings
 from scas4d_core.storage.npz import read_npz, sync_folder
 from server.problems import Problem, counted
@@ -101,7 +101,7 @@ class Scenes:
             try:
                 await self._restore(self._data.scene(name))
             except Exception as error:  # a fault of one scene is no fault of the others
-                self.unreadable[name] = f"the service failed: {type(error).__name__}: {told(error)}"
+                self.unreadable[name] = f"the service failed: {type(error).__name__}: {message_of(error)}"
                 log.exception("scene %s cannot be recovered", name)
         for path in graves:
             await asyncio.to_thread(shutil.rmtree, path, ignore_errors=True)
@@ -137,7 +137,7 @@ class Scenes:
             scene = Scene(definition, folder, found, self.server, self.placement, self.hub)
             scene.points_sha256 = await asyncio.to_thread(points_sha256, folder.points)
         except (DefinitionError, OSError) as error:
-            self.unreadable[folder.name] = told(error)
+            self.unreadable[folder.name] = message_of(error)
             log.error("folder %s holds no scene that can be read; it is left as it is: %s", folder.path, error)
             return
         for sentence in found.damage:

@@ -10,7 +10,7 @@ from typing import Any
 from blake3 import blake3
 
 from client.wire import SceneCreate
-from scas4d_core.errors import told
+from scas4d_core.errors import message_of
 from scas4d_core.settings import Settings
 from scas4d_core.storage.npz import written_whole
 from server.storage.events import JournalEvent, SceneCreated
@@ -60,7 +60,7 @@ class Definition:
                 Settings.model_validate(data["settings"]),
             )
         except (KeyError, TypeError, ValueError) as error:  # pydantic's error is a ValueError
-            raise DefinitionError(f"the definition cannot be read: {told(error)}") from None
+            raise DefinitionError(f"the definition cannot be read: {message_of(error)}") from None
 
 
 def write_definition(folder: SceneFolder, definition: Definition) -> None:
@@ -105,7 +105,7 @@ def _checked(folder: SceneFolder) -> tuple[Definition | None, str | None]:
     except FileNotFoundError:
         return None, f"{folder.definition.name} is gone"
     except (OSError, KeyError, TypeError, ValueError) as error:
-        return None, f"{folder.definition.name} is damaged ({told(error)})"
+        return None, f"{folder.definition.name} is damaged ({message_of(error)})"
 
 
 def never_acknowledged(folder: SceneFolder) -> bool:

@@ -7,7 +7,7 @@ import fcntl
 import os
 from pathlib import Path
 
-from scas4d_core.errors import told
+from scas4d_core.errors import message_of
 from server.problems import Problem
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
@@ -27,7 +27,7 @@ def full_disk(error: Exception) -> Problem:
     """Makes the answer, 507, for a full disk."""
     return Problem(
         507,
-        f"the disk has no room: {told(error)}",
+        f"the disk has no room: {message_of(error)}",
         remedy="free room in the service's data folder, or shorten the scene's retention, and send the same again",
         headers={"Retry-After": "5"},
     )

@@ -14,7 +14,7 @@ import numpy as np
 from blake3 import blake3
 
 from client.wire import Budget, FrameState, Retention
-from scas4d_core.errors import told
+from scas4d_core.errors import message_of
 from scas4d_core.storage.history import NEWEST_KEPT
 from server.storage.disk import full_disk, no_room
 from server.storage.events import (
@@ -281,7 +281,7 @@ class SceneLog:
             except OSError as error:
                 if not no_room(error):
                     raise
-                self._waits(f"the journal waits for room on the disk: {told(error)}")
+                self._waits(f"the journal waits for room on the disk: {message_of(error)}")
                 await asyncio.sleep(AGAIN_S)
 
     async def delete_pictures(self, names: Collection[str]) -> None:
