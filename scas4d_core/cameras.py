@@ -12,13 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scas4d_core.errors import InputError
+
 Float = NDArray[np.float64]
 
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of R Rᵀ − I that still counts as a rotation: calibration files round to 4–6 digits."""
 
 
-class CameraError(ValueError):
+class CameraError(InputError):
     """An impossible camera; the message names the camera, the field, the value and the remedy."""
 
 
@@ -56,9 +58,9 @@ class Camera:
         for field, shape in (("intrinsics", (3, 3)), ("world_to_camera", (4, 4))):
             value = np.array(getattr(self, field), dtype=np.float64)
             if value.shape != shape:
-                raise CameraError(f"camera {self.name!r}: {field} has shape {value.shape}; give {shape}")
+                raise CameraError(f"camera {self.name!r}: {field} has shape {value.shape}", f"give {shape}")
             if not np.isfinite(value).all():
-                raise CameraError(f"camera {self.name!r}: {field} holds NaN or infinity; give finite numbers")
+                raise CameraError(f"camera {self.name!r}: {field} holds NaN or infinity", "give finite numbers")
             value.setflags(write=False)
             object.__setattr__(self, field, value)
         with np.errstate(over="ignore", invalid="ignore"):  # numbers near the largest are no rotation either
@@ -68,23 +70,25 @@ class Camera:
         k, r = self.intrinsics, self.rotation
         if k[0, 0] <= 0 or k[1, 1] <= 0:
             raise CameraError(
-                f"camera {self.name!r}: focal lengths {k[0, 0]:g}, {k[1, 1]:g} must be positive; "
-                "give positive focal lengths in pixels"
+                f"camera {self.name!r}: focal lengths {k[0, 0]:g}, {k[1, 1]:g} must be positive",
+                "give positive focal lengths in pixels",
             )
         if abs(k[0, 1]) + abs(k[1, 0]) + abs(k[2, 0]) + abs(k[2, 1]) + abs(k[2, 2] - 1) > 1e-6:
             raise CameraError(
-                f"camera {self.name!r}: intrinsics must be [[fx,0,cx],[0,fy,cy],[0,0,1]]; undo skew first"
+                f"camera {self.name!r}: intrinsics must be [[fx,0,cx],[0,fy,cy],[0,0,1]]", "undo skew first"
             )
         if not np.abs(r @ r.T - np.eye(3)).max() <= ROTATION_TOLERANCE or np.linalg.det(r) < 0:
             raise CameraError(
-                f"camera {self.name!r}: world_to_camera[:3,:3] is no rotation "
-                f"(determinant {np.linalg.det(r):.4g}); give the rotation of world-to-camera with OpenCV axes"
+                f"camera {self.name!r}: world_to_camera[:3,:3] is no rotation (determinant {np.linalg.det(r):.4g})",
+                "give the rotation of world-to-camera with OpenCV axes",
             )
         if not np.allclose(self.world_to_camera[3], (0, 0, 0, 1)):
-            raise CameraError(f"camera {self.name!r}: the last row of world_to_camera is not 0 0 0 1; give a 4x4 pose")
+            raise CameraError(
+                f"camera {self.name!r}: the last row of world_to_camera is not 0 0 0 1", "give a 4x4 pose"
+            )
         if self.width < 1 or self.height < 1:
             raise CameraError(
-                f"camera {self.name!r}: size {self.width}x{self.height} is empty; give at least 1x1 pixels"
+                f"camera {self.name!r}: size {self.width}x{self.height} is empty", "give at least 1x1 pixels"
             )
 
     @property
@@ -216,11 +220,11 @@ class Rig:
     def __post_init__(self) -> None:
         names = [camera.name for camera in self.cameras]
         if not names:
-            raise CameraError("a rig needs at least one camera; add one")
+            raise CameraError("a rig needs at least one camera", "add one")
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise CameraError(
-                f"camera names must be unique within a rig, given twice: {', '.join(twice)}; rename all but one"
+                f"camera names must be unique within a rig, given twice: {', '.join(twice)}", "rename all but one"
             )
 
     def __len__(self) -> int:
@@ -273,13 +277,13 @@ class Rig:
         with np.errstate(over="ignore", invalid="ignore"):
             far = not np.isfinite(self._spread)
         if far:
-            raise CameraError("camera centres are too far away for numbers; give world_to_camera in other units")
+            raise CameraError("camera centres are too far away for numbers", "give world_to_camera in other units")
         if metres_per_unit == "auto":
             if self.at_one_place:
                 raise CameraError(
                     f"metres_per_unit 'auto' goes by how far apart the cameras are, and {len(self)} camera(s) are at "
-                    f"one place; give metres_per_unit as a number, such that what they see is about "
-                    f"{AUTO_RIG_RADIUS_M:g} m away"
+                    f"one place",
+                    f"give metres_per_unit as a number, such that what they see is about {AUTO_RIG_RADIUS_M:g} m away",
                 )
             metres = AUTO_RIG_RADIUS_M / self.radius
         else:

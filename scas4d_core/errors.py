@@ -1,4 +1,4 @@
-"""Messages of errors for users: without paths of this machine. Standard library only."""
+"""Errors with a fault and a remedy, and errors as text without paths of this machine. Standard library only."""
 
 from __future__ import annotations
 
@@ -7,6 +7,18 @@ import re
 
 _PATH = re.compile(r"(?<![\w.:/])/(?:[^\s'\"<>|:;,()\[\]]+/)*[^\s'\"<>|:;,()\[\]/]*")
 """An absolute path within a sentence; addresses as ``http://…`` do not begin with a slash."""
+
+
+class InputError(ValueError):
+    """Something that was given cannot be used; the text is "fault; remedy".
+
+    Attributes:
+        fault: what is wrong, with the value. remedy: what to give instead, or "".
+    """
+
+    def __init__(self, fault: str, remedy: str = "") -> None:
+        super().__init__(f"{fault}; {remedy}" if remedy else fault)
+        self.fault, self.remedy = fault, remedy
 
 
 def without_paths(text: str) -> str:

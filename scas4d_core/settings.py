@@ -12,6 +12,8 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from scas4d_core.errors import InputError
+
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 
@@ -99,7 +101,7 @@ class SceneSettings(Model):
     @classmethod
     def _points_somewhere(cls, floor: tuple[float, ...] | None) -> tuple[float, ...] | None:
         if floor is not None and not any(floor[:3]):
-            raise ValueError(f"floor {floor} has no direction; give (a, b, c, d) with (a, b, c) pointing down")
+            raise InputError(f"floor {floor} has no direction", "give (a, b, c, d) with (a, b, c) pointing down")
         return floor
 
 
@@ -303,8 +305,9 @@ class UpdateSettings(Model):
     @classmethod
     def _ascend(cls, clusters: tuple[int, ...]) -> tuple[int, ...]:
         if any(size < 1 for size in clusters) or list(clusters) != sorted(set(clusters)):
-            raise ValueError(
-                f"clusters {clusters} do not ascend; give numbers from 1, the coarsest layer's first, the finest's last"
+            raise InputError(
+                f"clusters {clusters} do not ascend",
+                "give numbers from 1, the coarsest layer's first, the finest's last",
             )
         return clusters
 

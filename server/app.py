@@ -1,4 +1,4 @@
-"""The application factory."""
+"""The application factory: middlewares, routes, and the life of the service."""
 
 from __future__ import annotations
 
@@ -15,20 +15,16 @@ from starlette.routing import Route, WebSocketRoute
 
 from client import __version__
 from server import problems
-from server.connections.guard import Guard
-from server.connections.limits import Limits
+from server.connections.guard import Guard, Limits
 from server.connections.proxies import ClientLimit
-from server.health.logs import AccessLog
 from server.health.readiness import Readiness
 from server.http import handlers
-from server.http.auth import Door
-from server.http.body_limit import BodyLimit
-from server.http.parameters import only_known
+from server.http.middleware import AccessLog, AuthMiddleware, BodyLimit
 from server.http.tickets import Tickets
 from server.problems import Problem
-from server.processes.local_placement import LocalPlacement
 from server.processes.placement import Placement
 from server.routes import (
+    access,
     budget,
     estimate,
     frames,
@@ -52,7 +48,7 @@ from server.stream.hub import Hub
 
 
 def create_app(settings: ServerSettings | None = None, placement: Placement | None = None) -> FastAPI:
-    """The service.
+    """Makes the application of the service.
 
     `server.connections.config.guarded` runs it, as `scas4d serve` does. With
     `uvicorn --factory server.app:create_app` it works too, but nothing bounds what a peer may send before
@@ -64,8 +60,8 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         settings.data.mkdir(parents=True, exist_ok=True)
-        app.state.hub = Hub(settings.max_subscribers, settings.stream_questions)
-        where = placement or LocalPlacement()
+        app.state.hub = Hub(settings.max_subscribers)
+        where = placement or Placement()
         app.state.readiness = Readiness(settings, where)
         app.state.scenes = Scenes(settings, where, app.state.hub)
         await app.state.scenes.open()
@@ -82,7 +78,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     )
     app.state.settings = settings
     app.state.guard = Guard(Limits.of(settings))
-    app.state.tickets = Tickets(settings.ticket_seconds, settings.max_tickets)
+    app.state.tickets = Tickets()
     handlers.install(app)
     # The last one added is the first that a request meets.
     app.add_middleware(BodyLimit, limit=int(settings.max_body_mb * 1e6))
@@ -94,7 +90,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
             allow_headers=["Authorization", "Content-Type"],
             expose_headers=["*"],
         )
-    app.add_middleware(Door, settings=settings, tickets=app.state.tickets)
+    app.add_middleware(AuthMiddleware, settings=settings, tickets=app.state.tickets)
     if settings.trusted_proxies:
         app.add_middleware(ClientLimit, guard=app.state.guard)
     app.add_middleware(AccessLog)
@@ -103,14 +99,14 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         *(estimate, tickets, health, metrics, viewer),
     )
     for resource in resources:
-        app.include_router(resource.router, dependencies=[] if resource is viewer else [Depends(only_known)])
+        app.include_router(resource.router, dependencies=[] if resource is viewer else [Depends(access.only_known)])
         _answer_plain_requests(app, resource.router)
     _keep_document(app)
     return app
 
 
 def _keep_document(app: FastAPI) -> None:
-    """Answers /openapi.json from memory: whoever has no token may read it, and writing it anew takes milliseconds."""
+    """Answers /openapi.json from memory: it needs no token, and writing it anew takes milliseconds."""
     kept: list[bytes] = []
 
     async def openapi(request: Request) -> Response:
@@ -123,7 +119,7 @@ def _keep_document(app: FastAPI) -> None:
 
 
 def _answer_plain_requests(app: FastAPI, router: APIRouter) -> None:
-    """At the address of a WebSocket, a request without an upgrade is told so (426), not that there is nothing."""
+    """Answers 426 instead of 404 to a plain request at the address of a WebSocket."""
 
     async def upgrade(request: Request) -> Response:
         raise Problem(

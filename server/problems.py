@@ -1,4 +1,4 @@
-"""Every error is a problem document (RFC 9457) that names the field, the value and the remedy."""
+"""Problem documents (RFC 9457): every error names the field, the value and the remedy."""
 
 from __future__ import annotations
 
@@ -17,17 +17,19 @@ from client.wire import ProblemDetails
 MEDIA_TYPE = "application/problem+json"
 VALUE_LENGTH = 200
 """A value quoted in an answer is cut here: it may be a whole cloud."""
+SERVICE_FAULT = "this is a fault of the service; its log has the traceback"
+"""The remedy where the service failed."""
 
 
 class Problem(HTTPException):
-    """An answer that says what was wrong.
+    """An error answer; `client.wire.ProblemDetails` has the fields of its document.
 
     Args:
         status: HTTP status, 400…599.
-        detail: one sentence for a person.
+        detail: the fault, one sentence for a person.
+        remedy: the action that helps, for a person.
         field: the parameter or field at fault.
-        value: what was given there; quoted, shortened.
-        remedy: what to send or do instead.
+        value: the value that was given there; it is quoted and shortened.
         headers: further headers of the answer.
         more: further members of the document, such as `expected`.
     """
@@ -37,9 +39,9 @@ class Problem(HTTPException):
         status: int,
         detail: str,
         *,
+        remedy: str,
         field: str | None = None,
         value: object = None,
-        remedy: str | None = None,
         headers: Mapping[str, str] | None = None,
         **more: Any,
     ) -> None:
@@ -56,18 +58,18 @@ class Problem(HTTPException):
 
 
 def counted(count: int, noun: str) -> str:
-    """A number and its noun: 1 camera, 2 cameras."""
+    """Returns a number and its noun: 1 camera, 2 cameras."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def quoted(value: object) -> str:
-    """A value as text, short enough to be sent back."""
+    """Returns a value as text, short enough to be sent back."""
     text = value if isinstance(value, str) else repr(value)
     return text if len(text) <= VALUE_LENGTH else text[: VALUE_LENGTH - 1] + "…"
 
 
 def answer(document: ProblemDetails, headers: Mapping[str, str] | None = None) -> Response:
-    """The document as a response; ASCII, so that text which is no Unicode (lone surrogates) can be quoted too."""
+    """Makes a response of the document; it is ASCII, so that lone surrogates can be quoted too."""
     body = json.dumps(document.model_dump(mode="python", exclude_none=True), ensure_ascii=True).encode()
     return Response(body, document.status, dict(headers or {}), media_type=MEDIA_TYPE)
 
@@ -82,7 +84,7 @@ async def refuse(problem: Problem, scope: Scope, receive: Receive, send: Send) -
 
 
 def plain_tuples(schema: Any) -> None:
-    """Tuples of one kind as arrays of a fixed length: what reads documents knows `items` better than `prefixItems`."""
+    """Writes tuples of one kind as arrays of a fixed length: more tools know `items` than `prefixItems`."""
     for part in schema.values() if isinstance(schema, dict) else schema if isinstance(schema, list) else ():
         plain_tuples(part)
     if isinstance(schema, dict) and schema.get("prefixItems") and "items" not in schema:
@@ -92,7 +94,7 @@ def plain_tuples(schema: Any) -> None:
 
 
 def document(app: FastAPI) -> dict[str, Any]:
-    """The OpenAPI document, with what FastAPI does not know: the media type of errors, and the token."""
+    """Returns the OpenAPI document, completed with the media type of errors and the token."""
     if app.openapi_schema is None:
         written = FastAPI.openapi(app)
         for path, operations in written["paths"].items():
@@ -112,9 +114,9 @@ def document(app: FastAPI) -> dict[str, Any]:
 
 
 RESPONSES: dict[int | str, dict[str, Any]] = {
-    "4XX": {"description": "What was wrong, with which value, and what to do.", "model": ProblemDetails},
+    "4XX": {"description": "The request is wrong: field, value and remedy.", "model": ProblemDetails},
     "5XX": {"description": "The service failed, or cannot answer now.", "model": ProblemDetails},
-    422: {"description": "A field that cannot be.", "model": ProblemDetails},
+    422: {"description": "A field has a wrong value.", "model": ProblemDetails},
 }
-"""For the OpenAPI document."""
+"""Answers of every route in the OpenAPI document."""
 PROBLEM = {"$ref": "#/components/schemas/ProblemDetails"}

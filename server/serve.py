@@ -1,4 +1,4 @@
-"""The service as a process: logs, signals, uvicorn."""
+"""Runs the service as a process: logs, signals, uvicorn."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from server.app import create_app
 from server.connections.config import guarded
 from server.connections.process import keep_freed_memory, room_for_connections
 from server.health import logs
-from server.processes.local_placement import LocalPlacement
+from server.processes.placement import STOP_SECONDS, Placement
 from server.scene.scenes import lock_data
 from server.settings import ServerSettings, unknown
 
@@ -25,29 +25,29 @@ log = logging.getLogger("scas4d.server")
 
 
 class Server(uvicorn.Server):
-    """uvicorn's, which says in words where it is.
+    """uvicorn's server, which logs its address in a sentence.
 
     Args:
         config: of uvicorn.
-        told: the sentence, logged once requests are answered.
+        greeting: the sentence that is logged once requests are answered.
     """
 
-    def __init__(self, config: uvicorn.Config, told: str) -> None:
+    def __init__(self, config: uvicorn.Config, greeting: str) -> None:
         super().__init__(config)
-        self._told = told
+        self._greeting = greeting
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Starts the application and listens."""
         await super().startup(sockets)
         if self.started:
-            log.info(self._told)
+            log.info(self._greeting)
 
 
 def serve(settings: ServerSettings) -> None:
     """Runs until SIGTERM or SIGINT.
 
     Then it takes no more connections, closes WebSockets (1012), answers what was asked, and asks the scenes' processes
-    to end: each has `stop_seconds`. What they do not finish is in the frame log, and is taken up at the next start.
+    to end: each has `STOP_SECONDS`. What they do not finish is in the frame log, and is taken up at the next start.
 
     Raises:
         RuntimeError: the address or the data folder is in use, or cannot be had.
@@ -63,22 +63,24 @@ def serve(settings: ServerSettings) -> None:
     sockets = listen(settings.host, settings.port)
     keep_freed_memory()
     config = guarded(
-        create_app(_with_files(settings), LocalPlacement(prepare)),
+        create_app(_with_files(settings), Placement(prepare)),
         log_config=None,
         access_log=False,
-        timeout_graceful_shutdown=max(1, round(settings.stop_seconds)),
+        timeout_graceful_shutdown=max(1, round(STOP_SECONDS)),
     )
-    # uvicorn ends gracefully and then raises the signal again, for whoever called it: here that is nobody, and the
+    # uvicorn ends gracefully and then raises the signal again, for its caller: here there is none, and the
     # process ends with status 0.
     for ending in (signal.SIGTERM, signal.SIGINT):
         signal.signal(ending, lambda *_: None)
-    told = f"listening; viewer at {address(settings.host, sockets)}, scenes in {settings.data}; Ctrl-C ends the service"
-    Server(config, told).run(sockets)
+    greeting = (
+        f"listening; viewer at {address(settings.host, sockets)}, scenes in {settings.data}; Ctrl-C ends the service"
+    )
+    Server(config, greeting).run(sockets)
     log.info("ended")
 
 
 def _with_files(settings: ServerSettings) -> ServerSettings:
-    """The settings with as many connections as files may be open for them."""
+    """Lowers the limit of connections to the number of files that may be open for them."""
     room = room_for_connections(settings.max_connections)
     if room < settings.max_connections:
         log.warning(
@@ -91,7 +93,7 @@ def _with_files(settings: ServerSettings) -> ServerSettings:
 
 
 def listen(host: str, port: int) -> list[socket.socket]:
-    """Sockets bound to every address of the host that this machine has, all at one port; uvicorn listens at them.
+    """Binds sockets to every address of the host that this machine has, all at one port; uvicorn listens at them.
 
     Raises:
         RuntimeError: there is no such address, or the port cannot be had.
@@ -99,7 +101,7 @@ def listen(host: str, port: int) -> list[socket.socket]:
     sockets: list[socket.socket] = []
     try:
         for family, kind, protocol, _, where in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
-            # Where any port will do, all addresses get that of the first.
+            # With port 0 all addresses get the port of the first.
             free = sockets[0].getsockname()[1] if sockets else port
             with contextlib.suppress(_NotHere):
                 sockets.append(_bound(family, kind, protocol, (where[0], free, *where[2:])))
@@ -143,6 +145,6 @@ def _bound(family: int, kind: int, protocol: int, where: tuple[Any, ...]) -> soc
 
 
 def address(host: str, sockets: list[socket.socket]) -> str:
-    """Where a browser on this machine finds the service."""
+    """Returns the address of the service for a browser on this machine."""
     name = "127.0.0.1" if host in ("0.0.0.0", "::", "") else host
     return f"http://{f'[{name}]' if ':' in name else name}:{sockets[0].getsockname()[1]}"

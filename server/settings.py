@@ -5,10 +5,12 @@ The first of these that names a setting decides. docs/operations.md has the tabl
 
 from __future__ import annotations
 
+import importlib
 import ipaddress
 import os
 import re
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -26,29 +28,46 @@ PREFIX = "SCAS4D_"
 CONFIG = "SCAS4D_CONFIG"
 """Names the TOML file; no setting itself."""
 URL = "SCAS4D_URL"
-"""Where clients find the service; it may be set for both."""
+"""The address of the service for clients; it may be set for both."""
 
 TOKEN = re.compile(r"[A-Za-z0-9._~+/=-]{16,512}")
-"""What can stand behind `Authorization: Bearer` (RFC 6750), and is long enough not to be guessed."""
+"""Tokens that fit behind `Authorization: Bearer` (RFC 6750) and are too long to be guessed."""
+
+FORMER = {
+    "engine": "server.settings:FORMER_ENGINE",
+    "ticket_seconds": "server.http.tickets:TICKET_SECONDS",
+    "max_tickets": "server.http.tickets:MOST_TICKETS",
+    "header_lines": "server.connections.guard:HEADER_LINES",
+    "max_ingest_sockets": "server.ingest.acknowledge:MOST_SOCKETS",
+    "max_points": "server.routes.points:MOST_POINTS",
+    "max_render_pixels": "server.routes.render:MOST_PIXELS",
+    "max_track_points": "server.routes.tracks:MOST_POINTS",
+    "max_track_json_points": "server.routes.tracks:MOST_JSON_POINTS",
+    "max_track_views": "server.routes.tracks:MOST_VIEWS",
+    "max_subscriptions": "server.stream.subscriber:MOST_SUBSCRIPTIONS",
+    "max_stream_message_kb": "server.stream.subscriber:MESSAGE_KB",
+    "stream_questions": "server.stream.shared_queries:QUERIES_AT_ONCE",
+    "waiting_questions": "server.processes.readers:MOST_WAITING",
+    "answer_seconds": "server.processes.readers:ANSWER_SECONDS",
+    "stop_seconds": "server.processes.placement:STOP_SECONDS",
+}
+"""Settings of earlier versions, and the constants that they became, as module:name."""
+FORMER_ENGINE = "server.engine:core_engine"
 
 Names = Annotated[tuple[str, ...], NoDecode]
 """Several names; in the environment with commas between."""
 
 
 class SettingsError(ValueError):
-    """A setting that cannot be: which, its value unless that may be a secret, and what to do."""
+    """A setting is refused: the text has its name, the remedy, and its value unless that may be a secret."""
 
 
 class ServerSettings(BaseSettings):
-    """What the one who runs the service may choose."""
+    """The settings of an operator."""
 
     model_config = SettingsConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True, env_prefix=PREFIX)
 
     data: Path = Field(default=Path("data"), description="Folder of the scenes; made when missing.")
-    engine: str = Field(
-        default="server.processes.engine:core_engine",
-        description="module:function that makes the engine of a scene, called once in each of its processes.",
-    )
 
     host: str = Field(
         default="127.0.0.1", description="Address to listen at. Beyond the loopback only together with a token."
@@ -57,10 +76,10 @@ class ServerSettings(BaseSettings):
     token: SecretStr | None = Field(
         default=None,
         description="Every request but /health/live, the viewer's page and the API's description has to bear it "
-        "(Authorization: Bearer). None: whoever is on this machine may do everything.",
+        "(Authorization: Bearer). None: every user of this machine may do everything.",
     )
     token_file: Path | None = Field(
-        default=None, description="File with the token, for those who mount secrets; not together with `token`."
+        default=None, description="File with the token, as a mounted secret; not together with `token`."
     )
     allowed_hosts: Names = Field(
         default=(),
@@ -73,39 +92,29 @@ class ServerSettings(BaseSettings):
         description="Other sites whose pages may use the service, as `https://viewer.example`; pages of the service "
         "itself always may.",
     )
-    ticket_seconds: float = Field(
-        default=30.0, gt=0, le=3600, description="Life of a ticket for a browser's WebSocket; it is used once."
-    )
-    max_tickets: int = Field(default=1024, ge=1, description="Tickets that wait to be used; more get 429.")
 
     header_seconds: float = Field(
         default=10.0,
         gt=0,
         le=600,
-        description="From the first byte of a request to the end of its header, and from opening a connection to that "
-        "byte, in seconds; later gets 408, or is closed where nothing has come. A header is one packet or two: ten "
-        "seconds are three times resent.",
+        description="Time from the first byte of a request to the end of its header, and from opening a connection to "
+        "that byte, in seconds; a later header gets 408, a connection without a byte is closed. A header is one or two "
+        "packets: ten seconds allow to send them three times again.",
     )
     header_kb: int = Field(
         default=64,
         ge=8,
         le=1024,
-        description="Largest header of a request, with its address, in kB of 1024 bytes; more gets 431 or 414. "
-        "Browsers send up to 16 with cookies of other services on this host; reading one takes time by the square of "
-        "its size.",
-    )
-    header_lines: int = Field(
-        default=100,
-        ge=20,
-        le=120,
-        description="Lines of a header; more get 431. Proxies add some ten; WebSockets take 128 at most.",
+        description="Largest header of a request, with its address, in kB of 1024 bytes; a larger one gets 431 or 414. "
+        "Browsers send up to 16 kB with cookies of other services on this host; the time to read a header grows with "
+        "the square of its size.",
     )
     body_seconds: float = Field(
         default=20.0,
         gt=0,
         le=3600,
         description="Time in which 16 kB of a body, or its end, have to come while the service reads, in seconds; else "
-        "408. A radio link that is lost for a moment comes back within; 0.8 kB/s could not send a picture.",
+        "408. A radio link that is lost for a moment comes back sooner; 0.8 kB/s could not send a picture.",
     )
     keep_alive_seconds: float = Field(
         default=15.0,
@@ -119,8 +128,8 @@ class ServerSettings(BaseSettings):
         default=30.0,
         gt=0,
         le=3600,
-        description="Time in which a peer has to read 16 kB of what waits for it, in seconds; else the connection is "
-        "ended, a WebSocket's too. What waits is held in memory.",
+        description="Time in which a peer has to read 16 kB of the data that waits for it, in seconds; else the "
+        "connection is ended, a WebSocket's too. That data is held in memory.",
     )
     max_connections: int = Field(
         default=1024,
@@ -131,8 +140,8 @@ class ServerSettings(BaseSettings):
     max_connections_per_peer: int = Field(
         default=256,
         ge=4,
-        description="The same for one address, or one client behind a trusted proxy: 64 cameras with a sender each, "
-        "and their viewers; else 429.",
+        description="Open connections of one address, or of one client behind a trusted proxy: enough for 64 cameras "
+        "with a sender each, and their viewers; more get 429.",
     )
     trusted_proxies: Names = Field(
         default=(),
@@ -150,13 +159,13 @@ class ServerSettings(BaseSettings):
     )
 
     max_scenes: int = Field(
-        default=8, ge=1, description="Each holds two or three processes and some hundred megabytes."
+        default=8, ge=1, description="Scenes at a time; each holds two or three processes and some hundred megabytes."
     )
     max_scene_memory_mb: float | None = Field(
         default=None,
         gt=0,
-        description="A scene that is estimated (POST /v1/estimate) to take more is refused; the machine's memory where "
-        "not given.",
+        description="Memory of a scene in MB: one with a larger estimate (POST /v1/estimate) is refused. Default: "
+        "the machine's memory.",
     )
     queue_frames: int = Field(
         default=4, ge=1, description="Frames of a scene acknowledged and not finished; more get 429."
@@ -164,52 +173,15 @@ class ServerSettings(BaseSettings):
     max_body_mb: float = Field(
         default=256,
         gt=0,
-        description="Largest request body: 64 cameras of 4 MB. One file, and a frame over a WebSocket, may have what "
-        "pictures of the rig can have at most, where that is less.",
-    )
-    max_ingest_sockets: int = Field(
-        default=64,
-        ge=1,
-        description="WebSockets that send frames to one scene: one a camera where each has a sender of its own.",
+        description="Largest request body: 64 cameras of 4 MB. One file, and a frame over a WebSocket, is "
+        "limited by the rig's pictures where that is less.",
     )
     max_image_pixels: int = Field(
         default=40_000_000,
         ge=1,
-        description="Of one camera; a decoded picture takes 3 bytes a pixel, twice while decoding.",
+        description="Pixels of one camera; a decoded picture takes 3 bytes a pixel, twice while decoding.",
     )
-    max_points: int = Field(default=2_000_000, ge=1, description="Of an initial cloud.")
-    max_render_pixels: int = Field(default=8_000_000, ge=1, description="Of one novel view.")
-    max_track_points: int = Field(default=1_000_000, ge=1, description="Points times frames of one track query.")
-    max_track_json_points: int = Field(
-        default=100_000, ge=1, description="The same where the answer is JSON, some 100 bytes each; npz takes more."
-    )
-    max_track_views: int = Field(
-        default=4096,
-        ge=1,
-        description="Cameras times frames of one track query in which visibility is asked: a depth picture each.",
-    )
-    max_subscribers: int = Field(default=128, ge=1, description="Of the stream of one scene.")
-    max_subscriptions: int = Field(default=16, ge=1, description="Of one subscriber at a time.")
-    max_stream_message_kb: int = Field(
-        default=256, ge=1, description="Largest message of a subscriber: some 8000 pixels to track."
-    )
-    stream_questions: int = Field(
-        default=2,
-        ge=1,
-        description="Views, tracks and parts for subscribers that a scene's reader has before it at a time; more wait.",
-    )
-    waiting_questions: int = Field(
-        default=64,
-        ge=1,
-        description="Views, or other questions, that wait for a scene's reader; more get 503. Beyond a second or two "
-        "of views, waiting only makes it worse.",
-    )
-    answer_seconds: float = Field(
-        default=120.0, gt=0, description="A render, track or part query that takes longer gets 503."
-    )
-    stop_seconds: float = Field(
-        default=5.0, gt=0, description="Grace for a worker to end by itself at shutdown and delete."
-    )
+    max_subscribers: int = Field(default=128, ge=1, description="Subscribers of one scene's stream; more get 429.")
     scrub_mb_per_second: float = Field(
         default=4.0,
         ge=0,
@@ -233,7 +205,7 @@ class ServerSettings(BaseSettings):
         dotenv_settings: PydanticBaseSettingsSource,
         file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """What is constructed here holds what is given; `from_environment` reads the environment and the file."""
+        """Keeps the constructor to its arguments; `from_environment` reads the environment and the file."""
         return (init_settings,)
 
     @field_validator("allowed_hosts", "allowed_origins", "trusted_proxies", mode="before")
@@ -287,7 +259,7 @@ class ServerSettings(BaseSettings):
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] | None = None, **given: object) -> ServerSettings:
-        """The defaults, overridden by the file, by the environment, by what is given (None counts as not given).
+        """Reads the settings: defaults, overridden by the file, the environment and arguments that are not None.
 
         Raises:
             SettingsError: names the setting and what to do.
@@ -303,6 +275,7 @@ class ServerSettings(BaseSettings):
             written = {} if file is None else TomlConfigSettingsSource(cls, toml_file=Path(file))()
         except ValueError as error:  # tomllib's says line and column
             raise SettingsError(f"{CONFIG}: {file} is no TOML ({error})") from None
+        _refuse_former(environment, written)
         merged = {**written, **read, **{n: v for n, v in given.items() if v is not None}}
         try:
             return cls.model_validate(merged)
@@ -310,20 +283,48 @@ class ServerSettings(BaseSettings):
             first = error.errors(include_input=False)[0]
             name = ".".join(str(part) for part in first["loc"])
             known = "" if first["type"] != "extra_forbidden" else f"; the settings are {', '.join(cls.model_fields)}"
-            fault = first["msg"].removeprefix("Value error, ")
+            ours = first["type"] == "value_error"
+            fault = str(first["ctx"]["error"] if ours else first["msg"])
             quotable = name in cls.model_fields and name != "token"
             value = f" is {merged[name]!r}, which cannot be" if quotable and name in merged else ""
             raise SettingsError((f"setting {name}{value}: " if name else "") + fault + known) from None
 
 
+def _refuse_former(environment: Mapping[str, str], written: dict[str, Any]) -> None:
+    """Takes settings of earlier versions out of `written`, the settings of the file.
+
+    Raises:
+        SettingsError: one of them, there or in the environment, differs from the constant that it became.
+    """
+    of_environment = {name.upper(): value for name, value in environment.items()}
+    for name, place in FORMER.items():
+        variable = PREFIX + name.upper()
+        given = {variable: of_environment.get(variable), name: written.pop(name, None)}
+        for known_as, value in given.items():
+            if value is None:
+                continue
+            module, _, constant = place.partition(":")
+            fixed = getattr(importlib.import_module(module), constant)
+            try:
+                same = value == fixed if isinstance(fixed, str) else float(value) == fixed
+            except (TypeError, ValueError):
+                same = False
+            if not same:
+                raise SettingsError(
+                    f"setting {known_as} is {value!r}, and is no setting any more: it is always {fixed!r}; leave it "
+                    f"out, or change {constant} in {module.replace('.', '/')}.py"
+                )
+
+
 def unknown(environment: Mapping[str, str]) -> list[str]:
-    """Names that look like settings and are none: misspelt, most likely."""
-    known = {f"{PREFIX}{name.upper()}" for name in ServerSettings.model_fields} | {CONFIG, URL}
+    """Returns names that look like settings and are none: misspelt, most likely."""
+    known = {f"{PREFIX}{name.upper()}" for name in (*ServerSettings.model_fields, *FORMER)} | {CONFIG, URL}
     return sorted(name for name in environment if name.upper().startswith(PREFIX) and name.upper() not in known)
 
 
+@lru_cache(64)
 def is_loopback(host: str) -> bool:
-    """Whether nothing but this machine reaches the address."""
+    """Returns True if only this machine reaches the address. Cached: every request asks for the same few."""
     try:
         return host.lower() == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:

@@ -10,7 +10,14 @@ from source_tree import MODULES, ROOT, imports, within
 
 HEAVY = ("torch", "numba", "scipy", "sklearn", "pycolmap", "fastapi", "uvicorn")
 
-LIGHT_ROOMS = ("scas4d_core.cameras", "scas4d_core.captures", "scas4d_core.settings", "scas4d_core.presets")
+LIGHT_ROOMS = (
+    "scas4d_core.errors",
+    "scas4d_core.frame_outcome",
+    "scas4d_core.cameras",
+    "scas4d_core.captures",
+    "scas4d_core.settings",
+    "scas4d_core.presets",
+)
 """What the client may import when it is imported; its heavy commands import the rest when they run."""
 
 NUMPY_ONLY = ("scas4d_core.cameras", "scas4d_core.gaussians", "scas4d_core.captures", "scas4d_core.settings")

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from client.wire.base import Model
 from client.wire.budgets import Budget
+from scas4d_core.frame_outcome import FrameOutcome
 
 
 class FrameReceipt(Model):
@@ -96,6 +97,9 @@ class FrameReportModel(Model):
     dropped_cameras: dict[str, str] = Field(
         default_factory=dict,
         description="Camera left out → reason: it sent nothing that can be decoded, or its picture did not fit.",
+    )
+    outcome: FrameOutcome | None = Field(
+        default=None, description="Outcome of the update; null while the frame is not committed."
     )
     degraded: str | None = Field(
         default=None, description="Why the committed state is not the frame's, or only by half; null where it is."

@@ -23,6 +23,7 @@ from pydantic import Field, FiniteFloat, ValidationError
 from client.wire.base import MAX_CAMERAS, CameraName, Model
 from client.wire.frames import FrameReceipt, PartReceipt
 from client.wire.service import ProblemDetails
+from scas4d_core.errors import InputError
 
 FRAME_MEDIA_TYPE = "application/vnd.scas4d.frame"
 MAGIC = b"S4DF"
@@ -32,17 +33,8 @@ MAX_HEAD = 1 << 20
 MAX_INDEX = 1_000_000_000
 
 
-class FramingError(ValueError):
-    """Bytes are no frame.
-
-    Attributes:
-        fault: what is wrong with them. remedy: what to send instead.
-    """
-
-    def __init__(self, fault: str, remedy: str) -> None:
-        super().__init__(f"{fault}; {remedy}")
-        self.fault = fault
-        self.remedy = remedy
+class FramingError(InputError):
+    """Bytes that are no frame: the message names the fault and the remedy."""
 
 
 class FileKind(StrEnum):

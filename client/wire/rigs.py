@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from client.wire.base import MAX_CAMERAS, MAX_PIXELS_A_SIDE, CameraName, Model, Row3, Row4
 from scas4d_core.cameras import Camera, Rig
+from scas4d_core.errors import InputError
 
 
 class CameraModel(Model):
@@ -27,7 +28,7 @@ class CameraModel(Model):
     @model_validator(mode="after")
     def _can_be(self) -> CameraModel:
         if self.name == "time" or self.name.startswith("mask."):
-            raise ValueError(f"camera name {self.name!r} is the name of another field of a frame; rename the camera")
+            raise InputError(f"camera name {self.name!r} is the name of another field of a frame", "rename the camera")
         self.camera()  # raises CameraError, a ValueError, for what cannot be a camera
         return self
 

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from client.wire.base import MAX_CAMERAS, Model
 from client.wire.budgets import Budget
 from client.wire.rigs import RigModel
+from scas4d_core.errors import InputError
 
 
 class Retention(Model):
@@ -21,7 +22,7 @@ class Retention(Model):
     @model_validator(mode="after")
     def _one_rule(self) -> Retention:
         if self.last is not None and self.bytes is not None:
-            raise ValueError("last and bytes are two rules; give one of them, or neither to keep all")
+            raise InputError("last and bytes are two rules", "give one of them, or neither to keep all")
         return self
 
 

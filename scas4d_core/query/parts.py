@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from threadpoolctl import threadpool_limits
 
+from scas4d_core.errors import InputError
 from scas4d_core.gaussians import Gaussians, moving_extent, quaternions_to_matrices
 from scas4d_core.storage.history import History
 
@@ -86,20 +87,20 @@ def parts(
     (1, 1, True)
     """
     if not len(history):
-        raise ValueError("the history is empty; commit a frame before asking for parts")
+        raise InputError("the history is empty", "commit a frame before asking for parts")
     newest = history.gaussians(history.indices[-1])
     rows = np.flatnonzero(newest.moving)
     if rows.size == 0:
-        raise ValueError(
-            "no Gaussian moves (foreground > 0.5), so there are no parts; ask again when something has moved"
+        raise InputError(
+            "no Gaussian moves (foreground > 0.5), so there are no parts", "ask again when something has moved"
         )
     if count is not None and not 1 <= count <= rows.size:
-        raise ValueError(
-            f"count {count} must be between 1 and the {rows.size} moving Gaussians; give no more than these"
+        raise InputError(
+            f"count {count} must be between 1 and the {rows.size} moving Gaussians", "give no more than these"
         )
 
     if previous is not None and previous.shape != (len(newest),):
-        raise ValueError(f"previous labels {previous.shape} must be [{len(newest)}], one a Gaussian")
+        raise InputError(f"previous labels {previous.shape} must be [{len(newest)}], one a Gaussian")
 
     rng = np.random.default_rng(SEED)
     chosen = rows if rows.size <= SAMPLE else np.sort(rng.choice(rows, SAMPLE, replace=False))

@@ -18,6 +18,7 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import WorldFrame
+from scas4d_core.errors import InputError
 from scas4d_core.gaussians import Gaussians
 
 Float = NDArray[np.float64]
@@ -37,7 +38,7 @@ _FIELDS = (
 )
 
 
-class PlyError(ValueError):
+class PlyError(InputError):
     """Gaussians that cannot be exported, or a file without any; the message names rows or path, and the fault."""
 
 
@@ -226,5 +227,6 @@ def _name_rows(gaussians: Gaussians, bad: NDArray[np.bool_], fault: str) -> None
     if rows.size:
         raise PlyError(
             f"{rows.size} Gaussians have {fault}: rows {rows[:5].tolist()}, ids {gaussians.ids[rows[:5]].tolist()}"
-            f"{' …' if rows.size > 5 else ''}; export an earlier frame, or mend them"
+            f"{' …' if rows.size > 5 else ''}",
+            "export an earlier frame, or mend them",
         )

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, maximum_filter
 
 from scas4d_core.cameras import Camera, WorldFrame
+from scas4d_core.errors import InputError
 from scas4d_core.gaussians import Gaussians, moving_extent, quaternions_to_matrices
 from scas4d_core.query.ray_depth import ray_depths
 from scas4d_core.rasterize.limits import DEFAULT, Limits
@@ -118,10 +119,12 @@ def tracks_of_points(
     """
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points have shape {points.shape}; give [Q, 3]")
+        raise InputError(f"points have shape {points.shape}", "give [Q, 3]")
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if bad.size:
-        raise ValueError(f"points {bad[:5].tolist()} hold NaN or infinity; give finite coordinates in the user's units")
+        raise InputError(
+            f"points {bad[:5].tolist()} hold NaN or infinity", "give finite coordinates in the user's units"
+        )
     theta = history.gaussians(index)
     extent = moving_extent(theta)
     inside = world.to_inside(points)
@@ -179,12 +182,12 @@ def tracks_of_pixels(
     """
     uv = np.asarray(uv, dtype=np.float64)
     if uv.ndim != 2 or uv.shape[1] != 2:
-        raise ValueError(f"uv has shape {uv.shape}; give [Q, 2] pixels")
+        raise InputError(f"uv has shape {uv.shape}", "give [Q, 2] pixels")
     outside = np.flatnonzero(~((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=1))
     if outside.size:
-        raise ValueError(
-            f"pixel {uv[outside[0]].tolist()} (query {outside[0]}) lies outside the picture of camera {camera.name!r}; "
-            f"give 0 <= u < {camera.width}, 0 <= v < {camera.height}"
+        raise InputError(
+            f"pixel {uv[outside[0]].tolist()} (query {outside[0]}) lies outside the picture of camera {camera.name!r}",
+            f"give 0 <= u < {camera.width}, 0 <= v < {camera.height}",
         )
     theta = history.gaussians(index)
     softening = RAY_SOFTENING * moving_extent(theta)
@@ -227,9 +230,9 @@ def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indice
     place = np.minimum(np.searchsorted(held, wanted, sorter=order), len(held) - 1)
     unknown = wanted[held[order[place]] != wanted] if len(held) else wanted
     if len(unknown):
-        raise ValueError(
-            f"ids {unknown[:5].tolist()} are no Gaussians of this scene; take ids out of an answer, or of its "
-            f"{len(held)} Gaussians"
+        raise InputError(
+            f"ids {unknown[:5].tolist()} are no Gaussians of this scene",
+            f"take ids out of an answer, or of its {len(held)} Gaussians",
         )
     positions = world.to_user(history.stacked("means", indices, order[place]))
     return Tracks(positions, np.ones(positions.shape[:2]), wanted, np.asarray(indices, dtype=np.int64))

@@ -1,4 +1,4 @@
-"""How uvicorn runs the application: with guarded connections, and with proxies only where they are trusted."""
+"""Configuration of uvicorn: guarded connections, and forwarded headers from trusted proxies only."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from server.connections.websocket import Socket
 
 
 def guarded(app: FastAPI, **more: Any) -> uvicorn.Config:
-    """The configuration of uvicorn for an application of `server.app.create_app`.
+    """Makes the configuration of uvicorn for an application of `server.app.create_app`.
 
     Args:
         app: the application, which knows its guard. more: further options of uvicorn, as `port`.
@@ -25,7 +25,7 @@ def guarded(app: FastAPI, **more: Any) -> uvicorn.Config:
         "http": type("GuardedConnection", (Connection,), of_service),
         "ws": type("GuardedSocket", (Socket,), of_service),
         "server_header": False,
-        # What others say about themselves is not believed; uvicorn would believe FORWARDED_ALLOW_IPS and the loopback.
+        # Other peers' headers are not believed; uvicorn would believe FORWARDED_ALLOW_IPS and the loopback.
         "proxy_headers": bool(proxies),
         "forwarded_allow_ips": proxies,
         "timeout_keep_alive": guard.limits.keep_alive_seconds,

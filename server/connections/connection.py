@@ -13,10 +13,11 @@ from typing import Any, ClassVar, cast
 import httptools
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
+from server.connections import guard as guard_module
 from server.connections.guard import Guard
 from server.connections.record import PROGRESS_BYTES, Phase
 from server.connections.refusals import Refusal, problem, response
-from server.http.auth import HEADERS
+from server.http.middleware import HEADERS
 
 END_OF_HEAD = b"\r\n\r\n"
 CHUNKED_BYTES = 64 << 10
@@ -32,8 +33,8 @@ DROPPED_BYTES = 1 << 20
 
 
 class Connection(HttpToolsProtocol):
-    """uvicorn's own, guarded, and without its two copies of a body: a frame is some 30 MB, and each costs as much as
-    reading it.
+    """uvicorn's HTTP connection, guarded, and without its two copies of a body: a frame is some 30 MB, and each copy
+    costs as much as reading it.
 
     `guard` is that of the service, set by `server.connections.config`.
     """
@@ -69,7 +70,7 @@ class Connection(HttpToolsProtocol):
 
     @property
     def waits_for_us(self) -> bool:
-        """Whether nothing can come because the service does not read now, or has yet to ask for the body."""
+        """True if nothing can come because the service does not read now, or has yet to ask for the body."""
         return self.flow.read_paused or (self._record.phase is Phase.BODY and self.cycle.waiting_for_100_continue)
 
     def data_received(self, data: bytes) -> None:
@@ -95,7 +96,7 @@ class Connection(HttpToolsProtocol):
             at += self._parse(data if whole else memoryview(data)[at:end])
 
     def _parse(self, piece: bytes | memoryview) -> int:
-        """Parses a piece, and says how much of it was taken."""
+        """Parses a piece; returns the bytes of it that were taken."""
         record, size = self._record, len(piece)
         self._delivered, in_head = 0, record.phase is Phase.HEAD
         taken = size
@@ -112,7 +113,7 @@ class Connection(HttpToolsProtocol):
             if self._head_bytes >= self.guard.limits.header_bytes:
                 self._fault = self._too_large()
         elif self._fault is None and not in_head and self._left is None:
-            # What was delivered pays for overhead, but does not add up: a large body must not buy an endless trailer,
+            # Delivered bytes pay for overhead, but do not add up: a large body must not buy an endless trailer,
             # which is joined in quadratic time as a header is.
             self._credit = min(OVERHEAD_BYTES, self._credit + self._delivered) - (size - self._delivered)
             if self._credit < 0:
@@ -136,10 +137,10 @@ class Connection(HttpToolsProtocol):
             self._begin_head()
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Takes a line of the header. Trailers are dropped: nobody reads them, and they must not pass for headers."""
+        """Takes a line of the header. Trailers are dropped: they are not used, and must not pass for headers."""
         if self._record.phase is not Phase.HEAD:
             return
-        if len(self.headers) >= self.guard.limits.header_lines:
+        if len(self.headers) >= guard_module.HEADER_LINES:
             self._fault = self._fault or Refusal.HEAD_LINES
             return
         super().on_header(name, value)
@@ -208,7 +209,7 @@ class Connection(HttpToolsProtocol):
                 self.transport.close()
 
     def on_response_complete(self) -> None:
-        """Waits for the next request, or for the end of a body that nobody needs any more."""
+        """Waits for the next request, or for the end of a body that is not needed any more."""
         super().on_response_complete()
         record = self._record
         record.served = True

@@ -1,4 +1,4 @@
-"""What every open connection is at, and what ends it: deadlines, caps, answers that nobody reads.
+"""Ends connections that break the limits: deadlines, caps, and answers that the peer does not read.
 
 A connection costs no timer of its own: one sweep, about once a second, looks at all of them while there are any.
 """
@@ -10,12 +10,16 @@ import ipaddress
 import logging
 from collections import Counter
 from collections.abc import Collection, Iterable
+from dataclasses import dataclass
 
-from server.connections.limits import Limits
 from server.connections.process import unread_bytes
 from server.connections.record import KINDS, PROGRESS_BYTES, Handler, Peer, Phase, Record
 from server.connections.refusals import Refusal
 from server.health.metrics import CONNECTIONS_REFUSED
+from server.settings import ServerSettings
+
+HEADER_LINES = 100
+"""Lines of a header; more get 431. Proxies add some ten to a browser's twenty; WebSockets take 128 at most."""
 
 SWEEP_S = 1.0
 LINGER_S = 5.0
@@ -24,7 +28,7 @@ LINGER_BYTES = 64 << 20
 """A body that goes on after its answer is read and dropped while `PROGRESS_BYTES` come in `LINGER_S`, so long in all,
 so far: closed at once, the connection would be reset, and the sender would lose the answer."""
 REFUSED_S = 2.0
-"""The same for a connection that was refused itself."""
+"""A connection that was refused is read and dropped for so long."""
 REFUSED_AT_ONCE = 64
 """Refused connections that wait for their peers to read why; the oldest go first."""
 CLOSING_SOCKET_S = 5.0
@@ -37,8 +41,57 @@ SUMMARY_S = 10.0
 log = logging.getLogger("scas4d.server")
 
 
+@dataclass(frozen=True)
+class Limits:
+    """The limits of connections: seconds, bytes, counts."""
+
+    header_seconds: float
+    header_bytes: int
+    body_seconds: float
+    keep_alive_seconds: float
+    unread_seconds: float
+    connections: int
+    per_peer: int
+    proxies: tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]
+
+    @classmethod
+    def of(cls, settings: ServerSettings) -> Limits:
+        """Takes the limits from the settings of a service."""
+        return cls(
+            header_seconds=settings.header_seconds,
+            header_bytes=settings.header_kb << 10,
+            body_seconds=settings.body_seconds,
+            keep_alive_seconds=settings.keep_alive_seconds,
+            unread_seconds=settings.unread_seconds,
+            connections=settings.max_connections,
+            per_peer=settings.max_connections_per_peer,
+            proxies=tuple(map(ipaddress.ip_network, settings.trusted_proxies)),
+        )
+
+    def of_refusal(self, refusal: Refusal) -> float:
+        """Returns the limit that a refusal names, in the unit of its setting."""
+        return {
+            Refusal.HEAD_SIZE: self.header_bytes / 1024,
+            Refusal.URL_SIZE: self.header_bytes / 1024,
+            Refusal.HEAD_LINES: HEADER_LINES,
+            Refusal.HEAD_TIME: self.header_seconds,
+            Refusal.BODY_TIME: self.body_seconds,
+            Refusal.PEER_CONNECTIONS: self.per_peer,
+            Refusal.CLIENT_REQUESTS: self.per_peer,
+            Refusal.CONNECTIONS: self.connections,
+        }.get(refusal, 0)
+
+    def is_proxy(self, address: str) -> bool:
+        """Returns True if the address is one of the trusted proxies."""
+        try:
+            found = ipaddress.ip_address(address)
+        except ValueError:
+            return False
+        return any(found in network for network in self.proxies)
+
+
 def peer_key(address: str) -> str:
-    """Under which connections count as one peer's: an IPv6 address by its /64, all of which is one customer's."""
+    """Returns the key of a peer's connections: of an IPv6 address its /64, which belongs to one customer."""
     try:
         found = ipaddress.ip_address(address)
     except ValueError:
@@ -69,11 +122,11 @@ class Guard:
     def admit(
         self, handler: Handler, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop, address: str
     ) -> tuple[Record, Refusal | None]:
-        """A new connection: its record, and why it has to be refused where it has to be.
+        """Takes a new connection: returns its record, and the refusal if it has to be refused.
 
         Where a cap is reached it takes the place of the oldest connection that has not sent a whole header, is idle, or
-        has stopped sending its body: whoever hangs about must not keep out who has a request. Where all places are
-        taken, any peer's may give way: who has many addresses has few connections from each.
+        has stopped sending its body: an idle peer must not keep out one that has a request. Where all places are
+        taken, any peer's may give way: a peer with many addresses has few connections from each.
         """
         now = loop.time()
         proxy = self.limits.is_proxy(address)
@@ -97,7 +150,7 @@ class Guard:
         return record, refusal
 
     def enter(self, record: Record, phase: Phase, now: float) -> None:
-        """Takes note that a connection is in another phase, from `now` (loop time) on."""
+        """Notes that a connection is in another phase, from `now` (loop time) on."""
         if record.gone:
             return
         record.phase, record.since, record.entered, record.body, record.dropped = phase, now, now, 0, 0
@@ -124,7 +177,7 @@ class Guard:
                 oldest.transport.abort()
 
     def hand_over(self, transport: asyncio.BaseTransport, handler: Handler, now: float) -> Record:
-        """The record of a connection that is a WebSocket from now on."""
+        """Returns the record of a connection that is a WebSocket from now on."""
         record = self._records[transport]
         record.handler = handler
         self.enter(record, Phase.SOCKET, now)
@@ -144,7 +197,7 @@ class Guard:
         self._pending[refusal.value] += 1
 
     def counts(self) -> dict[str, int]:
-        """Open connections by kind."""
+        """Counts the open connections by kind."""
         found = dict.fromkeys(KINDS.values(), 0)
         for record in self._records.values():
             found[KINDS[record.phase]] += 1
@@ -205,11 +258,11 @@ class Guard:
             record
             for peer in peers
             for record in peer.bodies
-            if record.received == 0 and now - record.heard > QUIET_S and not record.handler.waits_for_us
+            if record.received == 0 and now - record.last_bytes_at > QUIET_S and not record.handler.waits_for_us
         ]
         if not quiet:
             return False
-        self._end(min(quiet, key=lambda record: record.heard), now)
+        self._end(min(quiet, key=lambda record: record.last_bytes_at), now)
         return True
 
     def _sweep(self, loop: asyncio.AbstractEventLoop) -> None:

@@ -1,4 +1,4 @@
-"""What the process asks of its system for many connections: memory that is kept, files that may be open."""
+"""Resources of the process for many connections: freed memory that is kept, and open files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ KEPT_BYTES = 32 << 20
 OTHER_FILES = 256
 """Open beside connections: pipes of the scenes' processes, journals, what a library needs for a moment."""
 FILES_EACH = 2
-"""Of a connection: its socket, and the record that an upload is written to."""
+"""Files of a connection: its socket, and the record that an upload is written to."""
 
 
 def keep_freed_memory() -> None:
@@ -55,8 +55,8 @@ def room_for_connections(asked: int) -> int:
 
 
 def unread_bytes(transport: asyncio.Transport) -> int:
-    """Bytes that were written and that the peer has not acknowledged: the transport's, and where the system tells them
-    the kernel's. The kernel takes more in lumps of up to a megabyte, between which a slow reader would look like none.
+    """Returns bytes that were written and not acknowledged: the transport's and, on systems that count them, the
+    kernel's. The kernel takes more in lumps of up to a megabyte, between which a slow reader would look like none.
     """
     found = transport.get_write_buffer_size()
     socket = transport.get_extra_info("socket")

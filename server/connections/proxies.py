@@ -1,4 +1,4 @@
-"""Clients behind trusted proxies: each may have as many requests under way as a peer may have connections."""
+"""Limits the requests of each client behind a trusted proxy to the connections that a peer may have."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is known of one open connection, and of all those of an address."""
+"""Records of open connections, and of the peers that hold them."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Protocol
 from server.connections.refusals import Refusal
 
 PROGRESS_BYTES = 16 << 10
-"""What a window of `body_seconds` or `unread_seconds` has to move: less holds a connection open on purpose."""
+"""Bytes that have to move in a window of `body_seconds` or `unread_seconds`: less is done on purpose."""
 
 
 class Phase(Enum):
-    """Where a connection is."""
+    """Phases of a connection."""
 
     NEW = auto()
     """Nothing has come yet; browsers open connections ahead."""
@@ -50,7 +50,7 @@ class Handler(Protocol):
 
     @property
     def waits_for_us(self) -> bool:
-        """Whether nothing can come because the service does not read now."""
+        """True if nothing can come because the service does not read now."""
 
     def refuse(self, refusal: Refusal) -> None:
         """Answers with the refusal, as far as it can be answered, and ends the connection."""
@@ -90,12 +90,12 @@ class Record:
 
     @property
     def is_begun(self) -> bool:
-        """Whether its body has brought next to nothing, or nothing that anybody needs."""
+        """True if the body has brought next to nothing, or is dropped."""
         return self.phase is Phase.LINGER or not self.moved
 
     @property
-    def heard(self) -> float:
-        """Loop time at which the last of its body may have come."""
+    def last_bytes_at(self) -> float:
+        """Loop time at which the last bytes of the body may have come."""
         return max(self.since, self.quiet_since)
 
 

@@ -1,4 +1,4 @@
-"""Why a connection is refused, and the problem document that answers it."""
+"""Reasons to refuse a connection, and the problem document that answers each."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from server import problems
 from server.problems import Problem
 
 RETRY_SECONDS = 5
-"""`Retry-After` where there are too many connections: half-sent headers have made room by then."""
+"""`Retry-After` where there are too many connections: half-sent headers are timed out by then."""
 
 
 class Refusal(StrEnum):
-    """The label `reason` of `scas4d_connections_refused_total`."""
+    """Reasons; the value is the label `reason` of `scas4d_connections_refused_total`."""
 
     HEAD_SIZE = "head_size"
     HEAD_LINES = "head_lines"
@@ -31,7 +31,7 @@ class Refusal(StrEnum):
 
 
 def problem(refusal: Refusal, limit: float = 0) -> Problem:
-    """The answer to a refused connection or request.
+    """Makes the problem for a refused connection or request.
 
     Args:
         refusal: the reason. limit: the limit that was passed, in the unit of its setting.
@@ -46,8 +46,7 @@ def problem(refusal: Refusal, limit: float = 0) -> Problem:
                 f"the header of the request {what} than {limit:g}{unit}",
                 field="path" if refusal is Refusal.URL_SIZE else "headers",
                 value=f"more than {limit:g}{unit}",
-                remedy="send fewer or shorter headers, or raise "
-                + ("SCAS4D_HEADER_LINES" if lines else "SCAS4D_HEADER_KB"),
+                remedy="send fewer headers" if lines else "send fewer or shorter headers, or raise SCAS4D_HEADER_KB",
             )
         case Refusal.HEAD_TIME:
             return Problem(
@@ -102,7 +101,7 @@ def problem(refusal: Refusal, limit: float = 0) -> Problem:
 
 
 def response(refused: Problem, headers: dict[str, str]) -> bytes:
-    """The problem as a whole HTTP/1.1 response that ends the connection.
+    """Writes the problem as a whole HTTP/1.1 response that ends the connection.
 
     Args:
         refused: the problem. headers: further ones, of every answer of the service.

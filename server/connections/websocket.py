@@ -1,4 +1,4 @@
-"""WebSockets of uvicorn: messages bounded one by one, handshakes that cannot be read answered, peers that read."""
+"""WebSockets of uvicorn with limits: size of messages, malformed handshakes, peers that do not read."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from websockets.http11 import Request
 from server.connections.guard import LINGER_LONGEST_S, Guard
 from server.connections.record import Phase
 from server.connections.refusals import Refusal, problem, response
-from server.http.auth import HEADERS
+from server.http.middleware import HEADERS
 
 EARLY_BYTES = 1 << 16
-"""Largest message of a WebSocket before its handshake is answered: nobody has to send one then."""
+"""Largest message of a WebSocket before its handshake is answered: no client has to send one then."""
 SMALL_FRAGMENT = 4096
 PONG = b"\x8a"
 """First byte of such a frame."""
@@ -24,7 +24,7 @@ LIMIT = "scas4d.message_limit"
 
 
 class Socket(WebSocketsSansIOProtocol):
-    """uvicorn's own, whose largest message is the application's to set: it is refused (1009) before it is in memory.
+    """uvicorn's WebSocket; the application sets its largest message, and a larger one is refused (1009) unread.
 
     `guard` is that of the service, set by `server.connections.config`.
     """
@@ -37,7 +37,7 @@ class Socket(WebSocketsSansIOProtocol):
         self._pong = b""
         """The answer to the newest ping, while the peer does not read."""
         self._fell_behind = False
-        """Whether more waited than the transport likes, at some time since the last ping was sent."""
+        """True if more waited than the transport likes, at some time since the last ping was sent."""
         self._record = self.guard.hand_over(transport, self, self.loop.time())
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -140,7 +140,7 @@ class Socket(WebSocketsSansIOProtocol):
             self.transport.write(pong)
 
     def send_keepalive_ping(self) -> None:
-        """Asks whether the peer is there."""
+        """Sends a ping to a peer that is silent."""
         self._fell_behind = self._record.write_paused
         super().send_keepalive_ping()
 

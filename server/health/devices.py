@@ -1,30 +1,32 @@
-"""Whether the device of a scene can be had here, asked before the scene is made, not at its first frame."""
+"""Checks that the device of a scene can be had, before the scene is made and not at its first frame."""
 
 from __future__ import annotations
 
 import asyncio
+import json
 import sys
 
 from server.problems import Problem
 
 ASK = """
-import sys
+import json, sys
 from scas4d_core.torch_backend.device import DeviceError, require_device
 try:
     require_device(sys.argv[1])
 except DeviceError as error:
-    print(error)
+    print(json.dumps([error.fault, error.remedy]))
     sys.exit(3)
 """
-"""In a process of its own: torch takes hundreds of megabytes, and the service has no use for it."""
+"""Runs in a process of its own: torch takes hundreds of megabytes, and the service has no use for it."""
 REFUSED = 3
+"""Exit status of that process where the device cannot be had: fault and remedy are on its stdout."""
 PATIENCE_S = 120.0
 
 _found: set[str] = {"cpu"}
 
 
 async def require(device: str) -> None:
-    """Returns where updates can run on the device.
+    """Returns if updates can run on the device.
 
     Raises:
         Problem: 422, it is not there; the remedy says what to install. 503, no answer in time.
@@ -39,7 +41,7 @@ async def require(device: str) -> None:
     except TimeoutError:
         raise Problem(
             503,
-            f"whether there is a device {device!r} is not known after {PATIENCE_S:g} s",
+            f"it is not known yet if there is a device {device!r}, after {PATIENCE_S:g} s",
             field="settings.device",
             value=device,
             remedy="ask again, or choose device 'cpu'",
@@ -50,12 +52,9 @@ async def require(device: str) -> None:
     if asking.returncode == 0:
         _found.add(device)
         return
-    text = (said if asking.returncode == REFUSED else faults.strip().rpartition(b"\n")[2]).decode(errors="replace")
-    fault, _, remedy = text.strip().rpartition("; ")
-    raise Problem(
-        422,
-        fault or f"device {device!r} cannot be had: {text.strip()}",
-        field="settings.device",
-        value=device,
-        remedy=remedy if fault else "choose device 'cpu'",
-    )
+    if asking.returncode == REFUSED:
+        fault, remedy = json.loads(said)
+    else:
+        last = faults.decode(errors="replace").strip().rpartition("\n")[2]
+        fault, remedy = f"device {device!r} cannot be had: {last}", "choose device 'cpu'"
+    raise Problem(422, fault, field="settings.device", value=device, remedy=remedy)

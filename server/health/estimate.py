@@ -1,4 +1,4 @@
-"""What a scene will take, by a formula whose constants were measured (`scripts/measure_memory.py`; a test holds it)."""
+"""Estimates the memory and disk of a scene; the constants were measured by `scripts/measure_memory.py`."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ no masks, of two frames."""
 GAUSSIAN = 1800
 """Bytes for each Gaussian in the worker: state, layers, Adam, neighbours, and what a render needs."""
 READ_GAUSSIAN = 500
-"""The same in a reader."""
+"""Bytes for each Gaussian in a reader."""
 STATE = 81
 """Bytes on disk for each Gaussian and frame."""
 HISTORY = 28
 """Bytes for each Gaussian and frame of a query: position and material rotation."""
 LARGEST_BUDGET, MOST_PER_PIXEL = 100_000, 0.61
-"""Of `scas4d_core.first_frame.static_scene.budget`, a picture without background."""
+"""Limits of `scas4d_core.first_frame.static_scene.budget`, for a picture without background."""
 SCALES = (0.75, 0.5, 0.35, 0.25, 0.125)
 
 CGROUP = Path("/sys/fs/cgroup/memory.max")
 
 
 def machine_mb() -> float:
-    """Memory of the machine, or of the container where that is less."""
+    """Returns the memory of the machine, or of the container if that is less."""
     total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     try:
         return min(total, int(CGROUP.read_text())) / 1e6
@@ -43,7 +43,7 @@ def machine_mb() -> float:
 
 
 def estimate(rig: RigModel, settings: Settings, server: ServerSettings, scale: float | None = None) -> SceneEstimate:
-    """Of a scene with this rig and these settings; `scale` in place of their image_scale."""
+    """Estimates a scene with this rig and these settings; `scale` takes the place of their image_scale."""
     scale = settings.scene.image_scale if scale is None else scale
     sizes = [camera.width * camera.height for camera in rig.cameras]
     pixels = sum(sizes)
@@ -73,7 +73,7 @@ def estimate(rig: RigModel, settings: Settings, server: ServerSettings, scale: f
 
 
 def check(rig: RigModel, settings: Settings, server: ServerSettings) -> None:
-    """Refuses what will not fit.
+    """Refuses a scene that will not fit.
 
     Raises:
         Problem: 422, with the scale of the pictures that would.

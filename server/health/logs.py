@@ -1,4 +1,4 @@
-"""Logs on stderr from every process of the service: one JSON object a line, or in a terminal one that people read.
+"""Formats the logs of every process on stderr: one JSON object a line, or plain lines in a terminal.
 
 No secret is ever in one.
 """
@@ -9,30 +9,25 @@ import json
 import logging
 import re
 import sys
-import time
 from datetime import UTC, datetime
 from typing import Any, Literal
 
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
-
 SECRETS = re.compile(r"(?i)(bearer\s+|scas4d\.ticket\.|(?:token|ticket)=)[^\s\"',;&]+")
-"""What follows is hidden wherever it appears: it comes from clients, and may turn up in any message."""
+"""A secret follows these: it is hidden wherever it appears, because clients send it and any message may quote it."""
 
 _PLAIN = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName"}
 
-access = logging.getLogger("scas4d.access")
-
 
 def hidden(text: str) -> str:
-    """The text without tokens and tickets."""
+    """Returns the text without tokens and tickets."""
     return SECRETS.sub(r"\1***", text)
 
 
 class JsonFormatter(logging.Formatter):
-    """time, level, logger, message, process, what was given as `extra`, and the traceback of an exception."""
+    """Formats records as JSON: time, level, logger, message, process, `extra`, and the traceback of an exception."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line."""
+        """Returns one line."""
         entry: dict[str, Any] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
@@ -47,13 +42,13 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """For people: the time of day, the level where it is no mere information, the message."""
+    """Formats records for people: the time of day, the level from warning on, the message."""
 
     def __init__(self) -> None:
         super().__init__("%(asctime)s %(message)s", datefmt="%H:%M:%S")
 
     def format(self, record: logging.LogRecord) -> str:
-        """A line, or several with a traceback."""
+        """Returns a line, or several with a traceback."""
         said = super().format(record)
         if record.levelno > logging.INFO:
             moment, _, message = said.partition(" ")
@@ -62,7 +57,7 @@ class TextFormatter(logging.Formatter):
 
 
 def told_to_people(record: logging.LogRecord) -> bool:
-    """Not the requests that only read and succeed: a viewer or a rig that waits asks several times a second."""
+    """Filters out requests that only read and succeed: a viewer or a waiting rig sends several a second."""
     return record.levelno > logging.INFO or not (
         getattr(record, "method", "") in ("GET", "HEAD") and getattr(record, "status", 500) < 400
     )
@@ -89,55 +84,3 @@ def configure(format: Literal["auto", "json", "text"] = "auto", level: str = "in
         logging.getLogger("uvicorn").setLevel(max(logging.WARNING, logging.getLogger("uvicorn").level))
     # uvicorn logs a WebSocket with its whole address; `AccessLog` logs it without what follows the question mark.
     logging.getLogger("uvicorn.error").addFilter(lambda record: '"WebSocket %s"' not in str(record.msg))
-
-
-class AccessLog:
-    """A line a request and a line a WebSocket: method, path (no query), status, seconds, bytes. No headers."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Passes the request on and logs how it ended."""
-        if scope["type"] not in ("http", "websocket") or not access.isEnabledFor(logging.INFO):
-            await self.app(scope, receive, send)
-            return
-        began = time.perf_counter()
-        status, taken, given = 0, 0, 0
-
-        async def receiving() -> Message:
-            nonlocal taken
-            message = await receive()
-            taken += len(message.get("body") or message.get("bytes") or message.get("text") or b"")
-            return message
-
-        async def sending(message: Message) -> None:
-            nonlocal status, given
-            if "status" in message:
-                status = message["status"]
-            elif message["type"] == "websocket.accept":
-                status = 101
-            given += len(message.get("body") or message.get("bytes") or message.get("text") or b"")
-            await send(message)
-
-        try:
-            await self.app(scope, receiving, sending)
-        finally:
-            method = scope.get("method", "WEBSOCKET")
-            # As it was sent: percent-encoded, so that no path breaks a line.
-            path = scope.get("raw_path", scope["path"].encode()).decode("latin-1")
-            access.info(
-                "%s %s %d",
-                method,
-                path,
-                status,
-                extra={
-                    "method": method,
-                    "path": path,
-                    "status": status,
-                    "seconds": round(time.perf_counter() - began, 4),
-                    "bytes_in": taken,
-                    "bytes_out": given,
-                    "client": (scope.get("client") or ("",))[0],
-                },
-            )

@@ -1,11 +1,9 @@
-"""What Prometheus reads at /metrics. Counters are counted where the thing happens; gauges are read when asked."""
+"""Metrics for Prometheus. Counters are raised where the event happens; gauges are read on request."""
 
 from __future__ import annotations
 
 import shutil
-import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from typing import Protocol
 
 from prometheus_client import CollectorRegistry, Counter, Histogram
@@ -13,14 +11,13 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 
 from client.wire import FrameReportModel, FrameState, SceneState, SceneStatus
 from server.connections.refusals import Refusal
-from server.processes.messages import Query
 from server.settings import ServerSettings
 from server.stream.hub import Hub
 
 SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 4, 8, 16, 32, 64, 128, 256)
 
 registry = CollectorRegistry()
-"""Of this process, without the interpreter's own metrics."""
+"""Metrics of this process, without the interpreter's own."""
 
 FRAMES = Counter(
     "scas4d_frames",
@@ -91,28 +88,17 @@ def finished(report: FrameReportModel) -> None:
     FRAMES.labels(report.state.value).inc()
     if report.state == FrameState.COMMITTED:
         LEFT_OUT.inc(len(report.dropped_cameras))
-        if report.degraded is not None:
-            DEGRADED.labels("held" if report.degraded.startswith("held") else "in_part").inc()
+        if report.outcome is not None and report.outcome.degraded:
+            DEGRADED.labels("held" if report.outcome.held else "in_part").inc()
     for stage, seconds in report.seconds.items():
         UPDATE_SECONDS.labels(stage).observe(seconds)
 
 
-@contextmanager
-def answering(query: Query) -> Iterator[None]:
-    """Times a question to a scene's reader."""
-    kind, began, outcome = type(query).__name__.removesuffix("Query").lower(), time.perf_counter(), "failed"
-    try:
-        yield
-        outcome = "answered"
-    finally:
-        ANSWER_SECONDS.labels(kind, outcome).observe(time.perf_counter() - began)
-
-
 class HasStatus(Protocol):
-    """A scene, as far as it is looked at here."""
+    """A scene, as far as metrics read it."""
 
     def status(self) -> SceneStatus:
-        """As it is now."""
+        """Returns the status as it is now."""
 
 
 class State:
@@ -133,7 +119,7 @@ class State:
         self.connections = connections
 
     def collect(self) -> Iterator[Metric]:
-        """As it is now."""
+        """Yields the gauges as they are now."""
         statuses = [scene.status() for scene in list(self.scenes.values())]
         by_state = GaugeMetricFamily("scas4d_scenes", "Scenes by state.", labels=["state"])
         for state in SceneState:

@@ -1,6 +1,6 @@
-"""Whether the service can work at once: its kernels are compiled, or loaded from the cache, in a process beside it.
+"""Readiness of the service: a process beside it compiles the kernels, or loads them from the cache.
 
-The door itself never loads them. What the process leaves in the kernel cache is what the workers of scenes find there.
+The process that answers requests never loads them. Workers find the compiled kernels in the cache.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from typing import Any
 
 from scas4d_core.errors import message_of
 from server.problems import Problem
-from server.processes.engine import load_engine
 from server.processes.messages import Stop
 from server.processes.placement import Placement, Process
 from server.settings import ServerSettings
@@ -28,27 +27,29 @@ ENDS_S = 2.0
 
 @dataclass(frozen=True)
 class WarmedUp:
-    """The kernels are there; `fault` says why not."""
+    """The kernels are compiled; or not, for the reason in `fault`."""
 
     fault: str | None = None
 
 
-def main(engine: str, connection: Connection[Any, Any]) -> None:
-    """The process: warms up, says so, ends."""
+def main(spec: None, connection: Connection[Any, Any]) -> None:
+    """Runs the process: it warms up, reports, and ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        load_engine(engine).warm_up()
+        from scas4d_core.warm_up import warm_up  # in this process only: the service stays light
+
+        warm_up()
         connection.send(WarmedUp())
     except Exception as error:
         log.exception("the kernels could not be warmed up")
         connection.send(WarmedUp(f"{type(error).__name__}: {message_of(error)}"))
     with contextlib.suppress(EOFError, OSError):
-        connection.recv()  # until told to end, or until the service is gone: what was sent is read by then
+        connection.recv()  # until it is asked to end, or until the service is gone: by then the report is read
     os._exit(0)
 
 
 class Readiness:
-    """Begins when the service starts.
+    """Warms up the kernels from the start of the service on.
 
     Attributes:
         after: seconds from the start to being ready; None: not yet.
@@ -64,12 +65,12 @@ class Readiness:
         self._process: Process | None = None
         if settings.warm_up:
             log.info("warming up the kernels; the first time they are compiled, which takes about a minute")
-            self._process = placement.start(main, settings.engine, self._told, self._ended)
+            self._process = placement.start(main, None, self._received, self._ended)
         else:
             self.after = 0.0
 
     def check(self) -> float:
-        """Seconds from the start until it was ready.
+        """Returns the seconds from the start until the service was ready.
 
         Raises:
             Problem: 503, not ready; `warming_up` says that it will be, without anybody's doing.
@@ -102,7 +103,7 @@ class Readiness:
             process, self._process = self._process, None
             await process.stop(0.0 if self.after is None else ENDS_S)
 
-    def _told(self, message: WarmedUp) -> None:
+    def _received(self, message: WarmedUp) -> None:
         if message.fault is None:
             self.after = time.monotonic() - self._began
             log.info("ready after %.1f s", self.after, extra={"ready_after": round(self.after, 3)})

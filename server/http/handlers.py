@@ -1,11 +1,10 @@
-"""Every error of the application answered as a problem document: ours, the framework's, and faults."""
+"""Exception handlers: every error of the application is answered as a problem document."""
 
 from __future__ import annotations
 
 import logging
 import re
 from collections.abc import Mapping
-from http import HTTPStatus
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -15,7 +14,7 @@ from starlette.routing import compile_path
 
 from client.wire import ProblemDetails
 from server.http import validation
-from server.problems import Problem, answer, document, quoted
+from server.problems import SERVICE_FAULT, Problem, answer, document
 
 JSON = re.compile(r"application/([\w.-]+\+)?json")
 
@@ -55,13 +54,7 @@ def install(app: FastAPI) -> None:
 
     async def from_fault(request: Request, error: Exception) -> Response:
         log.exception("%s %s failed", request.method, request.url.path, exc_info=error)
-        document = ProblemDetails(
-            title=HTTPStatus.INTERNAL_SERVER_ERROR.phrase,
-            status=500,
-            detail=f"the service failed: {type(error).__name__}",
-            remedy="this is a fault of the service; its log has the traceback",
-        )
-        return answer(document)
+        return answer(Problem(500, f"the service failed: {type(error).__name__}", remedy=SERVICE_FAULT).document)
 
     app.openapi = lambda: document(app)  # type: ignore[method-assign]
     app.add_exception_handler(HTTPException, from_problem)
@@ -70,7 +63,7 @@ def install(app: FastAPI) -> None:
 
 
 def methods(app: FastAPI, path: str) -> list[str]:
-    """The methods that the document has for an address."""
+    """Returns the methods that the OpenAPI document has for an address."""
     return sorted(
         {
             method.upper()
@@ -82,19 +75,13 @@ def methods(app: FastAPI, path: str) -> list[str]:
 
 
 def _of_framework(request: Request, status: int, detail: str, headers: Mapping[str, str]) -> ProblemDetails:
-    """What Starlette and FastAPI refuse by themselves: no such path, no such method, a body that is no form."""
-    field = value = remedy = None
+    """The document where Starlette or FastAPI refuses: no such path, no such method, a body that is no form."""
+    field = value = None
+    remedy = "see /openapi.json"
     if status == 404:
-        field, value, remedy = "path", quoted(request.url.path), "GET /openapi.json lists all paths"
+        field, value, remedy = "path", request.url.path, "GET /openapi.json lists all paths"
     elif status == 405:
         field, value, remedy = "method", request.method, f"use {headers.get('Allow') or 'another'}"
     elif status == 400:
         field, remedy = "body", "send the body that Content-Type says; the schema is at /openapi.json"
-    return ProblemDetails(
-        title=HTTPStatus(status).phrase,
-        status=status,
-        detail=detail,
-        field=field,
-        value=value,
-        remedy=remedy,
-    )
+    return Problem(status, detail, field=field, value=value, remedy=remedy).document

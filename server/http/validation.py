@@ -1,6 +1,6 @@
-"""What pydantic finds wrong with a request, as a problem: which field, which value, and what to send instead.
+"""Turns validation errors of pydantic into problems: field, value, and the remedy.
 
-Its messages say what is wrong ("Input should be less than or equal to 100"); the remedies here say what to send.
+Pydantic's messages name the fault ("Input should be less than or equal to 100"); the remedies are made here.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
+from scas4d_core.errors import InputError
 from server.problems import Problem, counted
 
 MISSING = "nothing"
@@ -36,7 +37,7 @@ KINDS = {
     "model": "an object: {…}",
     "mapping": "an object: {…}",
 }
-"""What a type error asks for, by the first word of its name."""
+"""The right type for a type error, by the first word of the error's name."""
 
 
 def invalid(
@@ -48,7 +49,7 @@ def invalid(
     text: str | None = None,
     schema: str = "the schema is at /openapi.json",
 ) -> Problem:
-    """The answer to one error of a validation.
+    """Makes the problem for one error of a validation.
 
     Args:
         error: as in `ValidationError.errors()`.
@@ -57,7 +58,7 @@ def invalid(
         text: what was sent, where it may be broken JSON. schema: where all fields are listed.
     """
     loc = tuple(part for part in error["loc"] if isinstance(part, int) or not UNION.fullmatch(part))
-    fault = str(error["msg"]).removeprefix("Value error, ")
+    fault, ours = said_by(error)
     if error["type"] == "json_invalid":
         return _broken_json(error, loc, prefix, text)
     field = ".".join(str(part) for part in ((prefix,) if prefix else ()) + loc) or "message"
@@ -66,21 +67,21 @@ def invalid(
     more = f" (and {others} more)" if others else ""
     return Problem(
         422,
-        f"{field}: {_complaint(error, fault)}{more}",
+        f"{field}: {fault}{more}",
         field=field,
         value="null" if value is None else value,
-        remedy=_remedy(error, fault, field, fields_of(model, inner[:-1]), schema),
+        remedy=ours or _remedy(error, field, fields_of(model, inner[:-1]), schema),
     )
 
 
 def first_of(error: ValidationError, *, model: object = None, prefix: str = "", text: str | None = None) -> Problem:
-    """The answer to the first error of a failed validation."""
+    """Makes the problem for the first error of a failed validation."""
     found = error.errors()
     return invalid(found[0], model=model, prefix=prefix, others=len(found) - 1, text=text)
 
 
 def fields_of(model: object, loc: tuple[int | str, ...] = ()) -> list[str]:
-    """Names of the fields of the model that lies at `loc` inside another; none where that is no model."""
+    """Returns the names of the fields of the model at `loc` inside another; none if there is no model."""
     here = list(_models(model))
     for part in loc:
         if isinstance(part, str):
@@ -90,7 +91,7 @@ def fields_of(model: object, loc: tuple[int | str, ...] = ()) -> list[str]:
 
 
 def _models(annotation: object) -> Iterator[type[BaseModel]]:
-    """The models that a type is made of."""
+    """Yields the models that a type is made of."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for inner in get_args(annotation):
@@ -113,12 +114,15 @@ def _broken_json(error: Mapping[str, Any], loc: tuple[Any, ...], prefix: str, te
     )
 
 
-def _complaint(error: Mapping[str, Any], fault: str) -> str:
-    """Our own messages end in what to do, behind a semicolon."""
-    return (fault.rpartition("; ")[0] or fault) if error["type"] == "value_error" else fault
+def said_by(error: Mapping[str, Any]) -> tuple[str, str]:
+    """Returns fault and remedy of one error; no remedy if pydantic found it and not a validator of this project."""
+    raised = error.get("ctx", {}).get("error") if error["type"] == "value_error" else None
+    if isinstance(raised, InputError):
+        return raised.fault, raised.remedy
+    return str(error["msg"] if raised is None else raised), ""
 
 
-def _remedy(error: Mapping[str, Any], fault: str, field: str, known: list[str], schema: str) -> str:
+def _remedy(error: Mapping[str, Any], field: str, known: list[str], schema: str) -> str:
     kind, context = str(error["type"]), error.get("ctx", {})
     name = field.rpartition(".")[2]
     if kind == "missing":
@@ -144,7 +148,6 @@ def _remedy(error: Mapping[str, Any], fault: str, field: str, known: list[str], 
     if kind == "string_pattern_mismatch":
         return f"give text that matches {context['pattern']}"
     if kind == "value_error":
-        _, _, ours = fault.rpartition("; ")
-        return ours if ours != fault else f"give what {schema.removeprefix('the ')} asks for"
+        return f"give another value; {schema}"
     wanted = KINDS.get(kind.partition("_")[0])
     return f"give {wanted}" if wanted else f"send another value; {schema}"

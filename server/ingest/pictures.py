@@ -17,6 +17,7 @@ from PIL import Image
 from client.wire import FileKind, FrameFile
 from client.wire.framing import MAX_HEAD, PREFIX
 from scas4d_core.cameras import Camera, Rig
+from scas4d_core.errors import InputError
 from server.problems import Problem, counted
 
 _SCAN_END = re.compile(rb"\xff(?![\x00\xd0-\xd7\xff])(?=[\x00-\xff])", re.DOTALL)
@@ -148,7 +149,7 @@ def _orientation(data: memoryview) -> int:
         return 1
 
 
-class StructureError(ValueError):
+class StructureError(InputError):
     """A file is not a whole picture of an accepted format.
 
     Attributes:
@@ -156,9 +157,7 @@ class StructureError(ValueError):
     """
 
     def __init__(self, fault: str, remedy: str, value: str | None = None) -> None:
-        super().__init__(f"{fault}; {remedy}")
-        self.fault = fault
-        self.remedy = remedy
+        super().__init__(fault, remedy)
         self.value = value
 
 

@@ -1,4 +1,4 @@
-"""Pictures of the frame log to a frame: what can be used of them, and what is left out and why."""
+"""Decodes the pictures of the frame log to a frame; cameras that cannot be decoded are left out with the reason."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DECODERS = 8
 
 @dataclass(frozen=True)
 class Encoded:
-    """Files of a frame by camera, as they were sent. faults: records that could not be read, a sentence each."""
+    """The files of a frame by camera, as they were sent. faults: a sentence for each record that could not be read."""
 
     images: dict[str, memoryview]
     masks: dict[str, memoryview]
@@ -33,7 +33,7 @@ class Encoded:
 
 
 def read(folder: Path, message: FrameReady) -> Encoded:
-    """The files of a frame, from the frame log.
+    """Reads the files of a frame from the frame log.
 
     Raises:
         FrameDamage: the record that holds the whole frame cannot be used.
@@ -55,7 +55,7 @@ def read(folder: Path, message: FrameReady) -> Encoded:
 
 
 def decode(rig: Rig, message: FrameReady, encoded: Encoded) -> tuple[Frame, dict[str, str]]:
-    """The frame, and the cameras left out of it with the reason; cameras are decoded side by side."""
+    """Returns the frame, and the cameras left out of it with the reason; cameras are decoded side by side."""
     with ThreadPoolExecutor(max_workers=min(DECODERS, os.cpu_count() or 1)) as pool:
         found = list(pool.map(lambda camera: _pictures_of(camera, encoded), rig.cameras))
     images, masks, dropped = {}, {}, {}
@@ -71,7 +71,7 @@ def decode(rig: Rig, message: FrameReady, encoded: Encoded) -> tuple[Frame, dict
 
 
 def _pictures_of(camera: Camera, encoded: Encoded) -> tuple[Picture, Picture | None] | str:
-    """A camera's picture, and its mask where one was sent; or why it is left out."""
+    """Returns a camera's picture and its mask, if one was sent; or the reason to leave the camera out."""
     name, size = camera.name, (camera.width, camera.height)
     if name not in encoded.images:
         return "; ".join(encoded.faults) or f"camera {name!r} had sent nothing when the frame was closed"

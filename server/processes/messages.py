@@ -1,27 +1,27 @@
-"""All that crosses the pipes between the service and the two processes of a scene. Small; bulk goes by file."""
+"""Messages between the service and the processes of a scene. They are small: pictures and states go by file."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from client.wire import Budget, Retention
 from scas4d_core.cameras import Camera, Rig
+from scas4d_core.settings import Settings
 from server.storage.layout import SceneFolder
 
 
 @dataclass(frozen=True, eq=False)
 class SceneSpec:
-    """What both processes of a scene are started with. `settings` is the engine's own object."""
+    """The scene as its processes are given it when they start."""
 
-    engine: str
     folder: SceneFolder
     rig: Rig
-    settings: Any
+    settings: Settings
     minimum_cameras: int = 1
     keep_states: Retention = field(default_factory=Retention)
 
@@ -46,7 +46,7 @@ class FrameReady:
 
 @dataclass(frozen=True)
 class Mend:
-    """Files of the states' folder that were found damaged or gone: each is looked at, and written again if it can be.
+    """Asks the worker to check files of the states' folder, found damaged or gone, and to write them again if it can.
 
     `times` and `reports` of frames, as far as the service has them in memory.
     """
@@ -58,7 +58,7 @@ class Mend:
 
 @dataclass(frozen=True)
 class Remake:
-    """The state of a frame is made again from its pictures, starting from that of the committed frame `base`."""
+    """Asks the worker to compute a damaged state again, from its pictures and the committed frame `base`."""
 
     frame: FrameReady
     base: int
@@ -66,7 +66,7 @@ class Remake:
 
 @dataclass(frozen=True)
 class Stop:
-    """Finish what is at work and end."""
+    """Asks a process to finish its work and end."""
 
 
 # From the worker.
@@ -74,7 +74,7 @@ class Stop:
 
 @dataclass(frozen=True)
 class Ready:
-    """The worker takes frames. What it found committed: `indices`, those it could not read, and the newest's report.
+    """The worker takes frames. It found `indices` committed, could not read `damaged`, and sends the newest report.
 
     `undone`: frames whose commit was taken back, to be given again. `faults`: why, a sentence each.
     """
@@ -88,7 +88,7 @@ class Ready:
 
 @dataclass(frozen=True)
 class Broken:
-    """What is committed cannot be gone on from."""
+    """The worker cannot resume from the committed states."""
 
     reason: str
 
@@ -104,7 +104,7 @@ class Stalled:
 
 @dataclass(frozen=True)
 class Progressed:
-    """The first frame is this far."""
+    """Progress of the first frame."""
 
     stage: str
     done: int
@@ -135,14 +135,14 @@ class FrameFailed:
 
 
 class MendOutcome(StrEnum):
-    """What came of a file that was found damaged."""
+    """Outcomes for a file that was found damaged."""
 
     WHOLE = "whole"
     """It is not: it was written meanwhile, or the disk could not read it once."""
     WRITTEN = "written"
     """It was written again, the same bits."""
     REPORT_LOST = "report_lost"
-    """The state was written again, the same bits; its report was damaged, and nobody has it in memory."""
+    """The state was written again, the same bits; its report was damaged and is not in memory."""
     DAMAGED = "damaged"
     """It is, and nothing to write it from is in memory."""
     GONE = "gone"
@@ -159,7 +159,7 @@ class MendOutcome(StrEnum):
 
 @dataclass(frozen=True)
 class Mended:
-    """What came of one file (`Mend`) or of one state (`Remake`, with its new report)."""
+    """The outcome for one file (`Mend`) or for one state (`Remake`, with its new report)."""
 
     name: str
     outcome: MendOutcome
@@ -196,12 +196,12 @@ class ReplaySpec:
 
 @dataclass(frozen=True)
 class ReplayUpdated:
-    """One update is over."""
+    """One update of a replay is over."""
 
 
 @dataclass(frozen=True)
 class ReplayPoint:
-    """What one number of iterations costs and brings (`scas4d_core.replay.Replayed`)."""
+    """Cost and accuracy of one number of iterations (`scas4d_core.replay.Replayed`)."""
 
     iterations: int
     milliseconds: float
@@ -212,7 +212,7 @@ class ReplayPoint:
 
 @dataclass(frozen=True)
 class ReplayEnded:
-    """Nothing more comes; `fault` is None where all were measured."""
+    """The replay has ended; `fault` is None if all numbers of iterations were measured."""
 
     fault: str | None = None
 
@@ -222,7 +222,7 @@ class ReplayEnded:
 
 @dataclass(frozen=True)
 class Refresh:
-    """Frames were committed, deleted or taken back: these, or None where every file has to be looked at."""
+    """Frames were committed, deleted or taken back: these, or None if every file has to be checked."""
 
     frames: tuple[int, ...] | None = None
 
@@ -234,6 +234,7 @@ class RenderQuery:
     `parts` is the number of parts where they are asked for and it is given; `labels` [N] are then the parts themselves.
     """
 
+    kind: ClassVar[str] = "render"
     camera: Camera
     frame: int
     kinds: tuple[str, ...]
@@ -251,6 +252,7 @@ class TracksQuery:
     `project` are the cameras into which the trajectories are projected, with visibility.
     """
 
+    kind: ClassVar[str] = "tracks"
     frames: tuple[int, ...]
     at: int
     ids: tuple[int, ...] | None = None
@@ -265,6 +267,7 @@ class TracksQuery:
 class PartsQuery:
     """Labels of all Gaussians."""
 
+    kind: ClassVar[str] = "parts"
     count: int | None
 
 
@@ -272,6 +275,7 @@ class PartsQuery:
 class LabelsQuery:
     """Labels of all Gaussians as little-endian int16, in the order of the states."""
 
+    kind: ClassVar[str] = "labels"
     count: int | None
 
 
@@ -279,6 +283,7 @@ class LabelsQuery:
 class PlyQuery:
     """A committed frame as a 3DGS .ply."""
 
+    kind: ClassVar[str] = "ply"
     frame: int
 
 
@@ -286,7 +291,7 @@ Query = RenderQuery | TracksQuery | PartsQuery | LabelsQuery | PlyQuery
 
 
 @dataclass(frozen=True)
-class Ask:
+class AskedQuery:
     """A query with a number to find its answer by."""
 
     number: int
@@ -308,8 +313,9 @@ class Answer:
 
 @dataclass(frozen=True)
 class Refused:
-    """The query cannot be answered; `status` is that of the HTTP answer."""
+    """The query cannot be answered. `status` is that of the HTTP answer; `remedy` may be empty."""
 
     number: int
-    detail: str
+    fault: str
+    remedy: str = ""
     status: int = 422

@@ -1,4 +1,4 @@
-"""Part labels that last: each count's are kept beside the states, so that parts found later keep their labels.
+"""Part labels of a scene by number of parts, kept beside the states so that a part keeps its label.
 
 They are a derived thing: a lost or damaged file means that labels are numbered anew, by size.
 """
@@ -11,13 +11,15 @@ import os
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.storage.history import History
-from server.processes.engine import Reader
+
+if TYPE_CHECKING:
+    from scas4d_core.query.committed import CommittedScene
 
 log = logging.getLogger("scas4d.renderer")
 
@@ -41,11 +43,11 @@ class PartLabels:
         self._folder = folder
         self._known: dict[int | None, Known] = {}
 
-    def of(self, reader: Reader, history: History, count: int | None) -> NDArray[np.int64]:
-        """[N] labels from all that is committed, found once for each newest frame.
+    def of(self, reader: CommittedScene, history: History, count: int | None) -> NDArray[np.int64]:
+        """Returns [N] labels from all committed states; they are computed once for each newest frame.
 
         Raises:
-            ValueError: as ``Reader.parts``.
+            ValueError: as ``CommittedScene.parts``.
         """
         newest = history.indices[-1]
         known = self._known.get(count) or self._read(count)

@@ -1,47 +1,174 @@
-"""Where the processes of a scene run. A placement starts a process, carries its messages, and notices its end."""
+"""Starts the processes of the scenes, carries their messages and notices their end.
+
+Processes are spawned, never forked: the service has threads, and Numba and CUDA do not survive a fork.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import multiprocessing
+import os
+import queue
+import threading
+import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from multiprocessing.connection import Connection
+from typing import Any
+
+from server.processes.messages import Stop
 
 Entry = Callable[..., None]
 """Called in the process as entry(spec, connection); `connection` has recv and send of a multiprocessing Connection."""
 
+STOP_SECONDS = 5.0
+"""Grace for a process to end by itself when a scene or the service stops; an unfinished frame is taken up again."""
+PARENT_EVERY_S = 0.5
+"""A process notices so late that the service has ended."""
+
+_context = multiprocessing.get_context("spawn")
+
 
 class Ended(str):
-    """Why a process is gone, as a sentence; `exit_code` as in multiprocessing: −N for signal N, None where unknown."""
+    """The sentence that says why a process is gone; `exit_code` as in multiprocessing: −N for signal N, or None."""
 
     exit_code: int | None
 
     def __new__(cls, exit_code: int | None) -> Ended:
-        """The sentence for an exit code."""
+        """Makes the sentence for an exit code."""
         self = super().__new__(cls, f"its process ended by itself (exit code {exit_code})")
         self.exit_code = exit_code
         return self
 
 
-class Process(Protocol):
-    """A running process of a scene."""
+def end_with_parent() -> None:
+    """Ends this process soon after the one that started it: for processes that may be busy for long."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(PARENT_EVERY_S)
+        os._exit(0)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def use_one_thread() -> None:
+    """Keeps this process to one thread of Numba, OpenMP and BLAS: the other cores belong to the updates."""
+    import numba
+    from threadpoolctl import threadpool_limits
+
+    numba.set_num_threads(1)
+    threadpool_limits(1)  # scikit-learn's threads spin while they wait: 16 s for a part query on busy cores
+
+
+class Process:
+    """A running process of a scene. Two threads move its messages, so that the event loop never waits on a pipe."""
+
+    def __init__(
+        self,
+        entry: Entry,
+        spec: Any,
+        on_message: Callable[[Any], None],
+        on_end: Callable[[Ended], None],
+        prepare: Callable[[], None] | None = None,
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._on_message = on_message
+        self._on_end = on_end
+        self._stopping = False
+        self._reaping = threading.Lock()  # two threads that wait for one process confuse multiprocessing
+        self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._connection, theirs = _context.Pipe()
+        self._process = _context.Process(target=_run, args=(prepare, entry, spec, theirs), daemon=True)
+        # Starting takes some 20 ms and blocks; it is done on the event loop, once a scene.
+        self._process.start()
+        theirs.close()
+        self._threads = [
+            threading.Thread(target=self._write, args=(self._connection,), daemon=True),
+            threading.Thread(target=self._read, args=(self._connection,), daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def pid(self) -> int | None:
+        """The process id of the operating system."""
+        return self._process.pid
 
     def send(self, message: Any) -> None:
         """Posts a message and returns at once; messages to a process that has ended are dropped."""
+        self._outbox.put(message)
 
-    async def stop(self, seconds: float) -> None:
-        """Asks it to end, waits, then ends it."""
+    async def stop(self, seconds: float = STOP_SECONDS) -> None:
+        """Asks the process to end, waits for `seconds`, then kills it."""
+        self._stopping = True
+        self.send(Stop())
+        await asyncio.to_thread(self._join, seconds)
+
+    def _join(self, seconds: float) -> None:
+        with self._reaping:
+            self._process.join(seconds)
+            if self._process.is_alive():
+                self._process.kill()
+                self._process.join()
+        self._outbox.put(None)
+        for thread in self._threads:
+            thread.join()
+        self._connection.close()
+        self._process.close()
+
+    def _write(self, connection: Connection[Any, Any]) -> None:
+        while (message := self._outbox.get()) is not None:
+            with contextlib.suppress(OSError):  # it has ended: the reading thread says so
+                connection.send(message)
+
+    def _read(self, connection: Connection[Any, Any]) -> None:
+        while True:
+            try:
+                message = connection.recv()
+            except (EOFError, OSError):
+                break
+            self._call(self._on_message, message)
+        if self._stopping:
+            return
+        with self._reaping:
+            self._process.join()
+            code = self._process.exitcode
+        self._outbox.put(None)  # stop may never be called: the other thread ends with the process
+        self._call(self._on_end, Ended(code))
+
+    def _call(self, function: Callable[[Any], None], argument: Any) -> None:
+        with contextlib.suppress(RuntimeError):  # the event loop has closed
+            self._loop.call_soon_threadsafe(function, argument)
 
 
-class Placement(Protocol):
-    """Starts processes."""
+def _run(prepare: Callable[[], None] | None, entry: Entry, spec: Any, connection: Connection[Any, Any]) -> None:
+    if prepare is not None:
+        prepare()
+    entry(spec, connection)
+
+
+class Placement:
+    """Runs every process of every scene on this machine.
+
+    Args:
+        prepare: called first in every process, before its entry imports the core; it has to pickle. The service sets up
+            its logs with it, and tests put a fake in place of the core.
+    """
+
+    def __init__(self, prepare: Callable[[], None] | None = None) -> None:
+        self.prepare = prepare
 
     def start(
         self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[Ended], None]
     ) -> Process:
-        """Starts a process.
+        """Spawns a process.
 
         Args:
-            entry: what runs there; a module-level function.
-            spec: its first argument; has to pickle.
-            on_message: called on the event loop with every message it sends.
-            on_end: called on the event loop once, with the reason, when it has ended without being asked to.
+            entry: the module-level function that runs there.
+            spec: its first argument; it has to pickle.
+            on_message: called on the event loop with every message that the process sends.
+            on_end: called on the event loop once, with the reason, when the process ended without being asked to.
         """
+        return Process(entry, spec, on_message, on_end, self.prepare)

@@ -1,15 +1,16 @@
-"""The processes of a scene that answer from what is committed, and the queues before them.
+"""Answers queries about the committed states of a scene: its two reader processes and the queues before them.
 
 Views have a process of their own: a track query over a long history, or a search for parts, never stands before them.
-That other process starts with the first such question, runs at a lower priority, and is ended where nobody waits for
-what it is busy with any more: nothing in it can be interrupted in any other way, and it holds nothing that is not on
-disk. A process that ends by itself is started again, each time after a longer pause.
+That other process starts with its first query, runs at a lower priority, and is ended when its query was cancelled:
+nothing in it can be interrupted in any other way, and it holds nothing that is not on disk. A process that ends by
+itself is started again, each time after a longer pause.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -19,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.health import metrics
-from server.problems import Problem, counted
+from server.problems import SERVICE_FAULT, Problem, counted
 from server.processes import renderer, track_answers
 from server.processes.messages import (
     Answer,
-    Ask,
+    AskedQuery,
     Damaged,
     LabelsQuery,
     PartsQuery,
@@ -35,15 +36,25 @@ from server.processes.messages import (
     TracksQuery,
 )
 from server.processes.placement import Entry, Placement, Process
-from server.settings import ServerSettings
 
 GRACE_VIEWS_S, GRACE_BULK_S = 10.0, 1.0
-"""How long a process may go on with a question that nobody waits for any more. Views are short, and a new process takes
-a second or two to start."""
+"""A process may go on for so long with a query that was cancelled. Views are short, and a new process takes a second or
+two to start."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
-"""Before a process that ended by itself is started again; twice as long after each further end without an answer."""
+"""Pause before a process that ended by itself is started again; it doubles with each end without an answer."""
+MOST_WAITING = 64
+"""Queries before a process; more get 503. Beyond a second or two of views, waiting only makes it worse."""
+ANSWER_SECONDS = 120.0
+"""A query that takes longer gets 503: the longest that is let in takes about half of it."""
 COUNTS_KEPT = 8
 """Numbers of parts whose labels are kept."""
+
+REMEDIES = {
+    404: "ask for a frame that the scene's status counts as committed",
+    500: SERVICE_FAULT,
+    503: "ask again later",
+}
+"""Remedies by the status of an answer, where the process says none."""
 
 Noticed = Callable[[Mapping[str, str]], None]
 """Told of files of the states' folder that cannot be read, by name with the reason."""
@@ -52,30 +63,33 @@ log = logging.getLogger("scas4d.server")
 
 
 @dataclass(eq=False)
-class _Turn:
-    """A question and who waits for its answer."""
+class _WaitingQuery:
+    """A query and the future of its answer."""
 
     number: int
     query: Query
     answer: asyncio.Future[Answer | Refused]
 
+    def end(self, answer: Answer | Refused) -> None:
+        if not self.answer.done():
+            self.answer.set_result(answer)
 
-class Line:
-    """A process and the queue before it. One question is with the process; whoever leaves the queue is never begun.
+
+class QueryQueue:
+    """A reader process and the queue before it. The process has one query at a time; cancelled ones are never started.
 
     Args:
-        entry: what runs in the process. eager: start it now, not with the first question.
-        grace: seconds, see above. damaged: told of files that the process found damaged.
+        entry: what runs in the process. eager: start it now, not with the first query.
+        grace: seconds, see above. damaged: called with the files that the process found damaged.
 
     Attributes:
-        process: or None, before the first question and while it rests.
+        process: or None, before the first query and while it rests.
     """
 
     def __init__(
         self,
         entry: Entry,
         spec: SceneSpec,
-        server: ServerSettings,
         placement: Placement,
         *,
         eager: bool,
@@ -84,12 +98,11 @@ class Line:
     ) -> None:
         self._entry = entry
         self._spec = spec
-        self._server = server
         self._placement = placement
         self._grace = grace
         self._damaged = damaged
-        self._waiting: deque[_Turn] = deque()
-        self._at_work: _Turn | None = None
+        self._waiting: deque[_WaitingQuery] = deque()
+        self._at_work: _WaitingQuery | None = None
         self.process: Process | None = None
         self._life: object = None
         self._ending: set[asyncio.Task[None]] = set()
@@ -101,34 +114,34 @@ class Line:
             self._start()
 
     async def ask(self, query: Query) -> Answer | Refused:
-        """Waits for a turn and for the answer.
+        """Queues a query and returns its answer.
 
         Raises:
             Problem: 503, too many wait, or no answer within the time that the service allows.
         """
-        if len(self._waiting) >= self._server.waiting_questions:
+        if len(self._waiting) >= MOST_WAITING:
             raise Problem(
                 503,
                 f"{counted(len(self._waiting), 'question')} of this scene waiting for an answer already",
-                field="SCAS4D_WAITING_QUESTIONS",
-                value=self._server.waiting_questions,
+                field="id",
+                value=self._spec.folder.name,
                 remedy="ask less often, or subscribe (WS …/stream): it sends the newest only",
                 headers={"Retry-After": "1"},
             )
         if self._closed:
             return Refused(0, "the scene has ended", status=503)
         self._asked += 1
-        turn = _Turn(self._asked, query, asyncio.get_running_loop().create_future())
+        turn = _WaitingQuery(self._asked, query, asyncio.get_running_loop().create_future())
         self._waiting.append(turn)
         self._next()
         try:
-            return await asyncio.wait_for(turn.answer, self._server.answer_seconds)
+            return await asyncio.wait_for(turn.answer, ANSWER_SECONDS)
         except TimeoutError:
             raise Problem(
                 503,
-                f"no answer within {self._server.answer_seconds:g} s",
-                field="SCAS4D_ANSWER_SECONDS",
-                value=self._server.answer_seconds,
+                f"no answer within {ANSWER_SECONDS:g} s",
+                field="id",
+                value=self._spec.folder.name,
                 remedy="ask for less at once, or again later",
                 headers={"Retry-After": "5"},
             ) from None
@@ -139,12 +152,12 @@ class Line:
                 asyncio.get_running_loop().call_later(self._grace, self._give_up, turn)
 
     def refresh(self, frames: tuple[int, ...] | None) -> None:
-        """There is more to read, or less."""
+        """Tells the process that frames were committed, deleted or taken back."""
         if self.process is not None:
             self.process.send(Refresh(frames))
 
-    async def stop(self, seconds: float) -> None:
-        """Ends the process, at once where it is busy; whoever waits is refused, and whoever asks later."""
+    async def stop(self) -> None:
+        """Ends the process, at once if it is busy; queries that wait, and later ones, are refused."""
         self._closed = True
         if self._pause is not None:
             self._pause.cancel()
@@ -152,10 +165,10 @@ class Line:
         process, self.process = self.process, None
         busy, self._at_work = self._at_work is not None, None
         if process is not None:
-            await process.stop(0 if busy else seconds)
+            await (process.stop(0) if busy else process.stop())
         await asyncio.gather(*self._ending)
         for turn in turns:
-            _answer(turn, Refused(turn.number, "the scene has ended", status=503))
+            turn.end(Refused(turn.number, "the scene has ended", status=503))
 
     def _start(self) -> None:
         self._life = life = object()
@@ -163,14 +176,14 @@ class Line:
         self.process = self._placement.start(self._entry, self._spec, self._answered, ended)
 
     def _next(self) -> None:
-        """Gives the process the next question, where it is free."""
+        """Gives the process the next query, if it is free."""
         if self._at_work is not None or self._pause is not None or self._closed or not self._waiting:
             return
         if self.process is None:
             self._start()
         assert self.process is not None
         self._at_work = self._waiting.popleft()
-        self.process.send(Ask(self._at_work.number, self._at_work.query))
+        self.process.send(AskedQuery(self._at_work.number, self._at_work.query))
 
     def _answered(self, message: Answer | Refused | Damaged) -> None:
         if isinstance(message, Damaged):
@@ -181,17 +194,14 @@ class Line:
             return
         self._failures = 0
         self._at_work = None
-        _answer(turn, message)
+        turn.end(message)
         self._next()
 
-    def _give_up(self, turn: _Turn) -> None:
-        """Ends the process if it is still busy with what nobody waits for."""
+    def _give_up(self, turn: _WaitingQuery) -> None:
+        """Ends the process if it is still busy with a cancelled query."""
         if self._at_work is not turn or self.process is None:
             return
-        log.warning(
-            "scene %s: nobody waits for %s any more; its reader starts anew",
-            self._spec.folder.name, type(turn.query).__name__,
-        )  # fmt: skip
+        log.warning("scene %s: a %s query was cancelled; its reader restarts", self._spec.folder.name, turn.query.kind)
         task = asyncio.ensure_future(self.process.stop(0))
         self._ending.add(task)
         task.add_done_callback(self._ending.discard)
@@ -207,8 +217,7 @@ class Line:
         self._failures += 1
         log.error("scene %s: a reader is gone (%s); the next in %g s", self._spec.folder.name, reason, pause)
         if turn is not None:
-            detail = f"the reader ended while it was busy with this: {reason}"
-            _answer(turn, Refused(turn.number, detail, status=500))
+            turn.end(Refused(turn.number, f"the reader ended while it was busy with this: {reason}", status=500))
         self._pause = asyncio.get_running_loop().call_later(pause, self._go_on)
 
     def _go_on(self) -> None:
@@ -216,17 +225,12 @@ class Line:
         self._next()
 
 
-def _answer(turn: _Turn, answer: Answer | Refused) -> None:
-    if not turn.answer.done():
-        turn.answer.set_result(answer)
-
-
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """Parts as they were found from the frames up to one.
+    """Part labels, computed from the frames up to one.
 
     Attributes:
-        commits: how many commits the reader had been told of. frame: the last one read, as text.
+        commits: commits that the reader knew of. frame: the last one read, as text.
     """
 
     commits: int
@@ -235,15 +239,15 @@ class Labels:
 
 
 class Readers:
-    """All that answers questions about a scene's committed frames.
+    """Answers queries about a scene's committed frames.
 
     Attributes:
         views, bulk: the two processes.
     """
 
-    def __init__(self, spec: SceneSpec, server: ServerSettings, placement: Placement, damaged: Noticed) -> None:
+    def __init__(self, spec: SceneSpec, placement: Placement, damaged: Noticed) -> None:
         self._spec = spec
-        of_all = partial(Line, spec=spec, server=server, placement=placement, damaged=damaged)
+        of_all = partial(QueryQueue, spec=spec, placement=placement, damaged=damaged)
         self.views = of_all(renderer.views, eager=True, grace=GRACE_VIEWS_S)
         self.bulk = of_all(renderer.bulk, eager=False, grace=GRACE_BULK_S)
         self._commits = 0
@@ -251,12 +255,20 @@ class Readers:
         self._finding: dict[int | None, asyncio.Task[Labels]] = {}
 
     async def ask(self, query: Query) -> Answer:
-        """The answer to a question. If the asker is cancelled, so is the question.
+        """Returns the answer to a query; cancelling this cancels the query.
 
         Raises:
-            Problem: 4xx where the question cannot be answered, 503 where it takes too long or too many wait, 500 for a
-                fault of the reader.
+            Problem: 4xx, it cannot be answered; 503, it takes too long or too many wait; 500, a fault of the reader.
         """
+        began, outcome = time.perf_counter(), "failed"
+        try:
+            answer = await self._answer(query)
+            outcome = "answered"
+            return answer
+        finally:
+            metrics.ANSWER_SECONDS.labels(query.kind, outcome).observe(time.perf_counter() - began)
+
+    async def _answer(self, query: Query) -> Answer:
         if isinstance(query, TracksQuery):
             return await self._tracks(query)
         if not isinstance(query, RenderQuery):
@@ -268,19 +280,19 @@ class Readers:
         return replace(answer, headers={**answer.headers, "X-Parts-Frame": labels.frame})
 
     def refresh(self, frames: tuple[int, ...] | None = None) -> None:
-        """Frames were committed, deleted or taken back: these, or any where not told."""
+        """Tells the processes that frames were committed, deleted or taken back: these, or any of them for None."""
         self._commits += 1
         self.views.refresh(frames)
         self.bulk.refresh(frames)
 
-    async def stop(self, seconds: float) -> None:
-        """Ends the processes; whoever waits is refused."""
+    async def stop(self) -> None:
+        """Ends the processes; queries that wait are refused."""
         for task in self._finding.values():
             task.cancel()
-        await asyncio.gather(self.views.stop(seconds), self.bulk.stop(seconds))
+        await asyncio.gather(self.views.stop(), self.bulk.stop())
 
     async def _tracks(self, query: TracksQuery) -> Answer:
-        """Trajectories; a long question in pieces, so that others come in between."""
+        """Answers a track query; a long one in pieces, so that others come in between."""
         pieces = track_answers.pieces(query)
         if len(pieces) * len(pieces[0]) == 1:
             return _checked(await self.bulk.ask(query), query)
@@ -288,7 +300,7 @@ class Readers:
         return Answer(0, *await asyncio.to_thread(track_answers.together, answers, query, self._spec))
 
     async def _labels_of(self, count: int | None) -> Labels:
-        """The labels for a view: never waited for but the first time, then those found last.
+        """Returns the part labels for a view; only the first call waits, later ones get the labels found last.
 
         They are found from the whole history, which takes longer than a view. After a commit they are found anew while
         views go on with those before.
@@ -322,20 +334,15 @@ def _checked(answer: Answer | Refused, query: Query) -> Answer:
     if isinstance(answer, Answer):
         return answer
     if answer.status != 422:
-        remedies = {404: "ask for a frame that the scene's status counts as committed", 503: "ask again later"}
-        remedy = remedies.get(answer.status, "this is a fault of the service; its log has the traceback")
-        raise Problem(
-            answer.status, answer.detail, remedy=remedy, headers={"Retry-After": "1"} if answer.status == 503 else None
-        )
+        remedy = answer.remedy or REMEDIES[answer.status]
+        headers = {"Retry-After": "1"} if answer.status == 503 else None
+        raise Problem(answer.status, answer.fault, remedy=remedy, headers=headers)
     field, value = _asked(query)
-    fault, _, remedy = answer.detail.rpartition("; ")
-    raise Problem(
-        422, fault or answer.detail, field=field, value=value, remedy=remedy if fault else f"give another {field}"
-    )
+    raise Problem(422, answer.fault, field=field, value=value, remedy=answer.remedy or f"give another {field}")
 
 
 def _asked(query: Query) -> tuple[str, object]:
-    """What of a question the reader can find wrong that the door cannot: its field and value."""
+    """Returns field and value of the part of a query that only the reader can check."""
     if isinstance(query, TracksQuery):
         return ("ids", list(query.ids)) if query.ids is not None else ("at", query.at)
     if isinstance(query, LabelsQuery | PartsQuery):

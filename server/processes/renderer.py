@@ -1,28 +1,32 @@
-"""The processes that answer from committed states: views, and in another one tracks, parts, exports.
+"""The reader processes of a scene: one renders views, the other one answers tracks, parts and exports.
 
-Neither waits for an update; how questions come to them is told in ``readers``.
+Neither waits for an update; ``server.processes.readers`` queues their queries.
 """
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import signal
+from collections.abc import Mapping, Sequence
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
-from client.wire import parts_model
-from scas4d_core.errors import message_of
+from client.wire import part_colour, parts_model
+from scas4d_core.cameras import rig_inside
+from scas4d_core.errors import InputError, message_of, without_paths
+from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.storage.frame_files import frame_file
 from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFrameError
-from server.processes import encode, track_answers
-from server.processes.engine import Reader, load_engine
+from server.processes import track_answers
 from server.processes.messages import (
     Answer,
-    Ask,
+    AskedQuery,
     Damaged,
     LabelsQuery,
     PartsQuery,
@@ -36,6 +40,15 @@ from server.processes.messages import (
     TracksQuery,
 )
 from server.processes.part_labels import PartLabels
+from server.processes.placement import use_one_thread
+
+if TYPE_CHECKING:
+    from scas4d_core.query.committed import CommittedScene, View
+
+FLOAT32 = "application/octet-stream"
+QUALITY = 92
+"""Quality of JPEG and WebP, 1…100, if the query names none."""
+CHANNELS = {"colour": ("red", "green", "blue"), "depth": ("depth",), "alpha": ("alpha",), "parts": ("parts",)}
 
 BULK_NICE = 10
 """Added to the niceness of the process for tracks, parts and exports: views and updates go ahead of them."""
@@ -47,12 +60,12 @@ log = logging.getLogger("scas4d.renderer")
 
 
 def views(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
-    """The process for views. Runs until told to stop, or until the service is gone."""
+    """Runs the process for views until it is asked to stop, or until the service is gone."""
     _serve(spec, connection)
 
 
 def bulk(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
-    """The process for all that may take long."""
+    """Runs the process for queries that may take long."""
     os.nice(BULK_NICE)
     _serve(spec, connection)
 
@@ -69,9 +82,9 @@ def _serve(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
             break
         if isinstance(message, Refresh):
             renderer.changed(message.frames)
-        elif isinstance(message, Ask):
+        elif isinstance(message, AskedQuery):
             answer = renderer.answer(message)
-            if found := renderer.take_faults():  # before whoever was refused asks again
+            if found := renderer.take_faults():  # before a refused query is asked again
                 connection.send(Damaged(found))
             connection.send(answer)
     logging.shutdown()
@@ -79,19 +92,18 @@ def _serve(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
 
 
 class Renderer:
-    """Answers queries one after the other."""
+    """Answers queries about committed states, one after the other."""
 
     def __init__(self, spec: SceneSpec) -> None:
         self.spec = spec
-        self.engine = load_engine(spec.engine)
         self._stale: set[int] | None = set()
         self._history: History | None = None
-        self._reader: Reader | None = None
+        self._reader: CommittedScene | None = None
         self._parts = PartLabels(spec.folder.parts)
 
     @property
     def history(self) -> History:
-        """What is committed now: opened once, then kept up to date by what is new in its folder."""
+        """The committed states: opened once, then refreshed with the files that are new in their folder."""
         if self._history is None:
             self._history = History.load(self.spec.folder.states)
         elif self._stale is None or self._stale:
@@ -100,27 +112,33 @@ class Renderer:
         return self._history
 
     def changed(self, frames: tuple[int, ...] | None) -> None:
-        """These frames were committed, deleted or taken back since; None: any may have been."""
+        """Notes frames that were committed, deleted or taken back; None: any may have been."""
         self._stale = None if frames is None or self._stale is None else self._stale | set(frames)
 
     @property
-    def reader(self) -> Reader:
-        """The engine's reader of all that is committed."""
+    def reader(self) -> CommittedScene:
+        """The views, tracks and parts of all that is committed. The core is imported here, not in the service."""
         history = self.history
         if self._reader is None:
-            self._reader = self.engine.reader(self.spec.rig, self.spec.settings, history)
+            from scas4d_core.query.committed import CommittedScene
+
+            use_one_thread()
+            settings, rig = self.spec.settings.scene, self.spec.rig
+            world = rig.world_frame(settings.metres_per_unit)
+            limits = scene_limits(settings.near, rig_inside(world, rig.cameras).radius)
+            self._reader = CommittedScene(history, world, limits)
         return self._reader
 
     def labels(self, count: int | None) -> NDArray[np.int64]:
-        """Part labels, found once for what is committed now."""
+        """Returns [N] part labels from all committed states."""
         return self._parts.of(self.reader, self.history, count)
 
     def take_faults(self) -> dict[str, str]:
-        """Files that were found damaged or gone since this was asked last, by name with the reason."""
+        """Returns files that were found damaged or gone since the last call, by name with the reason."""
         return {} if self._history is None else self._history.take_faults()
 
     def _note_missing(self, query: Query) -> None:
-        """Frames that the service takes for committed and that are not here: it knows whether they were deleted."""
+        """Notes frames that the service takes for committed and that are missing; it knows if they were deleted."""
         frames = query.frames if isinstance(query, TracksQuery) else (getattr(query, "frame", None),)
         history = self._history
         if history is not None and history.files is not None:
@@ -129,9 +147,9 @@ class Renderer:
                 if index is not None and index not in known:
                     history.files.faults.setdefault(frame_file(index), f"{frame_file(index)} is gone")
 
-    def answer(self, ask: Ask) -> Answer | Refused:
-        """The encoded answer, or why there is none."""
-        asked = type(ask.query).__name__
+    def answer(self, ask: AskedQuery) -> Answer | Refused:
+        """Returns the encoded answer, or the reason for a refusal."""
+        asked = f"{ask.query.kind} query"
         for more in range(DAMAGED_AT_ONCE, -1, -1):
             try:
                 return self._answer(ask.number, ask.query)
@@ -139,11 +157,14 @@ class Renderer:
                 log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
                 if more and isinstance(ask.query, PartsQuery | LabelsQuery):  # found from all others
                     continue
-                return Refused(ask.number, f"{message_of(error)}; it is mended if it can be", status=503)
-            except UnreadableFrameError as error:  # deleted since the door looked
+                return Refused(ask.number, message_of(error), "ask again later: it is mended if it can be", status=503)
+            except UnreadableFrameError as error:  # deleted since the service checked
                 log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
                 self._note_missing(ask.query)
                 return Refused(ask.number, message_of(error), status=404)
+            except InputError as error:
+                log.warning("scene %s refused %s: %s", self.spec.folder.name, asked, error)
+                return Refused(ask.number, without_paths(error.fault), without_paths(error.remedy))
             except ValueError as error:
                 log.warning("scene %s refused %s: %s", self.spec.folder.name, asked, error)
                 return Refused(ask.number, message_of(error))
@@ -156,7 +177,7 @@ class Renderer:
         match query:
             case RenderQuery():
                 view = self.reader.render(query.camera, query.frame, background=query.background, labels=query.labels)
-                body, media_type, headers = encode.view(view, query.kinds, query.format, query.quality)
+                body, media_type, headers = encode_view(view, query.kinds, query.format, query.quality)
                 return Answer(number, body, media_type, {**headers, "X-Frame": str(query.frame)})
             case TracksQuery():
                 found = track_answers.find(self.reader, self.history, query)
@@ -174,3 +195,65 @@ class Renderer:
                 file = self.spec.folder.export
                 self.reader.write_ply(file, query.frame)
                 return Answer(number, file.read_bytes(), "application/octet-stream")
+
+
+def float32(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, str]]:
+    """Joins arrays [H, W] or [H, W, 3] in the last axis, as little-endian float32; returns them with their headers.
+
+    X-Shape is "H,W,C", X-Channels names the C channels, X-Dtype is "<f4". Rows from the top, C fastest.
+    """
+    names = [channel for kind in arrays for channel in CHANNELS[kind]]
+    stack = np.concatenate([array[..., None] if array.ndim == 2 else array for array in arrays.values()], axis=-1)
+    body = np.ascontiguousarray(stack, "<f4")
+    headers = {"X-Shape": ",".join(map(str, body.shape)), "X-Channels": ",".join(names), "X-Dtype": "<f4"}
+    return body.tobytes(), headers
+
+
+def encode_view(
+    view: View, kinds: Sequence[str], format: str, quality: int | None = None
+) -> tuple[bytes, str, dict[str, str]]:
+    """Encodes a view: returns body, media type and headers. The route has checked that a picture holds one kind.
+
+    Args:
+        view: the rendered arrays. kinds: those to encode.
+        format: png, jpeg, webp, npz or float32.
+        quality: 1…100, of JPEG and WebP.
+    """
+    arrays: dict[str, Any] = {kind: getattr(view, kind) for kind in kinds}
+    if format == "npz":
+        return track_answers.npz(arrays), track_answers.NPZ, {}
+    if format == "float32":
+        body, headers = float32(arrays)
+        return body, FLOAT32, headers
+    picture, headers = _picture(kinds[0], arrays[kinds[0]])
+    file = io.BytesIO()
+    if format == "jpeg":
+        picture.save(file, "JPEG", quality=quality or QUALITY, subsampling=0)
+    elif format == "webp":
+        # A live view: fast rather than small (method 0 takes a third of the time of the default).
+        picture.save(file, "WEBP", quality=quality or QUALITY, method=0)
+    else:
+        picture.save(file, "PNG", compress_level=1)
+    return file.getvalue(), f"image/{format}", headers
+
+
+def part_colours() -> list[int]:
+    """Returns a palette, 256 × RGB: 0 is black, then the colour of each label."""
+    return [0, 0, 0, *(channel for label in range(255) for channel in part_colour(label))]
+
+
+_PART_COLOURS = part_colours()
+
+
+def _picture(kind: str, array: NDArray[Any]) -> tuple[Image.Image, dict[str, str]]:
+    if kind == "depth":
+        met = np.isfinite(array)
+        near, far = (float(array[met].min()), float(array[met].max())) if met.any() else (0.0, 0.0)
+        steps = 1 + np.rint(65534 * (np.where(met, array, near) - near) / max(far - near, 1e-12))
+        levels = np.where(met, steps, 0).astype(np.uint16)
+        return Image.fromarray(levels), {"X-Depth-Near": repr(near), "X-Depth-Far": repr(far)}
+    if kind == "parts":
+        labels = Image.fromarray(array)  # pixels are the labels, and a browser shows their colours
+        labels.putpalette(_PART_COLOURS)
+        return labels, {}
+    return Image.fromarray(np.rint(255 * np.clip(array, 0, 1)).astype(np.uint8)), {}

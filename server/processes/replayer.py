@@ -1,4 +1,4 @@
-"""The process that updates a scene's last frames again, to measure other budgets; the scene's own worker goes first."""
+"""The replay process: updates a scene's last frames again, to measure other budgets, at a low priority."""
 
 from __future__ import annotations
 
@@ -13,33 +13,32 @@ from typing import Any
 from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History
 from server.processes.decoding import decode, read
-from server.processes.engine import load_engine
 from server.processes.messages import Damaged, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
-from server.processes.worker import end_with_parent
+from server.processes.placement import end_with_parent, use_one_thread
 
 NICE = 15
 """Added to its niceness: of a core that it shares with a scene's worker it gets about a tenth."""
 THREADS = 1
-"""That a replay runs on (`Engine.replay`)."""
+"""A replay runs on so many: the others belong to the update."""
 
 log = logging.getLogger("scas4d.replayer")
 
 
 def main(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
-    """Runs once through; the service ends it where nobody wants its answer any more."""
+    """Runs one replay; the service ends the process when its answer is not wanted any more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(NICE)
     end_with_parent()
     fault: str | None = None
     try:
         _replay(spec, connection)
-    except Exception as error:  # whatever the engine raises, the service goes on and says so
+    except Exception as error:  # whatever the core raises, the service goes on and says so
         log.exception("scene %s: the replay failed", spec.scene.folder.name)
         fault = f"{type(error).__name__}: {message_of(error)}"
     with contextlib.suppress(EOFError, OSError):  # the service is gone
         connection.send(ReplayEnded(fault))
         logging.shutdown()
-        connection.recv()  # until it is told to stop: an end of its own would be taken for a fault
+        connection.recv()  # until it is asked to stop: an end of its own would be taken for a fault
     os._exit(0)
 
 
@@ -54,9 +53,15 @@ def _replay(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
     finally:
         if faults := history.take_faults():
             connection.send(Damaged(faults))
-    engine = load_engine(scene.engine)
+    from scas4d_core.replay import replay  # in this process only: the one that imports this module stays light
+    from scas4d_core.warm_up import warm_up_elsewhere
+
+    if scene.settings.device == "cpu":
+        warm_up_elsewhere()
+
+    use_one_thread()
     for iterations in spec.iterations:
-        found = engine.replay(
+        found = replay(
             scene.rig, scene.settings, history, spec.base, frames, iterations, lambda: connection.send(ReplayUpdated())
         )
         connection.send(ReplayPoint(iterations, found.milliseconds, found.error, found.psnr, found.frames))

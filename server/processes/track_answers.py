@@ -1,16 +1,16 @@
-"""Trajectories as the bytes of an answer, and long questions cut into short ones.
+"""Encodes trajectories, and cuts long track queries into short ones.
 
-A reader answers one question after the other; a long one is asked in pieces, so that others come in between, and put
-together again. docs/tracks.md has the layout of the npz.
+A reader answers one query after the other. A long one is asked in pieces, so that others come in between, and the
+answers are joined. docs/tracks.md has the layout of the npz.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +19,14 @@ from client.wire import tracks_model
 from scas4d_core.cameras import Camera
 from scas4d_core.query.tapvid3d import tapvid3d
 from scas4d_core.storage.history import History
-from server.processes import encode
-from server.processes.engine import Reader
 from server.processes.messages import SceneSpec, TracksQuery
 
+if TYPE_CHECKING:
+    from scas4d_core.query.committed import CommittedScene
+
 Arrays = dict[str, NDArray[Any]]
+
+NPZ = "application/vnd.numpy.npz"
 
 PIECE_QUERIES = 2048
 """Points of one piece: some 0.3 s to find what carries them among 25,000 Gaussians."""
@@ -33,20 +36,27 @@ PIECE_VIEWS = 64
 """Depth pictures of one piece, one a frame and camera in which visibility is asked: some 1 s at 256×256."""
 
 
+def npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """Writes arrays as npz, without pickle."""
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **arrays)
+    return file.getvalue()
+
+
 def metres_per_unit(spec: SceneSpec) -> float:
-    """Metres in a unit of the scene's world."""
+    """Returns the metres in a unit of the scene's world."""
     return spec.rig.world_frame(spec.settings.scene.metres_per_unit).metres_per_unit
 
 
 def cameras_of(query: TracksQuery) -> list[Camera]:
-    """The cameras in which pixels and visibility are told: those asked for and, first, that of the query's pixels."""
+    """Returns the cameras with pixels and visibility: that of the query's pixels, then those asked for."""
     own = [query.camera] if query.pixels is not None and query.camera is not None else []
     names = [camera.name for camera in own]
     return own + [camera for camera in query.project if camera.name not in names]
 
 
-def find(reader: Reader, history: History, query: TracksQuery) -> Arrays:
-    """What a reader finds: ``tracks_world`` [T, Q, 3], ``confidence`` [T, Q] and more, as docs/tracks.md has it."""
+def find(reader: CommittedScene, history: History, query: TracksQuery) -> Arrays:
+    """Computes trajectories: ``tracks_world`` [T, Q, 3], ``confidence`` [T, Q] and more, as in docs/tracks.md."""
     frames = list(query.frames)
     if query.ids is not None:
         tracks = reader.tracks_of_ids(np.array(query.ids, dtype=np.int64), frames)
@@ -69,12 +79,12 @@ def find(reader: Reader, history: History, query: TracksQuery) -> Arrays:
 
 
 def encoded(found: Arrays, query: TracksQuery, metres_per_unit: float) -> tuple[bytes, str]:
-    """Body and media type of the answer, in the format that the query asks for."""
+    """Returns body and media type of the answer, in the format that the query asks for."""
     cameras = cameras_of(query)
     pixels = {camera.name: camera.project(found["tracks_world"])[0] for camera in cameras}
     if query.format == "npz":
         arrays = found | {f"pixels.{name}": uv for name, uv in pixels.items()}
-        return encode.npz(arrays | _layout(found, query, cameras, metres_per_unit)), encode.NPZ
+        return npz(arrays | _layout(found, query, cameras, metres_per_unit)), NPZ
     asked = [camera.name for camera in query.project]
     model = tracks_model(
         found["frames"].tolist(),
@@ -89,7 +99,7 @@ def encoded(found: Arrays, query: TracksQuery, metres_per_unit: float) -> tuple[
 
 
 def _layout(found: Arrays, query: TracksQuery, cameras: Sequence[Camera], metres_per_unit: float) -> Arrays:
-    """The keys of TAPVid-3D, in the first camera; where none is named, the points alone, in the axes of the world."""
+    """Returns the keys of TAPVid-3D in the first camera; without cameras the points alone, in the axes of the world."""
     if not cameras:
         return {"tracks_XYZ": (found["tracks_world"] * metres_per_unit).astype(np.float32)}
     row = query.frames.index(query.at) if query.at in query.frames else -1
@@ -100,7 +110,7 @@ def _layout(found: Arrays, query: TracksQuery, cameras: Sequence[Camera], metres
 
 
 def pieces(query: TracksQuery) -> list[list[TracksQuery]]:
-    """The query cut by points, then by frames; a short one is one piece. Every piece is answered as npz."""
+    """Cuts a query by points, then by frames; a short one stays one piece. Every piece is answered as npz."""
     queries = next(value for value in (query.ids, query.pixels, query.points) if value is not None)
     frames = min(PIECE_POINTS // min(len(queries), PIECE_QUERIES), PIECE_VIEWS // max(1, len(cameras_of(query))))
     return [
@@ -113,7 +123,7 @@ def pieces(query: TracksQuery) -> list[list[TracksQuery]]:
 
 
 def joined(answers: Sequence[Sequence[bytes]]) -> Arrays:
-    """What the pieces found, put together: inner ones follow each other in time, outer ones hold more points."""
+    """Joins the answers of pieces: inner ones follow each other in time, outer ones hold more points."""
     rows = [_in_time([_found(body) for body in row]) for row in answers]
     once = ("frames", "times")
     return {
@@ -125,7 +135,7 @@ def joined(answers: Sequence[Sequence[bytes]]) -> Arrays:
 
 
 def together(answers: Sequence[Sequence[bytes]], query: TracksQuery, spec: SceneSpec) -> tuple[bytes, str]:
-    """Body and media type of the whole answer, from those of its pieces."""
+    """Joins the answers of pieces; returns body and media type of the whole answer."""
     return encoded(joined(answers), query, metres_per_unit(spec))
 
 
@@ -136,7 +146,7 @@ def _in_time(found: Sequence[Arrays]) -> Arrays:
 
 
 def _found(body: bytes) -> Arrays:
-    """What ``find`` found, out of an answer as npz."""
+    """Reads the arrays of ``find`` from an answer as npz."""
     names = ("tracks_world", "confidence", "ids", "frames", "times")
     with np.load(io.BytesIO(body), allow_pickle=False) as file:
         return {name: file[name] for name in file.files if name in names or name.startswith("visibility.")}

@@ -1,4 +1,4 @@
-"""The process that owns a scene's `Reconstruction`: takes it up again, decodes frames, steps, commits, reports."""
+"""The worker process owns a scene's `Reconstruction`: it resumes, decodes frames, updates, commits and reports."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import contextlib
 import logging
 import os
 import signal
-import threading
 import time
 from collections import deque
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from client.wire import Budget
 from scas4d_core.captures import Frame, InitialPoints
@@ -18,7 +17,6 @@ from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.storage.npz import read_npz
 from server.processes.decoding import decode, read
-from server.processes.engine import Reconstruction, load_engine
 from server.processes.messages import (
     Broken,
     FrameCommitted,
@@ -32,13 +30,16 @@ from server.processes.messages import (
     Stalled,
     Stop,
 )
+from server.processes.placement import end_with_parent
 from server.repair import repairs
 from server.repair.repairs import mend_at_start
 from server.storage.disk import FolderLock, no_room
 from server.storage.frame_store import FrameDamage, holds
 
+if TYPE_CHECKING:
+    from scas4d_core.reconstruction import Reconstruction
+
 PROGRESS_EVERY_S = 0.2
-PARENT_EVERY_S = 0.5
 NICE = 5
 """Added to the worker's niceness: requests and views go ahead of updates (docs/live-views.md: what that is worth)."""
 STALL_S, LONGEST_STALL_S = 1.0, 30.0
@@ -47,7 +48,7 @@ log = logging.getLogger("scas4d.worker")
 
 
 def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
-    """Runs until told to stop, or until the service is gone."""
+    """Runs the process until it is asked to stop, or until the service is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the service says when to stop
     os.nice(NICE)
     end_with_parent()
@@ -77,29 +78,16 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     os._exit(0)
 
 
-def end_with_parent() -> None:
-    """The process ends soon after the one that started it: for those that may be busy for long."""
-    parent = os.getppid()
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(PARENT_EVERY_S)
-        os._exit(0)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
 class _Stopped(Exception):
-    """Told to stop while waiting for room on the disk."""
+    """The worker was asked to stop while it waited for room on the disk."""
 
 
 class Worker:
-    """One scene. Every frame ends as `FrameCommitted` or `FrameFailed`, or with the process."""
+    """Updates one scene. Every frame ends as `FrameCommitted` or `FrameFailed`, or with the process."""
 
     def __init__(self, spec: SceneSpec, connection: Connection[Any, Any]) -> None:
         self.spec = spec
         self.connection = connection
-        self.engine = load_engine(spec.engine)
         self.states: History | None = None
         self.reconstruction: Reconstruction | None = None
         self._progress_at = 0.0
@@ -109,13 +97,16 @@ class Worker:
         self._later: deque[Any] = deque()
 
     def open(self) -> bool:
-        """Takes up what is committed and says so; False where it cannot be gone on from."""
+        """Resumes from the committed states and reports them; returns False if that cannot be done."""
         try:
             self.states = history = History.open(self.spec.folder.states)
             undone: tuple[int, ...] = ()
             faults: tuple[str, ...] = ()
             if history.indices:
-                self.reconstruction = self.engine.resume(
+                from scas4d_core.reconstruction import Reconstruction  # in this process only: the service stays light
+
+                self._warm_up()
+                self.reconstruction = Reconstruction.resume(
                     self.spec.rig, self.spec.settings, history, held=lambda index: holds(self.spec.folder.frames, index)
                 )
                 if self.reconstruction.resumed is not None:
@@ -131,7 +122,7 @@ class Worker:
         return True
 
     def take(self, message: FrameReady) -> None:
-        """Reconstructs one frame; where the disk is full, again until there is room."""
+        """Reconstructs one frame; while the disk is full, tries again until there is room."""
         stall = STALL_S
         while True:
             try:
@@ -149,14 +140,14 @@ class Worker:
             stall = min(2 * stall, LONGEST_STALL_S)
 
     def next(self) -> Any:
-        """The next message; those that came while a frame waited for room first."""
+        """Returns the next message; those that came while a frame waited for room go first."""
         return self._later.popleft() if self._later else self.connection.recv()
 
     def _await_room(self, seconds: float) -> None:
-        """Waits; only being told to stop ends it early, everything else is for later.
+        """Waits; only `Stop` ends this early, other messages are kept for later.
 
         Raises:
-            _Stopped: it was.
+            _Stopped: the service asked the worker to stop.
         """
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0 and self.connection.poll(left):
@@ -166,7 +157,7 @@ class Worker:
             self._later.append(message)
 
     def finish(self, message: FrameReady) -> FrameCommitted | FrameFailed:
-        """Commits a frame, or says why not.
+        """Commits a frame, or returns the reason to set it aside.
 
         Raises:
             OSError: the disk is full; nothing is committed.
@@ -182,7 +173,7 @@ class Worker:
             return self.reconstruct(frame, dropped, message.budget, began)
         except FrameDamage as error:
             return FrameFailed(message.index, f"its record in the frame log is damaged: {error}", dropped)
-        except Exception as error:  # whatever the engine raises, the service goes on and says so
+        except Exception as error:  # whatever the core raises, the service goes on and says so
             if no_room(error):
                 raise
             log.exception("scene %s, frame %d", self.spec.folder.name, message.index)
@@ -191,27 +182,30 @@ class Worker:
             return FrameFailed(message.index, f"{type(error).__name__}: {message_of(error)}", dropped, fatal=first)
 
     def mend(self, message: Mend) -> None:
-        """Looks at files that were found damaged, and says what came of each."""
+        """Checks files that were found damaged, and reports the outcome of each."""
         assert self.states is not None
         for mended in repairs.mend(self.states, self.reconstruction, message):
             self.connection.send(mended)
 
     def remake(self, message: Remake) -> None:
-        """Makes a state again from its pictures, and says whether it could be."""
+        """Computes a damaged state again from its pictures, and reports the outcome."""
         assert self.states is not None
         frame = message.frame
 
         def pictures() -> tuple[Frame, dict[str, str]]:
             return decode(self.spec.rig, frame, read(self.spec.folder.frames, frame))
 
-        for mended in repairs.remake(self.engine, self.spec, self.states, message, pictures):
+        for mended in repairs.remake(self.spec, self.states, message, pictures):
             self.connection.send(mended)
 
     def reconstruct(self, frame: Frame, dropped: dict[str, str], budget: Budget, began: float) -> FrameCommitted:
         """Runs the first frame or an update, and commits. `began`: `perf_counter` before decoding."""
         assert self.states is not None
         if self.reconstruction is None:
-            self.reconstruction = self.engine.start(
+            from scas4d_core.reconstruction import Reconstruction
+
+            self._warm_up()
+            self.reconstruction = Reconstruction.start(
                 self.spec.rig,
                 frame,
                 self.spec.settings,
@@ -237,8 +231,15 @@ class Worker:
         self._publish_seconds = time.perf_counter() - ended
         return FrameCommitted(frame.index, committed, tuple(self.retain()))
 
+    def _warm_up(self) -> None:
+        """Compiles the kernels in a process beside, if nobody has: this one would keep the compiler's memory."""
+        from scas4d_core.warm_up import warm_up_elsewhere
+
+        if self.spec.settings.device == "cpu":
+            warm_up_elsewhere()
+
     def retain(self) -> list[int]:
-        """Deletes old states by the scene's rule; what cannot be deleted now is next time."""
+        """Deletes old states by the scene's rule and returns their indices; failures are tried again next time."""
         assert self.states is not None
         rule = self.spec.keep_states
         if rule.last is None and rule.bytes is None:
@@ -247,14 +248,14 @@ class Worker:
         return self.states.retain(last=last, size_bytes=size)
 
     def points(self) -> InitialPoints | None:
-        """The initial cloud that was put before the first frame."""
+        """Reads the initial cloud, if one was put before the first frame."""
         if not self.spec.folder.points.exists():
             return None
         arrays = read_npz(self.spec.folder.points)
         return InitialPoints(arrays["positions"], arrays["colours"], arrays.get("foreground"))
 
     def progress(self, progress: Any) -> None:
-        """Passes progress on, a few times a second at most, and the end of a stage always."""
+        """Sends progress a few times a second at most, and always at the end of a stage."""
         now = time.monotonic()
         if now - self._progress_at >= PROGRESS_EVERY_S or progress.done >= progress.total:
             self._progress_at = now

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from scas4d_core.captures import Frame
 from scas4d_core.errors import message_of
@@ -19,9 +19,11 @@ from scas4d_core.storage.frame_files import (
     frame_of,
 )
 from scas4d_core.storage.history import NEWEST_KEPT, PER_FRAME, History
-from server.processes.engine import Engine, Reconstruction
 from server.processes.messages import Mend, Mended, MendOutcome, Remake, SceneSpec
 from server.storage.disk import no_room
+
+if TYPE_CHECKING:
+    from scas4d_core.reconstruction import Reconstruction
 
 Decode = Callable[[], tuple[Frame, dict[str, str]]]
 
@@ -29,7 +31,7 @@ log = logging.getLogger("scas4d.worker")
 
 
 def mend_at_start(history: History) -> list[str]:
-    """Writes `fixed.npz`, the first state and their copies again where damaged; returns a sentence for each."""
+    """What every frame needs, and its copies, written again where they are damaged; a sentence for each."""
     try:
         mended = history.mend_fixed()
     except OSError as error:  # states can be read all the same: a disk that takes nothing must not keep them away
@@ -44,7 +46,7 @@ def mend_at_start(history: History) -> list[str]:
 
 
 def mend(history: History, reconstruction: Reconstruction | None, message: Mend) -> Iterator[Mended]:
-    """Checks each file and writes it again, the same bits, where that is possible; yields an answer for each."""
+    """Looks at each file and writes it again where it can be, the same bits."""
     assert history.files is not None
     for name in message.names:
         try:
@@ -80,7 +82,7 @@ def _mend(
 
 
 def _written_in_part(history: History, files: FrameFiles, index: int, message: Mend) -> MendOutcome:
-    """Writes a file again of which only the report or the time is damaged, and the state is whole."""
+    """Writes a file again of which only the report or the time is damaged: the state is whole in it."""
     try:
         arrays = files.read(index, PER_FRAME)
         report = message.reports.get(index)
@@ -96,7 +98,7 @@ def _written_in_part(history: History, files: FrameFiles, index: int, message: M
 
 
 def _report_of(files: FrameFiles, index: int) -> dict[str, Any] | None:
-    """Reads the report of a frame, or None where it is damaged."""
+    """The report of a frame, where that is what is whole."""
     try:
         report: dict[str, Any] = json.loads(files.read(index, ("report",))["report"].tobytes())
     except (ValueError, FileNotFoundError):
@@ -104,8 +106,8 @@ def _report_of(files: FrameFiles, index: int) -> dict[str, Any] | None:
     return report
 
 
-def remake(engine: Engine, spec: SceneSpec, history: History, message: Remake, decode: Decode) -> Iterator[Mended]:
-    """Makes a state again from its pictures; the scene goes on as before in any case.
+def remake(spec: SceneSpec, history: History, message: Remake, decode: Decode) -> Iterator[Mended]:
+    """Makes a state again from its pictures; whatever comes of it, the scene goes on as before.
 
     Damage often has neighbours: where the state before it is damaged too, and nobody has noticed, that comes first.
     """
@@ -126,10 +128,12 @@ def remake(engine: Engine, spec: SceneSpec, history: History, message: Remake, d
                 case _:
                     yield Mended(name, MendOutcome.LOST, "the state before it is gone")
             return
-    yield _remade(engine, spec, history, message, decode)
+    yield _remade(spec, history, message, decode)
 
 
-def _remade(engine: Engine, spec: SceneSpec, history: History, message: Remake, decode: Decode) -> Mended:
+def _remade(spec: SceneSpec, history: History, message: Remake, decode: Decode) -> Mended:
+    from scas4d_core.remake import remake as remake_state  # in the worker only: the service stays light
+
     index = message.frame.index
     assert history.files is not None
     name = history.files.path(index).name
@@ -140,10 +144,10 @@ def _remade(engine: Engine, spec: SceneSpec, history: History, message: Remake, 
             return Mended(name, MendOutcome.LOST, reason)
         budget = message.frame.budget.model_dump()
         notes = {"budget": budget}
-        report = engine.remake(
+        report = remake_state(
             spec.rig, spec.settings, history, message.base, frame, budget, dropped=dropped, notes=notes
         )
         return Mended(name, MendOutcome.REMADE, report=report)
-    except Exception as error:  # whatever the engine raises, the service goes on and says so
+    except Exception as error:  # whatever the core raises, the service goes on and says so
         log.exception("scene %s, frame %d cannot be made again", spec.folder.name, index)
         return Mended(name, MendOutcome.NO_ROOM if no_room(error) else MendOutcome.LOST, message_of(error))

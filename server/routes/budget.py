@@ -1,4 +1,4 @@
-"""What the updates of a scene may cost."""
+"""Routes of the budget: the limits of a scene's updates."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ router = APIRouter(prefix="/v1/scenes", tags=["budget"])
 
 @router.get("/{id}/budget")
 async def get(scene: TheScene) -> SceneBudget:
-    """The budget of frames that are not begun."""
+    """Returns the budget of frames that are not begun."""
     return scene.budget()
 
 
 @router.put("/{id}/budget")
 async def put(scene: TheScene, budget: Budget) -> SceneBudget:
-    """Another budget from the first frame on that is not begun; what is null is as the scene was made.
+    """Sets the budget from the first frame on that is not begun; null takes the scene's own setting.
 
     It is on disk when this answers: after any end of the service each frame gets the budget that held for it.
     """

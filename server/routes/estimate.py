@@ -1,4 +1,4 @@
-"""What a scene would take."""
+"""Route of the estimate: memory and disk of a scene before it is made."""
 
 from __future__ import annotations
 
@@ -15,5 +15,5 @@ router = APIRouter(prefix="/v1/estimate", tags=["service"])
 
 @router.post("")
 async def of_scene(request: SceneCreate, server: TheSettings) -> SceneEstimate:
-    """Memory and disk that the scene would take; nothing is created. A scene above the limit is refused."""
+    """Estimates the memory and disk of a scene, and creates nothing. A scene above the limit cannot be created."""
     return estimate(request.rig, scene_settings(request), server)

@@ -1,4 +1,4 @@
-"""Frames in, and what became of them."""
+"""Routes of frames: upload, reports, export."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ from server.ingest.camera_files import receive_camera, receive_file, receive_for
 from server.ingest.receive import receive_frame
 from server.problems import Problem
 from server.processes.messages import PlyQuery
-from server.routes.access import FrameIndex, TheScene
-from server.routes.asking import ask
+from server.routes.access import FrameIndex, TheScene, ask
 
 router = APIRouter(prefix="/v1/scenes", tags=["frames"])
 
@@ -73,7 +72,7 @@ async def put(scene: TheScene, n: FrameIndex, request: Request) -> FrameReceipt:
         if kind == "multipart/form-data":
             return await receive_form(scene.ingest, n, request)
     except ClientDisconnect:
-        raise Problem(400, "the sender went away", field="body", remedy="send the frame again") from None
+        raise Problem(400, "the sender closed the connection", field="body", remedy="send the frame again") from None
     raise Problem(
         415,
         f"a frame is {FRAME_MEDIA_TYPE} or multipart/form-data",
@@ -104,7 +103,7 @@ async def put_camera(
             return await receive_camera(scene.open_frames, n, c, _body(request), _length(request))
         return await receive_file(scene.open_frames, n, c, kind, time, _body(request), _length(request))
     except ClientDisconnect:
-        raise Problem(400, "the sender went away", field="body", remedy="send the picture again") from None
+        raise Problem(400, "the sender closed the connection", field="body", remedy="send the picture again") from None
 
 
 @router.post("/{id}/frames/{n}/close", status_code=202)
@@ -124,7 +123,7 @@ async def missing(scene: TheScene, n: FrameIndex, request: MissingRequest | None
 
 @router.get("/{id}/frames/{n}")
 async def report(scene: TheScene, n: FrameIndex) -> FrameReportModel:
-    """Where the frame is, and its numbers once it is committed."""
+    """Returns the state of a frame, and its numbers once it is committed."""
     found = await scene.report(n)
     if found is None:
         raise Problem(
@@ -143,7 +142,7 @@ async def report(scene: TheScene, n: FrameIndex) -> FrameReportModel:
     responses={200: {"content": {"application/octet-stream": {}}, "description": "A 3DGS .ply."}},
 )
 async def ply(scene: TheScene, n: FrameIndex, request: Request) -> Response:
-    """The committed frame in the file format of 3D Gaussian Splatting."""
+    """Exports a committed frame in the file format of 3D Gaussian Splatting."""
     answer = await ask(request, scene, PlyQuery(scene.committed_frame(n, "n")))
     return Response(answer.body, media_type=answer.media_type)
 
@@ -157,6 +156,6 @@ def _body(request: Request) -> AsyncIterator[bytes]:
 
 
 def _length(request: Request) -> int | None:
-    """Announced bytes of the body; the server has made sure that it is a number."""
+    """Returns the announced bytes of the body; the connection has checked that it is a number."""
     length = request.headers.get("content-length")
     return None if length is None or not length.isdigit() else int(length)

@@ -1,4 +1,4 @@
-"""Is the service there, and can it work?"""
+"""Routes of health: the process answers, and the service is ready."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ router = APIRouter(prefix="/health", tags=["service"])
 
 @router.get("/live")
 async def live(scenes: AllScenes) -> Health:
-    """The process answers. The only request that never asks for a token."""
+    """Answers while the process runs. This is the only request of the API that never asks for a token."""
     return Health(status="live", version=__version__, scenes=len(scenes.by_id))
 
 
 @router.get("/ready")
 async def ready(request: Request, scenes: AllScenes) -> Health:
-    """Scenes are recovered and kernels compiled; `ready_after` says how long the kernels took. 503 until then."""
+    """Answers 200 once scenes are recovered and kernels compiled, else 503. `ready_after`: seconds it took."""
     scenes.check_recovered()
     readiness: Readiness = request.app.state.readiness
     return Health(status="ready", version=__version__, scenes=len(scenes.by_id), ready_after=readiness.check())

@@ -1,4 +1,4 @@
-"""Frames over a WebSocket: one binary message a frame or a camera of it, an acknowledgement each, in order."""
+"""Route of frames over a WebSocket: one binary message for a frame or a camera of it, acknowledged in order."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from server.connections.websocket import limit_messages
 from server.ingest.camera_files import receive_camera
 from server.ingest.pictures import largest_frame
 from server.ingest.receive import framing_problem, receive_frame
-from server.problems import Problem
+from server.problems import SERVICE_FAULT, Problem
 from server.scene.scene import Scene
 from server.scene.scenes import Scenes
 from server.settings import ServerSettings
@@ -42,8 +42,8 @@ AHEAD = 1
 async def ingest(socket: WebSocket, id: str) -> None:
     """Takes binary messages as `client.wire.framing` writes them, each answered by an `IngestAnswer` as text.
 
-    Whoever does not wait for an answer before the next message has the next one received while this one is synced; the
-    answers keep the order of the messages. What is refused is answered and the socket stays open. The message with
+    A message may be sent before the answer to the last one: it is received while that one is synced. The answers keep
+    the order of the messages. What is refused is answered and the socket stays open. The message with
     `part` is as PUT …/cameras/{c}. A scene that is not here, or that has as many senders as it may, refuses the
     handshake (404, 429); a message larger than any frame of the rig can be ends the connection (1009).
     """
@@ -64,7 +64,7 @@ async def ingest(socket: WebSocket, id: str) -> None:
 
 
 async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:
-    """Until the sender has enough, or sends what is no frame."""
+    """Serves until the sender closes, or sends a message that is no frame."""
     taking: asyncio.Queue[asyncio.Task[IngestAnswer]] = asyncio.Queue(AHEAD)
     answering = asyncio.create_task(_answer(socket, taking))
     whole_before = True
@@ -95,7 +95,7 @@ async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:
     except WebSocketDisconnect:
         return
     finally:
-        # What was received whole is taken whole, whether or not somebody hears of it.
+        # A frame that was received whole is taken, even if its sender is gone.
         answering.cancel()
 
 
@@ -135,12 +135,11 @@ async def _take(scene: Scene, head: FrameHead | Problem, data: bytes) -> IngestA
     except Exception as error:
         log.exception("scene %s: a frame over the WebSocket failed", scene.id)
         detail = f"the service failed: {type(error).__name__}"
-        remedy = "this is a fault of the service; its log has the traceback"
-        return _refusal(head.index, Problem(500, detail, remedy=remedy))
+        return _refusal(head.index, Problem(500, detail, remedy=SERVICE_FAULT))
 
 
 def _refusal(index: int | None, problem: Problem) -> IngestAnswer:
-    """With the seconds that the HTTP door would have put into Retry-After."""
+    """Makes the answer that refuses a message; `retry_after` is the Retry-After of the same refusal over HTTP."""
     seconds = (problem.headers or {}).get("Retry-After")
     wait = None if seconds is None else int(seconds)
     return IngestAnswer(index=index, status=problem.status_code, retry_after=wait, problem=problem.document)

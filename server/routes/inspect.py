@@ -1,4 +1,4 @@
-"""What a viewer needs to begin with: the rig, and what became of the frames so far."""
+"""Routes for viewers: the rig, and the reports of all frames so far."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from server.routes.access import TheScene
 router = APIRouter(prefix="/v1/scenes")
 
 MOST_FRAMES = 500
-"""Of one answer: each frame's report names every camera."""
+"""Frames of one answer: each report names every camera."""
 
 
 @router.get("/{id}/rig", tags=["scenes"])
 async def rig(scene: TheScene) -> RigModel:
-    """The cameras of the scene, as they were given."""
+    """Returns the cameras of the scene, as they were given."""
     return scene.request.rig
 
 
@@ -28,7 +28,7 @@ async def frames(
     first: Annotated[int, Query(ge=0, le=1_000_000_000, description="Index of the first.")] = 0,
     limit: Annotated[int, Query(ge=1, le=MOST_FRAMES, description="So many at most.")] = MOST_FRAMES,
 ) -> FrameList:
-    """What became of many frames, from `first` on; `next` says where to go on."""
+    """Returns the reports of many frames, from `first` on; `next` is the index to go on from."""
     after = min(first + limit, scene.next_frame)  # frames are numbered without gaps
     reports = [await scene.report(index) for index in range(first, after)]
     short = [report.model_copy(update={"loss": [], "curve": []}) for report in reports if report is not None]

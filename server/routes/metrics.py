@@ -1,4 +1,4 @@
-"""For Prometheus."""
+"""Route of metrics, for Prometheus."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ router = APIRouter(tags=["service"])
 
 @router.get("/metrics", response_class=PlainTextResponse)
 async def metrics(request: Request, scenes: AllScenes, settings: TheSettings) -> Response:
-    """Counters, histograms and gauges in the text format of Prometheus."""
+    """Returns counters, histograms and gauges in the text format of Prometheus."""
     readiness: Readiness = request.app.state.readiness
     gauges = CollectorRegistry()
     state, guard = request.app.state, request.app.state.guard

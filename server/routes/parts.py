@@ -1,4 +1,4 @@
-"""Parts: which Gaussians move together."""
+"""Route of parts: Gaussians that move together."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from fastapi import APIRouter, Query, Request, Response
 
 from client.wire import PartsModel
 from server.processes.messages import PartsQuery
-from server.routes.access import TheScene
-from server.routes.asking import ask
+from server.routes.access import TheScene, ask
 
 router = APIRouter(prefix="/v1/scenes", tags=["parts"])
 
@@ -22,7 +21,7 @@ async def parts(
     request: Request,
     count: Annotated[int | None, Query(ge=1, le=254, description="How many; chosen by a rule if not given.")] = None,
 ) -> Response:
-    """A label for every Gaussian, from its motion over all committed frames."""
+    """Returns a label for every Gaussian, from its motion over all committed frames."""
     scene.committed_frame(None, "id")
     answer = await ask(request, scene, PartsQuery(count))
     return Response(answer.body, media_type=answer.media_type)

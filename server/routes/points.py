@@ -1,4 +1,4 @@
-"""The initial cloud."""
+"""Route of the initial cloud."""
 
 from __future__ import annotations
 
@@ -15,8 +15,11 @@ from numpy.typing import NDArray
 from client.wire import PointsReceipt
 from scas4d_core.storage.npz import write_npz
 from server.problems import Problem, counted
-from server.routes.access import TheScene, TheSettings
+from server.routes.access import TheScene
 from server.storage.disk import full_disk, no_room
+
+MOST_POINTS = 2_000_000
+"""Points of an initial cloud: twenty times the Gaussians that a scene can have, and 100 MB to check."""
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
@@ -29,15 +32,15 @@ BODY: dict[str, Any] = {
 
 
 @router.put("/{id}/points", openapi_extra=BODY)
-async def put(scene: TheScene, server: TheSettings, request: Request) -> PointsReceipt:
-    """Gives the cloud that frame 0 starts from, before frame 0.
+async def put(scene: TheScene, request: Request) -> PointsReceipt:
+    """Takes the cloud that frame 0 starts from; it has to come before frame 0.
 
     The body is an npz: `positions` [P, 3] in the rig's world and units, `colours` [P, 3] in 0…1, and optionally
     `foreground` [P] in 0…1. The same body again gets the same answer.
     """
     body = await request.body()
     sha256 = hashlib.sha256(body).hexdigest()
-    arrays = await asyncio.to_thread(read_points, body, server.max_points)
+    arrays = await asyncio.to_thread(read_points, body, MOST_POINTS)
     receipt = PointsReceipt(points=len(arrays["positions"]), sha256=sha256)
     async with scene.log.lock:
         if scene.points_sha256 == sha256:
@@ -61,7 +64,7 @@ async def put(scene: TheScene, server: TheSettings, request: Request) -> PointsR
 
 
 def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
-    """The checked arrays of an npz cloud; nothing is unpickled, and nothing is unpacked before its size is known."""
+    """Reads and checks the arrays of an npz cloud; nothing is unpickled, and the size is checked before unpacking."""
     shapes = {"positions": (np.float64, 3), "colours": (np.float32, 3), "foreground": (np.float32, 0)}
     try:
         with zipfile.ZipFile(io.BytesIO(body)) as archive:
@@ -72,7 +75,7 @@ def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
                 f"the cloud unpacks to {unpacked} bytes",
                 field="points",
                 value=unpacked,
-                remedy=f"give at most {limit} points, or raise SCAS4D_MAX_POINTS",
+                remedy=f"give at most {limit} points",
             )
         with np.load(io.BytesIO(body), allow_pickle=False) as file:
             arrays = {name: np.asarray(file[name]) for name in file.files if name in shapes}

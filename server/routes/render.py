@@ -1,4 +1,4 @@
-"""Novel views."""
+"""Routes of novel views."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from fastapi import APIRouter, Query, Request, Response
 from client.wire import MAX_PIXELS_A_SIDE, RenderFormat, RenderKind, RenderRequest
 from server.problems import Problem, counted
 from server.processes.messages import RenderQuery
-from server.routes.access import TheScene, TheSettings
-from server.routes.asking import ask
+from server.routes.access import TheScene, ask
 from server.scene.scenes import Scene
-from server.settings import ServerSettings
+
+MOST_PIXELS = 8_000_000
+"""Pixels of one view: 4K, some seconds on one core. A larger one would keep others waiting."""
 
 router = APIRouter(prefix="/v1/scenes", tags=["views"])
 
@@ -29,15 +30,14 @@ LOSSY = (RenderFormat.JPEG, RenderFormat.WEBP)
 
 
 @router.post("/{id}/render", response_class=Response, responses=PICTURES)
-async def render(scene: TheScene, server: TheSettings, request: Request, view: RenderRequest) -> Response:
-    """Any camera at any committed frame, from the last committed state; an update at work is not waited for."""
-    return await _answer(scene, server, request, view)
+async def render(scene: TheScene, request: Request, view: RenderRequest) -> Response:
+    """Renders a committed frame from any camera; this does not wait for an update at work."""
+    return await _answer(scene, request, view)
 
 
 @router.get("/{id}/render", response_class=Response, responses=PICTURES)
 async def render_by_name(
     scene: TheScene,
-    server: TheSettings,
     request: Request,
     camera: Annotated[str | None, Query(max_length=64, description="Of the rig; its first where not given.")] = None,
     frame: Annotated[int | None, Query(ge=0, description="A committed one; the last where not given.")] = None,
@@ -48,7 +48,7 @@ async def render_by_name(
     background: Annotated[str | None, Query(max_length=64, description="Red, green, blue in 0…1, as 1,1,1.")] = None,
     parts: Annotated[int | None, Query(ge=1, le=254, description="How many; chosen by the scene if not given.")] = None,
 ) -> Response:
-    """The same for a camera of the rig, as an address: for an `<img>`, or to open."""
+    """Renders a committed frame from a camera of the rig; the address can stand in an `<img>`."""
     view = RenderRequest(
         camera=scene.rig.names[0] if camera is None else camera,
         frame=frame,
@@ -59,30 +59,30 @@ async def render_by_name(
         background=None if background is None else _colour(background),
         parts=parts,
     )
-    return await _answer(scene, server, request, view)
+    return await _answer(scene, request, view)
 
 
-async def _answer(scene: Scene, server: ServerSettings, request: Request, view: RenderRequest) -> Response:
-    """Checks what is asked for and asks the reader."""
-    found = await ask(request, scene, query_of(scene, server, view))
+async def _answer(scene: Scene, request: Request, view: RenderRequest) -> Response:
+    """Checks the request and asks the reader."""
+    found = await ask(request, scene, query_of(scene, view))
     # The last frame is another one in a moment; one that was named stays what it is.
     caching = "no-store" if view.frame is None else "private, max-age=60"
     return Response(found.body, media_type=found.media_type, headers={**found.headers, "Cache-Control": caching})
 
 
-def query_of(scene: Scene, server: ServerSettings, request: RenderRequest) -> RenderQuery:
-    """The request, checked, as the reader takes it; `server.routes.stream` asks it too."""
+def query_of(scene: Scene, request: RenderRequest) -> RenderQuery:
+    """Checks a request and returns it as the reader takes it; live views use it too."""
     camera = scene.camera(request.camera) if isinstance(request.camera, str) else request.camera.camera()
     if request.width is not None:
         camera = camera.scaled(request.width / camera.width)
     pixels = camera.width * camera.height
-    if pixels > server.max_render_pixels:
+    if pixels > MOST_PIXELS:
         raise Problem(
             422,
             f"a view of {pixels} pixels",
             field="camera" if request.width is None else "width",
             value=f"{camera.width}x{camera.height}",
-            remedy=f"ask for at most {server.max_render_pixels} pixels, or raise SCAS4D_MAX_RENDER_PIXELS",
+            remedy=f"ask for at most {MOST_PIXELS} pixels",
         )
     kinds = tuple(dict.fromkeys(kind.value for kind in request.kinds))
     if request.format not in SEVERAL and len(kinds) > 1:

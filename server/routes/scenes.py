@@ -1,4 +1,4 @@
-"""Create, list, inspect, pause, resume, delete scenes."""
+"""Routes of scenes: create, list, inspect, pause, resume, delete."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def scene_settings(request: SceneCreate) -> Settings:
 
 
 def check_unit(request: SceneCreate, settings: Settings) -> None:
-    """Refuses a unit that the rig cannot tell."""
+    """Refuses the unit 'auto' if it cannot be found from the rig."""
     unit = settings.scene.metres_per_unit
     try:
         request.rig.rig().world_frame(unit)
     except CameraError as error:
-        what, _, remedy = str(error).partition("; ")
-        raise Problem(422, what, field="settings.scene.metres_per_unit", value=unit, remedy=remedy) from None
+        field = "settings.scene.metres_per_unit"
+        raise Problem(422, error.fault, field=field, value=unit, remedy=error.remedy) from None
 
 
 @router.post("", status_code=201)
@@ -62,27 +62,27 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
 
 @router.get("")
 async def listed(scenes: AllScenes) -> SceneList:
-    """All scenes; 503 while those of an earlier run are being recovered."""
+    """Lists all scenes; answers 503 while those of an earlier run are being recovered."""
     scenes.check_recovered()
     return SceneList(scenes=[scene.status() for scene in scenes.by_id.values()])
 
 
 @router.get("/{id}")
 async def inspect(scene: TheScene) -> SceneStatus:
-    """The scene's state, progress and queue."""
+    """Returns the scene's state, progress and queue."""
     return scene.status()
 
 
 @router.post("/{id}/pause")
 async def pause(scene: TheScene) -> SceneStatus:
-    """Frames are taken and none is reconstructed, after the one at work; holds over a restart of the service."""
+    """Pauses the scene after the frame at work: frames are accepted and not reconstructed, also after a restart."""
     await scene.pause(True)
     return scene.status()
 
 
 @router.post("/{id}/resume")
 async def resume(scene: TheScene) -> SceneStatus:
-    """The scene goes on with the frames that wait."""
+    """Resumes the scene with the frames that wait."""
     await scene.pause(False)
     return scene.status()
 

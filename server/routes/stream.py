@@ -1,4 +1,4 @@
-"""Subscriptions over a WebSocket, protocol `scas4d.stream.v1` (docs/stream.md)."""
+"""Route of subscriptions over a WebSocket, protocol `scas4d.stream.v1` (docs/stream.md)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from server import problems
 from server.connections.websocket import limit_messages
 from server.problems import Problem
 from server.scene.scenes import Scenes
-from server.settings import ServerSettings
 from server.stream.hub import Hub
 from server.stream.subscriber import Subscriber
 
@@ -25,14 +24,13 @@ log = logging.getLogger("scas4d.server")
 
 @router.websocket("/{id}/stream")
 async def stream(websocket: WebSocket, id: str) -> None:
-    """Scene state, finished frames, live views, tracks and parts, as the client subscribes to them."""
+    """Sends scene state, finished frames, live views, tracks and parts, as the client subscribes to them."""
     scenes: Scenes = websocket.app.state.scenes
-    server: ServerSettings = websocket.app.state.settings
     hub: Hub = websocket.app.state.hub
     try:
         scene = scenes[id]
         _require_protocol(websocket)
-        subscriber = hub.join(id, scene.ask, lambda room: Subscriber(scene, server, room))
+        subscriber = hub.join(id, scene.readers.ask, lambda channel: Subscriber(scene, channel))
     except Problem as problem:  # the handshake is answered like any request: browsers see only that it failed
         await websocket.send_denial_response(problems.answer(problem.document, problem.headers))
         return
@@ -50,7 +48,7 @@ def _require_protocol(websocket: WebSocket) -> None:
     if STREAM_PROTOCOL not in offered:
         raise Problem(
             400,
-            "the client speaks no protocol that the service speaks",
+            "the client offers no subprotocol that the service knows",
             field="Sec-WebSocket-Protocol",
             value=", ".join(name for name in offered if not name.startswith("scas4d.ticket.")),
             remedy=f"offer {STREAM_PROTOCOL}",
@@ -58,7 +56,7 @@ def _require_protocol(websocket: WebSocket) -> None:
 
 
 async def _serve(websocket: WebSocket, subscriber: Subscriber) -> None:
-    """Until either side has enough."""
+    """Serves until the client or the service closes."""
     await subscriber.greet()
     reading = asyncio.create_task(_read(websocket, subscriber))
     writing = asyncio.create_task(_write(websocket, subscriber))
@@ -92,7 +90,7 @@ async def _write(websocket: WebSocket, subscriber: Subscriber) -> None:
         else:
             await websocket.send_bytes(message)
 
-    await subscriber.mailbox.empty_into(send)
+    await subscriber.outbox.empty_into(send)
     if websocket.application_state == WebSocketState.CONNECTED:
         with contextlib.suppress(RuntimeError):
             await websocket.close(SCENE_GONE, "the scene was deleted")

@@ -1,18 +1,18 @@
-"""Tickets for browsers' WebSockets."""
+"""Route of tickets for browsers' WebSockets."""
 
 from __future__ import annotations
 
 from fastapi import APIRouter, Request
 
 from client.wire import Ticket
-from server.http.tickets import SUBPROTOCOL, Tickets
+from server.http.tickets import SUBPROTOCOL, TICKET_SECONDS, Tickets
 
 router = APIRouter(prefix="/v1/tickets", tags=["service"])
 
 
 @router.post("", status_code=201)
 async def issue(request: Request) -> Ticket:
-    """A ticket that opens one WebSocket within seconds; asked for with the token."""
+    """Issues a ticket that opens one WebSocket within seconds; the request bears the token."""
     tickets: Tickets = request.app.state.tickets
     ticket = tickets.issue()
-    return Ticket(ticket=ticket, subprotocol=SUBPROTOCOL + ticket, seconds=tickets.seconds)
+    return Ticket(ticket=ticket, subprotocol=SUBPROTOCOL + ticket, seconds=TICKET_SECONDS)

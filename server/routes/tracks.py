@@ -1,4 +1,4 @@
-"""Point tracks. docs/tracks.md says what the answers mean."""
+"""Routes of point tracks; docs/tracks.md describes the answers."""
 
 from __future__ import annotations
 
@@ -14,13 +14,18 @@ from scas4d_core.cameras import Camera
 from server.problems import Problem, counted
 from server.processes import track_answers
 from server.processes.messages import TracksQuery
-from server.routes.access import TheScene, TheSettings
-from server.routes.asking import ask
+from server.routes import render
+from server.routes.access import TheScene, ask
 from server.scene.scenes import Scene
-from server.settings import ServerSettings
 
 router = APIRouter(prefix="/v1/scenes", tags=["tracks"])
 
+MOST_POINTS = 1_000_000
+"""Points times frames of one query: a minute of the reader, which takes it in pieces, and 30 MB as npz."""
+MOST_JSON_POINTS = 100_000
+"""Points times frames of an answer as JSON, some 100 bytes each; npz takes more."""
+MOST_VIEWS = 4096
+"""Cameras times frames of a query in which visibility is asked for: a depth picture each, about a minute in all."""
 LARGEST_ID = 2**63 - 1
 FARTHEST = 1e15
 """Coordinates beyond overflow where they are squared and scaled, and what comes out is no number."""
@@ -32,15 +37,14 @@ ANSWERS: dict[int | str, dict[str, Any]] = {
 
 
 @router.post("/{id}/tracks/query", response_class=Response, responses=ANSWERS)
-async def query(scene: TheScene, server: TheSettings, http: Request, request: TracksRequest) -> Response:
-    """Trajectories in the world of what is asked for by id, by pixel, or by 3D point; any number of them."""
-    return await answer(http, scene, server, request)
+async def query(scene: TheScene, http: Request, request: TracksRequest) -> Response:
+    """Returns trajectories in the world of Gaussians by id, of pixels, or of 3D points."""
+    return await answer(http, scene, request)
 
 
 @router.get("/{id}/tracks", response_class=Response, responses=ANSWERS)
 async def tracks(
     scene: TheScene,
-    server: TheSettings,
     http: Request,
     ids: Annotated[str | None, Query(max_length=10_000, description="Of Gaussians, separated by commas.")] = None,
     pixel: Annotated[Many, Query(description="u,v in the picture of `camera`, repeated.")] = None,
@@ -54,7 +58,7 @@ async def tracks(
     project: Annotated[Many, Query(max_length=64, description="Cameras of the rig to project into.")] = None,
     format: Literal["json", "npz"] = "json",
 ) -> Response:
-    """The same for a few, as an address."""
+    """Returns a few trajectories; the query is in the address."""
     request = TracksRequest(
         ids=_ids(ids) if ids else None,
         pixels=_numbers(pixel, "pixel", 2) if pixel else None,
@@ -66,23 +70,23 @@ async def tracks(
         project=list(project or []),
         format=format,
     )
-    return await answer(http, scene, server, request)
+    return await answer(http, scene, request)
 
 
-async def answer(http: Request, scene: Scene, server: ServerSettings, request: TracksRequest) -> Response:
+async def answer(http: Request, scene: Scene, request: TracksRequest) -> Response:
     """Checks the request and asks the reader."""
-    found = await ask(http, scene, query_of(scene, server, request))
+    found = await ask(http, scene, query_of(scene, request))
     return Response(found.body, media_type=found.media_type)
 
 
-def query_of(scene: Scene, server: ServerSettings, request: TracksRequest) -> TracksQuery:
-    """The request, checked, as the reader takes it; `server.routes.stream` asks it too."""
+def query_of(scene: Scene, request: TracksRequest) -> TracksQuery:
+    """Checks a request and returns it as the reader takes it; live tracks use it too."""
     kinds = {"ids": request.ids, "pixels": request.pixels, "points": request.points}
     asked = [(name, value) for name, value in kinds.items() if value is not None]
     if len(asked) != 1:
         given = ", ".join(name for name, _ in asked) or "none"
         raise Problem(
-            422, f"asked by {given}", field="ids", value=given, remedy="give exactly one of ids, pixels, points"
+            422, f"the query has {given}", field="ids", value=given, remedy="give exactly one of ids, pixels, points"
         )
     scene.committed_frame(None, "from")
     start = scene.committed[0] if request.first is None else request.first
@@ -97,21 +101,21 @@ def query_of(scene: Scene, server: ServerSettings, request: TracksRequest) -> Tr
             remedy=f"ask within {scene.committed[0]} to {scene.committed[-1]}",
         )
     field, queries = asked[0]
-    if len(queries) * len(frames) > server.max_track_points:
+    if len(queries) * len(frames) > MOST_POINTS:
         raise Problem(
             422,
             f"{counted(len(queries), 'point')} over {counted(len(frames), 'frame')}",
             field=field,
             value=len(queries) * len(frames),
-            remedy=f"ask for at most {server.max_track_points} at once, or raise SCAS4D_MAX_TRACK_POINTS",
+            remedy=f"ask for at most {MOST_POINTS} points times frames at once",
         )
-    if request.format == "json" and len(queries) * len(frames) > server.max_track_json_points:
+    if request.format == "json" and len(queries) * len(frames) > MOST_JSON_POINTS:
         raise Problem(
             422,
             f"{counted(len(queries), 'point')} over {counted(len(frames), 'frame')} as JSON",
             field="format",
             value="json",
-            remedy=f"ask for npz, or for at most {server.max_track_json_points} (SCAS4D_MAX_TRACK_JSON_POINTS)",
+            remedy=f"ask for npz, or for at most {MOST_JSON_POINTS} points times frames",
         )
     if request.ids is not None and not all(0 <= id <= LARGEST_ID for id in request.ids):
         below = next(id for id in request.ids if not 0 <= id <= LARGEST_ID)
@@ -121,7 +125,7 @@ def query_of(scene: Scene, server: ServerSettings, request: TracksRequest) -> Tr
     if request.pixels is not None and request.camera is None:
         raise Problem(
             422,
-            "pixels of which camera is not said",
+            "pixels need a camera, and none is named",
             field="camera",
             value="nothing",
             remedy=f"name one of {', '.join(scene.rig.names)}",
@@ -138,22 +142,21 @@ def query_of(scene: Scene, server: ServerSettings, request: TracksRequest) -> Tr
         frames=frames,
         at=scene.committed_frame(scene.committed[0] if request.at is None else request.at, "at"),
         ids=None if request.ids is None else tuple(request.ids),
-        camera=None if request.camera is None else _camera(scene, server, request.camera),
+        camera=None if request.camera is None else _camera(scene, request.camera),
         pixels=None if request.pixels is None else np.array(request.pixels),
         points=None if request.points is None else np.array(request.points),
-        project=_different([_camera(scene, server, camera) for camera in request.project]),
+        project=_different([_camera(scene, camera) for camera in request.project]),
         format=request.format,
     )
     _check_pixels(query)
     cameras = track_answers.cameras_of(query)
-    if len(cameras) * len(frames) > server.max_track_views:
+    if len(cameras) * len(frames) > MOST_VIEWS:
         raise Problem(
             422,
             f"visibility in {counted(len(cameras), 'camera')} over {counted(len(frames), 'frame')}",
             field="project" if request.project else "camera",
             value=len(cameras) * len(frames),
-            remedy=f"ask for at most {server.max_track_views} cameras times frames (SCAS4D_MAX_TRACK_VIEWS): "
-            "fewer frames or cameras at once",
+            remedy=f"ask for at most {MOST_VIEWS} cameras times frames: fewer frames or cameras at once",
         )
     return query
 
@@ -176,7 +179,7 @@ def _check_pixels(query: TracksQuery) -> None:
 
 
 def _different(cameras: list[Camera]) -> tuple[Camera, ...]:
-    """Answers go by the camera's name."""
+    """Checks that cameras of one name are the same: answers go by the name."""
     by_name: dict[str, Camera] = {}
     for camera in cameras:
         known = by_name.setdefault(camera.name, camera)
@@ -191,18 +194,18 @@ def _different(cameras: list[Camera]) -> tuple[Camera, ...]:
     return tuple(by_name.values())
 
 
-def _camera(scene: Scene, server: ServerSettings, camera: CameraModel | str) -> Camera:
+def _camera(scene: Scene, camera: CameraModel | str) -> Camera:
     if isinstance(camera, str):
         return scene.camera(camera)
-    # Where a point can be seen is found from a rendered depth: the limit of views holds.
-    if camera.width * camera.height > server.max_render_pixels:
+    # Visibility is found from a rendered depth: the limit of views holds.
+    if camera.width * camera.height > render.MOST_PIXELS:
         size = f"{camera.width}x{camera.height}"
         raise Problem(
             422,
             f"camera {camera.name!r} has a picture of {size}",
             field="camera",
             value=size,
-            remedy=f"give at most {server.max_render_pixels} pixels",
+            remedy=f"give at most {render.MOST_PIXELS} pixels",
         )
     return camera.camera()
 

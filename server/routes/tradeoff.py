@@ -1,4 +1,4 @@
-"""What accuracy costs in time, for a scene on its machine."""
+"""Routes of the trade-off between accuracy and time, for a scene on its machine."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ router = APIRouter(prefix="/v1/scenes", tags=["budget"])
 
 @router.get("/{id}/tradeoff")
 async def get(scene: TheScene) -> TradeoffModel:
-    """Measured: what the newest 64 frames ran. Replayed: what was asked for. Extrapolated: the times of the rest."""
+    """Returns points of accuracy and time: measured in the newest 64 frames, replayed, and extrapolated in time."""
     return await answer(scene)
 
 
@@ -37,7 +37,7 @@ async def end(scene: TheScene) -> TradeoffModel:
 
 
 async def answer(scene: Scene) -> TradeoffModel:
-    """All that is known now."""
+    """Returns all points that are known now."""
     newest = scene.committed[-tradeoff.NEWEST :]
     found = [await scene.report(index) for index in newest]
     first = scene.committed[0] if newest else 0

@@ -1,4 +1,4 @@
-"""The viewer's page: files as they are, no build step, nothing from anywhere else."""
+"""Routes of the viewer's page: its files as they are, without a build step, and nothing from other sites."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ router = APIRouter(include_in_schema=False)
 FOLDER = Path(__file__).parents[1] / "viewer"
 MEDIA_TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 FILES = {file.name: file for file in FOLDER.iterdir() if file.suffix in MEDIA_TYPES}
-"""What is served: these names and no others."""
+"""The files that are served: these names and no others."""
 
 HEADERS = {
     # No inline script or style, nothing from another site, no frames: what a rig or a scene is called stays text.
@@ -29,19 +29,19 @@ HEADERS = {
 @router.get("/")
 @router.get("/viewer/")
 async def page() -> Response:
-    """The page."""
+    """Returns the page."""
     return _answer("index.html")
 
 
 @router.get("/viewer")
 async def elsewhere() -> Response:
-    """Where people look for it."""
+    """Redirects to the page from the address without a slash."""
     return RedirectResponse("/viewer/")
 
 
 @router.get("/viewer/{name}")
 async def file(name: str) -> Response:
-    """What the page is made of."""
+    """Returns a file of the page."""
     return _answer(name)
 
 

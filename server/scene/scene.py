@@ -13,7 +13,7 @@ from scas4d_core.errors import message_of
 from server.health import metrics
 from server.ingest.acknowledge import Ingest, IngestRules, uncancelled
 from server.ingest.open_frames import OpenFrames
-from server.processes.messages import Answer, Query, SceneSpec
+from server.processes.messages import SceneSpec
 from server.processes.placement import Placement
 from server.processes.readers import Readers
 from server.repair.mending import DamageKind, DamageLog
@@ -49,7 +49,8 @@ class Scene:
 
     Attributes:
         log: journal, ledger and frame log. ingest: accepts whole frames. open_frames: accepts them camera by camera.
-        updates: gives frames to the worker. replays: of its last frames. points_sha256: of the initial cloud.
+        updates: gives frames to the worker. readers: answer queries. replays: of its last frames.
+        points_sha256: of the initial cloud.
     """
 
     def __init__(
@@ -73,12 +74,9 @@ class Scene:
             minimum_cameras=-(-len(rig) // 2) if least is None else min(least, len(rig)),
             part_seconds=asked.part_seconds,
         )
-        self.spec = SceneSpec(
-            server.engine, folder, rig, definition.settings, self.rules.minimum_cameras, asked.keep_states
-        )
+        self.spec = SceneSpec(folder, rig, definition.settings, self.rules.minimum_cameras, asked.keep_states)
         self.points_sha256: str | None = None
         self._definition = definition
-        self._server = server
         self._hub = hub
         self._background = Background(self._failed)
         self._damage = DamageLog(found.damage)
@@ -89,13 +87,13 @@ class Scene:
             FrameLogIndex(folder.frames, found.sizes),
             self._waits,
         )
-        self._readers = Readers(self.spec, server, placement, lambda files: self.updates.mending.noticed(files))
+        self.readers = Readers(self.spec, placement, lambda files: self.updates.mending.noticed(files))
         self._reports = FrameReports(self.ledger, folder.states, lambda files: self.updates.mending.noticed(files))
         self.updates = Updates(
             self.log,
             self.spec,
             self._damage,
-            self._readers,
+            self.readers,
             self._reports,
             self._background,
             placement,
@@ -201,11 +199,6 @@ class Scene:
         """Returns the report of a frame; see `FrameReports.of`."""
         return await self._reports.of(index)
 
-    async def ask(self, query: Query) -> Answer:
-        """Returns a reader's answer; see `Readers.ask`."""
-        with metrics.answering(query):
-            return await self._readers.ask(query)
-
     def budget(self) -> SceneBudget:
         """Describes the budget of frames that are not begun."""
         since, asked = self.ledger.budgets[-1]
@@ -247,8 +240,7 @@ class Scene:
         self.open_frames.stop()
         self.updates.stop()
         self._background.cancel()
-        seconds = self._server.stop_seconds
-        await asyncio.gather(self.updates.stop_worker(seconds), self._readers.stop(seconds), self.replays.stop())
+        await asyncio.gather(self.updates.stop_worker(), self.readers.stop(), self.replays.stop())
         await self.log.journal.close()
 
     # Events.

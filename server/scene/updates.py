@@ -301,17 +301,17 @@ class Updates:
             self._restart.cancel()
         self.mending.stop()
 
-    async def stop_worker(self, seconds: float) -> None:
+    async def stop_worker(self) -> None:
         """Ends the worker; an unfinished frame is updated again after the next start."""
-        await self._worker.stop(seconds)
+        await self._worker.stop()
 
 
 def trouble_of(report: FrameReportModel) -> str | None:
     """Says why a scene is degraded whose newest finished frame has this report; None: it is not."""
     if report.state == FrameState.SET_ASIDE:
         return f"frame {report.index} was set aside: {report.error}"
-    if report.degraded is not None:
-        verb = "" if report.degraded.startswith("held") else "committed in part: "
+    if report.outcome is not None and report.outcome.degraded:
+        verb = "" if report.outcome.held else "committed in part: "
         return f"frame {report.index} was {verb}{report.degraded}"
     if report.dropped_cameras:
         left_out = "; ".join(f"{name}: {reason}" for name, reason in report.dropped_cameras.items())

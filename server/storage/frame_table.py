@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.wire import FINISHED, FrameReceipt, FrameReportModel, FrameState
+from scas4d_core.frame_outcome import outcome_of
 from server.storage.events import OpenFrame
 
 RECORDS_KEPT = 512
@@ -42,6 +43,7 @@ def committed_fields(record: Mapping[str, Any]) -> dict[str, Any]:
     """Fields of the report on the wire from the record of a commit (`scas4d_core.frame_report.FrameReport.record`)."""
     sent = {WIRE_NAMES.get(name, name): value for name, value in record.items() if name not in NOT_SENT}
     found = {name: sent[name] for name in FrameReportModel.model_fields if sent.get(name) is not None}
+    found["outcome"] = outcome_of(record)  # records of earlier versions have it in words alone
     seconds = {name: float(value) for name, value in found.get("seconds", {}).items()}
     if "report" in seconds:  # the report before this one was published after its commit
         seconds["report"] += record.get("publish_seconds") or 0.0

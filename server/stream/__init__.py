@@ -1,1 +1,1 @@
-"""Subscriptions: who listens, what is sent, what is asked once for all."""
+"""Subscriptions: listeners of scenes, their messages, and queries shared among them."""

@@ -1,4 +1,4 @@
-"""Who listens to which scene. Publishing puts an event before every listener and waits for none of them."""
+"""Channels of scenes and their listeners. Publishing hands an event to every listener and waits for none."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Protocol, TypeVar
 
 from client.wire import FrameReportModel, SceneStatus
 from server.problems import Problem
-from server.stream.shared_queries import Ask, Desk
+from server.stream.shared_queries import AskReaders, SharedQueries
 
 log = logging.getLogger("scas4d.server")
 
 
 @dataclass(frozen=True)
 class SceneChanged:
-    """The scene's state, progress or queue is another."""
+    """The scene's state, progress or queue has changed."""
 
 
 @dataclass(frozen=True)
@@ -38,26 +38,26 @@ Event = SceneChanged | FrameFinished
 class Listener(Protocol):
     """A subscriber, as the hub sees it. Both methods return at once."""
 
-    def told(self, event: Event) -> None:
+    def on_event(self, event: Event) -> None:
         """Something happened in the scene."""
 
-    def gone(self, reason: str) -> None:
+    def on_close(self, reason: str) -> None:
         """The scene is no more."""
 
 
 L = TypeVar("L", bound=Listener)
 
 
-class Room:
-    """The listeners of one scene, and the desk that asks its reader for them."""
+class Channel:
+    """The listeners of one scene, and the queries that they share."""
 
-    def __init__(self, ask: Ask, turns: int) -> None:
+    def __init__(self, ask: AskReaders) -> None:
         self.listeners: list[Listener] = []
-        self.desk = Desk(ask, turns)
+        self.queries = SharedQueries(ask)
         self._status: str | None = None
 
     def changed(self) -> None:
-        """The status is another."""
+        """Notes that the status has changed."""
         self._status = None
 
     def status(self, read: Callable[[], SceneStatus]) -> str:
@@ -68,67 +68,65 @@ class Room:
 
 
 class Hub:
-    """The rooms of all scenes, by scene id.
+    """The channels of all scenes, by scene id.
 
     Args:
         max_listeners: of one scene.
-        turns: questions of a scene's listeners that may be with its reader at a time.
     """
 
-    def __init__(self, max_listeners: int, turns: int) -> None:
+    def __init__(self, max_listeners: int) -> None:
         self.max_listeners = max_listeners
-        self.turns = turns
-        self._rooms: dict[str, Room] = {}
+        self._channels: dict[str, Channel] = {}
 
-    def join(self, scene: str, ask: Ask, make: Callable[[Room], L]) -> L:
-        """Lets a listener in.
+    def join(self, scene: str, ask: AskReaders, make: Callable[[Channel], L]) -> L:
+        """Adds a listener to a scene's channel and returns it.
 
         Raises:
             Problem: 429, as many listen as may.
         """
-        room = self._rooms.get(scene) or Room(ask, self.turns)
-        if len(room.listeners) >= self.max_listeners:
+        channel = self._channels.get(scene) or Channel(ask)
+        if len(channel.listeners) >= self.max_listeners:
             raise Problem(
                 429,
-                f"this scene has all the subscribers that it may have: {len(room.listeners)}",
+                f"this scene has its maximum of subscribers: {len(channel.listeners)}",
                 field="SCAS4D_MAX_SUBSCRIBERS",
                 value=self.max_listeners,
                 remedy="close another subscriber of the scene, or raise the limit",
                 headers={"Retry-After": "5"},
             )
-        self._rooms[scene] = room
-        listener = make(room)
-        room.listeners.append(listener)
+        self._channels[scene] = channel
+        listener = make(channel)
+        channel.listeners.append(listener)
         return listener
 
     def leave(self, scene: str, listener: Listener) -> None:
-        """Lets a listener go; an empty room is given up."""
-        room = self._rooms.get(scene)
-        if room is None or listener not in room.listeners:
+        """Removes a listener; an empty channel is given up."""
+        channel = self._channels.get(scene)
+        if channel is None or listener not in channel.listeners:
             return
-        room.listeners.remove(listener)
-        if not room.listeners:
-            del self._rooms[scene]
+        channel.listeners.remove(listener)
+        if not channel.listeners:
+            del self._channels[scene]
 
     def count(self, scene: str | None = None) -> int:
-        """How many listen, to one scene or to all."""
-        rooms = self._rooms.values() if scene is None else filter(None, [self._rooms.get(scene)])
-        return sum(len(room.listeners) for room in rooms)
+        """Counts the listeners of one scene, or of all."""
+        channels = self._channels.values() if scene is None else filter(None, [self._channels.get(scene)])
+        return sum(len(channel.listeners) for channel in channels)
 
     def publish(self, scene: str, event: Event) -> None:
         """Tells every listener of a scene. Never blocks, never raises: the scene's own work comes first."""
-        room = self._rooms.get(scene)
-        if room is None:
+        channel = self._channels.get(scene)
+        if channel is None:
             return
-        room.changed()
-        for listener in tuple(room.listeners):
+        channel.changed()
+        for listener in tuple(channel.listeners):
             try:
-                listener.told(event)
+                listener.on_event(event)
             except Exception:
-                log.exception("scene %s: a subscriber could not be told of %s", scene, type(event).__name__)
+                log.exception("scene %s: a subscriber could not take the event %s", scene, type(event).__name__)
 
     def close(self, scene: str, reason: str) -> None:
-        """The scene is gone: every listener is told so and let go."""
-        room = self._rooms.pop(scene, None)
-        for listener in () if room is None else room.listeners:
-            listener.gone(reason)
+        """Closes the channel of a scene that is gone, and tells its listeners."""
+        channel = self._channels.pop(scene, None)
+        for listener in () if channel is None else channel.listeners:
+            listener.on_close(reason)

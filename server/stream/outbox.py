@@ -1,4 +1,4 @@
-"""What waits to be sent to one subscriber: replies in order, and of each subscription the newest message only."""
+"""Messages that wait for one subscriber: replies in order, and of each subscription the newest message only."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class _Slot:
     weight: int
 
 
-class Mailbox:
-    """Bounded by the number of subscriptions, however slowly it is emptied. For one event loop."""
+class Outbox:
+    """Unsent messages of a subscriber, for one event loop. It is bounded by the number of subscriptions."""
 
     def __init__(self) -> None:
         self._replies: deque[str] = deque()

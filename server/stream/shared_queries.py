@@ -1,4 +1,4 @@
-"""Questions to a scene's reader on behalf of its subscribers: each is asked once, however many want the answer."""
+"""Queries to a scene's readers on behalf of its subscribers: equal ones are asked once."""
 
 from __future__ import annotations
 
@@ -12,10 +12,13 @@ import numpy as np
 
 from server.processes.messages import Answer, Query, RenderQuery
 
+QUERIES_AT_ONCE = 2
+"""Queries of a lane that a scene's reader has for subscribers: one at work and one that follows at once; the others are
+made up when their turn comes, for what is newest then."""
 KEPT_ANSWERS = 64
 KEPT_BYTES = 32_000_000
 
-Ask = Callable[[Query], Awaitable[Answer]]
+AskReaders = Callable[[Query], Awaitable[Answer]]
 
 
 class Question(Protocol):
@@ -23,18 +26,18 @@ class Question(Protocol):
 
     @property
     def key(self) -> Hashable:
-        """See above."""
+        """Equal for equal queries."""
 
     @property
     def query(self) -> Query:
-        """What the reader is asked."""
+        """The query to the readers."""
 
 
 Q = TypeVar("Q", bound=Question)
 
 
 def fingerprint(value: Any) -> Hashable:
-    """A value that is equal for equal questions: dataclasses by field, arrays by content."""
+    """A value that is equal for equal queries: dataclasses by field, arrays by content."""
     if is_dataclass(value) and not isinstance(value, type):
         return (type(value).__name__, *(fingerprint(getattr(value, field.name)) for field in fields(value)))
     if isinstance(value, np.ndarray):
@@ -48,28 +51,28 @@ def fingerprint(value: Any) -> Hashable:
 
 
 def lane(query: Query) -> str:
-    """Views are short and somebody is looking; trajectories and parts take longer and must not stand before them."""
+    """Returns the lane of a query: trajectories and parts take longer than views and must not stand before them."""
     return "views" if isinstance(query, RenderQuery) and "parts" not in query.kinds else "bulk"
 
 
-class Desk:
-    """Asks the reader, `turns` questions of a lane at a time; keeps the last answers for those who come a moment later.
+class SharedQueries:
+    """Asks the reader, `QUERIES_AT_ONCE` of a lane at a time; keeps the last answers for those who come a moment later.
 
-    Whoever waits for a turn makes up the question when the turn has come: a camera that was moved meanwhile is asked
-    for where it is now. Turns are given in the order of waiting, so nobody is starved by one who asks faster.
+    A subscriber that waits for its turn makes up the query when the turn has come: a camera that was moved meanwhile is
+    asked for where it is now. Turns are given in the order of waiting, so no subscriber starves another one.
     """
 
-    def __init__(self, ask: Ask, turns: int) -> None:
+    def __init__(self, ask: AskReaders) -> None:
         self._ask = ask
-        self._turns = {"views": asyncio.Semaphore(turns), "bulk": asyncio.Semaphore(turns)}
+        self._turns = {lane: asyncio.Semaphore(QUERIES_AT_ONCE) for lane in ("views", "bulk")}
         self._working: dict[Hashable, asyncio.Future[Answer]] = {}
         self._kept: OrderedDict[Hashable, Answer] = OrderedDict()
         self._bytes = 0
         self.asked = 0
-        """Questions that reached the reader."""
+        """Queries that reached the readers."""
 
     async def answer(self, question: Callable[[], Q]) -> tuple[Q, Answer]:
-        """What was asked, and its answer; `question` says what to ask at the moment of asking.
+        """Returns the query and its answer; `question` makes up the query at the moment of asking.
 
         Raises:
             Problem: what `question` or the scene raises.
@@ -81,7 +84,7 @@ class Desk:
             begun = False
             try:
                 now = question()
-                # Another kind of question by now: it has its own turns to wait for.
+                # Another kind of query by now: it has its own turns to wait for.
                 if not self._known(now.key) and self._turns[lane(now.query)] is turns:
                     self._begin(now.key, now.query, turns)
                     begun = True

@@ -1,4 +1,4 @@
-"""One client of a scene's stream: what it subscribed to, and what the scene's events mean for that."""
+"""One client of a scene's stream: its subscriptions, and the messages that the scene's events become."""
 
 from __future__ import annotations
 
@@ -28,45 +28,49 @@ from client.wire.stream import (
 )
 from server.http import validation
 from server.problems import Problem, counted
+from server.routes import render, tracks
 from server.scene.scenes import Scene
-from server.settings import ServerSettings
-from server.stream.feeds import Feed, PartsFeed, RenderFeed, TracksFeed
-from server.stream.hub import Event, FrameFinished, Room
-from server.stream.outbox import Mailbox
+from server.stream.hub import Channel, Event, FrameFinished
+from server.stream.live_queries import LiveParts, LiveQuery, LiveRender, LiveTracks
+from server.stream.outbox import Outbox
 
 T = TypeVar("T")
 
+MOST_SUBSCRIPTIONS = 16
+"""Subscriptions of one subscriber: enough for a page with views of some cameras. A second stream takes more."""
+MESSAGE_KB = 256
+"""Largest message of a subscriber: some 8000 pixels to track."""
+
 WHERE = "docs/stream.md lists the messages"
 
-FEEDS: dict[Topic, type[Feed]] = {Topic.RENDER: RenderFeed, Topic.TRACKS: TracksFeed, Topic.PARTS: PartsFeed}
+LIVE: dict[Topic, type[LiveQuery]] = {Topic.RENDER: LiveRender, Topic.TRACKS: LiveTracks, Topic.PARTS: LiveParts}
 
 
 class Subscriber:
-    """Listens to a scene for one client. Its mailbox is emptied by whoever holds the connection."""
+    """Listens to a scene for one client. The route that holds the connection empties its outbox."""
 
-    def __init__(self, scene: Scene, server: ServerSettings, room: Room) -> None:
+    def __init__(self, scene: Scene, channel: Channel) -> None:
         self.scene = scene
-        self.server = server
-        self.mailbox = Mailbox()
-        self._room = room
+        self.outbox = Outbox()
+        self._channel = channel
         self._topics: dict[str, Topic] = {}
-        self._feeds: dict[str, tuple[Feed, asyncio.Task[None]]] = {}
+        self._live: dict[str, tuple[LiveQuery, asyncio.Task[None]]] = {}
 
     def limits(self) -> StreamLimits:
-        """What the client is told."""
+        """Returns the limits that the client is sent."""
         return StreamLimits(
-            subscriptions=self.server.max_subscriptions,
-            message_bytes=self.server.max_stream_message_kb * 1000,
-            render_pixels=self.server.max_render_pixels,
-            track_points=self.server.max_track_points,
+            subscriptions=MOST_SUBSCRIPTIONS,
+            message_bytes=MESSAGE_KB * 1000,
+            render_pixels=render.MOST_PIXELS,
+            track_points=tracks.MOST_POINTS,
         )
 
     async def greet(self) -> None:
-        """The first message."""
-        await self.mailbox.reply(Hello(protocol=STREAM_PROTOCOL, scene=self.scene.id, limits=self.limits()))
+        """Sends the first message."""
+        await self.outbox.reply(Hello(protocol=STREAM_PROTOCOL, scene=self.scene.id, limits=self.limits()))
 
     async def take(self, text: str | None) -> None:
-        """A message of the client, None for a binary one; what is wrong with it is answered and changes nothing."""
+        """Takes a message of the client, None for a binary one; a wrong one is answered and changes nothing."""
         id: str | None = None
         tag: int | None = None
         try:
@@ -77,26 +81,26 @@ class Subscriber:
             if isinstance(message, Unsubscribe):
                 self._known(id)
                 self._end(id)
-                await self.mailbox.reply(Unsubscribed(id=id))
+                await self.outbox.reply(Unsubscribed(id=id))
                 return
             tag = message.tag
             if isinstance(message, Subscribe):
                 request = self._begin(message)
-                await self.mailbox.reply(Subscribed(id=id))
+                await self.outbox.reply(Subscribed(id=id))
                 self._start(message, request)
             else:
                 self._update(message)
         except Problem as problem:
-            await self.mailbox.reply(StreamProblem(id=id, tag=tag, problem=problem.document))
+            await self.outbox.reply(StreamProblem(id=id, tag=tag, problem=problem.document))
 
     def close(self) -> None:
-        """The client has left."""
+        """Ends all subscriptions of a client that has left."""
         for id in list(self._topics):
             self._end(id)
 
-    # What the hub tells.
+    # Events of the hub.
 
-    def told(self, event: Event) -> None:
+    def on_event(self, event: Event) -> None:
         """Something happened in the scene."""
         for id, topic in self._topics.items():
             if topic == Topic.SCENE:
@@ -104,12 +108,12 @@ class Subscriber:
             elif topic == Topic.FRAMES and isinstance(event, FrameFinished):
                 self._put_report(id, event)
         if isinstance(event, FrameFinished) and event.report.state == FrameState.COMMITTED:
-            for feed, _ in self._feeds.values():
-                feed.change()
+            for live, _ in self._live.values():
+                live.change()
 
-    def gone(self, reason: str) -> None:
+    def on_close(self, reason: str) -> None:
         """The scene is no more."""
-        self.mailbox.close_with(Gone(reason=reason))
+        self.outbox.close_with(Gone(reason=reason))
 
     # Subscriptions.
 
@@ -123,12 +127,12 @@ class Subscriber:
     def _begin(self, message: Subscribe) -> Model:
         wanted = REQUESTS[message.topic]
         request = _valid(wanted.model_validate, message.request, "request", wanted)
-        if message.id not in self._topics and len(self._topics) >= self.server.max_subscriptions:
+        if message.id not in self._topics and len(self._topics) >= MOST_SUBSCRIPTIONS:
             raise Problem(
                 429,
                 f"{counted(len(self._topics), 'subscription')} open already, and no more are taken",
-                field="SCAS4D_MAX_SUBSCRIPTIONS",
-                value=self.server.max_subscriptions,
+                field="subscriptions",
+                value=MOST_SUBSCRIPTIONS,
                 remedy="unsubscribe from another one, or open a second stream",
             )
         return request
@@ -143,13 +147,13 @@ class Subscriber:
                 newest = self.scene.frames[self.scene.committed[-1]].report
                 self._put_report(message.id, FrameFinished(newest))
         else:
-            feed = FEEDS[message.topic](message.id, self.scene, self.server, self._room.desk, self.mailbox)
-            feed.ask_for(request, message.tag)
-            self._feeds[message.id] = (feed, asyncio.create_task(feed.run()))
+            live = LIVE[message.topic](message.id, self.scene, self._channel.queries, self.outbox)
+            live.ask_for(request, message.tag)
+            self._live[message.id] = (live, asyncio.create_task(live.run()))
 
     def _update(self, message: Update) -> None:
         topic = self._known(message.id)
-        if message.id not in self._feeds:
+        if message.id not in self._live:
             raise Problem(
                 422,
                 f"topic {topic} has nothing to update",
@@ -157,25 +161,25 @@ class Subscriber:
                 value=message.id,
                 remedy="update subscriptions to render, tracks or parts",
             )
-        feed, _ = self._feeds[message.id]
-        changed = feed.request.model_dump() | message.request
-        feed.ask_for(_valid(REQUESTS[topic].model_validate, changed, "request", REQUESTS[topic]), message.tag)
+        live, _ = self._live[message.id]
+        changed = live.request.model_dump() | message.request
+        live.ask_for(_valid(REQUESTS[topic].model_validate, changed, "request", REQUESTS[topic]), message.tag)
 
     def _end(self, id: str) -> None:
         self._topics.pop(id, None)
-        if id in self._feeds:
-            self._feeds.pop(id)[1].cancel()
-        self.mailbox.drop(id)
+        if id in self._live:
+            self._live.pop(id)[1].cancel()
+        self.outbox.drop(id)
 
     def _put_status(self, id: str) -> None:
-        # The status is read when it is sent: whoever is slow gets it as it is then.
+        # The status is read when it is sent: a slow subscriber gets it as it is then.
         def make(missed: int) -> str:
-            return _text("scene", id, missed, "status", self._room.status(self.scene.status))
+            return _text("scene", id, missed, "status", self._channel.status(self.scene.status))
 
-        self.mailbox.put(id, make)
+        self.outbox.put(id, make)
 
     def _put_report(self, id: str, finished: FrameFinished) -> None:
-        self.mailbox.put(id, lambda missed: _text("frame", id, missed, "report", finished.text))
+        self.outbox.put(id, lambda missed: _text("frame", id, missed, "report", finished.text))
 
 
 def _text(kind: str, id: str, missed: int, name: str, value: str) -> str:

@@ -43,7 +43,7 @@ export class Chart {
     return value === null ? "not measured" : `${value.toFixed(value < 10 ? 2 : 1)} ${this.unit}`;
   }
 
-  /** @param points [{index, value or null, fault, held, change}] by index: why it is marked, or nothing */
+  /** @param points [{index, value or null, fault, held, change}] by index: the reason for a mark, or nothing */
   set(points) {
     this.points = points;
     this.draw();

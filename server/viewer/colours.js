@@ -11,7 +11,7 @@ export const DEPTH_RAMP = Array.from({ length: 256 }, (_, i) => {
   return VIRIDIS[low].map((value, k) => Math.round(value + (at - low) * (VIRIDIS[low + 1][k] - value)));
 });
 
-/** Told apart on dark and on light, Okabe and Ito's set without black. */
+/** Okabe and Ito's set without black: distinct on dark and on light, and for the colour-blind. */
 export const TRACKS = ["#e69f00", "#56b4e9", "#00c896", "#f0e442", "#4c8dff", "#ff6b3d", "#e285c2", "#f2f4f7"];
 
 /** Depth [H, W] float32 (NaN: nothing) as an image, and the range of its colours: from the 1st to the 99th hundredth. */

@@ -41,7 +41,7 @@ function solve(m, b) {
   return [0, 1, 2].map((k) => det(m.map((row, i) => row.map((value, j) => (j === k ? b[i] : value)))) / d);
 }
 
-/** What the rig says of the scene: where it looks, which way is up, how far away it stands. */
+/** Finds from the rig the point that it looks at, its up direction and its distance. */
 export function fitRig(cameras) {
   const n = cameras.length;
   const forward = cameras.map((camera) => unit(camera.rows[2]));
@@ -83,7 +83,7 @@ export class Orbit {
     this.from(cameras[0]);
   }
 
-  /** Looks from where a camera of the rig stands, at what it looks at. */
+  /** Takes the position and direction of a camera of the rig. */
   from(camera) {
     const ahead = unit(camera.rows[2]);
     const distance = Math.max(dot(sub(this.rig.target, camera.centre), ahead), 0.1 * this.rig.radius);
@@ -104,7 +104,7 @@ export class Orbit {
     return add(this.target, scale(out, this.distance));
   }
 
-  /** As the service takes it, for a picture of a size. */
+  /** Returns the camera as the service takes it, for a picture of a size. */
   camera(width, height) {
     const eye = this.eye();
     const z = unit(sub(this.target, eye));

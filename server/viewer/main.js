@@ -1,4 +1,4 @@
-// The page: which scene, which frame, and what of it is shown.
+// The page: chooses a scene and a frame, and shows them.
 
 import { Chart } from "./charts.js";
 import { TRACKS } from "./colours.js";
@@ -66,7 +66,7 @@ async function listScenes() {
   if (there && there.id !== page.scene) openScene(there.id);
 }
 
-/** The address names a scene that is not here: another one would be taken for it. */
+/** The address names a scene that is not here. No other scene is opened in its place: it would be taken for it. */
 function missing(id, scenes) {
   const box = curtain("There is no such scene", `The service has no scene ${id}. ${scenes.length ? "Choose one:" : "It has no others either."}`);
   box.querySelector(".detail").replaceChildren(...scenes.map((scene) =>
@@ -148,7 +148,7 @@ function connection(state, wait) {
     page.lost = false;
   } else {
     page.lost = true;
-    $("banner").textContent = `The connection to the service is lost. The next try is in ${wait < 1 ? "a moment" : `${Math.round(wait)} s`}; what is shown is the last that came.`;
+    $("banner").textContent = `The connection to the service is lost. The next try is in ${wait < 1 ? "a moment" : `${Math.round(wait)} s`}; the page shows the last data that came.`;
   }
 }
 
@@ -173,7 +173,7 @@ function showStatus(status) {
         `${progress.done} of ${progress.total}${loss === undefined ? "" : ` · loss ${loss.toFixed(4)}`}`,
         progress.total ? progress.done / progress.total : null);
     } else if (status.state === "initialising") curtain("Reconstructing the first frame", "The pictures are being read");
-    else curtain("Waiting for the first frame", "The scene is there and takes frames.", `PUT ${scenePath(status.id)}/frames/0`);
+    else curtain("Waiting for the first frame", "The scene accepts frames.", `PUT ${scenePath(status.id)}/frames/0`);
   }
   if (status.committed && !view.shown) curtain("Opening the scene", "The first picture is on its way.");
   showTimeline();
@@ -213,7 +213,7 @@ function redraw() {
   const reports = inOrder();
   const fault = (one) => (one.state === "committed" ? "" : one.error ?? one.state);
   psnr.set(reports.map((one) => ({ index: one.index, value: one.psnr ?? null, fault: fault(one), held: reasonOf(one) })));
-  // The first frame takes minutes and would flatten all others; it is told in words.
+  // The first frame takes minutes and would flatten all others; it is written below the chart.
   const first = reports.find((one) => one.state === "committed");
   const updates = reports.filter((one) => one !== first);
   const budgets = updates.filter((one) => one.budget);
@@ -223,13 +223,13 @@ function redraw() {
     value: one === first ? null : one.seconds?.total ?? null })));
   const times = updates.map((one) => one.seconds?.total).filter((value) => value !== undefined).sort((a, b) => a - b);
   $("figures").textContent = first
-    ? `First frame ${(first.seconds?.total ?? 0).toFixed(1)} s` + (times.length ? `; updates ${times[times.length >> 1].toFixed(2)} s in the middle, ${times.at(-1).toFixed(2)} s at most` : "")
+    ? `First frame ${(first.seconds?.total ?? 0).toFixed(1)} s` + (times.length ? `; updates ${times[times.length >> 1].toFixed(2)} s in the median, ${times.at(-1).toFixed(2)} s at most` : "")
     : "";
   showTimeline();
   showHealth();
 }
 
-/** Another budget than the frame before had, in words. */
+/** A change of budget since the frame before, in words. */
 function change(before, now) {
   if (JSON.stringify(before) === JSON.stringify(now)) return "";
   if (now.budget_ms !== null) return `from here on ${now.budget_ms} ms`;
@@ -275,7 +275,7 @@ function showTimeline() {
   seconds.choose(report?.index ?? null);
 }
 
-/** Where on the slider frames are that are not what their pictures show. */
+/** Marks frames on the slider whose state is not what their pictures show. */
 function showMarks(reports) {
   const last = Math.max(reports.length - 1, 1);
   $("marks").replaceChildren(...reports.flatMap((report, at) => {
@@ -380,7 +380,7 @@ function failed(message) {
   note(message.problem.detail, track ? null : message.id);
 }
 
-/** The same view in a smaller picture: where a point can be seen is found from depth pictures of this size. */
+/** The same view in a smaller picture: visibility is computed from depth pictures of this size. */
 function smaller(camera) {
   const ratio = Math.min(1, PICK_PX / Math.max(camera.width, camera.height));
   const [width, height] = [Math.round(camera.width * ratio), Math.round(camera.height * ratio)];
@@ -442,12 +442,12 @@ function showTracks() {
   if (page.stream) view.draw();
 }
 
-// Hands and keys.
+// Pointer and keys.
 
 function askForToken(again) {
   const door = $("door");
   if (door.open) return;
-  if (again) $("door-words").textContent = "The service does not know that token. Enter the one that it was started with (SCAS4D_TOKEN).";
+  if (again) $("door-words").textContent = "The token is wrong. Enter the token that the service was started with (SCAS4D_TOKEN).";
   token.forget();
   door.showModal();
   door.addEventListener("close", () => {

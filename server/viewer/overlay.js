@@ -1,8 +1,8 @@
-// What is drawn over the picture.
+// Draws tracks and the rig over the picture.
 
 import { add, scale } from "./geometry.js";
 
-/** A trajectory each: what lies behind the frame shown is solid, what comes is faint. */
+/** Draws each trajectory: frames before the one shown are solid, later ones faint. */
 export function drawTracks(context, place, tracks, frame, dense) {
   context.lineJoin = context.lineCap = "round";
   for (const track of tracks) {
@@ -43,7 +43,7 @@ export function drawTracks(context, place, tracks, frame, dense) {
   context.globalAlpha = 1;
 }
 
-/** The rig's cameras as pyramids with their names. */
+/** Draws the rig's cameras as pyramids with their names. */
 export function drawFrusta(context, place, cameras, radius, dense) {
   const depth = 0.07 * radius;
   context.font = `${11 * dense}px system-ui, sans-serif`;

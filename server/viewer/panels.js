@@ -10,7 +10,7 @@ export const STATES = {
   failed: "Failed",
 };
 
-/** What the scene does, and what holds beside it. */
+/** The state of the scene in words, with what else holds. */
 export function stateWords(status) {
   const words = [STATES[status.state] ?? status.state];
   if (status.paused && status.state !== "paused" && status.state !== "failed") words.push("pausing");
@@ -30,7 +30,7 @@ export function node(name, attributes = {}, ...children) {
   return made;
 }
 
-/** Why a committed frame is not what its pictures show, or only by half; empty where it is. */
+/** The reason why a committed frame does not show its pictures, or only in part; empty if it does. */
 export function reasonOf(report) {
   if (!report?.degraded) return "";
   return report.degraded[0].toUpperCase() + report.degraded.slice(1);
@@ -51,7 +51,7 @@ export function showFacts(list, status) {
   list.replaceChildren(...facts.flatMap(([name, value]) => [node("dt", {}, name), node("dd", {}, value)]));
 }
 
-/** One box a place in the queue; the words say the same. */
+/** Draws one box for each place in the queue; the words say the same. */
 export function showQueue(box, words, status) {
   const places = Math.min(status.queue_limit, 24);
   const taken = Math.ceil(places * status.queued / status.queue_limit);
@@ -72,7 +72,7 @@ const BELOW_DB = 4;
 const SHIFT = 0.02;
 const UNWELL = 0.4;
 
-/** What looks wrong with a camera beside the others and beside itself before; empty where nothing does. */
+/** Lists faults of a camera, compared with the others and with itself before; empty if there are none. */
 export function complaints(name, report, reports) {
   const fit = report.cameras?.[name];
   const found = name in (report.dropped_cameras ?? {}) ? [`left out of this frame: ${report.dropped_cameras[name]}`] : [];
@@ -87,7 +87,7 @@ export function complaints(name, report, reports) {
   // Some cameras always see more detail than others: a camera is held against itself where it has a past.
   const usual = own ?? middle;
   if (usual !== null && fit.psnr !== null && usual - fit.psnr > BELOW_DB) {
-    found.push(`its picture is met ${(usual - fit.psnr).toFixed(1)} dB worse than ${own === null ? "the others'" : "before"}: moved, dirty or out of focus?`);
+    found.push(`its PSNR is ${(usual - fit.psnr).toFixed(1)} dB lower than ${own === null ? "that of the others" : "before"}: moved, dirty or out of focus?`);
   }
   if (fit.colour_shift) {
     const past = before.filter((one) => one?.colour_shift);
@@ -98,7 +98,7 @@ export function complaints(name, report, reports) {
   return found;
 }
 
-/** A row a camera: how well its picture was met, how its colours differ, and what looks wrong. */
+/** Fills a row for each camera: PSNR of its picture, shift of its colours, and faults. */
 export function showCameras(body, summary, names, report, reports, lookFrom) {
   const fits = report?.cameras ?? {};
   const known = Object.values(fits).map((fit) => fit.psnr).filter((value) => value !== null);

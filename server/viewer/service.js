@@ -1,4 +1,4 @@
-// Requests to the service. Whatever fails is an Error whose message is a sentence for a person.
+// Requests to the service. A failure is an Error whose message is a sentence for a person.
 
 const KEY = "scas4d.token";
 
@@ -36,7 +36,7 @@ export async function call(method, path, body) {
 
 export const scenePath = (id) => `/v1/scenes/${encodeURIComponent(id)}`;
 
-/** Subprotocol of a ticket for one WebSocket: a browser cannot send a token with it. None where none is asked for. */
+/** Subprotocol of a ticket for one WebSocket: a browser cannot send a token with it. Without a token, none is needed. */
 export async function ticket() {
   if (!token.get()) return null;
   return (await call("POST", "/v1/tickets")).subprotocol;

@@ -69,7 +69,7 @@ export class Stream {
     }
   }
 
-  /** The browser does not say why a handshake was refused: a request for the scene does. */
+  /** Finds the reason of a refused handshake with a request for the scene: the browser does not tell it. */
   async broken() {
     if (this.closed) return;
     try {

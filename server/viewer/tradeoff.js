@@ -1,9 +1,9 @@
-// What accuracy costs in time: error over milliseconds a frame, and the budget that is chosen by it.
+// The trade-off panel: error over milliseconds a frame, and the budget.
 
 import { element, step } from "./charts.js";
 import { call, scenePath } from "./service.js";
 
-// Below the plot is a strip of its own for what has a time but no error, so that the two are not taken for each other.
+// Points with a time but no error have a strip of their own below the plot, so that the two are not confused.
 const [LEFT, RIGHT, TOP, STRIP, BOTTOM] = [48, 20, 36, 34, 18];
 const EFFECT_FRAMES = 16;
 // Under a budget in time every frame has iterations of its own: measured points of about the same time and not too
@@ -16,14 +16,14 @@ const STEPS = 1000;
 // From and to of the slider, which is logarithmic.
 const RANGES = { iterations: [5, 1000], budget_ms: [20, 20000] };
 const UNITS = { iterations: "iterations", budget_ms: "ms" };
-const HOW = { measured: "measured on frames of the scene", replayed: "replayed", extrapolated: "extrapolated: its time alone" };
+const HOW = { measured: "measured on frames of the scene", replayed: "replayed", extrapolated: "extrapolated: only its time" };
 
-/** So many milliseconds in the unit that people say them in. */
+/** Writes milliseconds in the usual unit. */
 const spoken = (time) => (time < 1000 ? `${short(time)} ms` : `${short(time / 1000)} s`);
 
 const middle = (values) => [...values].sort((a, b) => a - b)[values.length >> 1];
 
-/** Three digits that mean something are enough to choose by. */
+/** Rounds to three significant digits: enough to choose by. */
 const short = (value) => Number(value.toPrecision(value < 100 ? 2 : 3));
 
 /** The points, with the measured ones that took about as long as one: means by frames. */
@@ -63,7 +63,7 @@ export class Tradeoff {
       this.draw();
     });
     $("budget").addEventListener("change", () => this.put());
-    // Let go where it was: that is no change, and no event says so.
+    // Released where it was: that is no change, and no event comes.
     $("budget").addEventListener("pointerup", () => setTimeout(() => this.putting || this.rest(), 50));
     $("measure").addEventListener("click", () => this.measure());
     new ResizeObserver(() => this.draw()).observe($("tradeoff"));
@@ -83,7 +83,7 @@ export class Tradeoff {
     this.place();
   }
 
-  /** A frame is finished, or something else may have changed: soon, but not for every frame of a fast rig. */
+  /** Reads again soon after a frame or another change, but not for every frame of a fast rig. */
   refresh(soonest = 0) {
     if (!this.scene || this.timer) return;
     this.timer = setTimeout(() => this.load(), Math.max(soonest, this.due - performance.now(), 0));
@@ -165,7 +165,7 @@ export class Tradeoff {
     return model ? model.fixed + model.per_iteration * iterations : null;
   }
 
-  /** What the control says, and what that would cost or bring. */
+  /** Writes the value of the control, and its cost or effect. */
   tell() {
     const words = this.$("budget-words");
     const effective = this.effective;
@@ -173,7 +173,7 @@ export class Tradeoff {
     this.$("budget-effect").textContent = effective ? this.effect() : "";
     if (!effective) return words.textContent = "";
     const own = effective.budget_ms === null ? `${effective.iterations} iterations a frame` : `as many iterations as fit into ${spoken(effective.budget_ms)}`;
-    const now = `Now: ${own}${this.asked.iterations === null && this.asked.budget_ms === null ? ", as the scene was made" : `, from frame ${this.since} on`}.`;
+    const now = `Now: ${own}${this.asked.iterations === null && this.asked.budget_ms === null ? ", as the scene was created" : `, from frame ${this.since} on`}.`;
     const model = this.model?.model;
     let then = "";
     if (this.moving && model) {
@@ -184,12 +184,12 @@ export class Tradeoff {
     words.textContent = now + then;
   }
 
-  /** Which kind of budget holds: by time or by iterations; none where it is as the scene was made. */
+  /** The kind of budget that holds: time or iterations; empty if it is the scene's own. */
   get held() {
     return this.effective.budget_ms !== null ? "budget_ms" : this.asked.iterations !== null ? "iterations" : "";
   }
 
-  /** What the last change has brought: the frames since beside those before. */
+  /** The effect of the last change: the frames since, compared with those before. */
   effect() {
     if (!this.updates.length || this.since === null || this.since === undefined) return "";
     const after = this.updates.filter((one) => one.index >= this.since).slice(-EFFECT_FRAMES);
@@ -205,7 +205,7 @@ export class Tradeoff {
     return psnr.length ? `${time}, ${middle(psnr).toFixed(1)} dB a frame` : `${time} a frame`;
   }
 
-  /** The control goes back to the budget that holds. */
+  /** Sets the control back to the budget that holds. */
   rest() {
     this.moving = false;
     this.place();
@@ -254,7 +254,7 @@ export class Tradeoff {
     const { clientWidth, clientHeight } = svg;
     svg.replaceChildren();
     const points = grouped(this.model?.points.filter((point) => point.iterations > 0) ?? []);
-    // Settings that judge nothing have no witnesses: then the PSNR stands for the accuracy.
+    // Settings without validation have no probe views: then the PSNR stands for the accuracy.
     const by = points.some((point) => point.error !== null) ? "error" : "psnr";
     const known = points.filter((point) => point[by] !== null);
     this.$("tradeoff-unit").textContent = by === "error" ? "error against time a frame" : "PSNR against time a frame";
@@ -308,7 +308,7 @@ export class Tradeoff {
     const place = (point) => [x(point.milliseconds), point[by] === null ? base - 3 : y(point[by])];
     const taken = points.map((point) => place(point)).map(([px, py]) => [px - 4, px + 4, py - 4, py + 4]);
     if (chosen) taken.push([x(chosen) - 1, x(chosen) + 1, TOP, base]);
-    /** A label beside its point, where it hides nothing; else the point has it as a title alone. */
+    /** Writes a label beside its point if it hides nothing; else the point has it as a title only. */
     const label = (px, places, words) => {
       const half = 3.4 * words.length + 1;
       for (const [side, at] of places) {

@@ -91,7 +91,7 @@ export class LiveView {
     return [Math.round(width), Math.round(height)];
   }
 
-  /** The camera, the size or the mode is another: a quick picture now, a sharp one when it rests. */
+  /** Asks after a change of camera, size or mode: a quick picture now, a sharp one when it rests. */
   moved(sharp = false) {
     if (!this.stream) return;
     this.request("update", sharp ? 1 : this.coarse);
@@ -170,7 +170,7 @@ export class LiveView {
     drawTracks(context, place, this.tracks, this.shown.frame, dense);
   }
 
-  // The user's hands.
+  // Pointer and keys.
 
   listen() {
     const canvas = this.overlay;

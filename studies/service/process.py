@@ -31,7 +31,7 @@ class Service:
     """A service over one data folder; `start` and `kill` may be called again and again.
 
     Args:
-        data: its folder. environment: further variables, as SCAS4D_ENGINE.
+        data: its folder. environment: further variables, as SCAS4D_TOKEN.
     """
 
     def __init__(self, data: Path, environment: Mapping[str, str] | None = None) -> None:

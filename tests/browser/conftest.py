@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 
+import browser_engine
 import pytest
 from browser_page import FRAMES, push, start_scene
 from running import Running, fake_settings
@@ -46,7 +47,7 @@ def page(chromium):
 @pytest.fixture(scope="session")
 def service(tmp_path_factory):
     folder = tmp_path_factory.mktemp("viewer")
-    running = Running(fake_settings(folder, engine="browser_engine:engine", max_render_pixels=2_000_000))
+    running = Running(fake_settings(folder), core=browser_engine.install)
     yield running
     running.stop()
 

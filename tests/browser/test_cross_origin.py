@@ -7,6 +7,7 @@ import shutil
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
+import browser_engine
 import pytest
 from browser_engine import make_rig
 from running import Running, fake_settings
@@ -102,7 +103,7 @@ def test_a_name_that_was_pointed_at_this_machine_gets_nothing(chromium, service,
 
 
 def test_a_browser_accepts_the_handshake_of_a_ticket(chromium, tmp_path):
-    running = Running(fake_settings(tmp_path, engine="browser_engine:engine", token=TOKEN))
+    running = Running(fake_settings(tmp_path, token=TOKEN), core=browser_engine.install)
     bearer = {"Authorization": f"Bearer {TOKEN}"}
     try:
         with Client(running.url, token=TOKEN) as sdk:

@@ -49,7 +49,7 @@ def test_what_was_measured_and_what_is_extrapolated_are_told_apart(page, service
     assert said.startswith("40 iterations")
     assert "error 0.0250" in said
     assert "measured" in said
-    assert "its time alone" in page.locator("#tradeoff .point.extrapolated title").first.text_content()
+    assert "only its time" in page.locator("#tradeoff .point.extrapolated title").first.text_content()
     assert text(page, "tradeoff-unit").startswith("error")
     assert "40 iterations a frame, from frame 4 on" in text(page, "budget-words")
     assert page.locator("#seconds .change").count() == 1  # where the budget changed
@@ -74,7 +74,7 @@ def test_a_budget_that_is_moved_holds_from_the_next_frame_on(page, service, ran)
     until(page, "document.getElementById('budget-words').innerText.includes('as fit into 20 ms')")
     assert sdk.budget(id).asked == Budget(budget_ms=20)
     page.select_option("#budget-kind", "")
-    until(page, "document.getElementById('budget-words').innerText.includes('as the scene was made')")
+    until(page, "document.getElementById('budget-words').innerText.includes('as the scene was created')")
     assert sdk.budget(id).asked == Budget()
     assert page.faults == []
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import browser_engine
 import numpy as np
 import pytest
 from browser_page import FRAMES, canvas, opened, push, shown, start_scene, until
@@ -155,7 +156,7 @@ def test_a_bumped_camera_shows(page, service, finished):
     row = page.locator("#cameras tr.bad")
     assert row.count() == 1
     assert row.locator("th").inner_text() == "c2"
-    assert "dB worse than before" in page.locator("#camera-summary").inner_text()
+    assert "dB lower than before" in page.locator("#camera-summary").inner_text()
     page.locator("#time").fill("3")  # before it was bumped
     until(page, "document.querySelectorAll('#cameras tr.bad').length === 0")
     assert page.faults == []
@@ -184,8 +185,8 @@ def test_a_scene_from_its_first_frame_to_its_deletion(page, service, finished):
 
 
 def test_it_connects_again_when_the_service_restarts(page, tmp_path):
-    settings = fake_settings(tmp_path, engine="browser_engine:engine")
-    service = Running(settings)
+    settings = fake_settings(tmp_path)
+    service = Running(settings, core=browser_engine.install)
     try:
         with Client(service.url, patience=30) as sdk:
             id = start_scene(sdk)
@@ -197,7 +198,7 @@ def test_it_connects_again_when_the_service_restarts(page, tmp_path):
         page.wait_for_selector("#banner:not([hidden])")
         assert "connection to the service is lost" in page.locator("#banner").inner_text()
         assert page.locator("#curtain").is_hidden()  # the last picture stays
-        service = Running(settings, service.port)
+        service = Running(settings, service.port, core=browser_engine.install)
         page.wait_for_selector("#banner[hidden]", state="attached")
         with Client(service.url, patience=30) as sdk:
             push(sdk, id, 1)
@@ -222,7 +223,7 @@ def test_an_address_of_no_scene_is_told_and_the_others_are_offered(page, service
 
 
 def test_without_a_scene_it_says_what_to_do(page, tmp_path):
-    service = Running(fake_settings(tmp_path, engine="browser_engine:engine"))
+    service = Running(fake_settings(tmp_path), core=browser_engine.install)
     try:
         page.goto(service.url)
         until(page, "document.querySelector('#curtain').innerText.includes('scas4d push')")
@@ -233,7 +234,7 @@ def test_without_a_scene_it_says_what_to_do(page, tmp_path):
 
 def test_a_token_is_asked_for_and_the_stream_opens_with_a_ticket(page, tmp_path):
     token = "a-token-that-is-long-enough"
-    service = Running(fake_settings(tmp_path, engine="browser_engine:engine", token=token))
+    service = Running(fake_settings(tmp_path, token=token), core=browser_engine.install)
     try:
         with Client(service.url, token=token, patience=30) as sdk:
             id = start_scene(sdk)
@@ -243,7 +244,7 @@ def test_a_token_is_asked_for_and_the_stream_opens_with_a_ticket(page, tmp_path)
         page.wait_for_selector("#door[open]")
         page.fill("#token", "a-token-that-is-another-one")
         page.click("#door button")
-        until(page, "document.getElementById('door-words').innerText.includes('does not know')")
+        until(page, "document.getElementById('door-words').innerText.includes('The token is wrong')")
         page.fill("#token", token)
         page.click("#door button")
         shown(page, frame="0")

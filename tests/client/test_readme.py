@@ -27,7 +27,7 @@ def after(tmp_path_factory):
     """The names of the example once it has run."""
     from running import Running
 
-    running = Running(ServerSettings(data=tmp_path_factory.mktemp("readme")))
+    running = Running(ServerSettings(data=tmp_path_factory.mktemp("readme")), core=None)
     lines = replaced(LINES, "Client()", f"Client({running.url!r})")
     lines = replaced(lines, '{"update": {"iterations": 100}}', SHORTER)
     lines = replaced(lines, '"samples/robot"', repr(str(ROOT / "samples/robot")))

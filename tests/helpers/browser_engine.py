@@ -1,4 +1,4 @@
-"""The fake engine with pictures: points drawn as discs; they depend on camera, frame and mode."""
+"""The fake core with pictures: points drawn as discs; they depend on camera, frame and mode."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class DrawnReconstruction(fakes.FakeReconstruction):
         return super().commit(frame, dropped, {**(notes or {}), **more})
 
 
-class DrawnReader(fakes.FakeReader):
+class DrawnCommitted(fakes.FakeCommitted):
     def render(self, camera, index, *, background, labels=None):
         inside = self.world.camera_to_inside(camera)
         means = self.history.gaussians(index).means
@@ -82,18 +82,6 @@ class DrawnReader(fakes.FakeReader):
         return np.arange(COUNT) * (count or 3) // COUNT
 
 
-class DrawnEngine(fakes.FakeEngine):
-    def start(self, rig, frame, settings, *, points, **options):
-        made = super().start(rig, frame, settings, points=points, **options)
-        return DrawnReconstruction(made.points, made.history)
-
-    def resume(self, rig, settings, history, **options):
-        made = super().resume(rig, settings, history, **options)
-        return DrawnReconstruction(made.points, made.history, made.resumed)
-
-    def reader(self, rig, settings, history):
-        return DrawnReader(rig, history)
-
-
-def engine():
-    return DrawnEngine()
+def install():
+    """Puts this in the place of the core in this process."""
+    fakes.install(Reconstruction=DrawnReconstruction, CommittedScene=DrawnCommitted)

@@ -23,7 +23,7 @@ def start_scene(sdk, name="ring"):
 
 
 def push(sdk, id, index, red=0):
-    """One frame; `red` tells the fake engine what to do."""
+    """One frame; `red` tells the fake what to do."""
     sdk.put_frame(id, index, {name: picture(red, (32, 24)) for name in make_rig().names})
 
 

@@ -1,16 +1,22 @@
-"""An engine without a method: it honours the contract of the real one and does what the first picture's red says."""
+"""A core without a method: it keeps the contract of the real one and does what the first picture's red says.
+
+``install`` puts it in the place of the core's modules in a process of a service: ``Running`` passes it to the service's
+`Placement`; for services that are started as commands, `fake_core/sitecustomize.py` calls it (see ``environment``).
+"""
 
 from __future__ import annotations
 
 import os
+import sys
 import time
 from dataclasses import asdict, dataclass, field
-from types import SimpleNamespace
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.query import tracks
 from scas4d_core.storage.history import History, HistoryError
 
 SLOW, SLOW_RAISES, RAISES, DIES, HELD, LEAVES_OUT, STANDS = 200, 201, 250, 251, 240, 241, 242
@@ -86,6 +92,31 @@ class FakeReconstruction:
         self.resumed = resumed
         self.iterations = ITERATIONS
 
+    @classmethod
+    def start(cls, rig, frame, settings, *, points, progress, history, dropped=None, notes=None, started=None):
+        assert started is None or started <= time.perf_counter()
+        obey(frame)
+        for done in range(3):
+            progress(Progress("fitting", done + 1, 3, {"psnr": 30.0}))
+        given = points.positions if points is not None else np.array([[0.0, 0, 0], [0.5, 0, 0]])
+        scene = cls(rig.world_frame().to_inside(given), history)
+        scene.commit(frame, dropped, notes)
+        return scene
+
+    @classmethod
+    def resume(cls, rig, settings, history, *, held=lambda index: True):
+        first, faults = history.indices[0], list(history.damaged.values())
+        for last in reversed(history.indices):
+            try:
+                history.gaussians(last)
+                history.report(last)
+                break
+            except HistoryError as error:
+                faults.append(str(error))
+        offset = np.array([STEP_M * first, 0, 0])
+        points = history.gaussians(first).means - offset
+        return cls(points, history, Resumed(last, history.cut(last), faults, False))
+
     def commit(self, frame, dropped, notes):
         count = len(self.points)
         report = Report(frame.index, frame.time, self.iterations, {"update": 0.01}, [0.5, 0.25], 31.5, count, count)
@@ -121,10 +152,13 @@ class FakeReconstruction:
         return False  # it needs none
 
 
-class FakeReader:
-    def __init__(self, rig, history):
+class FakeCommitted:
+    def __init__(self, history, world, limits):
+        from scas4d_core.query import tracks  # in the readers alone: it loads SciPy
+
         self.history = history
-        self.world = rig.world_frame()
+        self.world = world
+        self.find = tracks
 
     def render(self, camera, index, *, background, labels=None):
         self.history.gaussians(index)
@@ -139,17 +173,17 @@ class FakeReader:
         return np.full((camera.height, camera.width), np.inf), np.zeros((camera.height, camera.width))
 
     def tracks_of_points(self, points, index, indices):
-        return tracks.tracks_of_points(self.history, self.world, points, index, indices)
+        return self.find.tracks_of_points(self.history, self.world, points, index, indices)
 
     def tracks_of_pixels(self, camera, uv, index, indices):
-        return tracks.tracks_of_pixels(self.history, self.world, camera, uv, index, indices, self._depth)
+        return self.find.tracks_of_pixels(self.history, self.world, camera, uv, index, indices, self._depth)
 
     def tracks_of_ids(self, ids, indices):
         if HANGS in ids:
             time.sleep(600)
         if KILLS in ids:
             os._exit(9)
-        return tracks.tracks_of_ids(self.history, self.world, ids, indices)
+        return self.find.tracks_of_ids(self.history, self.world, ids, indices)
 
     def with_visibility(self, found, camera, index):
         return found.with_visibility(camera, self._depth, 0.01)
@@ -161,67 +195,62 @@ class FakeReader:
         path.write_bytes(b"ply\n" + str(index).encode())
 
 
-class FakeEngine:
-    def start(self, rig, frame, settings, *, points, progress, history, dropped=None, notes=None, started=None):
-        assert started is None or started <= time.perf_counter()
+def remake(rig, settings, history, base, frame, budget, *, dropped=None, notes=None):
+    obey(frame)
+    first = history.indices[0]
+    copy = History()
+    copy.append(base, history.time(base), history.gaussians(base), history.report(base))
+    points = history.gaussians(first).means - np.array([STEP_M * first, 0, 0])
+    scene = FakeReconstruction(points, copy)
+    scene.set_budget(**budget)
+    scene.commit(frame, dropped, {**(notes or {}), "remade": True})
+    report = copy.report(frame.index)
+    history.replace(frame.index, frame.time, copy.gaussians(frame.index).arrays(), report)
+    return report
+
+
+def replay(rig, settings, history, base, frames, iterations, over):
+    history.gaussians(base)
+    indices = []
+    for decode in frames:
+        frame, _ = decode()
         obey(frame)
-        for done in range(3):
-            progress(Progress("fitting", done + 1, 3, {"psnr": 30.0}))
-        given = points.positions if points is not None else np.array([[0.0, 0, 0], [0.5, 0, 0]])
-        scene = FakeReconstruction(rig.world_frame().to_inside(given), history)
-        scene.commit(frame, dropped, notes)
-        return scene
-
-    def resume(self, rig, settings, history, *, held=lambda index: True):
-        first, faults = history.indices[0], list(history.damaged.values())
-        for last in reversed(history.indices):
-            try:
-                history.gaussians(last)
-                history.report(last)
-                break
-            except HistoryError as error:
-                faults.append(str(error))
-        offset = np.array([STEP_M * first, 0, 0])
-        points = history.gaussians(first).means - offset
-        return FakeReconstruction(points, history, Resumed(last, history.cut(last), faults, False))
-
-    def remake(self, rig, settings, history, base, frame, budget, *, dropped=None, notes=None):
-        obey(frame)
-        first = history.indices[0]
-        copy = History()
-        copy.append(base, history.time(base), history.gaussians(base), history.report(base))
-        points = history.gaussians(first).means - np.array([STEP_M * first, 0, 0])
-        scene = FakeReconstruction(points, copy)
-        scene.set_budget(**budget)
-        scene.commit(frame, dropped, {**(notes or {}), "remade": True})
-        report = copy.report(frame.index)
-        history.replace(frame.index, frame.time, copy.gaussians(frame.index).arrays(), report)
-        return report
-
-    def replay(self, rig, settings, history, base, frames, iterations, over):
-        history.gaussians(base)
-        indices = []
-        for decode in frames:
-            frame, _ = decode()
-            obey(frame)
-            indices.append(frame.index)
-            over()
-        if iterations == RAISES_IN_REPLAY:
-            raise FloatingPointError("the fake was told to raise")
-        if iterations == DIES_IN_REPLAY:
-            os._exit(7)
-        return SimpleNamespace(
-            iterations=iterations, milliseconds=3.0 * iterations, error=1 / iterations, psnr=30.0,
-            frames=len(indices) - 1,
-        )  # fmt: skip
-
-    def reader(self, rig, settings, history):
-        return FakeReader(rig, history)
-
-    def warm_up(self):
-        if "SCAS4D_FAKE_FAULT" in os.environ:
-            raise FloatingPointError("the fake was told to raise")
+        indices.append(frame.index)
+        over()
+    if iterations == RAISES_IN_REPLAY:
+        raise FloatingPointError("the fake was told to raise")
+    if iterations == DIES_IN_REPLAY:
+        os._exit(7)
+    return SimpleNamespace(
+        iterations=iterations, milliseconds=3.0 * iterations, error=1 / iterations, psnr=30.0,
+        frames=len(indices) - 1,
+    )  # fmt: skip
 
 
-def engine():
-    return FakeEngine()
+def warm_up():
+    if "FAKE_FAULT" in os.environ:
+        raise FloatingPointError("the fake was told to raise")
+
+
+def install(**others):
+    """Puts the fake, or `others` of the same names, in the place of the core's modules in this process."""
+    of_core = {
+        "scas4d_core.reconstruction": {"Reconstruction": FakeReconstruction},
+        "scas4d_core.query.committed": {"CommittedScene": FakeCommitted},
+        "scas4d_core.remake": {"remake": remake},
+        "scas4d_core.replay": {"replay": replay},
+        "scas4d_core.warm_up": {"warm_up": warm_up, "warm_up_elsewhere": lambda: None},
+        "numba": {"set_num_threads": lambda count: None},  # nothing here needs it, and loading it takes a second
+    }
+    for name, members in of_core.items():
+        module = ModuleType(name)
+        module.__spec__ = ModuleSpec(name, None)
+        module.__dict__.update({member: others.get(member, fake) for member, fake in members.items()})
+        sys.modules[name] = module
+
+
+def environment(*folders, **more):
+    """The environment of a command whose processes have the fake in place of the core; `folders` go before it."""
+    helpers = Path(__file__).parent
+    path = [*folders, helpers / "fake_core", helpers, helpers.parents[1]]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, path)), **more}

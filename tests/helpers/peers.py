@@ -16,8 +16,7 @@ from starlette.responses import JSONResponse, StreamingResponse
 from starlette.routing import Route, WebSocketRoute
 
 from server.connections.config import guarded
-from server.connections.guard import Guard
-from server.connections.limits import Limits
+from server.connections.guard import Guard, Limits
 from server.connections.proxies import ClientLimit
 from server.connections.websocket import limit_messages
 from server.settings import ServerSettings

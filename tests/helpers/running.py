@@ -1,4 +1,4 @@
-"""A real service on a free port of the loopback with the fake engine, small rigs and pictures."""
+"""A real service on a free port of the loopback with a fake in place of the core, small rigs and pictures."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 
+import fakes
 import numpy as np
 import uvicorn
 from PIL import Image
@@ -15,19 +16,20 @@ from scas4d_core.cameras import Camera, Rig
 from server.app import create_app
 from server.connections.config import guarded
 from server.problems import Problem
+from server.processes.placement import Placement
 from server.settings import ServerSettings
 
 WIDTH, HEIGHT = 24, 16
 
 
 class Running:
-    """A uvicorn server in a thread."""
+    """A uvicorn server in a thread; `core` is called first in each of its processes, None: the core itself."""
 
-    def __init__(self, settings, port=None, ready=True):
+    def __init__(self, settings, port=None, ready=True, core=fakes.install):
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = port or free.getsockname()[1]
-        self.app = create_app(settings)
+        self.app = create_app(settings, Placement(core))
         config = guarded(self.app, port=self.port, log_level="error")
         self.server = uvicorn.Server(config)
         self.thread = threading.Thread(target=self.server.run)
@@ -53,19 +55,7 @@ class Running:
 
 def fake_settings(folder, **changes):
     """Small limits, so that tests reach them."""
-    given = dict(
-        data=folder,
-        engine="fakes:engine",
-        queue_frames=2,
-        max_body_mb=2,
-        max_scenes=4,
-        max_points=1000,
-        max_track_points=5000,
-        max_track_json_points=4000,
-        max_track_views=60,
-        max_ingest_sockets=3,
-        warm_up=False,
-    )
+    given = dict(data=folder, queue_frames=2, max_body_mb=2, max_scenes=4, warm_up=False)
     return ServerSettings(**given | changes)
 
 

@@ -43,7 +43,7 @@ def opened(tmp_path_factory):
     """The folder opened by this version, the frames that were acknowledged reconstructed, the last one completed."""
     folder = tmp_path_factory.mktemp("older") / "data"
     shutil.copytree(HERE / "data_folder", folder)
-    running = Running(ServerSettings(data=folder, scrub_mb_per_second=0))
+    running = Running(ServerSettings(data=folder, scrub_mb_per_second=0), core=None)
     try:
         with Client(running.url, patience=60) as sdk:
             read = {index: sdk.frame(ID, index) for index in (0, 1, 2, 3, 4)}

@@ -1,4 +1,4 @@
-"""A running service with the fake engine. Its processes import the fakes, so this folder is on the path."""
+"""A running service with a fake in place of the core. Its processes import the fakes, so this folder is on the path."""
 
 from __future__ import annotations
 

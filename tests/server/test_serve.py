@@ -12,13 +12,14 @@ import subprocess
 import sys
 import time
 
+import fakes
 import httpx
 import pytest
 
 from server.serve import address, listen
 from server.storage.disk import FolderLock
 
-ENVIRONMENT = {**os.environ, "SCAS4D_WARM_UP": "false", "SCAS4D_ENGINE": "fakes:engine"}
+ENVIRONMENT = fakes.environment(SCAS4D_WARM_UP="false")
 
 
 def command(folder, port, host="127.0.0.1"):

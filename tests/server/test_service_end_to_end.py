@@ -1,4 +1,4 @@
-"""The real engine behind the real service: a small, short robot goes in, and comes back as views, tracks and parts."""
+"""The core itself behind the real service: a small, short robot goes in, and comes back as views, tracks and parts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SETTINGS = {
 
 @pytest.fixture(scope="module")
 def pushed(tmp_path_factory):
-    running = Running(ServerSettings(data=tmp_path_factory.mktemp("real")))
+    running = Running(ServerSettings(data=tmp_path_factory.mktemp("real")), core=None)
     told = []
     try:
         with Client(running.url) as client:

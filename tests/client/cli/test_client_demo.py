@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import io
-import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
+import fakes
 import numpy as np
 import pytest
 from PIL import Image
@@ -19,28 +18,21 @@ from client.sdk import Client
 from scas4d_core.captures import open_capture
 from server.storage.disk import FolderLock
 
-FAKES = str(Path(__file__).parents[2] / "helpers")
 SLOW = """
 import time
-from fakes import FakeEngine
+import fakes
 
-class Slow(FakeEngine):
-    def warm_up(self):
-        time.sleep(3)
-
-def engine():
-    return Slow()
+fakes.install(warm_up=lambda: time.sleep(3))
 """
 
 
 def demo(capture, out, *more, before=(), **environment):
-    path = os.pathsep.join([*map(str, before), FAKES, os.getcwd()])
     return subprocess.run(
         [sys.executable, "-m", "client.cli.main", "demo", "--capture", str(capture), "--out", str(out), *more],
         capture_output=True,
         text=True,
         timeout=100,
-        env={**os.environ, "PYTHONPATH": path, "SCAS4D_ENGINE": "fakes:engine", "TERM": "dumb", **environment},
+        env=fakes.environment(*before, TERM="dumb", **environment),
     )
 
 
@@ -48,8 +40,8 @@ def demo(capture, out, *more, before=(), **environment):
 def done(capture_folder, tmp_path_factory):
     """A demo whose kernels take their time; the folder it left, and what it said."""
     folder = tmp_path_factory.mktemp("demo")
-    (folder / "slow.py").write_text(SLOW)
-    ended = demo(capture_folder, folder / "out", before=[folder], SCAS4D_ENGINE="slow:engine")
+    (folder / "sitecustomize.py").write_text(SLOW)
+    ended = demo(capture_folder, folder / "out", before=[folder])
     assert ended.returncode == 0, ended.stdout + ended.stderr
     return folder / "out", ended.stdout
 
@@ -70,8 +62,7 @@ def test_its_scene_can_be_looked_at_later_and_its_parts_have_the_colours_of_the_
 ):
     out, said = done
     id = re.search(rf"scas4d serve --data {out / 'data'}, and open \S+/#scene=(\w+)", said)[1]
-    monkeypatch.setenv("SCAS4D_ENGINE", "fakes:engine")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([FAKES, os.getcwd()]))
+    monkeypatch.setenv("PYTHONPATH", fakes.environment()["PYTHONPATH"])
     camera = open_capture(capture_folder).full_test_rig.cameras[0]
     with running_service(out / "data", tmp_path / "log") as url, Client(url) as client:
         assert client.scene(id).committed == 4
@@ -104,7 +95,7 @@ def test_a_service_that_ends_is_told_with_its_reason(capture_folder, tmp_path):
 
 
 def test_kernels_that_cannot_be_made_are_not_waited_for(capture_folder, tmp_path):
-    ended = demo(capture_folder, tmp_path / "out", SCAS4D_FAKE_FAULT="1")
+    ended = demo(capture_folder, tmp_path / "out", FAKE_FAULT="1")
     assert ended.returncode == 1
     assert ended.stderr.startswith("scas4d: the service cannot become ready: 503")
     assert "the fake was told to raise" in ended.stderr

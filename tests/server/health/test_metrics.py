@@ -114,7 +114,7 @@ def test_ready_says_how_long_the_kernels_took(tmp_path):
 
 
 def test_kernels_that_cannot_be_warmed_up_are_reported(tmp_path, monkeypatch):
-    monkeypatch.setenv("SCAS4D_FAKE_FAULT", "1")
+    monkeypatch.setenv("FAKE_FAULT", "1")
     running = Running(fake_settings(tmp_path, warm_up=True))
     try:
         answer, _ = waited(running)

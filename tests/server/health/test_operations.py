@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import signal
 import socket
@@ -27,13 +26,12 @@ TOKEN = "a-token-of-thirty-two-characters"
 
 @contextmanager
 def served(folder, *arguments, **environment):
-    """`scas4d serve` with the fake engine at a free port; its process, address and log."""
+    """`scas4d serve` with a fake in place of the core at a free port; its process, address and log."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    path = os.pathsep.join([str(ROOT / "tests" / "helpers"), str(ROOT)])
-    inherited = {name: value for name, value in os.environ.items() if not name.startswith("SCAS4D_")}
-    environment = {**inherited, "PYTHONPATH": path, "SCAS4D_ENGINE": "fakes:engine", **environment}
+    inherited = {name: value for name, value in fakes.environment().items() if not name.startswith("SCAS4D_")}
+    environment = {**inherited, **environment}
     log = folder / "log"
     command = [sys.executable, "-m", "client.cli.main", "serve", "--port", str(port), "--data", str(folder / "data")]
     with log.open("w") as file:
@@ -67,7 +65,7 @@ def children(pid):
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="processes are counted in /proc")
 @pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT])
 def test_it_ends_gracefully_in_the_middle_of_an_update(tmp_path, ending):
-    with served(tmp_path, SCAS4D_STOP_SECONDS="10") as (process, url, log):
+    with served(tmp_path) as (process, url, log):
         with Client(url) as sdk:
             id = sdk.create_scene(make_rig()).id
             sdk.put_frame(id, 0, pictures())

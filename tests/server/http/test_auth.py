@@ -14,8 +14,8 @@ from running import Running, fake_settings, make_rig, problem
 
 from client.wire import RigModel
 from client.wire.stream import STREAM_PROTOCOL
-from server.http import origin
-from server.http.auth import Door
+from server.http import tickets as tickets_module
+from server.http.middleware import AuthMiddleware, check_origin
 from server.http.tickets import SUBPROTOCOL, Tickets
 from server.settings import ServerSettings, SettingsError
 
@@ -31,7 +31,6 @@ def guarded(tmp_path_factory):
         token=TOKEN,
         allowed_hosts="studio.example, proxied.example:8443",
         allowed_origins="https://viewer.example",
-        max_tickets=3,
     )
     running = Running(settings)
     yield running
@@ -148,7 +147,7 @@ def test_without_a_token_only_this_machine_reaches_it():
         headers = [(b"host", b"localhost")] + ([(b"authorization", f"Bearer {token}".encode())] if token else [])
         scope = {"type": "http", "path": "/", "method": "GET", "headers": headers, "server": (address, 80)}
         answered.clear()
-        asyncio.run(Door(app, ServerSettings(token=token), Tickets(1, 1))(scope, None, send))
+        asyncio.run(AuthMiddleware(app, ServerSettings(token=token), Tickets())(scope, None, send))
         return answered[0]["status"]
 
     assert ask("10.0.0.7") == 403
@@ -158,9 +157,9 @@ def test_without_a_token_only_this_machine_reaches_it():
 
 def test_an_address_that_was_connected_to_is_a_name_of_ours():
     scope = {"type": "http", "headers": [(b"host", b"10.0.0.7:8000")], "server": ("10.0.0.7", 8000), "method": "GET"}
-    origin.check(scope, (), ())
+    check_origin(scope, (), ())
     with pytest.raises(Exception, match="name"):
-        origin.check(scope | {"server": ("10.0.0.8", 8000)}, (), ())
+        check_origin(scope | {"server": ("10.0.0.8", 8000)}, (), ())
 
 
 # Tokens.
@@ -260,7 +259,7 @@ def test_a_ticket_alone_is_echoed_so_that_browsers_accept_the_handshake():
     async def send(message):
         sent.append(message)
 
-    tickets = Tickets(30, 3)
+    tickets = Tickets()
     offered = SUBPROTOCOL + tickets.issue()
     scope = {
         "type": "websocket",
@@ -269,7 +268,7 @@ def test_a_ticket_alone_is_echoed_so_that_browsers_accept_the_handshake():
         "subprotocols": [offered],
         "extensions": {"websocket.http.response": {}},
     }
-    asyncio.run(Door(app, ServerSettings(token=TOKEN), tickets)(scope, None, send))
+    asyncio.run(AuthMiddleware(app, ServerSettings(token=TOKEN), tickets)(scope, None, send))
     assert sent == [{"type": "websocket.accept", "subprotocol": offered}]
 
 
@@ -311,7 +310,7 @@ def test_a_server_that_cannot_answer_a_handshake_closes_it():
         sent.append(message)
 
     scope = {"type": "websocket", "path": "/", "headers": [(b"host", b"evil.example")]}
-    asyncio.run(Door(None, ServerSettings(), Tickets(1, 1))(scope, None, send))
+    asyncio.run(AuthMiddleware(None, ServerSettings(), Tickets())(scope, None, send))
     assert [(message["type"], message["code"]) for message in sent] == [("websocket.close", 1008)]
     assert "name" in sent[0]["reason"]
 
@@ -319,9 +318,10 @@ def test_a_server_that_cannot_answer_a_handshake_closes_it():
 # Tickets by themselves, and the settings.
 
 
-def test_tickets_expire_are_bounded_and_kept_hashed():
+def test_tickets_expire_are_bounded_and_kept_hashed(monkeypatch):
+    monkeypatch.setattr(tickets_module, "MOST_TICKETS", 2)
     now = [0.0]
-    tickets = Tickets(30, 2, clock=lambda: now[0])
+    tickets = Tickets(clock=lambda: now[0])
     first, second = tickets.issue(), tickets.issue()
     assert not any(first.encode() in digest for digest in tickets._until)
     with pytest.raises(Exception, match="2 tickets of at most 2 wait"):

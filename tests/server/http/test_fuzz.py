@@ -49,7 +49,7 @@ def test_the_document_has_every_resource():
 @pytest.fixture(scope="module")
 def fuzzed(tmp_path_factory):
     """A service with a scene of two committed frames and one that has not begun."""
-    running = Running(fake_settings(tmp_path_factory.mktemp("fuzzed"), token=TOKEN, max_scenes=3, max_tickets=20))
+    running = Running(fake_settings(tmp_path_factory.mktemp("fuzzed"), token=TOKEN, max_scenes=3))
     with Client(running.url, token=TOKEN) as sdk:
         known["id"] = sdk.create_scene(make_rig()).id
         for index in range(2):

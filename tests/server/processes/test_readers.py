@@ -7,6 +7,7 @@ import contextlib
 import io
 import threading
 import time
+from unittest import mock
 
 import fakes
 import httpx
@@ -17,7 +18,8 @@ from running import HEIGHT, WIDTH, Running, fake_settings, make_rig, pictures, p
 
 from client.sdk import Client
 from client.wire import CameraModel, part_colour
-from server.processes import encode
+from server.processes import readers as readers_module
+from server.processes import renderer
 
 PATIENCE_S = 30
 
@@ -25,10 +27,10 @@ PATIENCE_S = 30
 @pytest.fixture(scope="module")
 def impatient(tmp_path_factory):
     """A service that soon gives up waiting for an answer; long enough for a process to start on a busy machine."""
-    settings = fake_settings(tmp_path_factory.mktemp("data")).model_copy(update={"answer_seconds": 10.0})
-    running = Running(settings)
-    yield running
-    running.stop()
+    with mock.patch.object(readers_module, "ANSWER_SECONDS", 10.0):
+        running = Running(fake_settings(tmp_path_factory.mktemp("data")))
+        yield running
+        running.stop()
 
 
 @contextlib.contextmanager
@@ -39,7 +41,7 @@ def two_frames(impatient):
         for index in range(2):
             sdk.put_frame(id, index, pictures())
         sdk.wait(id, 1)
-        yield id, impatient.app.state.scenes[id]._readers, http
+        yield id, impatient.app.state.scenes[id].readers, http
         sdk.delete_scene(id)
 
 
@@ -138,9 +140,9 @@ def test_the_process_for_bulk_starts_with_the_first_question_and_yields_to_the_o
     assert nice(readers.bulk.process) == min(19, nice(readers.views.process) + 10)
 
 
-def test_too_many_questions_are_refused(scene):
+def test_too_many_questions_are_refused(scene, monkeypatch):
     id, readers, http = scene
-    readers.bulk._server = readers.bulk._server.model_copy(update={"waiting_questions": 1})
+    monkeypatch.setattr(readers_module, "MOST_WAITING", 1)
     hanging = in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}"))
     until(lambda: readers.bulk._at_work is not None)
     in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids=0"))
@@ -156,7 +158,7 @@ def test_deleting_a_scene_answers_whoever_waits(service):
         id = sdk.create_scene(make_rig()).id
         sdk.put_frame(id, 0, pictures())
         sdk.wait(id, 0)
-        readers = service.app.state.scenes[id]._readers
+        readers = service.app.state.scenes[id].readers
         hanging = in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}"))
         until(lambda: readers.bulk._at_work is not None)
         processes = [readers.views.process._process, readers.bulk.process._process]
@@ -247,7 +249,7 @@ def test_parts_are_labels_with_colours_that_stay(still):
     picture = Image.open(io.BytesIO(http.get(f"/v1/scenes/{id}/render?kind=parts&parts=2").content))
     assert picture.mode == "P"
     assert np.array(picture)[3, 3] == 2
-    palette = np.array(encode.part_colours()).reshape(256, 3)
+    palette = np.array(renderer.part_colours()).reshape(256, 3)
     assert palette[0].tolist() == [0, 0, 0]
     assert tuple(palette[2]) == part_colour(1)
     assert picture.convert("RGB").getpixel((3, 3)) == tuple(palette[2])

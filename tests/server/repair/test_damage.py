@@ -316,8 +316,7 @@ def test_sentences_are_bounded_and_counted():
 
 def test_flipped_bits_over_everything(tmp_path):
     capture = open_capture(CAPTURE)
-    fake = {"SCAS4D_ENGINE": "fakes:engine", "PYTHONPATH": f"{ROOT}/tests/helpers:{ROOT}"}
-    study = of.Study(tmp_path, capture, [], {}, fake)
+    study = of.Study(tmp_path, capture, [], {}, fakes.environment())
     outcome = faults.flipped_bits(study, 3, 1, lambda said: None)
     assert outcome.faults == []
 

@@ -11,7 +11,8 @@ from client.calls import put_frame
 from client.sdk import ServiceError
 from client.wire import RigModel
 from scas4d_core.captures import InitialPoints
-from server.processes import encode
+from server.processes import track_answers
+from server.routes import points
 
 
 def rig_json(count=2):
@@ -39,7 +40,7 @@ def test_a_scene_is_created_listed_and_deleted(http, service):
     url = created.headers["Location"]
     assert status["id"] in [scene["id"] for scene in http.get("/v1/scenes").json()["scenes"]]
     scene = service.app.state.scenes[status["id"]]
-    processes = [scene.updates._worker._process, scene._readers.views.process._process]
+    processes = [scene.updates._worker._process, scene.readers.views.process._process]
     assert http.delete(url).status_code == 204
     problem(http.get(url), 404)
     assert not scene.spec.folder.path.exists()
@@ -115,7 +116,7 @@ def test_more_scenes_than_the_limit_are_refused(sdk, http):
 
 
 def npz(**arrays):
-    return encode.npz(arrays)
+    return track_answers.npz(arrays)
 
 
 def test_points_come_before_the_first_frame(http, sdk, scene):
@@ -147,7 +148,8 @@ BAD_POINTS = {
 
 
 @pytest.mark.parametrize("name", BAD_POINTS)
-def test_bad_points_are_refused_by_name(http, quiet_scene, name):
+def test_bad_points_are_refused_by_name(http, quiet_scene, monkeypatch, name):
+    monkeypatch.setattr(points, "MOST_POINTS", 1000)
     body, field = BAD_POINTS[name]
     assert problem(http.put(f"/v1/scenes/{quiet_scene}/points", content=body), 422)["field"] == field
 
@@ -163,7 +165,8 @@ def test_nothing_is_unpickled(http, quiet_scene, tmp_path):
     assert not (tmp_path / "sprung").exists()
 
 
-def test_a_cloud_that_unpacks_to_gigabytes_is_refused_unread(http, quiet_scene):
+def test_a_cloud_that_unpacks_to_gigabytes_is_refused_unread(http, quiet_scene, monkeypatch):
+    monkeypatch.setattr(points, "MOST_POINTS", 1000)
     body = io.BytesIO()
     np.savez_compressed(body, positions=np.zeros((100_000, 3)), colours=C)
     problem(http.put(f"/v1/scenes/{quiet_scene}/points", content=body.getvalue()), 413)
@@ -173,7 +176,7 @@ def test_a_reader_that_dies_is_replaced(sdk, scene, service):
     sdk.put_frame(scene, 0, pictures())
     sdk.wait(scene, 0)
     sdk.render(scene, "c0")
-    service.app.state.scenes[scene]._readers.views.process._process.kill()
+    service.app.state.scenes[scene].readers.views.process._process.kill()
     time.sleep(0.2)
     assert sdk.render(scene, "c0").shape == (HEIGHT, WIDTH, 3)
 

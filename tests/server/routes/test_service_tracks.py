@@ -15,6 +15,7 @@ from client.wire import CameraModel
 from scas4d_core.storage.history import History
 from server.processes import track_answers
 from server.processes.messages import TracksQuery
+from server.routes import tracks
 
 FRAMES = 6
 
@@ -130,7 +131,7 @@ def test_a_long_history_is_read_a_frame_at_a_time(tmp_path, monkeypatch):
         return stacked(self, name, indices, rows)
 
     monkeypatch.setattr(History, "stacked", noting)
-    reader = fakes.FakeReader(make_rig(), history)
+    reader = fakes.FakeCommitted(history, make_rig().world_frame(), None)
     query = TracksQuery(frames=tuple(range(30)), at=0, points=points)
     found = track_answers.find(reader, history, query)
     assert found["tracks_world"].shape == (30, 2, 3)
@@ -141,12 +142,14 @@ def test_a_long_history_is_read_a_frame_at_a_time(tmp_path, monkeypatch):
     ("changes", "field", "remedy"),
     [
         ({"points": [[0, 0, 0]] * 800}, "format", "npz"),
-        ({"points": [[0, 0, 0]] * 900, "format": "npz"}, "points", "SCAS4D_MAX_TRACK_POINTS"),
-        ({"points": [[0, 0, 0]], "project": ["many"]}, "project", "SCAS4D_MAX_TRACK_VIEWS"),
+        ({"points": [[0, 0, 0]] * 900, "format": "npz"}, "points", "at most 5000"),
+        ({"points": [[0, 0, 0]], "project": ["many"]}, "project", "at most 60"),
         ({"points": [[0, 0, 0]], "project": ["c0", "other c0"]}, "project", "differently"),
     ],
 )
-def test_what_is_too_much_is_refused_by_name(http, finished, changes, field, remedy):
+def test_what_is_too_much_is_refused_by_name(http, finished, monkeypatch, changes, field, remedy):
+    for name, limit in (("MOST_POINTS", 5000), ("MOST_JSON_POINTS", 4000), ("MOST_VIEWS", 60)):
+        monkeypatch.setattr(tracks, name, limit)
     mine = CameraModel.of(make_rig().cameras[0]).model_dump()
     named = {"many": [mine | {"name": f"m{i}"} for i in range(11)], "other c0": [mine | {"width": 30}], "c0": ["c0"]}
     if "project" in changes:

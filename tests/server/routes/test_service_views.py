@@ -10,6 +10,7 @@ from running import HEIGHT, WIDTH, make_rig, pictures, problem
 
 from client.sdk import Client, ServiceError
 from client.wire import CameraModel
+from server.routes import tracks as routes
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +132,8 @@ def test_a_bad_track_query_is_refused_by_name(http, finished, query, field):
     assert field in problem(http.get(f"/v1/scenes/{finished}/tracks?{query}"), 422)["field"]
 
 
-def test_many_tracks_and_any_camera(sdk, finished):
+def test_many_tracks_and_any_camera(sdk, finished, monkeypatch):
+    monkeypatch.setattr(routes, "MOST_POINTS", 5000)
     mine = make_rig().cameras[0].scaled(2)
     tracks = sdk.tracks(finished, points=np.zeros((3000, 3)), frames=(2, 2), project=[mine, "c1"])
     assert np.shape(tracks.positions) == (3000, 1, 3)

@@ -53,7 +53,7 @@ def metric(sdk, line):
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
     folder = tmp_path_factory.mktemp("judged")
-    running = Running(ServerSettings(data=folder))
+    running = Running(ServerSettings(data=folder), core=None)
     try:
         with Client(running.url, patience=60) as sdk:
             id = sdk.create_scene(RIG, settings=SETTINGS, frames_per_second=10).id
@@ -141,7 +141,7 @@ def test_what_was_judged_is_known_again_after_a_restart(served):
     index = sdk.scene(id).next_frame
     before = put(sdk, id, index, RIG.names)
     running.stop()
-    again = Running(running.app.state.settings)
+    again = Running(running.app.state.settings, core=None)
     try:
         with Client(again.url, patience=60) as after, httpx.Client(base_url=again.url) as http:
             assert after.frame(id, index) == before

@@ -197,8 +197,8 @@ def test_two_services_do_not_share_a_folder(tmp_path):
 def _start_second(folder):
     import asyncio
 
-    from server.processes.local_placement import LocalPlacement
+    from server.processes.placement import Placement
     from server.scene.scenes import Scenes
     from server.stream.hub import Hub
 
-    asyncio.run(Scenes(fake_settings(folder), LocalPlacement(), Hub(1, 1)).open())
+    asyncio.run(Scenes(fake_settings(folder), Placement(), Hub(1)).open())

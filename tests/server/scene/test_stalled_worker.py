@@ -15,7 +15,7 @@ from server.processes.worker import Worker, _Stopped
 @pytest.fixture
 def worker(tmp_path):
     ours, theirs = Pipe()
-    worker = Worker(SceneSpec("fakes:engine", tmp_path, make_rig(), preset("scas4d")), theirs)
+    worker = Worker(SceneSpec(tmp_path, make_rig(), preset("scas4d")), theirs)
     worker.service = ours
     yield worker
     ours.close()

@@ -267,7 +267,7 @@ def test_long_trajectories_are_asked_for_in_pieces(service, sdk, scene, stream, 
     """So that the questions of others find their turn in between."""
     push(sdk, scene, range(4))
     monkeypatch.setattr("server.processes.track_answers.PIECE_POINTS", 2)
-    bulk = service.app.state.scenes[scene]._readers.bulk
+    bulk = service.app.state.scenes[scene].readers.bulk
     stream.subscribe("t", tracks(ids=[0, 1]))
     event = until(stream, lambda e: True)[-1]
     assert (event.first, event.frame) == (0, 3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from types import SimpleNamespace
+from unittest import mock
 
 import pytest
 from running import WIDTH, make_rig, pictures
@@ -14,10 +15,10 @@ from client.wire import CameraModel, RenderRequest
 from client.wire.stream import STREAM_PROTOCOL, Subscribed, unpack
 from server.problems import Problem
 from server.processes.messages import Answer, PartsQuery, RenderQuery
-from server.settings import ServerSettings
-from server.stream.feeds import RenderFeed
-from server.stream.outbox import UNSENT_REPLIES, Mailbox
-from server.stream.shared_queries import Desk, fingerprint
+from server.stream import shared_queries
+from server.stream.live_queries import LiveRender
+from server.stream.outbox import UNSENT_REPLIES, Outbox
+from server.stream.shared_queries import SharedQueries, fingerprint
 
 READERS = 99
 FRAMES = 5
@@ -51,6 +52,11 @@ class Reader:
         await settle()
 
 
+def one_at_once(ask):
+    with mock.patch.object(shared_queries, "QUERIES_AT_ONCE", 1):
+        return SharedQueries(ask)
+
+
 def question(name):
     return lambda: SimpleNamespace(key=name, query=name)
 
@@ -58,15 +64,15 @@ def question(name):
 def test_many_who_ask_the_same_share_one_answer():
     async def test():
         reader = Reader()
-        desk = Desk(reader, 2)
-        tasks = [asyncio.create_task(desk.answer(question("a"))) for _ in range(100)]
+        shared = SharedQueries(reader)
+        tasks = [asyncio.create_task(shared.answer(question("a"))) for _ in range(100)]
         await settle()
         assert reader.asked == ["a"]
         tasks[0].cancel()  # the one who came first leaves: the others keep their answer
         await reader.answer(b"picture")
         answers = await asyncio.gather(*tasks[1:])
         assert {answer.body for _, answer in answers} == {b"picture"}
-        assert (await desk.answer(question("a")))[1].body == b"picture"  # who comes a moment later
+        assert (await shared.answer(question("a")))[1].body == b"picture"  # who comes a moment later
         assert reader.asked == ["a"]
 
     run(test())
@@ -75,8 +81,8 @@ def test_many_who_ask_the_same_share_one_answer():
 def test_no_more_than_so_many_questions_are_with_the_reader_and_nobody_is_passed_over():
     async def test():
         reader = Reader()
-        desk = Desk(reader, 2)
-        tasks = [asyncio.create_task(desk.answer(question(name))) for name in "abcd"]
+        shared = SharedQueries(reader)
+        tasks = [asyncio.create_task(shared.answer(question(name))) for name in "abcd"]
         for asked in (["a", "b"], ["a", "b", "c"], ["a", "b", "c", "d"], ["a", "b", "c", "d"]):
             await settle()
             assert reader.asked == asked
@@ -89,11 +95,11 @@ def test_no_more_than_so_many_questions_are_with_the_reader_and_nobody_is_passed
 def test_trajectories_and_parts_do_not_stand_before_views():
     async def test():
         reader = Reader()
-        desk = Desk(reader, 1)
+        shared = one_at_once(reader)
         camera = make_rig().cameras[0]
         view = RenderQuery(camera, 0, ("colour",), "png", (0.0, 0.0, 0.0))
         queries = [PartsQuery(2), PartsQuery(3), view]
-        tasks = [asyncio.create_task(desk.answer(question(query))) for query in queries]
+        tasks = [asyncio.create_task(shared.answer(question(query))) for query in queries]
         await settle()
         assert reader.asked == [queries[0], view]  # one of each lane
         for _ in queries:
@@ -107,16 +113,16 @@ def test_trajectories_and_parts_do_not_stand_before_views():
 def test_a_question_that_fails_gives_its_turn_back():
     async def test():
         def raises():
-            raise Problem(404, "the frame is gone")
+            raise Problem(404, "the frame is gone", remedy="-")
 
         async def refuses(query):
-            raise Problem(503, "too slow")
+            raise Problem(503, "too slow", remedy="-")
 
-        desk = Desk(refuses, 1)
+        shared = one_at_once(refuses)
         for asked in (raises, question("a"), question("a"), raises):
             with pytest.raises(Problem):
-                await desk.answer(asked)
-        assert desk.asked == 2
+                await shared.answer(asked)
+        assert shared.asked == 2
 
     run(test())
 
@@ -131,27 +137,27 @@ def test_equal_questions_have_one_fingerprint():
     assert len({asked(make_rig()), *others}) == 4
 
 
-def feed_of(reader, mailbox):
+def live_of(reader, outbox):
     rig = make_rig()
     scene = SimpleNamespace(
         id="s", committed=[0], rig=rig, camera=rig.__getitem__, committed_frame=lambda index, field="frame": 0,
         spec=SimpleNamespace(settings=SimpleNamespace(scene=SimpleNamespace(background=(0.0, 0.0, 0.0)))),
     )  # fmt: skip
-    return RenderFeed("v", scene, ServerSettings(), Desk(reader, 1), mailbox)
+    return LiveRender("v", scene, one_at_once(reader), outbox)
 
 
 def test_a_dragged_camera_is_rendered_where_it_is_not_everywhere_it_was():
     async def test():
-        reader, mailbox, sent = Reader(), Mailbox(), []
+        reader, outbox, sent = Reader(), Outbox(), []
 
         async def send(message):
             sent.append(unpack(message)[0])
 
-        feed = feed_of(reader, mailbox)
-        tasks = [asyncio.create_task(feed.run()), asyncio.create_task(mailbox.empty_into(send))]
+        live = live_of(reader, outbox)
+        tasks = [asyncio.create_task(live.run()), asyncio.create_task(outbox.empty_into(send))]
         for tag in range(50):
             camera = CameraModel.of(make_rig().cameras[0].scaled(1 + tag))
-            feed.ask_for(RenderRequest(camera=camera), tag)
+            live.ask_for(RenderRequest(camera=camera), tag)
             if tag == 0:
                 await settle()
         await reader.answer()  # of the first place; the reader had begun it
@@ -166,19 +172,19 @@ def test_a_dragged_camera_is_rendered_where_it_is_not_everywhere_it_was():
 
 def test_a_slow_reader_asks_for_nothing_more():
     async def test():
-        reader, mailbox, sent, gate = Reader(), Mailbox(), [], asyncio.Event()
+        reader, outbox, sent, gate = Reader(), Outbox(), [], asyncio.Event()
 
         async def send(message):
             await gate.wait()
             sent.append(unpack(message)[0])
 
-        feed = feed_of(reader, mailbox)
-        tasks = [asyncio.create_task(feed.run()), asyncio.create_task(mailbox.empty_into(send))]
-        feed.ask_for(RenderRequest(camera="c0"), 0)
+        live = live_of(reader, outbox)
+        tasks = [asyncio.create_task(live.run()), asyncio.create_task(outbox.empty_into(send))]
+        live.ask_for(RenderRequest(camera="c0"), 0)
         await settle()
         await reader.answer()
         for tag in range(1, 21):
-            feed.ask_for(RenderRequest(camera="c1"), tag)
+            live.ask_for(RenderRequest(camera="c1"), tag)
             await settle()
         assert len(reader.asked) == 1
         gate.set()
@@ -193,22 +199,22 @@ def test_a_slow_reader_asks_for_nothing_more():
 
 def test_a_mailbox_keeps_the_newest_of_each_and_says_what_it_took_the_place_of():
     async def test():
-        mailbox, sent = Mailbox(), []
+        outbox, sent = Outbox(), []
 
         async def send(message):
             sent.append(message)
 
         for number in range(10):
-            mailbox.put("a", lambda missed, number=number: f"a{number} {missed}")
-        mailbox.put("b", lambda missed: f"b {missed}", missed=4)
-        mailbox.put("a", lambda missed: f"a10 {missed}")  # keeps its place before b
-        mailbox.put("c", lambda missed: "c")
-        mailbox.drop("c")
-        await mailbox.reply(Subscribed(id="x"))
-        task = asyncio.create_task(mailbox.empty_into(send))
+            outbox.put("a", lambda missed, number=number: f"a{number} {missed}")
+        outbox.put("b", lambda missed: f"b {missed}", missed=4)
+        outbox.put("a", lambda missed: f"a10 {missed}")  # keeps its place before b
+        outbox.put("c", lambda missed: "c")
+        outbox.drop("c")
+        await outbox.reply(Subscribed(id="x"))
+        task = asyncio.create_task(outbox.empty_into(send))
         await settle()
         assert sent == ['{"type":"subscribed","id":"x"}', "a10 10", "b 4"]
-        mailbox.put("a", lambda missed: f"again {missed}")
+        outbox.put("a", lambda missed: f"again {missed}")
         await settle()
         assert sent[-1] == "again 0"
         task.cancel()
@@ -218,15 +224,15 @@ def test_a_mailbox_keeps_the_newest_of_each_and_says_what_it_took_the_place_of()
 
 def test_a_client_that_sends_without_reading_is_not_listened_to():
     async def test():
-        mailbox = Mailbox()
+        outbox = Outbox()
 
         async def flood():
             for number in range(1000):
-                await mailbox.reply(Subscribed(id=str(number)))
+                await outbox.reply(Subscribed(id=str(number)))
 
         task = asyncio.create_task(flood())
         await settle()
-        assert len(mailbox._replies) == UNSENT_REPLIES
+        assert len(outbox._replies) == UNSENT_REPLIES
         task.cancel()
 
     run(test())
@@ -270,7 +276,7 @@ def test_a_hundred_subscribers_of_which_one_never_reads(service, sdk, scene):
             assert [head.frame for head in looked] == list(range(FRAMES))
             assert sum(head.missed for head in looked) == 0
         # Three cameras are three renders a frame, and the sleeper costs one at most.
-        assert 3 * FRAMES < service.app.state.hub._rooms[scene].desk.asked <= 4 * FRAMES
+        assert 3 * FRAMES < service.app.state.hub._channels[scene].queries.asked <= 4 * FRAMES
         newest = {}
         while newest.get("f", (0, 0))[0] < FRAMES - 1 or newest.get("v", (0, 0))[0] < FRAMES - 1:
             message = await asyncio.wait_for(sleeper.recv(), 60)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import fakes
 import pytest
 
 from scas4d_core.captures import open_capture
@@ -23,7 +24,7 @@ SHORT = {
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
     capture = open_capture(CAPTURE)
-    fake = {"SCAS4D_ENGINE": "fakes:engine", "PYTHONPATH": f"{ROOT}/tests/helpers:{ROOT}", "FAKE_UPDATE_S": "0.1"}
+    fake = fakes.environment(FAKE_UPDATE_S="0.1")
     frames = of.encoded_frames(capture, 8)
     return of.Study(tmp_path_factory.mktemp("faults"), capture, frames, {}, fake)
 

@@ -32,7 +32,7 @@ def test_views_are_asked_for_at_their_rate_and_timed(address):
 
 def test_arrivals_do_not_wait_for_answers(address, service, monkeypatch):
     """One second of views is asked for while nothing is answered; each counts from when it was due."""
-    readers = service.app.state.scenes[address.rstrip("/").rsplit("/", 1)[1]]._questions
+    readers = service.app.state.scenes[address.rstrip("/").rsplit("/", 1)[1]].readers
     ask = readers.views.ask
     opened = time.perf_counter() + 3.0
 

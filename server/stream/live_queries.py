@@ -1,7 +1,7 @@
-"""Subscriptions that cost the reader something: views, tracks, parts. Each has one question and one message under way.
+"""Subscriptions that query the readers: views, tracks, parts. Each has one query and one message under way.
 
-A feed asks only when its message before was sent, for what is newest at that moment: a slow reader costs less, and a
-camera that is dragged is rendered where it is, not everywhere it was.
+A live query asks only when its message before was sent, for the newest frame at that moment: a slow client costs less,
+and a camera that is dragged is rendered where it is, not everywhere it was.
 """
 
 from __future__ import annotations
@@ -16,20 +16,19 @@ from typing import Any, Literal
 from client.wire import RenderRequest, TracksRequest
 from client.wire.base import Model
 from client.wire.stream import BulkHead, PartsSubscription, StreamProblem, pack
-from server.problems import Problem
+from server.problems import SERVICE_FAULT, Problem
 from server.processes.messages import PartsQuery, Query, RenderQuery, TracksQuery
 from server.routes import render, tracks
 from server.scene.scenes import Scene
-from server.settings import ServerSettings
-from server.stream.outbox import Mailbox
-from server.stream.shared_queries import Desk, fingerprint
+from server.stream.outbox import Outbox
+from server.stream.shared_queries import SharedQueries, fingerprint
 
 log = logging.getLogger("scas4d.server")
 
 
 @dataclass(frozen=True)
-class Asked:
-    """A question of a feed.
+class LiveQuestion:
+    """A query of a subscription at one moment.
 
     Attributes:
         key: the same for all who would get the same answer.
@@ -43,8 +42,8 @@ class Asked:
     changes: int
 
 
-class Feed(ABC):
-    """One subscription.
+class LiveQuery(ABC):
+    """One subscription to views, tracks or parts.
 
     Attributes:
         request: what the client asks for. tag: the client's, of that request; comes back with what is sent for it.
@@ -53,32 +52,31 @@ class Feed(ABC):
     request: Any
     tag: int | None
 
-    def __init__(self, id: str, scene: Scene, server: ServerSettings, desk: Desk, box: Mailbox) -> None:
+    def __init__(self, id: str, scene: Scene, queries: SharedQueries, box: Outbox) -> None:
         self.id = id
         self.scene = scene
-        self.server = server
-        self._desk = desk
-        self._mailbox = box
+        self._queries = queries
+        self._outbox = box
         self._changes = 0
         self._changed = asyncio.Event()
         self._sent: Hashable = None
 
     def ask_for(self, request: Model, tag: int | None) -> None:
-        """Another question from now on."""
+        """Changes the request from now on."""
         self.request = request
         self.tag = tag
         self.change()
 
     def change(self) -> None:
-        """There may be something newer to send."""
+        """Notes that there may be something newer to send."""
         self._changes += 1
         self._changed.set()
 
     async def run(self) -> None:
-        """Until cancelled."""
+        """Asks and sends until it is cancelled."""
         while True:
             await self._changed.wait()
-            await self._mailbox.sent(self.id)
+            await self._outbox.sent(self.id)
             self._changed.clear()
             if not (self.scene.committed and self.due()):
                 self._changes = 0
@@ -87,19 +85,19 @@ class Feed(ABC):
                 await self._send_newest()
             except Problem as problem:
                 self._changes = 0
-                await self._mailbox.reply(StreamProblem(id=self.id, tag=self.tag, problem=problem.document))
+                await self._outbox.reply(StreamProblem(id=self.id, tag=self.tag, problem=problem.document))
             except Exception:
                 log.exception("scene %s, subscription %r", self.scene.id, self.id)
-                fault = Problem(500, "the service failed", remedy="its log has the traceback")
-                await self._mailbox.reply(StreamProblem(id=self.id, tag=self.tag, problem=fault.document))
+                fault = Problem(500, "the service failed", remedy=SERVICE_FAULT)
+                await self._outbox.reply(StreamProblem(id=self.id, tag=self.tag, problem=fault.document))
 
     async def _send_newest(self) -> None:
         asked = self._ask()
         if (asked.key, asked.head.tag) != self._sent:
-            asked, answer = await self._desk.answer(self._ask)
+            asked, answer = await self._queries.answer(self._ask)
             headers = {name.lower(): value for name, value in answer.headers.items()}
             head = asked.head.model_copy(update={"media_type": answer.media_type, "headers": headers})
-            self._mailbox.put(
+            self._outbox.put(
                 self.id,
                 lambda missed: pack(head.model_copy(update={"missed": missed}), answer.body),
                 missed=asked.changes - 1,
@@ -108,42 +106,42 @@ class Feed(ABC):
             self.answered(head)
         self._changes -= asked.changes
 
-    def _ask(self) -> Asked:
+    def _ask(self) -> LiveQuestion:
         query = self.query()
-        # Parts are found from the whole history: the same question has another answer after a commit.
+        # Parts are found from the whole history: the same query has another answer after a commit.
         newest = self.scene.committed[-1] if self.of_all_history(query) else None
         head = self.head(query).model_copy(update={"id": self.id, "tag": self.tag})
-        return Asked((fingerprint(query), newest), query, head, self._changes)
+        return LiveQuestion((fingerprint(query), newest), query, head, self._changes)
 
     def due(self) -> bool:
-        """Whether there is something to ask for now."""
+        """Returns True if there is something to ask for now."""
         return True
 
     def of_all_history(self, query: Query) -> bool:
-        """Whether the answer depends on every committed frame."""
+        """Returns True if the answer depends on every committed frame."""
         return False
 
     def answered(self, head: BulkHead) -> None:
-        """The message with this head is on its way."""
+        """Notes that the message with this head is on its way."""
         return
 
     @abstractmethod
     def query(self) -> Query:
-        """What to ask now; raises `Problem` where that cannot be asked."""
+        """Returns the query to ask now; raises `Problem` if the request cannot be asked."""
 
     @abstractmethod
     def head(self, query: Query) -> BulkHead:
-        """Of the message that answers the query."""
+        """Returns the head of the message that answers the query."""
 
 
-class RenderFeed(Feed):
+class LiveRender(LiveQuery):
     """A view of the newest frame, or of a chosen one, from a camera that may be moved."""
 
     request: RenderRequest
 
     def query(self) -> RenderQuery:
-        """The view as the reader takes it."""
-        return render.query_of(self.scene, self.server, self.request)
+        """Returns the view as the reader takes it."""
+        return render.query_of(self.scene, self.request)
 
     def head(self, query: Query) -> BulkHead:
         """Names the frame."""
@@ -151,35 +149,33 @@ class RenderFeed(Feed):
         return _head("render", query.frame)
 
     def of_all_history(self, query: Query) -> bool:
-        """Parts are."""
+        """Returns True for parts."""
         return isinstance(query, RenderQuery) and "parts" in query.kinds
 
 
-class TracksFeed(Feed):
-    """Trajectories: first over all frames asked for, then over those committed since, so that nothing is missed."""
+class LiveTracks(LiveQuery):
+    """Trajectories: first over all frames asked for, then over those committed since; none is missed."""
 
     request: TracksRequest
     _from: int | None = None
     _at: int | None = None
 
     def ask_for(self, request: Model, tag: int | None) -> None:
-        """Trajectories of another question are sent from their beginning."""
+        """Changes the request; its trajectories are sent from their beginning."""
         self._from = self._at = None
         super().ask_for(request, tag)
 
     def due(self) -> bool:
-        """Whether there are frames that were not sent, within those asked for."""
+        """Returns True if frames within those asked for were not sent."""
         newest, last = self.scene.committed[-1], self.request.last
         return self._from is None or (self._from <= newest and (last is None or self._from <= last))
 
     def query(self) -> TracksQuery:
-        """The frames not yet sent."""
+        """Asks for the frames that were not sent yet."""
         first = self.request.first if self._from is None else self._from
         if self._at is None:  # stays the same frame when the scene gives up its first ones
             self._at = self.scene.committed[0] if self.request.at is None else self.request.at
-        return tracks.query_of(
-            self.scene, self.server, self.request.model_copy(update={"first": first, "at": self._at})
-        )
+        return tracks.query_of(self.scene, self.request.model_copy(update={"first": first, "at": self._at}))
 
     def head(self, query: Query) -> BulkHead:
         """Names the frames."""
@@ -191,23 +187,23 @@ class TracksFeed(Feed):
         self._from = head.frame + 1
 
 
-class PartsFeed(Feed):
+class LiveParts(LiveQuery):
     """Labels of all Gaussians."""
 
     request: PartsSubscription
     _next: int | None = None
 
     def ask_for(self, request: Model, tag: int | None) -> None:
-        """Another question is answered at once."""
+        """Changes the request, which is answered at once."""
         self._next = None
         super().ask_for(request, tag)
 
     def due(self) -> bool:
-        """Whether enough frames came since."""
+        """Returns True if enough frames came since the last message."""
         return self._next is None or self.scene.committed[-1] >= self._next
 
     def query(self) -> PartsQuery:
-        """How many parts."""
+        """Returns the number of parts as the reader takes it."""
         return PartsQuery(self.request.count)
 
     def head(self, query: Query) -> BulkHead:
@@ -215,11 +211,11 @@ class PartsFeed(Feed):
         return _head("parts", self.scene.committed[-1])
 
     def of_all_history(self, query: Query) -> bool:
-        """They are."""
+        """Returns True: parts are found from all frames."""
         return True
 
     def answered(self, head: BulkHead) -> None:
-        """The next waits for more frames."""
+        """Waits for more frames before the next message."""
         self._next = head.frame + self.request.every
 
 
