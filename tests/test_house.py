@@ -14,14 +14,7 @@ EXEMPT_FOLDERS = ("server/routes",)
 """One file a resource, however many there are."""
 
 MOST_LINES = 350
-LONG = {
-    "scas4d_core/reconstruction.py": "to be shortened",
-    "scas4d_core/robust/solve_frame.py": "to be shortened",
-    "scas4d_core/storage/history.py": "to be shortened",
-    "scas4d_core/torch_backend/update.py": "the twin of the whole update, read beside it",
-    "server/scene/scene.py": "to be shortened",
-}
-"""Longer files, each with its reason. Kernels are exempt: one flat function is one file."""
+"""Kernels are exempt: one flat function is one file."""
 
 MOST_HEADLESS = 20
 HEADLESS = {"What", "Who", "Whoever", "Where", "Which", "How", "Whether", "That"}
@@ -37,10 +30,6 @@ def all_imports() -> dict[str, set[str]]:
     }
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="three circles: core reconstruction and warm_up; server frame_table and ledger; eight files around Scene",
-)
 def test_no_circles() -> None:
     assert circles(all_imports()) == []
 
@@ -85,10 +74,8 @@ def test_no_folder_is_crowded() -> None:
 
 def test_no_file_is_long() -> None:
     lines = {path.relative_to(ROOT).as_posix(): path.read_text().count("\n") for path in product().values()}
-    long = {path: n for path, n in lines.items() if n > MOST_LINES and "/kernels/" not in path}
-    assert {path: n for path, n in long.items() if path not in LONG} == {}
-    assert [path for path in LONG if path not in long] == [], "these are short enough to leave the list"
-    assert all(LONG.values())
+    assert len(lines) > 100  # the tree was read
+    assert {path: n for path, n in lines.items() if n > MOST_LINES and "/kernels/" not in path} == {}
 
 
 def headless(paths: list[Path]) -> list[str]:
@@ -96,7 +83,6 @@ def headless(paths: list[Path]) -> list[str]:
     return [text for path in paths for text in docstrings(path) if text.split(None, 1)[0] in HEADLESS]
 
 
-@pytest.mark.xfail(strict=True, reason="many docstrings still begin with What, Where, Which")
 def test_sentences_have_a_subject() -> None:
     found = headless(list(product().values()))
     assert len(found) <= MOST_HEADLESS, "\n".join(text.splitlines()[0] for text in found)
@@ -113,16 +99,20 @@ def test_a_sentence_without_a_subject_is_found(tmp_path: Path) -> None:
 
 
 def settings_fields() -> dict[str, int]:
-    """Annotated fields by class, of the classes in files of settings and of those called so."""
+    """Annotated fields by class, of the models in files of settings and of those called so."""
     return {
-        f"{name}.{node.name}": sum(isinstance(field, ast.AnnAssign) for field in node.body)
+        f"{name}.{node.name}": sum(
+            isinstance(field, ast.AnnAssign) and not ast.unparse(field.annotation).startswith("ClassVar")
+            for field in node.body
+        )
         for name, path in product().items()
         for node in ast.walk(tree(path))
-        if isinstance(node, ast.ClassDef) and (path.name == "settings.py" or node.name.endswith("Settings"))
+        if isinstance(node, ast.ClassDef)
+        and node.bases
+        and (path.name == "settings.py" or node.name.endswith("Settings"))
     }
 
 
-@pytest.mark.xfail(strict=True, reason="the method's author's constants are still settings")
 def test_settings_are_few() -> None:
     assert sum(settings_fields().values()) <= MOST_SETTINGS, settings_fields()
 

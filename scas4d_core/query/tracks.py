@@ -60,8 +60,7 @@ class Tracks:
         positions: [T, Q, 3] float64, user's world and units; NaN for a pixel query that met no surface.
         confidence: [T, Q] float64 in 0…1: (1 − Π(1 − oᵢ exp(−½ mᵢ²))) / (1 + (s/a)²), the opacity of the carriers at
             the query point (m the Mahalanobis distance) over what their disagreement s in that frame takes away: the
-            weighted mean distance of their answers from the track (a = ``AGREEMENT``). 0 for a pixel
-            query that met no surface.
+            weighted mean distance of their answers from the track (a = ``AGREEMENT``). 0 for a query that met nothing.
         ids: [Q] int64: the Gaussian that carries the point most; −1 for a pixel query that met no surface.
         indices: [T] int64 frames.
         visibility: by camera name, [T, Q] bool, for the cameras queried; see ``seen``.
@@ -114,8 +113,6 @@ def tracks_of_points(
     >>> tracks.positions[:, 0]
     array([[0.1, 0. , 0. ],
            [0.1, 1. , 0. ]])
-    >>> tracks.ids
-    array([0])
     """
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:

@@ -48,9 +48,7 @@ def committed_fields(record: Mapping[str, Any]) -> dict[str, Any]:
     if "report" in seconds:  # the report before this one was published after its commit
         seconds["report"] += record.get("publish_seconds") or 0.0
     seconds.setdefault("total", sum(seconds.values()))
-    found["seconds"] = seconds
-    found["loss"] = [value for value in found.get("loss", []) if value is not None]
-    return found
+    return {**found, "seconds": seconds, "loss": [value for value in found.get("loss", []) if value is not None]}
 
 
 @dataclass(slots=True)
