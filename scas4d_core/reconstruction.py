@@ -38,7 +38,7 @@ from scas4d_core.update.frame_update import Updater, prepare
 from scas4d_core.update.picture_loss import PictureLoss
 from scas4d_core.update.result import REPORT, Stopwatch
 from scas4d_core.update.schedule import mask_weight
-from scas4d_core.update.stopping import Budget
+from scas4d_core.update.stopping import TimeBudget
 from scas4d_core.update.views import TrainingView, ViewFactory
 
 __all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "ResumePoint", "StepError", "View"]
@@ -85,7 +85,7 @@ class Reconstruction(CommittedScene):
         self._updater: Updater
         self._carried = CarryOver()
         self._checkpoints = None if history.directory is None else Checkpoints(history.directory)
-        self._budget = Budget(settings.update.budget_ms)
+        self._budget = TimeBudget(settings.update.budget_ms)
 
     @classmethod
     def start(

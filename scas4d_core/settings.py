@@ -1,7 +1,7 @@
 """Settings of a scene: every number that a user can set, with its unit, range and the reason for its default.
 
-Numbers that only the method's author would turn are constants beside their use; ``Model.constants`` lists those that
-were settings once.
+Numbers that only the method's author would turn are constants beside their use; ``SettingsModel.constants`` lists those
+that were settings once.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Constant(NamedTuple):
     place: str = ""
 
 
-class Model(BaseModel):
+class SettingsModel(BaseModel):
     """Base of all settings: they do not change once read, and an unknown name is an error.
 
     Attributes:
@@ -67,7 +67,7 @@ def _refusal(name: str, given: Any, constant: Constant) -> InitErrorDetails | No
     return InitErrorDetails(type=error, loc=(name,), input=given)
 
 
-class SceneSettings(Model):
+class SceneSettings(SettingsModel):
     """The world of the scene: unit, pictures, background, floor.
 
     >>> SceneSettings(metres_per_unit="auto").image_scale
@@ -105,7 +105,7 @@ class SceneSettings(Model):
         return floor
 
 
-class StaticSettings(Model):
+class StaticSettings(SettingsModel):
     """Frame 0: 3D Gaussian Splatting with adaptive density control.
 
     >>> StaticSettings.model_validate({"seed": 3, "min_views": 2}).seed  # min_views is a constant now: dropped
@@ -154,7 +154,7 @@ class StaticSettings(Model):
     seed: int = Field(0, ge=0, description="Seed of the order of views and of the split of Gaussians.")
 
 
-class LayerRates(Model):
+class LayerRates(SettingsModel):
     """Adam rates of one layer of clusters."""
 
     rotation: Positive = Field(description="Per iteration, in units of tan(angle/2).")
@@ -162,7 +162,7 @@ class LayerRates(Model):
     scaling: Positive = Field(description="Of c (1/m) and s.")
 
 
-class Weights(Model):
+class Weights(SettingsModel):
     """Weights of the terms, beside 1 for the image loss. A term with weight 0 is not computed."""
 
     constants: ClassVar[Mapping[str, Constant]] = {
@@ -189,7 +189,7 @@ class Weights(Model):
     floor: NotNegative = Field(2.0, description="Dynamic3DGaussians; only where the scene names a floor.")
 
 
-class UpdateSettings(Model):
+class UpdateSettings(SettingsModel):
     """One update: from Θ_{t−1} and the pictures of frame t to Θ_t.
 
     >>> UpdateSettings(iterations=50, budget_ms=400).clusters
@@ -312,7 +312,7 @@ class UpdateSettings(Model):
         return clusters
 
 
-class Settings(Model):
+class Settings(SettingsModel):
     """All settings of one scene.
 
     >>> settings = Settings.model_validate({"scene": {"metres_per_unit": 0.01}, "update": {"iterations": 50}})

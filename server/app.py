@@ -15,7 +15,7 @@ from starlette.routing import Route, WebSocketRoute
 
 from client import __version__
 from server import problems
-from server.connections.guard import Guard, Limits
+from server.connections.guard import ConnectionGuard, ConnectionLimits
 from server.connections.proxies import ClientLimit
 from server.health.readiness import Readiness
 from server.http import handlers
@@ -77,7 +77,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         responses=problems.RESPONSES,
     )
     app.state.settings = settings
-    app.state.guard = Guard(Limits.of(settings))
+    app.state.guard = ConnectionGuard(ConnectionLimits.of(settings))
     app.state.tickets = Tickets()
     handlers.install(app)
     # The last one added is the first that a request meets.

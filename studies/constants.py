@@ -1,6 +1,6 @@
 """Varies constants of the method: what only its author turns is a constant in the module that uses it, not a setting.
 
-``Model.constants`` in ``scas4d_core/settings.py`` lists the constants that were settings once.
+``SettingsModel.constants`` in ``scas4d_core/settings.py`` lists the constants that were settings once.
 """
 
 from __future__ import annotations

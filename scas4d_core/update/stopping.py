@@ -104,7 +104,7 @@ class Stopping:
         return min(self.most, max(1, done + left))
 
 
-class Budget:
+class TimeBudget:
     """Milliseconds that each frame of a scene may take; learns what comes before and after the iterations.
 
     Decoding comes before the iterations and is seen by the clock; comparing and checking the end, writing the

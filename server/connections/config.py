@@ -8,7 +8,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from server.connections.connection import Connection
-from server.connections.guard import Guard
+from server.connections.guard import ConnectionGuard
 from server.connections.websocket import Socket
 
 
@@ -18,7 +18,7 @@ def guarded(app: FastAPI, **more: Any) -> uvicorn.Config:
     Args:
         app: the application, which knows its guard. more: further options of uvicorn, as `port`.
     """
-    guard: Guard = app.state.guard
+    guard: ConnectionGuard = app.state.guard
     proxies = [str(network) for network in guard.limits.proxies]
     of_service: dict[str, Any] = {"guard": guard}
     options: dict[str, Any] = {

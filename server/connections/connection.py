@@ -14,7 +14,7 @@ import httptools
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from server.connections import guard as guard_module
-from server.connections.guard import Guard
+from server.connections.guard import ConnectionGuard
 from server.connections.record import PROGRESS_BYTES, Phase
 from server.connections.refusals import Refusal, problem, response
 from server.http.middleware import HEADERS
@@ -39,7 +39,7 @@ class Connection(HttpToolsProtocol):
     `guard` is that of the service, set by `server.connections.config`.
     """
 
-    guard: ClassVar[Guard]
+    guard: ClassVar[ConnectionGuard]
 
     def __init__(self, *given: Any, **named: Any) -> None:
         super().__init__(*given, **named)

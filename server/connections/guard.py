@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 from server.connections.process import unread_bytes
-from server.connections.record import KINDS, PROGRESS_BYTES, Handler, Peer, Phase, Record
+from server.connections.record import KINDS, PROGRESS_BYTES, Handler, OpenConnection, Peer, Phase
 from server.connections.refusals import Refusal
 from server.health.metrics import CONNECTIONS_REFUSED
 from server.settings import ServerSettings
@@ -42,7 +42,7 @@ log = logging.getLogger("scas4d.server")
 
 
 @dataclass(frozen=True)
-class Limits:
+class ConnectionLimits:
     """The limits of connections: seconds, bytes, counts."""
 
     header_seconds: float
@@ -55,7 +55,7 @@ class Limits:
     proxies: tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]
 
     @classmethod
-    def of(cls, settings: ServerSettings) -> Limits:
+    def of(cls, settings: ServerSettings) -> ConnectionLimits:
         """Takes the limits from the settings of a service."""
         return cls(
             header_seconds=settings.header_seconds,
@@ -103,15 +103,15 @@ def peer_key(address: str) -> str:
     return f"{ipaddress.IPv6Address(int(found) >> 64 << 64)}/64"
 
 
-class Guard:
+class ConnectionGuard:
     """The open connections of one service, its limits, and the sweep that enforces them."""
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: ConnectionLimits) -> None:
         self.limits = limits
-        self._records: dict[asyncio.BaseTransport, Record] = {}
+        self._records: dict[asyncio.BaseTransport, OpenConnection] = {}
         self._peers: dict[str, Peer] = {}
         self._counted = self._bodies = 0
-        self._refused: dict[Record, None] = {}
+        self._refused: dict[OpenConnection, None] = {}
         self._pending: Counter[str] = Counter()
         self._told = float("-inf")
         self._timer: asyncio.TimerHandle | None = None
@@ -121,7 +121,7 @@ class Guard:
 
     def admit(
         self, handler: Handler, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop, address: str
-    ) -> tuple[Record, Refusal | None]:
+    ) -> tuple[OpenConnection, Refusal | None]:
         """Takes a new connection: returns its record, and the refusal if it has to be refused.
 
         Where a cap is reached it takes the place of the oldest connection that has not sent a whole header, is idle, or
@@ -139,7 +139,7 @@ class Guard:
             refusal = Refusal.PEER_CONNECTIONS
         elif self._counted >= self.limits.connections and not self._displace(self._peers.values(), now):
             refusal = Refusal.CONNECTIONS
-        record = self._records[transport] = Record(handler, transport, peer, now, now)
+        record = self._records[transport] = OpenConnection(handler, transport, peer, now, now)
         self._peers[key] = peer  # it went where its last connection gave way
         peer.count += 1
         self._counted += 1
@@ -149,7 +149,7 @@ class Guard:
             self._timer = loop.call_later(self._every, self._sweep, loop)
         return record, refusal
 
-    def enter(self, record: Record, phase: Phase, now: float) -> None:
+    def enter(self, record: OpenConnection, phase: Phase, now: float) -> None:
         """Notes that a connection is in another phase, from `now` (loop time) on."""
         if record.gone:
             return
@@ -176,14 +176,14 @@ class Guard:
                 del self._refused[oldest]
                 oldest.transport.abort()
 
-    def hand_over(self, transport: asyncio.BaseTransport, handler: Handler, now: float) -> Record:
+    def hand_over(self, transport: asyncio.BaseTransport, handler: Handler, now: float) -> OpenConnection:
         """Returns the record of a connection that is a WebSocket from now on."""
         record = self._records[transport]
         record.handler = handler
         self.enter(record, Phase.SOCKET, now)
         return record
 
-    def leave(self, record: Record) -> None:
+    def leave(self, record: OpenConnection) -> None:
         """Forgets a connection that is gone."""
         record.gone = True
         self._records.pop(record.transport, None)
@@ -203,13 +203,13 @@ class Guard:
             found[KINDS[record.phase]] += 1
         return found
 
-    def _unqueue(self, record: Record) -> None:
+    def _unqueue(self, record: OpenConnection) -> None:
         if record.queue is not None:
             del record.queue[record]
             self._bodies -= record.queue is record.peer.bodies
             record.queue = None
 
-    def _make_room_for_headers(self, new: Record) -> None:
+    def _make_room_for_headers(self, new: OpenConnection) -> None:
         """Keeps uploads that have brought next to nothing to half of a cap, the oldest go.
 
         The other half is then of connections that give way at once: who has a request finds a place at any moment, and
@@ -228,13 +228,13 @@ class Guard:
         if most:
             self._end(most[0], new.since)
 
-    def _end(self, record: Record, now: float) -> None:
+    def _end(self, record: OpenConnection, now: float) -> None:
         """Ends a connection that gives way, without an answer."""
         self.refused(Refusal.DISPLACED)
         self.enter(record, Phase.REFUSED, now)
         record.transport.abort()
 
-    def _release(self, record: Record) -> None:
+    def _release(self, record: OpenConnection) -> None:
         """Makes room: a connection that is refused or gone does not count."""
         if not record.counted:
             return
@@ -281,7 +281,7 @@ class Guard:
         go_on = bool(self._records or self._pending)
         self._timer = loop.call_later(self._every, self._sweep, loop) if go_on else None
 
-    def _overdue(self, record: Record, now: float, passed: float) -> None:
+    def _overdue(self, record: OpenConnection, now: float, passed: float) -> None:
         """Ends a connection whose phase has taken too long."""
         limits, phase = self.limits, record.phase
         if phase is Phase.REFUSED:
@@ -312,7 +312,7 @@ class Guard:
             case Phase.BODY if waited > limits.body_seconds:
                 record.handler.refuse(Refusal.BODY_TIME)
 
-    def _unread(self, record: Record, now: float) -> bool:
+    def _unread(self, record: OpenConnection, now: float) -> bool:
         """Ends a connection whose peer does not read what it asked for.
 
         Only where nothing is written meanwhile, so that what is unread less than before was read: the application

@@ -1,4 +1,4 @@
-"""Limits the requests of each client behind a trusted proxy to the connections that a peer may have."""
+"""ConnectionLimits the requests of each client behind a trusted proxy to the connections that a peer may have."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections import Counter
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from server import problems
-from server.connections.guard import Guard
+from server.connections.guard import ConnectionGuard
 from server.connections.refusals import Refusal, problem
 
 
@@ -18,7 +18,7 @@ class ClientLimit:
     uvicorn from trusted proxies alone) is held to the same number.
     """
 
-    def __init__(self, app: ASGIApp, guard: Guard) -> None:
+    def __init__(self, app: ASGIApp, guard: ConnectionGuard) -> None:
         self.app = app
         self.guard = guard
         self._under_way: Counter[str] = Counter()

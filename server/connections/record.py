@@ -57,7 +57,7 @@ class Handler(Protocol):
 
 
 @dataclass(eq=False, slots=True)
-class Record:
+class OpenConnection:
     """One open connection.
 
     Attributes:
@@ -74,7 +74,7 @@ class Record:
     since: float
     quiet_since: float
     phase: Phase = Phase.NEW
-    queue: dict[Record, None] | None = None
+    queue: dict[OpenConnection, None] | None = None
     counted: bool = True
     gone: bool = False
     entered: float = 0.0
@@ -106,8 +106,8 @@ class Peer:
     address: str
     proxy: bool
     count: int = 0
-    strangers: dict[Record, None] = field(default_factory=dict)
+    strangers: dict[OpenConnection, None] = field(default_factory=dict)
     """No header was ever completed."""
-    idle: dict[Record, None] = field(default_factory=dict)
+    idle: dict[OpenConnection, None] = field(default_factory=dict)
     """Between two requests."""
-    bodies: dict[Record, None] = field(default_factory=dict)
+    bodies: dict[OpenConnection, None] = field(default_factory=dict)

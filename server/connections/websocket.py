@@ -10,7 +10,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.frames import Frame
 from websockets.http11 import Request
 
-from server.connections.guard import LINGER_LONGEST_S, Guard
+from server.connections.guard import LINGER_LONGEST_S, ConnectionGuard
 from server.connections.record import Phase
 from server.connections.refusals import Refusal, problem, response
 from server.http.middleware import HEADERS
@@ -29,7 +29,7 @@ class Socket(WebSocketsSansIOProtocol):
     `guard` is that of the service, set by `server.connections.config`.
     """
 
-    guard: ClassVar[Guard]
+    guard: ClassVar[ConnectionGuard]
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Takes the connection over from the HTTP request that asked for the upgrade."""

@@ -22,8 +22,10 @@ READERS = "\n".join(path.read_text() for path in CORE.rglob("*.py") if path.name
 HANGS_ON = {"Weights": r"weights", "Settings": r"settings", "SceneSettings": r"scene", "LayerRates": r"\w+"}
 
 
-def models() -> list[type[module.Model]]:
-    own = [value for value in vars(module).values() if isinstance(value, type) and issubclass(value, module.Model)]
+def models() -> list[type[module.SettingsModel]]:
+    own = [
+        value for value in vars(module).values() if isinstance(value, type) and issubclass(value, module.SettingsModel)
+    ]
     return [model for model in own if model.model_fields]
 
 
@@ -95,7 +97,7 @@ def test_right_values_are_taken() -> None:
     assert read.scene.metres_per_unit == "auto"
 
 
-class Former(module.Model):
+class Former(module.SettingsModel):
     constants: ClassVar[Mapping[str, module.Constant]] = {
         "length": module.Constant(0.02, "here.LENGTH"),
         "starts": module.Constant((0.0, 0.2), "here.STARTS"),
@@ -103,7 +105,7 @@ class Former(module.Model):
     kept: int = 1
 
 
-class Nested(module.Model):
+class Nested(module.SettingsModel):
     inner: Former = Former()
 
 
@@ -128,11 +130,13 @@ def test_a_former_setting_with_another_value_is_refused_by_name(name: str, value
     assert refused.value.errors()[0]["type"] == "constant"
 
 
-CONSTANTS = [(model, name) for model in (module.Model, *models()) for name in model.constants]
+CONSTANTS = [(model, name) for model in (module.SettingsModel, *models()) for name in model.constants]
 
 
 @pytest.mark.parametrize(("model", "name"), CONSTANTS, ids=lambda v: v if isinstance(v, str) else v.__name__)
-def test_the_constant_of_a_former_setting_is_where_it_is_said_to_be(model: type[module.Model], name: str) -> None:
+def test_the_constant_of_a_former_setting_is_where_it_is_said_to_be(
+    model: type[module.SettingsModel], name: str
+) -> None:
     constant = model.constants[name]
     assert name not in model.model_fields
     owner, _, attribute = constant.place.rpartition(".")

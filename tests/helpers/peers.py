@@ -16,7 +16,7 @@ from starlette.responses import JSONResponse, StreamingResponse
 from starlette.routing import Route, WebSocketRoute
 
 from server.connections.config import guarded
-from server.connections.guard import Guard, Limits
+from server.connections.guard import ConnectionGuard, ConnectionLimits
 from server.connections.proxies import ClientLimit
 from server.connections.websocket import limit_messages
 from server.settings import ServerSettings
@@ -202,7 +202,7 @@ def stub(uvicorn_options=None, **changes):
     routes = [Route(f"/{name}", getattr(seen, name), methods=["GET", "PUT", "POST"]) for name in names]
     sockets = [WebSocketRoute(f"/{name}", getattr(seen, name)) for name in ("socket", "feed")]
     app = Starlette(routes=[*routes, *sockets])
-    app.state.guard = Guard(Limits.of(settings))
+    app.state.guard = ConnectionGuard(ConnectionLimits.of(settings))
     if settings.trusted_proxies:
         app.add_middleware(ClientLimit, guard=app.state.guard)
     with socket.create_server(("127.0.0.1", 0)) as listening:

@@ -28,7 +28,7 @@ from scas4d_core.update import schedule
 from scas4d_core.update.best_state import mean_error
 from scas4d_core.update.frame_update import SMALLEST_CLUSTER, FrameUpdate
 from scas4d_core.update.result import AttemptOptions, UpdateResult
-from scas4d_core.update.stopping import COOLING, LOOK_EVERY, Budget, Stopping
+from scas4d_core.update.stopping import COOLING, LOOK_EVERY, Stopping, TimeBudget
 from scas4d_core.update.views import ViewFactory
 from scas4d_core.update.warm_start import Motion
 
@@ -303,7 +303,7 @@ def test_an_update_by_the_clock_ends_with_it_and_tells_what_an_iteration_takes()
     assert 1 <= len(found.trace.losses) == found.trace.planned[-1][1] < SETTINGS.iterations
     assert len(found.trace.moments) == len(found.trace.losses)
     assert found.trace.moments == sorted(found.trace.moments)
-    budget = Budget(500.0)
+    budget = TimeBudget(500.0)
     budget.learn(found.trace.moments, found.trace.seconds, commit=0.0)
     assert budget.each is not None
     assert 0 < budget.each <= found.trace.moments[-1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from scas4d_core.update.stopping import AFTER_S, COOLING, LOOK_EVERY, MOST_TIMED, PROBE, RATE, Budget, Stopping
+from scas4d_core.update.stopping import AFTER_S, COOLING, LOOK_EVERY, MOST_TIMED, PROBE, RATE, Stopping, TimeBudget
 
 
 class Clock:
@@ -86,14 +86,14 @@ def test_what_was_decided_is_told() -> None:
 
 
 def learn(
-    budget: Budget, iterations: int, each: float, start: float = 0.0, end: float = 0.0, commit: float = 0.02
+    budget: TimeBudget, iterations: int, each: float, start: float = 0.0, end: float = 0.0, commit: float = 0.02
 ) -> None:
     moments = [start + (k + 1) * each for k in range(iterations)]
     budget.learn(moments, {"start": start, "end": end}, commit)
 
 
 def test_a_budget_learns_what_an_iteration_and_the_end_take() -> None:
-    budget = Budget(500.0)
+    budget = TimeBudget(500.0)
     assert budget.end(10.0) == pytest.approx(10.5 - AFTER_S)
     learn(budget, 20, 0.01, start=0.1, end=0.03, commit=0.02)
     assert budget.each == pytest.approx(0.01)
@@ -107,11 +107,11 @@ def test_a_budget_learns_what_an_iteration_and_the_end_take() -> None:
 
 
 def test_one_slow_frame_costs_the_next_one_its_iterations_but_no_more() -> None:
-    budget = Budget(500.0)
+    budget = TimeBudget(500.0)
     for each in (0.01, 30.0, 0.01):
         learn(budget, 20, each, commit=0.02)
     assert budget.each == pytest.approx(0.01)
 
 
 def test_without_a_budget_there_is_no_end() -> None:
-    assert Budget(None).end(3.0) is None
+    assert TimeBudget(None).end(3.0) is None

@@ -94,7 +94,7 @@ def test_small_pieces_grow_without_being_copied():
         cycle = Cycle()
         connection = Connection.__new__(Connection)
         connection.__dict__.update(_fault=None, _delivered=0, _left=None, cycle=cycle)
-        connection._record = type("Record", (), {"body": 0})()
+        connection._record = type("OpenConnection", (), {"body": 0})()
         connection.parser = type("Parser", (), {"should_upgrade": lambda self: False})()
         connection.flow = type("Flow", (), {"pause_reading": lambda self: None})()
         cycle.message_event = type("Event", (), {"set": lambda self: None})()
