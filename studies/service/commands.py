@@ -1,4 +1,4 @@
-"""`scripts/bench faults`, `ingest` and `views`."""
+"""`scripts/bench faults`, `ingest`, `views` and `crossing`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,6 @@ def faults(
     ),
     out: Page = None,
     changes: Changes = None,
-    engine: Annotated[str | None, typer.Option(help="module:function instead of the method itself.")] = None,
 ) -> None:
     """Kills the service and its workers, cuts and damages its files, fills its disk; compares with an undisturbed run.
 
@@ -59,7 +58,7 @@ def faults(
         opened,
         encoded_frames(opened, frames),
         parse_changes(changes),
-        {} if engine is None else {"SCAS4D_ENGINE": engine},
+        {},
     )
     parts = part or of_faults.PARTS
     outcomes = of_faults.run(
@@ -107,7 +106,6 @@ def views(
     work: Annotated[Path, typer.Option(help="Folder for the service's data; what is there goes.")] = Path("out/views"),
     out: Page = None,
     changes: Changes = None,
-    engine: Annotated[str | None, typer.Option(help="module:function instead of the method itself.")] = None,
 ) -> None:
     """Measures live views beside updates: latency under an open-loop load, and what it costs the updates.
 
@@ -127,9 +125,23 @@ def views(
         turns=turns,
         width=width,
         settings=parse_changes(changes),
-        environment={} if engine is None else {"SCAS4D_ENGINE": engine},
+        environment={},
         echo=typer.echo,
     )
     text = of_views.page(rows, capture.name, width, updates, turns)
     typer.echo(text)
     write_page(out, text)
+
+
+def crossing(
+    sample: Annotated[
+        Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture with points and test cameras.")
+    ] = Path("samples/robot"),
+) -> None:
+    """Lists the files that a frame crosses between PUT and commit, and a render; fails where they are too many."""
+    from client.cli.extras import need_server
+    from studies.service.crossing import run
+
+    need_server()
+    if not run(sample, typer.echo):
+        raise typer.Exit(1)
