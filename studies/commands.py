@@ -10,14 +10,14 @@ from studies.hard_cases.commands import stability
 from studies.kernels.commands import device, kernels
 from studies.paper.commands import paper
 from studies.quality.commands import processors, quality, table, targets
-from studies.service.commands import crossing, faults, ingest, views
+from studies.service.commands import crossing, faults, ingest, memory, views
 
 STUDIES = {
     "Quality": (quality, targets, table, processors),
     "Accuracy against time": (frontier, effort, paper),
     "Speed of the code": (kernels, device),
     "Hard cases": (stability,),
-    "The running service": (faults, ingest, views, crossing),
+    "The running service": (faults, ingest, views, memory, crossing),
 }
 """The commands by the heading under which `scripts/bench --help` lists them."""
 

@@ -1,4 +1,4 @@
-"""Estimates the memory and disk of a scene; the constants were measured by `scripts/measure_memory.py`."""
+"""Estimates the memory and disk of a scene; the constants were measured by `scripts/bench memory`."""
 
 from __future__ import annotations
 

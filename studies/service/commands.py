@@ -1,4 +1,4 @@
-"""`scripts/bench faults`, `ingest`, `views` and `crossing`."""
+"""`scripts/bench faults`, `ingest`, `views`, `memory` and `crossing`."""
 
 from __future__ import annotations
 
@@ -145,3 +145,20 @@ def crossing(
     need_server()
     if not run(sample, typer.echo):
         raise typer.Exit(1)
+
+
+def memory(
+    cameras: Annotated[int, typer.Option(min=1, help="Cameras of the rig.")] = 24,
+    size: Annotated[int, typer.Option(min=16, help="Width and height of the pictures in pixels.")] = 256,
+    gaussians: Annotated[int, typer.Option(min=100, help="Gaussians of the scene.")] = 10_000,
+    scale: Annotated[float, typer.Option(help="The setting scene.image_scale.")] = 1.0,
+    masks: Annotated[bool, typer.Option("--masks", help="Frames with masks.")] = False,
+) -> None:
+    """Measures the peak memory of a worker against the service's estimate; prints JSON."""
+    import json
+
+    from client.cli.extras import need_server
+    from studies.service.memory import measure
+
+    need_server()
+    typer.echo(json.dumps(measure(cameras, size, gaussians, scale, masks)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import httpx
 import pytest
 from running import Running, fake_settings, make_rig
@@ -41,6 +43,10 @@ def quiet_scene(service):
     """A scene that takes nothing: what is refused must leave it as it is."""
     with Client(service.url) as client:
         status = client.create_scene(make_rig())
+        states, until = service.app.state.settings.data / "scenes" / status.id / "states", time.monotonic() + 20
+        while not states.exists():  # its worker makes the folder
+            assert time.monotonic() < until
+            time.sleep(0.02)
         yield status.id
         assert client.scene(status.id) == status
         client.delete_scene(status.id)

@@ -262,7 +262,7 @@ def test_a_device_that_is_not_there_says_what_to_do(monkeypatch: pytest.MonkeyPa
 
 def test_a_reconstruction_refuses_before_it_fits_anything(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(name: str) -> None:
-        raise DeviceError(f"no {name}")
+        raise DeviceError(f"no {name}", "choose another")
 
     monkeypatch.setattr(reconstruction, "require_device", refuse)
     monkeypatch.setattr(reconstruction, "fit_first", functools.partial(pytest.fail, "fitted"))

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[3]
 
 @pytest.mark.parametrize("arguments", [("--cameras", "16", "--size", "384"), ("--gaussians", "60000", "--masks")])
 def test_the_estimate_is_near_what_is_measured(arguments):
-    command = [sys.executable, str(ROOT / "scripts/measure_memory.py"), *arguments]
+    command = [sys.executable, "-m", "studies", "memory", *arguments]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     measured = json.loads(done.stdout.splitlines()[-1])
     assert 0.6 <= measured["ratio"] <= 1.1, measured

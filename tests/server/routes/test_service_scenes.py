@@ -36,7 +36,7 @@ def test_a_scene_is_created_listed_and_deleted(http, service):
     status = created.json()
     assert (status["state"], status["next_frame"], status["name"]) == ("awaiting_first_frame", 0, "studio")
     assert status["settings"]["update"]["iterations"] == 7
-    assert status["settings"]["update"]["neighbours"] == 20  # the preset's
+    assert status["settings"]["update"]["views"] == 1  # the preset's
     url = created.headers["Location"]
     assert status["id"] in [scene["id"] for scene in http.get("/v1/scenes").json()["scenes"]]
     scene = service.app.state.scenes[status["id"]]

@@ -53,7 +53,7 @@ def test_nan_does_not_agree() -> None:
 
 def test_without_a_gpu_the_command_says_so_and_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(name: str) -> None:
-        raise DeviceError(f"device {name!r}: none")
+        raise DeviceError(f"device {name!r}: none", "choose another")
 
     monkeypatch.setattr(device, "require_device", refuse)
     result = CliRunner().invoke(app, ["device"])
