@@ -25,21 +25,18 @@ from scas4d_core.frame_report import FrameReport, Progress, report_of_first, rep
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.committed import CommittedScene, View
 from scas4d_core.rasterize.limits import scene_limits
+from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness, fingerprints, lit
 from scas4d_core.robust.outliers import Past
-from scas4d_core.robust.picture_checks import brightness, check_brightness, fingerprints, lit
 from scas4d_core.robust.solve_frame import FrameSolver, UpdateInput
-from scas4d_core.robust.validation import axis_lengths
 from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.storage.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, find_commit
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.structure.motion_mask import labelled, labels_learnt, with_reliable_labels
 from scas4d_core.torch_backend.device import require_device
 from scas4d_core.update.frame_update import Updater, prepare
-from scas4d_core.update.picture_loss import PictureLoss
+from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import REPORT, Stopwatch
-from scas4d_core.update.schedule import mask_weight
-from scas4d_core.update.stopping import TimeBudget
-from scas4d_core.update.views import TrainingView, ViewFactory
+from scas4d_core.update.schedule import TimeBudget, mask_weight
 
 __all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "ResumePoint", "StepError", "View"]
 
@@ -245,7 +242,7 @@ class Reconstruction(CommittedScene):
         steady = unusable is None and exposure == 1.0  # else nothing can be told from differences of the pictures
         updater, carried = self._learn_motion_mask(believed if steady else [])
         given = UpdateInput(
-            state=labelled(self._state(None), carried.labels),
+            state=self.history.newest if carried.labels is None else labelled(self.history.newest, carried.labels),
             motion=carried.motion,
             seconds=frame.time - past.fitted if isfinite(past.fitted) else seconds,
             step=seconds,
@@ -269,7 +266,7 @@ class Reconstruction(CommittedScene):
 
         if result.outcome.held:  # motion that seemed to be in its pictures is as little believed as they are
             updater, carried = self._updater, self._carried
-            result = replace(result, gaussians=self._state(None), motion=carried.motion)
+            result = replace(result, gaussians=self.history.newest, motion=carried.motion)
         report = report_of_update(frame, result, left_out, self.rig.names, watch, dropped)
         how = {"cold": given.motion is None, "relabelled": updater is not self._updater, **(notes or {})}
         carried = carried.after(result, past, frame.time, None if self._fixed.masked else believed, shown)
@@ -293,7 +290,7 @@ class Reconstruction(CommittedScene):
         """The views of a frame; without masks where no term asks for them: they are not even read."""
         settings, moving = self.settings.update, len(self._updater.hierarchy.rows)
         try:
-            use_masks = settings.use_masks and mask_weight(settings, moving, len(self._state(None))) > 0
+            use_masks = settings.use_masks and mask_weight(settings, moving, len(self.history.newest)) > 0
             return self._factory.views(self._factory.scaled(frame), self._fixed.exposures, use_masks)
         except ValueError as error:
             raise StepError(str(error)) from error
@@ -341,7 +338,7 @@ class Reconstruction(CommittedScene):
         carried = self._carried
         if self._fixed.masked or not carried.seen:
             return self._updater, carried
-        labels = labels_learnt(self._state(None), carried.labels, carried.seen, believed, self._picture)
+        labels = labels_learnt(self.history.newest, carried.labels, carried.seen, believed, self._picture)
         if labels is None:
             return self._updater, carried
         first = labelled(self.history.gaussians(self.history.indices[0]), labels)

@@ -55,7 +55,8 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     its token is looked at.
     """
     settings = settings or ServerSettings.from_environment()
-    logging.getLogger("scas4d").setLevel(logging.INFO)
+    if logging.getLogger("scas4d").level == logging.NOTSET:  # `serve` has set it
+        logging.getLogger("scas4d").setLevel(logging.INFO)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:

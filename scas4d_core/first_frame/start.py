@@ -14,10 +14,10 @@ from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.first_frame.initial_points import initial_points
 from scas4d_core.first_frame.static_scene import StaticResult, fit_static_scene
 from scas4d_core.frame_report import Progress
-from scas4d_core.robust.validation import axis_lengths
+from scas4d_core.robust.checks import axis_lengths
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
-from scas4d_core.update.views import ViewFactory
+from scas4d_core.update.picture_loss import ViewFactory
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """Outlying cameras and frames: each camera is compared with its own past and with the others of the frame.
 
 The figures are those that an update has anyway: how well each camera was met when it was rendered first and last, and
-the mean brightness of its picture (``picture_checks``). One camera that fits much worse than the others is left out; a
+the mean brightness of its picture (``checks``). One camera that fits much worse than the others is left out; a
 frame that all cameras agree on is believed as long as it can be met as a whole. The thresholds were read off the
 captures: docs/stability.md has the distributions.
 """
@@ -60,7 +60,7 @@ class Past:
             seconds, time of the last frame that was learnt from. behind: frames since some were held or not moved, 0
             once they are met as usual again.
         iterations: of the last update. error: usual at the end of an update, by probe view.
-        light: times that the last frame was brighter, see ``picture_checks.check_brightness``. lit: frames in a row
+        light: times that the last frame was brighter, see ``checks.check_brightness``. lit: frames in a row
             that were brighter, or that were darker.
     """
 

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.update.picture_loss import PictureLoss
-from scas4d_core.update.views import LABEL, TrainingView
+from scas4d_core.update.picture_loss import LABEL, PictureLoss, TrainingView
 
 Float = NDArray[np.float64]
 

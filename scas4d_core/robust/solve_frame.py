@@ -18,17 +18,14 @@ from numpy.typing import NDArray
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust import outliers
+from scas4d_core.robust.checks import EXPOSURE, evened, gain_of, relit, validated
 from scas4d_core.robust.outliers import Past
-from scas4d_core.robust.picture_checks import EXPOSURE, evened, gain_of, relit
 from scas4d_core.robust.relocation import find_jump, shifted
-from scas4d_core.robust.validation import validated
 from scas4d_core.settings import UpdateSettings
 from scas4d_core.update.frame_update import Updater
-from scas4d_core.update.picture_loss import PictureLoss
+from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import AS_SET, AttemptOptions, UpdateResult, UpdateTrace
-from scas4d_core.update.schedule import all_begun
-from scas4d_core.update.stopping import MOST_TIMED, PROBE, Stopping
-from scas4d_core.update.views import TrainingView, ViewFactory
+from scas4d_core.update.schedule import MOST_TIMED, PROBE, Stopping, all_begun
 from scas4d_core.update.warm_start import Motion
 
 LADDER = (
@@ -54,7 +51,7 @@ class UpdateInput:
         views: of the frame, to learn from. suspects: views of cameras that are left out.
         brightness: mean of each camera's picture. seed: of the update. past: the usual figures.
         lengths: [N, 3] metres, of the axes in frame 0.
-        exposure, left_out, unusable: by the brightness of the pictures, see ``picture_checks.check_brightness``.
+        exposure, left_out, unusable: by the brightness of the pictures, see ``checks.check_brightness``.
         end: moment by which the last iteration has to be over. each: seconds of an iteration in the updates before.
     """
 

@@ -25,8 +25,8 @@ from scas4d_core.robust.outliers import Past
 from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
 from scas4d_core.storage.history import NEWEST_KEPT, History, HistoryError
 from scas4d_core.storage.npz import read_npz, write_npz
+from scas4d_core.update.picture_loss import TrainingView, ViewFactory
 from scas4d_core.update.result import UpdateResult
-from scas4d_core.update.views import TrainingView, ViewFactory
 from scas4d_core.update.warm_start import Motion
 
 FORMAT = 2
@@ -47,7 +47,7 @@ class CarryOver:
         seen: views of the last frame that was not held, in scenes without masks; the next are compared with them.
         structure: digest of the clusters and neighbours that the motion belongs to.
         past: usual values of the scene and its cameras.
-        shown: fingerprint of each picture of the last frame that was not held (``picture_checks``).
+        shown: fingerprint of each picture of the last frame that was not held (``checks``).
     """
 
     motion: Motion | None = None

@@ -159,6 +159,11 @@ class HistoryReader:
             self._texts[index] = text
         return report
 
+    @property
+    def newest(self) -> Gaussians:
+        """Θ of the newest frame; see ``gaussians``."""
+        return self.gaussians(self.indices[-1])
+
     def gaussians(self, index: int) -> Gaussians:
         """The state of one committed frame; the arrays are the history's own and must not be written to.
 

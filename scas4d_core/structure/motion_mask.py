@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.update.picture_loss import PictureLoss
-from scas4d_core.update.views import TrainingView
+from scas4d_core.update.picture_loss import PictureLoss, TrainingView
 
 Array = NDArray[np.float32]
 

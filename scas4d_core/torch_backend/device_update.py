@@ -25,11 +25,9 @@ from scas4d_core.torch_backend.update import TorchUpdate
 from scas4d_core.update import deformation, schedule
 from scas4d_core.update.best_state import BestState, ProbeViews
 from scas4d_core.update.deformation import CpuDeformation, first_lengths, length_bounds
-from scas4d_core.update.picture_loss import PictureLoss
+from scas4d_core.update.picture_loss import LABEL, PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import AS_SET, AttemptOptions, Stopwatch, UpdateResult, UpdateTrace, camera_fit
-from scas4d_core.update.schedule import Rates, ViewPlan, mask_weight, plan_samples
-from scas4d_core.update.stopping import Stopping
-from scas4d_core.update.views import LABEL, TrainingView, ViewFactory
+from scas4d_core.update.schedule import Rates, Stopping, ViewPlan, mask_weight, plan_samples
 from scas4d_core.update.warm_start import Motion
 
 Array = NDArray[np.float32]

@@ -31,8 +31,7 @@ from scas4d_core.torch_backend.deformation import (
     deform,
     material_rotations,
 )
-from scas4d_core.update.schedule import Rates
-from scas4d_core.update.stopping import Stopping
+from scas4d_core.update.schedule import Rates, Stopping
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Render: TypeAlias = Callable[[Tensor, Tensor, Tensor, Tensor, CameraParams, Tensor, Limits], Rendered]

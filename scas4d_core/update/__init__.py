@@ -1,13 +1,13 @@
 """Update of one frame (paper, algorithm 1): Θ_{t−1} and the pictures of frame t in, Θ_t out.
 
-``frame_update`` has the loop; it uses ``schedule`` (views, samples, rates, Adam), ``stopping`` (iterations),
+``frame_update`` has the loop; it uses ``schedule`` (iterations, views, samples, rates, Adam),
 ``warm_start``, ``deformation`` (the cascade and the neighbour terms), ``picture_loss`` (render and compare), ``floor``
-and ``best_state`` (the better of start and end). ``views`` are the pictures. ``robust`` decides around it which
+and ``best_state`` (the better of start and end). ``robust`` decides around it which
 pictures and which results are believed.
 
 The values that one update passes through, from ``Reconstruction.step`` to the commit:
 
-1. ``views.TrainingView``: one camera's pictures of the frame.
+1. ``picture_loss.TrainingView``: one camera's pictures of the frame.
 2. ``storage.checkpoint.CarryOver``: all that the update before left beside Θ_{t−1}; in the end, that of this one.
 3. ``robust.outliers.Past``: the usual figures of the scene and its cameras; a part of the carry-over.
 4. ``warm_start.Motion``: the motion that was found; a part of the carry-over.

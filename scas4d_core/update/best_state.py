@@ -16,8 +16,7 @@ from scas4d_core.cameras import Rig
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.update.deformation import CpuDeformation
-from scas4d_core.update.picture_loss import PictureLoss
-from scas4d_core.update.views import TrainingView, ViewFactory
+from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.warm_start import Motion, warm_start
 
 Array = NDArray[np.float32]

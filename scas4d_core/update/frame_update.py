@@ -24,11 +24,9 @@ from scas4d_core.update import schedule
 from scas4d_core.update.best_state import BestState, ProbeViews
 from scas4d_core.update.deformation import CpuDeformation, length_bounds
 from scas4d_core.update.floor import floor_inside, floor_term
-from scas4d_core.update.picture_loss import PictureLoss
+from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import AS_SET, REPORT, AttemptOptions, Stopwatch, UpdateResult, UpdateTrace
-from scas4d_core.update.schedule import Adam, Rates, ViewPlan, mask_weight, plan_samples
-from scas4d_core.update.stopping import Stopping
-from scas4d_core.update.views import TrainingView, ViewFactory
+from scas4d_core.update.schedule import Adam, Rates, Stopping, ViewPlan, mask_weight, plan_samples
 from scas4d_core.update.warm_start import Motion, quaternion_products
 
 Array = NDArray[np.float32]

@@ -9,9 +9,8 @@ from typing import TypedDict
 
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.update.picture_loss import PictureLoss
-from scas4d_core.update.stopping import Stopping
-from scas4d_core.update.views import TrainingView
+from scas4d_core.update.picture_loss import PictureLoss, TrainingView
+from scas4d_core.update.schedule import Stopping
 from scas4d_core.update.warm_start import Motion
 
 REPORT = "report"

@@ -1,10 +1,15 @@
-"""Schedule of an update, the same on every device: views, samples, weights and rates of each iteration; Adam's step."""
+"""Schedule of an update, the same on every device: iterations, views, samples, weights and rates; Adam's step.
+
+Layers begin, and rates fall, by the share of the iterations that is done, so the stopping rule says before each
+iteration how many there will be in all. What it said is recorded with the commit.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import cos, pi
+from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +17,7 @@ from numpy.typing import NDArray
 from scas4d_core.guards import GuardCounts
 from scas4d_core.kernels.adam import ACTED, EVERY_ROW, adam
 from scas4d_core.settings import UpdateSettings
-from scas4d_core.update.views import TrainingView, view_order
+from scas4d_core.update.picture_loss import TrainingView, view_order
 
 Array = NDArray[np.float32]
 
@@ -199,3 +204,135 @@ class Adam:
             self._beta1, self._beta2, self._steps,
         )  # fmt: skip
         self.guards.add(ACTED, acted)
+
+
+COOLING = 0.15
+"""Share of the iterations that follows the decision to stop: the rates fall to their end first."""
+
+LOOK_EVERY = 10
+"""Iterations between two looks at the probe views, where an update ends once it gains nothing."""
+
+PROBE = 4
+"""Iterations after which an update's own speed is worth more than what the updates before took."""
+
+MOST_TIMED = 4000
+"""Iterations that an update by the clock has at most."""
+
+UNTIMED = 100
+"""Iterations that are planned by the clock before any was measured."""
+
+RATE = 0.3
+"""How fast what a budget foresees follows what was."""
+AFTER_S = 0.05
+"""Seconds after the last iteration that are foreseen before any frame was measured."""
+
+
+class Stopping:
+    """Decides how long one update goes on: so many iterations, as many as fit, or fewer once nothing is gained.
+
+    Args:
+        most: iterations there can be at most.
+        end: moment of ``clock`` by which the last iteration has to be over, seconds; at least one is made. None: there
+            are ``most`` iterations.
+        each: seconds of an iteration in the updates before, or None where there was none.
+        gain: every ``LOOK_EVERY`` iterations the probe views (training views, never those held out) are looked at;
+            where their error fell by less than this share since the look before, the update cools down and ends.
+            0: it does not look.
+        first: share of the iterations before which it does not end so: what begins late has to have begun.
+
+    Attributes:
+        planned_so_far: (iteration, iterations in all) whenever what is planned changed.
+
+    >>> stopping = Stopping(7)
+    >>> stopping.planned(0), stopping.planned(3), stopping.planned_so_far
+    (7, 7, [(0, 7)])
+    """
+
+    def __init__(
+        self,
+        most: int = MOST_TIMED,
+        *,
+        end: float | None = None,
+        each: float | None = None,
+        gain: float = 0.0,
+        first: float = 0.0,
+        clock: Callable[[], float] = perf_counter,
+    ) -> None:
+        self.most, self.end = most, end
+        self._each, self._gain, self._first, self._clock = each, gain, first, clock
+        self.planned_so_far: list[tuple[int, int]] = []
+        self._began = 0.0
+        self._error: float | None = None
+        self._stop: int | None = None
+
+    def planned(self, done: int) -> int:
+        """Iterations in all, as seen before iteration ``done``, counted from 0; the update ends at ``done`` or less."""
+        total = self._total(done)
+        if self._stop is not None:
+            total = min(total, self._stop)
+        if not self.planned_so_far or self.planned_so_far[-1][1] != total:
+            self.planned_so_far.append((done, total))
+        return total
+
+    def looks(self, done: int) -> bool:
+        """True where it needs the error on the probe views after ``done`` iterations."""
+        return self._gain > 0 and self._stop is None and done % LOOK_EVERY == 0
+
+    def saw(self, done: int, error: float) -> None:
+        """Take the error on the probe views after ``done`` iterations, where ``looks`` said so."""
+        total = self._total(done)
+        if self._error is not None and done >= self._first * total and error > (1 - self._gain) * self._error:
+            self._stop = done + max(1, round(COOLING * total))
+        self._error = error
+
+    def _total(self, done: int) -> int:
+        """Iterations in all, but for an early end."""
+        if self.end is None:
+            return self.most
+        now = self._clock()
+        if done == 0:
+            self._began = now
+        each = self._each
+        if done >= PROBE or (each is None and done > 0):
+            each = (now - self._began) / done
+        if each is None:
+            return min(self.most, UNTIMED)
+        left = int((self.end - now) / max(each, 1e-9))
+        return min(self.most, max(1, done + left))
+
+
+class TimeBudget:
+    """Milliseconds that each frame of a scene may take; learns what comes before and after the iterations.
+
+    Decoding comes before the iterations and is seen by the clock; comparing and checking the end, writing the
+    checkpoint and the commit come after them and are foreseen.
+
+    Attributes:
+        milliseconds: a frame may take, None: as many as it needs. each: seconds of an iteration, None: not known yet.
+        after: seconds from the last iteration to the end of the commit.
+    """
+
+    def __init__(self, milliseconds: float | None) -> None:
+        self.milliseconds = milliseconds
+        self.each: float | None = None
+        self.after = AFTER_S
+
+    def end(self, began: float) -> float | None:
+        """The moment by which the last iteration has to be over, of a frame begun at ``began``; None: no limit."""
+        return None if self.milliseconds is None else began + self.milliseconds / 1000 - self.after
+
+    def learn(self, moments: Sequence[float], seconds: Mapping[str, float], commit: float) -> None:
+        """Take how long a frame took.
+
+        Args:
+            moments, seconds: of its update, see ``UpdateTrace``. commit: seconds that checking and writing took.
+        """
+        if not moments:
+            return
+        each = max(0.0, moments[-1] - seconds.get("start", 0.0)) / len(moments)
+        after = commit + sum(seconds.get(stage, 0.0) for stage in ("end", "commit"))
+        if self.each is None:
+            self.each, self.after = each, after
+        else:
+            self.each = min(each, self.each + RATE * (each - self.each))  # one slow frame is forgotten with the next
+            self.after += RATE * (after - self.after)

@@ -9,7 +9,7 @@ from typing import Protocol
 from prometheus_client import CollectorRegistry, Counter, Histogram
 from prometheus_client.core import GaugeMetricFamily, Metric
 
-from client.wire import FrameReportModel, FrameState, SceneState, SceneStatus
+from client.wire import SceneState, SceneStatus
 from server.connections.refusals import Refusal
 from server.settings import ServerSettings
 from server.stream.hub import Hub
@@ -81,17 +81,6 @@ for state in ("acknowledged", "committed", "set_aside", "skipped", "missing"):
     FRAMES.labels(state)
 for how in ("held", "in_part"):
     DEGRADED.labels(how)
-
-
-def finished(report: FrameReportModel) -> None:
-    """Counts a frame that ended, and what its update took."""
-    FRAMES.labels(report.state.value).inc()
-    if report.state == FrameState.COMMITTED:
-        LEFT_OUT.inc(len(report.dropped_cameras))
-        if report.outcome is not None and report.outcome.degraded:
-            DEGRADED.labels("held" if report.outcome.held else "in_part").inc()
-    for stage, seconds in report.seconds.items():
-        UPDATE_SECONDS.labels(stage).observe(seconds)
 
 
 class HasStatus(Protocol):

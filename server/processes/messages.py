@@ -220,13 +220,6 @@ class ReplayEnded:
 # To the readers.
 
 
-@dataclass(frozen=True)
-class Refresh:
-    """Frames were committed, deleted or taken back: these, or None if every file has to be checked."""
-
-    frames: tuple[int, ...] | None = None
-
-
 @dataclass(frozen=True, eq=False)
 class RenderQuery:
     """A view of a committed frame.
@@ -292,10 +285,14 @@ Query = RenderQuery | TracksQuery | PartsQuery | LabelsQuery | PlyQuery
 
 @dataclass(frozen=True)
 class AskedQuery:
-    """A query with a number to find its answer by."""
+    """A query with a number to find its answer by.
+
+    `stale` are frames that were committed, deleted or taken back since the query before; None: any may have been.
+    """
 
     number: int
     query: Query
+    stale: frozenset[int] | None = frozenset()
 
 
 # From the readers.

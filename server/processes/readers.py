@@ -1,9 +1,8 @@
 """Answers queries about the committed states of a scene: its two reader processes and the queues before them.
 
-Views have a process of their own: a track query over a long history, or a search for parts, never stands before them.
-That other process starts with its first query, runs at a lower priority, and is ended when its query was cancelled:
-nothing in it can be interrupted in any other way, and it holds nothing that is not on disk. A process that ends by
-itself is started again, each time after a longer pause.
+Views have a process of their own: a long track query, or a search for parts, never stands before them. The other process
+starts with its first query, runs at a lower priority, and is ended when its query was cancelled: it holds nothing that is
+not on disk. A process that ends by itself is started again, each time after a longer pause.
 """
 
 from __future__ import annotations
@@ -29,7 +28,6 @@ from server.processes.messages import (
     LabelsQuery,
     PartsQuery,
     Query,
-    Refresh,
     Refused,
     RenderQuery,
     SceneSpec,
@@ -38,14 +36,15 @@ from server.processes.messages import (
 from server.processes.placement import Entry, Placement, Process
 
 GRACE_VIEWS_S, GRACE_BULK_S = 10.0, 1.0
-"""A process may go on for so long with a query that was cancelled. Views are short, and a new process takes a second or
-two to start."""
+"""A process may go on for so long with a cancelled query: a new process takes a second or two to start."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
 """Pause before a process that ended by itself is started again; it doubles with each end without an answer."""
 MOST_WAITING = 64
 """Queries before a process; more get 503. Beyond a second or two of views, waiting only makes it worse."""
 ANSWER_SECONDS = 120.0
 """A query that takes longer gets 503: the longest that is let in takes about half of it."""
+MOST_STALE = 10_000
+"""Frames that are noted one by one; for more, the states are listed anew."""
 COUNTS_KEPT = 8
 """Numbers of parts whose labels are kept."""
 
@@ -53,11 +52,10 @@ REMEDIES = {
     404: "ask for a frame that the scene's status counts as committed",
     500: SERVICE_FAULT,
     503: "ask again later",
-}
-"""Remedies by the status of an answer, where the process says none."""
+}  # by the status of an answer, where the process says none
 
 Noticed = Callable[[Mapping[str, str]], None]
-"""Told of files of the states' folder that cannot be read, by name with the reason."""
+"""Called with files of the states' folder that cannot be read, by name with the reason."""
 
 log = logging.getLogger("scas4d.server")
 
@@ -109,6 +107,7 @@ class QueryQueue:
         self._failures = 0
         self._pause: asyncio.TimerHandle | None = None
         self._asked = 0
+        self._stale: set[int] | None = set()
         self._closed = False
         if eager:
             self._start()
@@ -152,9 +151,11 @@ class QueryQueue:
                 asyncio.get_running_loop().call_later(self._grace, self._give_up, turn)
 
     def refresh(self, frames: tuple[int, ...] | None) -> None:
-        """Tells the process that frames were committed, deleted or taken back."""
-        if self.process is not None:
-            self.process.send(Refresh(frames))
+        """Notes frames that were committed, deleted or taken back, for the next query; None: any may have been."""
+        if frames is None or self._stale is None or len(self._stale) > MOST_STALE:
+            self._stale = None
+        else:
+            self._stale.update(frames)
 
     async def stop(self) -> None:
         """Ends the process, at once if it is busy; queries that wait, and later ones, are refused."""
@@ -162,8 +163,8 @@ class QueryQueue:
         if self._pause is not None:
             self._pause.cancel()
         turns = [*self._waiting, *([self._at_work] if self._at_work else [])]
-        process, self.process = self.process, None
-        busy, self._at_work = self._at_work is not None, None
+        process, busy = self.process, self._at_work is not None
+        self.process = self._at_work = None
         if process is not None:
             await (process.stop(0) if busy else process.stop())
         await asyncio.gather(*self._ending)
@@ -183,7 +184,8 @@ class QueryQueue:
             self._start()
         assert self.process is not None
         self._at_work = self._waiting.popleft()
-        self.process.send(AskedQuery(self._at_work.number, self._at_work.query))
+        stale, self._stale = None if self._stale is None else frozenset(self._stale), set()
+        self.process.send(AskedQuery(self._at_work.number, self._at_work.query, stale))
 
     def _answered(self, message: Answer | Refused | Damaged) -> None:
         if isinstance(message, Damaged):
@@ -280,7 +282,7 @@ class Readers:
         return replace(answer, headers={**answer.headers, "X-Parts-Frame": labels.frame})
 
     def refresh(self, frames: tuple[int, ...] | None = None) -> None:
-        """Tells the processes that frames were committed, deleted or taken back: these, or any of them for None."""
+        """Notes frames that were committed, deleted or taken back: these, or any of them for None."""
         self._commits += 1
         self.views.refresh(frames)
         self.bulk.refresh(frames)

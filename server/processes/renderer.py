@@ -32,7 +32,6 @@ from server.processes.messages import (
     PartsQuery,
     PlyQuery,
     Query,
-    Refresh,
     Refused,
     RenderQuery,
     SceneSpec,
@@ -80,9 +79,7 @@ def _serve(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
             break
         if isinstance(message, Stop):
             break
-        if isinstance(message, Refresh):
-            renderer.changed(message.frames)
-        elif isinstance(message, AskedQuery):
+        if isinstance(message, AskedQuery):
             answer = renderer.answer(message)
             if found := renderer.take_faults():  # before a refused query is asked again
                 connection.send(Damaged(found))
@@ -110,10 +107,6 @@ class Renderer:
             self._history.refresh(self._stale)
         self._stale = set()
         return self._history
-
-    def changed(self, frames: tuple[int, ...] | None) -> None:
-        """Notes frames that were committed, deleted or taken back; None: any may have been."""
-        self._stale = None if frames is None or self._stale is None else self._stale | set(frames)
 
     @property
     def reader(self) -> CommittedScene:
@@ -150,6 +143,7 @@ class Renderer:
     def answer(self, ask: AskedQuery) -> Answer | Refused:
         """Returns the encoded answer, or the reason for a refusal."""
         asked = f"{ask.query.kind} query"
+        self._stale = None if ask.stale is None or self._stale is None else self._stale | ask.stale
         for more in range(DAMAGED_AT_ONCE, -1, -1):
             try:
                 return self._answer(ask.number, ask.query)

@@ -12,9 +12,9 @@ from typing import Any
 
 from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History
-from server.processes.decoding import decode, read
 from server.processes.messages import Damaged, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
 from server.processes.placement import end_with_parent, use_one_thread
+from server.processes.worker import decode, read
 
 NICE = 15
 """Added to its niceness: of a core that it shares with a scene's worker it gets about a tenth."""

@@ -8,15 +8,22 @@ import os
 import signal
 import time
 from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from client.wire import Budget
+from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import Frame, InitialPoints
+from scas4d_core.captures.images import ImageError, decode_image, decode_mask
 from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.storage.npz import read_npz
-from server.processes.decoding import decode, read
 from server.processes.messages import (
     Broken,
     FrameCommitted,
@@ -34,7 +41,8 @@ from server.processes.placement import end_with_parent
 from server.repair import repairs
 from server.repair.repairs import mend_at_start
 from server.storage.disk import FolderLock, no_room
-from server.storage.frame_store import FrameDamage, holds
+from server.storage.frame_store import FrameDamage, holds, read_pictures
+from server.storage.ledger import frame_identity
 
 if TYPE_CHECKING:
     from scas4d_core.reconstruction import Reconstruction
@@ -88,6 +96,7 @@ class Worker:
     def __init__(self, spec: SceneSpec, connection: Connection[Any, Any]) -> None:
         self.spec = spec
         self.connection = connection
+        self._pictures = spec.folder.frames
         self.states: History | None = None
         self.reconstruction: Reconstruction | None = None
         self._progress_at = 0.0
@@ -107,7 +116,7 @@ class Worker:
 
                 self._warm_up()
                 self.reconstruction = Reconstruction.resume(
-                    self.spec.rig, self.spec.settings, history, held=lambda index: holds(self.spec.folder.frames, index)
+                    self.spec.rig, self.spec.settings, history, held=lambda index: holds(self._pictures, index)
                 )
                 if self.reconstruction.resumed is not None:
                     undone = tuple(self.reconstruction.resumed.undone)
@@ -165,7 +174,7 @@ class Worker:
         dropped: dict[str, str] = {}
         began = time.perf_counter()
         try:
-            frame, dropped = decode(self.spec.rig, message, read(self.spec.folder.frames, message))
+            frame, dropped = decode(self.spec.rig, message, read(self._pictures, message))
             least = self.spec.minimum_cameras
             if len(frame.images) < least:
                 reason = f"{len(frame.images)} cameras' pictures are left, the scene's minimum is {least}"
@@ -193,7 +202,7 @@ class Worker:
         frame = message.frame
 
         def pictures() -> tuple[Frame, dict[str, str]]:
-            return decode(self.spec.rig, frame, read(self.spec.folder.frames, frame))
+            return decode(self.spec.rig, frame, read(self._pictures, frame))
 
         for mended in repairs.remake(self.spec, self.states, message, pictures):
             self.connection.send(mended)
@@ -261,3 +270,70 @@ class Worker:
             self._progress_at = now
             detail = {name: float(value) for name, value in progress.detail.items()}
             self.connection.send(Progressed(progress.stage, int(progress.done), int(progress.total), detail))
+
+
+Picture = NDArray[np.uint8]
+
+DECODERS = 8
+"""Cameras that are decoded at a time at most: each holds its picture twice meanwhile."""
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """The files of a frame by camera, as they were sent. faults: a sentence for each record that could not be read."""
+
+    images: dict[str, memoryview]
+    masks: dict[str, memoryview]
+    faults: list[str]
+
+
+def read(folder: Path, message: FrameReady) -> Encoded:
+    """Reads the files of a frame from the frame log.
+
+    Raises:
+        FrameDamage: the record that holds the whole frame cannot be used.
+    """
+    found = Encoded({}, {}, [])
+    for name in message.files:
+        try:
+            pictures = read_pictures(folder, name)
+        except FrameDamage as error:
+            if len(message.files) == 1:
+                raise
+            found.faults.append(f"a record in the frame log is damaged: {error}")
+            continue
+        if len(message.files) == 1 and frame_identity(pictures.hashes, message.time) != message.identity:
+            raise FrameDamage(f"{name}: it holds other pictures than were acknowledged")
+        found.images.update(pictures.images)
+        found.masks.update(pictures.masks)
+    return found
+
+
+def decode(rig: Rig, message: FrameReady, encoded: Encoded) -> tuple[Frame, dict[str, str]]:
+    """Returns the frame, and the cameras left out of it with the reason; cameras are decoded side by side."""
+    with ThreadPoolExecutor(max_workers=min(DECODERS, os.cpu_count() or 1)) as pool:
+        found = list(pool.map(lambda camera: _pictures_of(camera, encoded), rig.cameras))
+    images, masks, dropped = {}, {}, {}
+    # In the order of the rig, whatever the order in which they came: the same pictures give the same bits.
+    for camera, pictures in zip(rig.cameras, found, strict=True):
+        if isinstance(pictures, str):
+            dropped[camera.name] = pictures
+            continue
+        images[camera.name], mask = pictures
+        if mask is not None:
+            masks[camera.name] = mask
+    return Frame(message.index, message.time, images, masks), dropped
+
+
+def _pictures_of(camera: Camera, encoded: Encoded) -> tuple[Picture, Picture | None] | str:
+    """Returns a camera's picture and its mask, if one was sent; or the reason to leave the camera out."""
+    name, size = camera.name, (camera.width, camera.height)
+    if name not in encoded.images:
+        return "; ".join(encoded.faults) or f"camera {name!r} had sent nothing when the frame was closed"
+    try:
+        image = decode_image(bytes(encoded.images[name]), size=size, name=f"image of camera {name!r}")
+        if name not in encoded.masks:
+            return image, None
+        return image, decode_mask(bytes(encoded.masks[name]), size=size, name=f"mask of camera {name!r}")
+    except ImageError as error:
+        return str(error)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Iterator, Sequence
+from functools import partial
 from itertools import chain
 
 from client.wire import Budget, FrameReportModel, FrameState, SceneBudget, SceneState, SceneStatus
 from scas4d_core.cameras import Camera
 from scas4d_core.errors import message_of
-from server.health import metrics
 from server.ingest.acknowledge import Ingest, IngestRules, uncancelled
 from server.ingest.open_frames import OpenFrames
 from server.processes.messages import SceneSpec
@@ -32,7 +32,7 @@ from server.storage.layout import SceneFolder
 from server.storage.ledger import SceneLog
 from server.storage.recovery import Recovered
 from server.storage.snapshot import events_of
-from server.stream.hub import Event, FrameFinished, Hub, SceneChanged
+from server.stream.hub import FrameFinished, Hub, SceneChanged
 
 log = logging.getLogger("scas4d.server")
 
@@ -98,7 +98,7 @@ class Scene:
             self._background,
             placement,
             keep_frames=asked.keep_frames,
-            tell=self._tell,
+            publish=partial(hub.publish, self.id),
             close_due=lambda: self.open_frames.close_due(),
             remake=found.remake,
         )
@@ -107,7 +107,7 @@ class Scene:
             self.rules,
             remaining=self.updates.clock.remaining,
             accepted=self.updates.begin,
-            ended=lambda index: self._tell(FrameFinished(self.frames[index].report)),
+            ended=lambda index: self.updates.tell(FrameFinished(self.frames[index].report)),
         )
         self.open_frames = OpenFrames(self.ingest, self._background.run)
         self.replays = Replays(self.spec, self.ledger, placement, self.updates.mending.noticed, self._background)
@@ -245,15 +245,9 @@ class Scene:
 
     # Events.
 
-    def _tell(self, event: Event) -> None:
-        """Publishes an event; to be called at every change of the scene's status or of a frame."""
-        if isinstance(event, FrameFinished):
-            metrics.finished(event.report)
-        self._hub.publish(self.id, event)
-
     def _waits(self, sentence: str) -> None:
         self.updates.trouble = sentence
-        self._tell(SceneChanged())
+        self.updates.tell(SceneChanged())
 
     def _all_events(self) -> Iterator[JournalEvent]:
         """Snapshot for the journal; see `Journal`."""
@@ -261,9 +255,9 @@ class Scene:
 
     def _journal_renewed(self, fault: str) -> None:
         self._damage.say(DamageKind.JOURNAL, f"{fault}; it was written anew from what the service knows")
-        self._tell(SceneChanged())
+        self.updates.tell(SceneChanged())
 
     def _failed(self, error: BaseException) -> None:
         self.ledger.fatal = f"the service failed: {type(error).__name__}: {message_of(error)}"
         log.error("scene %s", self.id, exc_info=error)
-        self._tell(SceneChanged())
+        self.updates.tell(SceneChanged())

@@ -60,7 +60,7 @@ class Updates:
         placement: Placement,
         *,
         keep_frames: Retention,
-        tell: Callable[[Event], None],
+        publish: Callable[[Event], None],
         close_due: Callable[[], Awaitable[None]],
         remake: Mapping[int, str],
     ) -> None:
@@ -73,7 +73,7 @@ class Updates:
         self._background = background
         self._placement = placement
         self._keep_frames = keep_frames
-        self._tell = tell
+        self._publish = publish
         self._close_due = close_due
         self.clock = WorkClock()
         self.deaths = WorkerDeaths()
@@ -96,6 +96,19 @@ class Updates:
         self._worker: Process
         self._start_worker()
 
+    def tell(self, event: Event) -> None:
+        """Counts and publishes an event; to be called at every change of the scene's status or of a frame."""
+        if isinstance(event, FrameFinished):
+            report = event.report
+            metrics.FRAMES.labels(report.state.value).inc()
+            if report.state == FrameState.COMMITTED:
+                metrics.LEFT_OUT.inc(len(report.dropped_cameras))
+                if report.outcome is not None and report.outcome.degraded:
+                    metrics.DEGRADED.labels("held" if report.outcome.held else "in_part").inc()
+            for stage, seconds in report.seconds.items():
+                metrics.UPDATE_SECONDS.labels(stage).observe(seconds)
+        self._publish(event)
+
     @property
     def at_work(self) -> bool:
         """True while the worker has a frame."""
@@ -103,7 +116,7 @@ class Updates:
 
     def begin(self) -> None:
         """Gives the worker its next frame, if it is idle and one waits; to be called whenever that may have changed."""
-        self._tell(SceneChanged())
+        self.tell(SceneChanged())
         ledger = self._ledger
         if not self._ready or self._index is not None or self._holding or self.mending.at_work is not None:
             return
@@ -120,7 +133,7 @@ class Updates:
         self._index = index
         self.clock.begin(first=not ledger.committed)
         self._worker.send(FrameReady(index, receipt.time, entry.files, receipt.identity, ledger.budget_of(index)))
-        self._tell(SceneChanged())
+        self.tell(SceneChanged())
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -143,7 +156,7 @@ class Updates:
                     stage=message.stage, done=message.done, total=message.total, detail=message.detail
                 )
                 self.clock.progress(message.stage, message.done, message.total)
-                self._tell(SceneChanged())
+                self.tell(SceneChanged())
             case FrameCommitted():
                 self._background.run(self._commit(message))
             case FrameFailed():
@@ -156,11 +169,11 @@ class Updates:
             case Stalled():
                 self.trouble = f"frame {message.index} waits for room on the disk: {message.reason}"
                 self.clock.stall(message.seconds)
-                self._tell(SceneChanged())
+                self.tell(SceneChanged())
             case Broken():
                 self._ledger.fatal = f"what is committed cannot be gone on from: {message.reason}"
                 log.error("scene %s: %s", self._ledger.scene, self._ledger.fatal)
-                self._tell(SceneChanged())
+                self.tell(SceneChanged())
 
     async def _resume(self, ready: Ready) -> None:
         """Brings the ledger in line with the committed states that a new worker has loaded, and goes on."""
@@ -177,7 +190,7 @@ class Updates:
             self._record(ready.indices[-1], ready.report)
             self._readers.refresh()
             if ready.indices[-1] > newest:  # committed by a worker that died before it could say so
-                self._tell(FrameFinished(ledger.frames[ready.indices[-1]].report))
+                self.tell(FrameFinished(ledger.frames[ready.indices[-1]].report))
         self.trouble = self._last_trouble()
         self._ready = True
         self.mending.taken_up(ready.damaged)
@@ -192,13 +205,13 @@ class Updates:
         report = self._ledger.frames[message.index].report
         self.trouble = trouble_of(report)
         self._readers.refresh((message.index, *message.deleted))
-        self._tell(FrameFinished(report))
+        self.tell(FrameFinished(report))
         self.begin()
         if message.deleted:
             self.mending.retired(message.deleted)
             deleted = StatesDeleted(frames=message.deleted)
             self._ledger.apply(deleted)
-            self._tell(SceneChanged())
+            self.tell(SceneChanged())
             await self._log.write(deleted)
         await self.retain()
         if self._ledger.open:
@@ -215,7 +228,7 @@ class Updates:
                 pass
             await self._fail_waiting()
         log.warning("scene %s: %s", self._ledger.scene, self.trouble)
-        self._tell(FrameFinished(self._ledger.frames[event.index].report))
+        self.tell(FrameFinished(self._ledger.frames[event.index].report))
         self.begin()
         if self._ledger.open:
             await self._close_due()
@@ -226,7 +239,7 @@ class Updates:
             await self._log.write(*events)
         for event in events:
             self._ledger.apply(event)
-            self._tell(FrameFinished(self._ledger.frames[event.index].report))
+            self.tell(FrameFinished(self._ledger.frames[event.index].report))
 
     def _record(self, index: int, record: Mapping[str, Any]) -> None:
         self._ledger.frames.set_record(index, record)
@@ -245,7 +258,7 @@ class Updates:
         names = [name for index in gone for name in self._ledger.frames[index].files]
         event = PicturesDeleted(frames=tuple(gone))
         self._ledger.apply(event)
-        self._tell(SceneChanged())
+        self.tell(SceneChanged())
         await self._log.delete_pictures(names)
         await self._log.write(event)
 
@@ -290,7 +303,7 @@ class Updates:
             event = given_up(self._ledger.frames[index], death)
             if event is not None and not await self._reports.is_committed(index):
                 await self._set_aside(event)
-        self._tell(SceneChanged())
+        self.tell(SceneChanged())
         if not self._stopping:
             self._restart = asyncio.get_running_loop().call_later(delay, self._start_worker)
 

@@ -57,7 +57,7 @@ TREND = 1.5
 UNIT = 1e-5
 """Target: how far from 1 the norm of a rotation may be."""
 GROWTH = 10.5
-"""Target: times longer or shorter than in frame 0 that an axis may be: ``validation.SHRUNK``, less rounding."""
+"""Target: times longer or shorter than in frame 0 that an axis may be: ``checks.SHRUNK``, less rounding."""
 HALF = 10
 """Rows that a half needs for that."""
 MEMORY = 1.1

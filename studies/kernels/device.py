@@ -30,9 +30,8 @@ from scas4d_core.torch_backend.device import require_device
 from scas4d_core.torch_backend.device_update import DeviceUpdate
 from scas4d_core.update.deformation import CpuDeformation, first_lengths
 from scas4d_core.update.frame_update import NEIGHBOURS, FrameUpdate
-from scas4d_core.update.picture_loss import PictureLoss
+from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 from scas4d_core.update.result import UpdateResult
-from scas4d_core.update.views import ViewFactory
 from scas4d_core.update.warm_start import Motion
 from studies.kernels import synthetic
 from studies.machine import in_words, machine

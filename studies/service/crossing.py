@@ -28,8 +28,9 @@ SETTINGS = {
     "update": {"iterations": 20},
 }
 POLL_S = 0.05
-SETTLE_S = 1.0
-"""After the commit or the answer, for what a process still does about it; before, for what it did."""
+SETTLE_S = 0.3
+"""After the commit or the answer, for what a process still does about it; before, for what it did. Short: what
+runs in the background every few seconds does not belong to the frame."""
 
 PROFILER = """
 import os, sys, threading, time
@@ -70,7 +71,12 @@ def crossed(folder: Path, capture: Capture) -> dict[str, list[str]]:
     (folder / "sitecustomize.py").write_text(PROFILER)
     root = Path(__file__).parents[2]
     path = os.pathsep.join((str(folder), str(root)))
-    environment = {"PYTHONPATH": path, "CROSSING_FOLDER": str(folder), "SCAS4D_SCRUB_MB_PER_SECOND": "0"}
+    environment = {
+        "PYTHONPATH": path,
+        "CROSSING_FOLDER": str(folder),
+        "SCAS4D_SCRUB_MB_PER_SECOND": "0",
+        "SCAS4D_LOG_LEVEL": "info",
+    }
     assert capture.test_rig is not None
     camera = capture.test_rig.cameras[0]
     service = Service(folder / "data", environment)

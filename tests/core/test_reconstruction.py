@@ -256,7 +256,7 @@ def test_what_seems_to_move_in_a_frame_that_is_held_is_not_learnt() -> None:
 
 
 def test_what_another_light_changes_has_not_moved(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scas4d_core.robust.picture_checks.ENOUGH", 1)
+    monkeypatch.setattr("scas4d_core.robust.checks.ENOUGH", 1)
     frames = [replace(frame, masks={}) for frame in FRAMES]
     scene = start(frame=frames[0])
     usual = scene.step(frames[1])

@@ -29,9 +29,8 @@ from scas4d_core.torch_backend.device_update import DeviceUpdate
 from scas4d_core.update import schedule
 from scas4d_core.update.deformation import CpuDeformation
 from scas4d_core.update.frame_update import SMALLEST_CLUSTER, FrameUpdate
-from scas4d_core.update.picture_loss import PictureLoss
+from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import UpdateResult
-from scas4d_core.update.views import TrainingView, ViewFactory
 from scas4d_core.update.warm_start import Motion
 
 MADE = make_box()

@@ -13,8 +13,8 @@ from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.metrics import psnr
 from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.robust.checks import lit as with_light
 from scas4d_core.robust.outliers import Past
-from scas4d_core.robust.picture_checks import lit as with_light
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 from studies.hard_frames import footage as frames_footage

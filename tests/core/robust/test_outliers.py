@@ -8,9 +8,9 @@ from math import isnan, nan
 import numpy as np
 import pytest
 
-from scas4d_core.robust import outliers, picture_checks
+from scas4d_core.robust import checks, outliers
+from scas4d_core.robust.checks import check_brightness
 from scas4d_core.robust.outliers import Past
-from scas4d_core.robust.picture_checks import check_brightness
 
 NAMES = [f"c{k}" for k in range(10)]
 LEVEL = 33.0
@@ -48,7 +48,7 @@ def test_exposure_is_the_median_of_the_cameras_once_it_is_told_from_noise(factor
 
 
 def test_few_cameras_tell_no_exposure_but_a_black_frame() -> None:
-    few = {name: BRIGHT[name] for name in NAMES[: picture_checks.ENOUGH - 1]}
+    few = {name: BRIGHT[name] for name in NAMES[: checks.ENOUGH - 1]}
     assert check_brightness(PAST, {name: 1.4 * value for name, value in few.items()})[0] == 1.0
     assert check_brightness(PAST, {name: 3 * value for name, value in few.items()})[2] is None
     assert check_brightness(PAST, dict.fromkeys(few, 0.0))[2] is not None
@@ -69,8 +69,8 @@ def test_where_most_cameras_show_nothing_none_is_left_out() -> None:
 def test_brightness_looks_at_every_fourth_pixel_and_not_at_shadows_of_dark_pictures() -> None:
     picture = np.zeros((16, 16, 3), np.uint8)
     picture[::4, ::4] = 255
-    assert picture_checks.brightness_of(picture) == 1.0
-    dark = Past({"c0": 0.0}, {"c0": picture_checks.DARKEST / 2}, {"c0": 0}, LEVEL, 3)
+    assert checks.brightness_of(picture) == 1.0
+    dark = Past({"c0": 0.0}, {"c0": checks.DARKEST / 2}, {"c0": 0}, LEVEL, 3)
     assert check_brightness(dark, {"c0": 0.5})[2] is None
 
 

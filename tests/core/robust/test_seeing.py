@@ -12,16 +12,15 @@ from scas4d_core.cameras import rig_inside
 from scas4d_core.captures.frame import Frame
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.robust.picture_checks import evened, gain_of, relit
+from scas4d_core.robust.checks import evened, gain_of, relit
 from scas4d_core.robust.relocation import find_jump, shifted
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.best_state import VIEWS, BestState, ProbeViews, mean_error, spread
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.picture_loss import PictureLoss
+from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import AttemptOptions
-from scas4d_core.update.stopping import Stopping
-from scas4d_core.update.views import TrainingView, ViewFactory
+from scas4d_core.update.schedule import Stopping
 from studies.hard_frames.footage import ANGLE, SyntheticFootage
 from studies.hard_frames.scene import BALL, GOES, first_state, gone
 

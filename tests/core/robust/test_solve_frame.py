@@ -14,16 +14,14 @@ from scas4d_core.cameras import Rig
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust import outliers as judge
+from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness
+from scas4d_core.robust.checks import lit as with_light
 from scas4d_core.robust.outliers import Past
-from scas4d_core.robust.picture_checks import brightness, check_brightness
-from scas4d_core.robust.picture_checks import lit as with_light
 from scas4d_core.robust.solve_frame import ERROR_RISE, FrameSolver, UpdateInput
-from scas4d_core.robust.validation import axis_lengths
 from scas4d_core.settings import UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
-from scas4d_core.update.picture_loss import PictureLoss
+from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import AS_SET, AttemptOptions, UpdateResult, UpdateTrace, camera_fit
-from scas4d_core.update.views import TrainingView, ViewFactory
 from scas4d_core.update.warm_start import Motion
 from studies.hard_frames.footage import SyntheticFootage
 from studies.hard_frames.scene import first_state, gone

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.robust.validation import BRIGHTEST, FARTHEST, FEW, LONGEST, SHRUNK, STRETCHED, axis_lengths, validated
+from scas4d_core.robust.checks import BRIGHTEST, FARTHEST, FEW, LONGEST, SHRUNK, STRETCHED, axis_lengths, validated
 from scas4d_core.update.result import UpdateResult, UpdateTrace
 from studies.hard_frames.scene import first_state, gone
 

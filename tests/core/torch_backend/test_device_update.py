@@ -27,9 +27,9 @@ from scas4d_core.torch_backend.device_update import DeviceUpdate
 from scas4d_core.update import schedule
 from scas4d_core.update.best_state import mean_error
 from scas4d_core.update.frame_update import SMALLEST_CLUSTER, FrameUpdate
+from scas4d_core.update.picture_loss import ViewFactory
 from scas4d_core.update.result import AttemptOptions, UpdateResult
-from scas4d_core.update.stopping import COOLING, LOOK_EVERY, Stopping, TimeBudget
-from scas4d_core.update.views import ViewFactory
+from scas4d_core.update.schedule import COOLING, LOOK_EVERY, Stopping, TimeBudget
 from scas4d_core.update.warm_start import Motion
 
 BEFORE = make_box()

@@ -23,11 +23,9 @@ from scas4d_core.update import frame_update as update_module
 from scas4d_core.update import schedule
 from scas4d_core.update.deformation import MAX_SCALE, CpuDeformation
 from scas4d_core.update.frame_update import SMALLEST_CLUSTER, FrameUpdate
-from scas4d_core.update.picture_loss import PictureLoss
+from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory, view_order
 from scas4d_core.update.result import REPORT, AttemptOptions, Stopwatch, UpdateResult
-from scas4d_core.update.schedule import Adam, Rates, ViewPlan, plan_samples
-from scas4d_core.update.stopping import Stopping
-from scas4d_core.update.views import TrainingView, ViewFactory, view_order
+from scas4d_core.update.schedule import Adam, Rates, Stopping, ViewPlan, plan_samples
 
 BEFORE = make_box()
 AFTER = moved(BEFORE)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from scas4d_core.update.stopping import AFTER_S, COOLING, LOOK_EVERY, MOST_TIMED, PROBE, RATE, Stopping, TimeBudget
+from scas4d_core.update.schedule import AFTER_S, COOLING, LOOK_EVERY, MOST_TIMED, PROBE, RATE, Stopping, TimeBudget
 
 
 class Clock:
