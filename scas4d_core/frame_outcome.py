@@ -72,19 +72,25 @@ def degraded_text(outcome: FrameOutcome, reason: str) -> str | None:
     return HELD_TEXT + reason if outcome.held else reason
 
 
-def outcome_of(record: Mapping[str, Any]) -> FrameOutcome:
+def outcome_of(record: Mapping[str, Any]) -> FrameOutcome | None:
     """The outcome in a report as it was committed. Reports of earlier versions have the text alone, which is read here.
 
     Args:
         record: as ``History.report`` gives it.
+
+    Returns:
+        None for a report that was lost, or whose outcome only a later version knows.
 
     >>> outcome_of({"degraded": "held as it was: the pictures are 0.01 times as bright as they were"})
     <FrameOutcome.HELD_UNUSABLE: 'held_unusable'>
     >>> outcome_of({"outcome": "stood", "degraded": None})
     <FrameOutcome.STOOD: 'stood'>
     """
+    if not record:
+        return None
     if "outcome" in record:
-        return FrameOutcome(record["outcome"])
+        known = {outcome.value: outcome for outcome in FrameOutcome}
+        return known.get(record["outcome"])
     text = record.get("degraded")
     if text is None:
         return FrameOutcome.STOOD if record.get("iterations") == 0 else FrameOutcome.UPDATED

@@ -51,7 +51,8 @@ def remake(
     aside.set_budget(**budget)
     aside.step(frame, dropped=dropped, notes={**(notes or {}), REMADE: True})
     report = aside.history.report(frame.index)
-    if outcome_of(report).held:  # nothing was learnt from the pictures
+    outcome = outcome_of(report)
+    if outcome is not None and outcome.held:  # nothing was learnt from the pictures
         raise StepError(f"frame {frame.index} does not fit the frame before it: {report['degraded']}")
     arrays = aside.history.gaussians(frame.index).arrays()
     history.replace(frame.index, frame.time, {name: arrays[name] for name in PER_FRAME}, report)

@@ -310,9 +310,10 @@ def _refuse_former(environment: Mapping[str, str], written: dict[str, Any]) -> N
             except (TypeError, ValueError):
                 same = False
             if not same:
+                place = "" if name == "engine" else f", or change {constant} in {module.replace('.', '/')}.py"
                 raise SettingsError(
                     f"setting {known_as} is {value!r}, and is no setting any more: it is always {fixed!r}; leave it "
-                    f"out, or change {constant} in {module.replace('.', '/')}.py"
+                    f"out{place}"
                 )
 
 

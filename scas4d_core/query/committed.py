@@ -90,7 +90,7 @@ class CommittedScene:
         """
         gaussians = self._state(index)
         inside = self.world.camera_to_inside(camera)
-        features = np.concatenate([gaussians.colours, np.zeros((len(gaussians), 1), np.float32)], axis=1)
+        features = np.concatenate([gaussians.colours, np.zeros((len(gaussians.means), 1), np.float32)], axis=1)
         picture = self._rasterizer.forward(
             gaussians.means, gaussians.factors, gaussians.opacities, features, CameraArrays.of(inside),
             np.array([*background, 0.0], np.float32), depth_channel=3,

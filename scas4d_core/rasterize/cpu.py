@@ -175,7 +175,8 @@ class CpuRasterizer:
             counts,
             acted,
         )
-        self.guards.add(projection.ACTED, acted)
+        if acted.any():
+            self.guards.add(projection.ACTED, acted)
         if depth_channel >= 0:
             features[:, depth_channel] = splats[:, projection.DEPTH]
         visible, order = tiles.depth_order(

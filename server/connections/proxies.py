@@ -1,4 +1,4 @@
-"""ConnectionLimits the requests of each client behind a trusted proxy to the connections that a peer may have."""
+"""Limits the requests of each client behind a trusted proxy to the connections that a peer may have."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ class Ingest:
             self.admit(head.index, self.time_of(head.index, head.time))
         elif head.index > awaited:
             raise self.gap(head.index)
-        else:  # the frames before it are arriving: it is judged when they are here
+        else:  # the frames before it are arriving: it is checked when they are here
             self.refuse_if_failed()
         return True
 

@@ -1,8 +1,8 @@
 """Answers queries about the committed states of a scene: its two reader processes and the queues before them.
 
-Views have a process of their own: a long track query, or a search for parts, never stands before them. The other process
-starts with its first query, runs at a lower priority, and is ended when its query was cancelled: it holds nothing that is
-not on disk. A process that ends by itself is started again, each time after a longer pause.
+Views have a process of their own: a long track query, or a search for parts, never stands before them. The other
+process starts with its first query, runs at a lower priority, and is ended when its query was cancelled: it holds
+nothing that is not on disk. A process that ends by itself is started again, each time after a longer pause.
 """
 
 from __future__ import annotations
@@ -48,11 +48,9 @@ MOST_STALE = 10_000
 COUNTS_KEPT = 8
 """Numbers of parts whose labels are kept."""
 
-REMEDIES = {
-    404: "ask for a frame that the scene's status counts as committed",
-    500: SERVICE_FAULT,
-    503: "ask again later",
-}  # by the status of an answer, where the process says none
+NOT_COMMITTED = "ask for a frame that the scene's status counts as committed"
+REMEDIES = {404: NOT_COMMITTED, 500: SERVICE_FAULT, 503: "ask again later"}
+"""Remedies by the status of an answer, where the process says none."""
 
 Noticed = Callable[[Mapping[str, str]], None]
 """Called with files of the states' folder that cannot be read, by name with the reason."""
@@ -264,8 +262,7 @@ class Readers:
         """
         began, outcome = time.perf_counter(), "failed"
         try:
-            answer = await self._answer(query)
-            outcome = "answered"
+            answer, outcome = await self._answer(query), "answered"
             return answer
         finally:
             metrics.ANSWER_SECONDS.labels(query.kind, outcome).observe(time.perf_counter() - began)

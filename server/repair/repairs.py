@@ -32,6 +32,8 @@ log = logging.getLogger("scas4d.worker")
 
 def mend_at_start(history: History) -> list[str]:
     """What every frame needs, and its copies, written again where they are damaged; a sentence for each."""
+    folder = history.directory
+    absent = {name for name in (FIXED_COPY, FIRST_COPY) if folder is not None and not (folder / name).exists()}
     try:
         mended = history.mend_fixed()
     except OSError as error:  # states can be read all the same: a disk that takes nothing must not keep them away
@@ -41,7 +43,7 @@ def mend_at_start(history: History) -> list[str]:
     return [
         f"{reason}; it was written again from its copy"
         for name, reason in mended.items()
-        if not (name in (FIXED_COPY, FIRST_COPY) and reason.endswith("is gone"))  # an earlier version wrote none
+        if name not in absent  # an earlier version wrote no copies
     ]
 
 

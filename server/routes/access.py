@@ -30,7 +30,8 @@ def _settings(request: Request) -> ServerSettings:
 
 
 def _scene(request: Request, id: Annotated[str, Path(max_length=64)]) -> Scene:
-    return _scenes(request)[id]
+    scenes = _scenes(request)
+    return scenes.by_id.get(id) or scenes.refuse(id)
 
 
 AllScenes = Annotated[Scenes, Depends(_scenes)]

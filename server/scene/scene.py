@@ -13,13 +13,14 @@ from scas4d_core.cameras import Camera
 from scas4d_core.errors import message_of
 from server.ingest.acknowledge import Ingest, IngestRules, uncancelled
 from server.ingest.open_frames import OpenFrames
+from server.problems import Problem
 from server.processes.messages import SceneSpec
 from server.processes.placement import Placement
 from server.processes.readers import Readers
 from server.repair.mending import DamageKind, DamageLog
 from server.repair.scrub import Scrub
 from server.scene.replays import Replays
-from server.scene.status import FrameReports, camera_of, committed_frame_of, effective_budget, state_of
+from server.scene.status import FrameReports, camera_of, effective_budget, state_of
 from server.scene.supervision import Background
 from server.scene.updates import Updates
 from server.settings import ServerSettings
@@ -192,8 +193,47 @@ class Scene:
         return camera_of(self.rig, name)
 
     def committed_frame(self, index: int | None, field: str = "frame") -> int:
-        """Returns the index of a committed frame; see `committed_frame_of`."""
-        return committed_frame_of(self.ledger, self.state, index, field)
+        """Returns the index, or the last one for None, once it is checked that its state can be read.
+
+        Raises:
+            Problem: 404 or 409, it cannot; 503, it is being made again.
+        """
+        frames = self.ledger.frames
+        if not frames.committed:
+            raise Problem(
+                409,
+                "no frame of this scene is committed yet",
+                field=field,
+                remedy="wait until `committed` in the scene's status is above 0",
+                state=self.state,
+            )
+        if index is None:
+            return frames.committed[-1]
+        entry = frames.get(index)
+        if entry is not None and entry.unreadable:
+            raise Problem(
+                503,
+                f"the state of frame {index} was damaged on disk and is being made again",
+                field=field,
+                value=index,
+                remedy="ask again, or for another frame",
+                headers={"Retry-After": "2"},
+            )
+        other = f"ask for a committed frame, {frames.committed[0]} to {frames.committed[-1]}"
+        if entry is not None and entry.deleted and entry.error is not None:
+            raise Problem(404, entry.error, field=field, value=index, remedy=other)
+        if entry is None or entry.state != FrameState.COMMITTED or entry.deleted:
+            found = "not here" if entry is None else entry.state.value
+            if entry is not None and entry.deleted:
+                found = "deleted by the scene's retention"
+            raise Problem(
+                404,
+                f"frame {index} is {found}; only committed frames that are kept can be read",
+                field=field,
+                value=index,
+                remedy=other,
+            )
+        return index
 
     async def report(self, index: int) -> FrameReportModel | None:
         """Returns the report of a frame; see `FrameReports.of`."""

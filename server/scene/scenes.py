@@ -8,6 +8,7 @@ import secrets
 import shutil
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NoReturn
 
 from client.wire import SceneCreate
 from scas4d_core.errors import message_of
@@ -190,14 +191,19 @@ class Scenes:
         await asyncio.to_thread(write_definition, folder, definition)
 
     def __getitem__(self, id: str) -> Scene:
-        scene = self.by_id.get(id)
-        if scene is None:
-            self.check_recovered(id)
-            reason = f": {self.unreadable[id]}" if id in self.unreadable else ""
-            raise Problem(
-                404, f"no scene {id!r}{reason}", field="id", value=id, remedy="GET /v1/scenes lists the scenes"
-            )
-        return scene
+        if id not in self.by_id:
+            self.refuse(id)
+        return self.by_id[id]
+
+    def refuse(self, id: str) -> NoReturn:
+        """Says why there is no such scene.
+
+        Raises:
+            Problem: 404, or 503 while scenes are still recovered.
+        """
+        self.check_recovered(id)
+        reason = f": {self.unreadable[id]}" if id in self.unreadable else ""
+        raise Problem(404, f"no scene {id!r}{reason}", field="id", value=id, remedy="GET /v1/scenes lists the scenes")
 
     async def delete(self, id: str) -> None:
         """Ends the scene's processes and removes its folder. The scene is gone once the folder is renamed."""

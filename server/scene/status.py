@@ -54,49 +54,6 @@ def camera_of(rig: Rig, name: str) -> Camera:
     return rig[name]
 
 
-def committed_frame_of(ledger: Ledger, state: SceneState, index: int | None, field: str) -> int:
-    """Returns the index, or the last one for None, once it is checked that its state can be read.
-
-    Raises:
-        Problem: 404 or 409, it cannot; 503, it is being made again.
-    """
-    if not ledger.committed:
-        raise Problem(
-            409,
-            "no frame of this scene is committed yet",
-            field=field,
-            remedy="wait until `committed` in the scene's status is above 0",
-            state=state,
-        )
-    if index is None:
-        return ledger.committed[-1]
-    entry = ledger.frames.get(index)
-    if entry is not None and entry.unreadable:
-        raise Problem(
-            503,
-            f"the state of frame {index} was damaged on disk and is being made again",
-            field=field,
-            value=index,
-            remedy="ask again, or for another frame",
-            headers={"Retry-After": "2"},
-        )
-    other = f"ask for a committed frame, {ledger.committed[0]} to {ledger.committed[-1]}"
-    if entry is not None and entry.deleted and entry.error is not None:
-        raise Problem(404, entry.error, field=field, value=index, remedy=other)
-    if entry is None or entry.state != FrameState.COMMITTED or entry.deleted:
-        found = "not here" if entry is None else entry.state.value
-        if entry is not None and entry.deleted:
-            found = "deleted by the scene's retention"
-        raise Problem(
-            404,
-            f"frame {index} is {found}; only committed frames that are kept can be read",
-            field=field,
-            value=index,
-            remedy=other,
-        )
-    return index
-
-
 class FrameReports:
     """Reports of a scene's frames; records of commits that are not in memory are read from disk.
 

@@ -99,13 +99,17 @@ def _checked(folder: SceneFolder) -> tuple[Definition | None, str | None]:
     """Reads `scene.json`: the definition, or its fault."""
     try:
         data = json.loads(folder.definition.read_bytes())
-        if _digest(json.dumps(data["scene"], indent=1)) != data["blake3"]:
-            raise DefinitionError("it fails its checksum")
-        return Definition.of_json(data["scene"]), None
+        whole = _digest(json.dumps(data["scene"], indent=1)) == data["blake3"]
     except FileNotFoundError:
         return None, f"{folder.definition.name} is gone"
     except (OSError, KeyError, TypeError, ValueError) as error:
         return None, f"{folder.definition.name} is damaged ({message_of(error)})"
+    if not whole:
+        return None, f"{folder.definition.name} is damaged (it fails its checksum)"
+    try:
+        return Definition.of_json(data["scene"]), None
+    except DefinitionError as error:  # as it was written, by a version that took other settings
+        return None, f"{folder.definition.name}: {error}"
 
 
 def never_acknowledged(folder: SceneFolder) -> bool:

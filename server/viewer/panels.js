@@ -36,7 +36,9 @@ export function reasonOf(report) {
   return report.degraded[0].toUpperCase() + report.degraded.slice(1);
 }
 
-export const isHeld = (report) => Boolean(report?.degraded?.startsWith("held"));
+const HELD = ["held_unusable", "held_implausible", "held_unmet"];
+
+export const isHeld = (report) => HELD.includes(report?.outcome);
 
 export function showFacts(list, status) {
   const facts = [

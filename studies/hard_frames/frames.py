@@ -62,7 +62,7 @@ class Sent:
 
 
 @dataclass(frozen=True, eq=False)
-class FrameOutcome:
+class FrameStep:
     """Outcome of one frame.
 
     Attributes:
@@ -80,7 +80,7 @@ class FrameOutcome:
 
 
 Make = Callable[[Footage, int, Any], "list[Sent] | None"]
-Holds = Callable[[Sequence[FrameOutcome], Any], list[str]]
+Holds = Callable[[Sequence[FrameStep], Any], list[str]]
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class FrameCase:
     holds: Holds
 
 
-def violations(case: FrameCase, steps: Sequence[FrameOutcome], size: Any) -> list[str]:
+def violations(case: FrameCase, steps: Sequence[FrameStep], size: Any) -> list[str]:
     """Laws that do not hold, a sentence each."""
     found = [f"frame {step.report.index}: not finite, or a rotation is no unit" for step in steps if not step.sound]
     faulty = [step for step in steps if not step.sent.good]
@@ -118,10 +118,10 @@ def violations(case: FrameCase, steps: Sequence[FrameOutcome], size: Any) -> lis
 # What must hold of the faulty frames
 
 
-def held(steps: Sequence[FrameOutcome], size: Any) -> list[str]:
+def held(steps: Sequence[FrameStep], size: Any) -> list[str]:
     """The state stays as it was, and the report says why."""
     found = [f"frame {step.report.index}: the state has changed" for step in steps if not step.kept]
-    return found + [f"frame {s.report.index}: not said to be held" for s in steps if not _says(s, "held as it was")]
+    return found + [f"frame {s.report.index}: not said to be held" for s in steps if not s.report.outcome.held]
 
 
 def left_out(names: Callable[[Any], Sequence[str]], first: int = 0, may: Sequence[str] = ()) -> Holds:
@@ -131,7 +131,7 @@ def left_out(names: Callable[[Any], Sequence[str]], first: int = 0, may: Sequenc
         first: number of the faulty frame from which on they have to be.
     """
 
-    def holds(steps: Sequence[FrameOutcome], size: Any) -> list[str]:
+    def holds(steps: Sequence[FrameStep], size: Any) -> list[str]:
         found = []
         for number, step in enumerate(steps):
             wanted, dropped = set(names(size)), set(step.report.dropped)
@@ -145,7 +145,7 @@ def left_out(names: Callable[[Any], Sequence[str]], first: int = 0, may: Sequenc
     return holds
 
 
-def near(steps: Sequence[FrameOutcome], size: Any) -> list[str]:
+def near(steps: Sequence[FrameStep], size: Any) -> list[str]:
     """The frames are followed nearly as well as usual."""
     return [
         f"frame {step.report.index}: {step.psnr - step.usual:+.2f} dB against the undisturbed run"
@@ -154,13 +154,13 @@ def near(steps: Sequence[FrameOutcome], size: Any) -> list[str]:
     ]
 
 
-def stood(steps: Sequence[FrameOutcome], size: Any) -> list[str]:
+def stood(steps: Sequence[FrameStep], size: Any) -> list[str]:
     """Nothing is moved, and the report says so."""
     found = [f"frame {step.report.index}: the state has changed" for step in steps if not step.kept]
     return found + [f"frame {s.report.index}: not said to stand" for s in steps if s.report.iterations]
 
 
-def jumped(steps: Sequence[FrameOutcome], size: Any) -> list[str]:
+def jumped(steps: Sequence[FrameStep], size: Any) -> list[str]:
     """Degraded at first, and explained; then found again."""
     found = [] if steps[0].report.degraded else [f"frame {steps[0].report.index}: not degraded"]
     last = steps[-1]
@@ -169,13 +169,9 @@ def jumped(steps: Sequence[FrameOutcome], size: Any) -> list[str]:
     return found
 
 
-def explained(steps: Sequence[FrameOutcome], size: Any) -> list[str]:
+def explained(steps: Sequence[FrameStep], size: Any) -> list[str]:
     """Each is degraded, or left cameras out, and says why."""
     return [f"frame {s.report.index}: not explained" for s in steps if not (s.report.degraded or s.report.dropped)]
-
-
-def _says(step: FrameOutcome, words: str) -> bool:
-    return (step.report.degraded or "").startswith(words)
 
 
 # What is sent

@@ -16,7 +16,7 @@ from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.storage.history import History
 from studies.constants import all_varied
 from studies.hard_frames.footage import AnyFootage
-from studies.hard_frames.frames import FrameCase, FrameOutcome, Pictures, Sent, named, violations
+from studies.hard_frames.frames import FrameCase, FrameStep, Pictures, Sent, named, violations
 
 AT = 5
 """The frame at which each case begins: by then it is known what is usual."""
@@ -80,7 +80,7 @@ class FrameStudy:
         line.violations = violations(case, steps, size)
         return line
 
-    def _steps(self, sent: Sequence[Sent]) -> list[FrameOutcome]:
+    def _steps(self, sent: Sequence[Sent]) -> list[FrameStep]:
         scene, steps = self._branch("case"), []
         for number, one in enumerate(sent):
             index = AT + number
@@ -88,7 +88,7 @@ class FrameStudy:
             report = scene.step(replace(one.frame, index=index, time=index * self._interval))
             after = scene.history.gaussians(index)
             steps.append(
-                FrameOutcome(
+                FrameStep(
                     one, report, _same(before, after), sound(after), self._measured(scene, index, one.truth),
                     self.undisturbed(one.like),
                 )
@@ -151,7 +151,7 @@ def _decibels(values: Sequence[float]) -> str:
     return " ".join(f"{value:+.1f}" for value in values)
 
 
-def _said(step: FrameOutcome) -> str:
+def _said(step: FrameStep) -> str:
     """A frame's report in one line."""
     report = step.report
     words = [] if report.degraded is None else [report.degraded]

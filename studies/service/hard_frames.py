@@ -21,6 +21,7 @@ from PIL import Image
 
 from client.wire import FRAME_MEDIA_TYPE, FrameState, frame_chunks
 from scas4d_core.captures.frame import Frame
+from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import psnr
@@ -28,7 +29,7 @@ from scas4d_core.query.committed import CommittedScene
 from scas4d_core.storage.history import History
 from server.storage.layout import DataFolder
 from studies.hard_frames.footage import AnyFootage
-from studies.hard_frames.frames import FrameCase, FrameOutcome, Pictures, Sent, good, named, teleported, violations
+from studies.hard_frames.frames import FrameCase, FrameStep, Pictures, Sent, good, named, teleported, violations
 from studies.hard_frames.study import AT, sound
 from studies.options import Echo
 from studies.service.process import PATIENCE_S, Service, StudyError
@@ -148,7 +149,8 @@ class Pushed:
     def report(self, index: int) -> FrameReport:
         """Of a frame, as it was committed."""
         record = self.committed.history.report(index)
-        return FrameReport(**{item.name: record[item.name] for item in fields(FrameReport) if item.name in record})
+        known = {item.name: record[item.name] for item in fields(FrameReport) if item.name in record}
+        return FrameReport(**{**known, "outcome": FrameOutcome(record["outcome"])})
 
     def psnr(self, footage: AnyFootage, index: int, truth: Pictures) -> float:
         """DB of the held-out cameras."""
@@ -237,7 +239,7 @@ def _result(part: SentCase, scene: Pushed, usual: Pushed, footage: AnyFootage) -
         before, after = scene.state(index - 1).arrays(), scene.state(index).arrays()
         like = BackAndForth(footage).truth(sent.like)
         steps.append(
-            FrameOutcome(
+            FrameStep(
                 replace(sent, frame=Frame(index, 0.0, {}, {})),
                 scene.report(index),
                 all(np.array_equal(before[name], after[name]) for name in before),

@@ -11,10 +11,11 @@ from scas4d_core.frame_outcome import Candidate, FrameOutcome, degraded_text, ou
 
 FAULT = "7 of 300 Gaussians are not finite, or moved or grew too far"
 UNMET = "the pictures are met at 12.0 dB, 21.0 dB less than usual"
-BEFORE: list[tuple[dict[str, Any], FrameOutcome]] = [
+BEFORE: list[tuple[dict[str, Any], FrameOutcome | None]] = [
     ({"degraded": None, "iterations": 100}, FrameOutcome.UPDATED),
     ({"degraded": None, "iterations": 0}, FrameOutcome.STOOD),
-    ({}, FrameOutcome.UPDATED),
+    ({}, None),
+    ({"outcome": "of a later version"}, None),
     ({"degraded": f"as set: {FAULT}"}, FrameOutcome.RETRIED),
     ({"degraded": f"{UNMET}; sought 0.30 m away"}, FrameOutcome.RELOCATED),
     ({"degraded": f"{UNMET}, for 10 frames: taken as it is from here on"}, FrameOutcome.ACCEPTED),

@@ -123,7 +123,14 @@ class FakeReconstruction:
         known = self.history.indices
         before = self.history.gaussians(known[-1]).colours[0, 0] if known else None
         red = int(next(iter(frame.images.values()))[0, 0, 0])
-        record = {**asdict(report), "used": list(frame.images), "dropped": dropped or {}, **(notes or {})}
+        outcome = {HELD: "held_unmet", STANDS: "stood"}.get(red, "updated")
+        record = {
+            **asdict(report),
+            "outcome": outcome,
+            "used": list(frame.images),
+            "dropped": dropped or {},
+            **(notes or {}),
+        }
         if red == HELD:
             record |= {"degraded": "held as it was: the fake was told so", "kept": "still", "used": []}
         if red == STANDS:

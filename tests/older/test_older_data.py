@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from blake3 import blake3
 from box_scene import SHIFT, make_box, make_rig, moved, take_frame
 from PIL import Image
 from running import Running
@@ -17,6 +18,8 @@ from scipy.spatial.transform import Rotation
 from client.sdk import Client
 from scas4d_core.storage.history import History
 from server.settings import ServerSettings
+from server.storage.definition import check_definition
+from server.storage.layout import SceneFolder
 
 HERE = Path(__file__).parent
 EXPECTED = json.loads((HERE / "expected.json").read_text())
@@ -97,3 +100,15 @@ def test_answers_are_those_of_before(opened):
     assert sdk.parts(ID, 2).labels == EXPECTED["labels"]
     assert sdk.budget(ID).model_dump(mode="json") == EXPECTED["budget"]
     assert sdk.scene(ID).state == "ready"
+
+
+def test_a_scene_made_with_another_value_of_a_former_setting_is_refused_by_name(tmp_path):
+    folder = SceneFolder(tmp_path / ID)
+    shutil.copytree(HERE / "data_folder" / "scenes" / ID, folder.path)
+    stored = json.loads(folder.definition.read_text())
+    stored["scene"]["settings"]["update"]["max_scale"] = 0.05
+    stored["blake3"] = blake3(json.dumps(stored["scene"], indent=1).encode()).hexdigest()
+    folder.definition.write_text(json.dumps(stored))
+    fault = check_definition(folder)
+    assert "max_scale cannot be 0.05" in fault
+    assert "damaged" not in fault

@@ -17,12 +17,10 @@ def files(tmp_path_factory):
     return crossed(tmp_path_factory.mktemp("crossing"), open_capture(SAMPLE))
 
 
-@pytest.mark.xfail(strict=True, reason="files that always go together are still to be merged")
 def test_a_later_frame_crosses_few_files(files):
     assert len(files["frame"]) <= MOST_OF_A_FRAME, files["frame"]
 
 
-@pytest.mark.xfail(strict=True, reason="files that always go together are still to be merged")
 def test_a_render_crosses_few_files(files):
     assert len(files["render"]) <= MOST_OF_A_RENDER, files["render"]
 
