@@ -115,7 +115,7 @@ def _setting_error(error: ValidationError) -> SettingError:
     first = found[0]
     setting = ".".join(str(part) for part in first["loc"])
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-    remedy = "docs/settings.md lists all with their ranges"
+    remedy = "docs/settings.md lists all settings"
     if first["type"] == "extra_forbidden":
         fault = "there is no setting of this name"
         if near := difflib.get_close_matches(setting, list(_names(Settings().model_dump())), 1):

@@ -39,11 +39,12 @@ def main(spec: None, connection: Connection[Any, Any]) -> None:
         from scas4d_core.warm_up import warm_up  # in this process only: the service stays light
 
         warm_up()
-        connection.send(WarmedUp())
+        found = WarmedUp()
     except Exception as error:
         log.exception("the kernels could not be warmed up")
-        connection.send(WarmedUp(f"{type(error).__name__}: {message_of(error)}"))
+        found = WarmedUp(f"{type(error).__name__}: {message_of(error)}")
     with contextlib.suppress(EOFError, OSError):
+        connection.send(found)
         connection.recv()  # until it is asked to end, or until the service is gone: by then the report is read
     os._exit(0)
 

@@ -62,7 +62,7 @@ def test_a_fault_of_the_service_names_no_more_than_its_kind(service, monkeypatch
     def fails(*_):
         raise KeyError("an inner secret")
 
-    monkeypatch.setattr("server.scene.scenes.Scenes.__getitem__", fails)
+    monkeypatch.setattr("server.scene.scenes.Scenes.refuse", fails)
     document = problem(httpx.get(f"{service.url}/v1/scenes/x"), 500)
     assert "KeyError" in document["detail"]
     assert "secret" not in str(document)

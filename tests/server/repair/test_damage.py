@@ -45,9 +45,11 @@ def filled(http, sdk, frames=8, **ingest):
 
 def flip(file, at=200):
     """A bit of the first array of a state, or of the pictures of a record."""
-    content = bytearray(file.read_bytes())
-    content[at] ^= 4
-    file.write_bytes(content)
+    with file.open("r+b") as open_file:  # in place: nobody reads a file that is half written
+        open_file.seek(at)
+        byte = open_file.read(1)[0]
+        open_file.seek(at)
+        open_file.write(bytes([byte ^ 4]))
 
 
 def eventually(look, seconds=20):

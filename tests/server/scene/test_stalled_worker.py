@@ -10,12 +10,13 @@ from running import make_rig
 from scas4d_core.presets import preset
 from server.processes.messages import Mend, SceneSpec, Stop
 from server.processes.worker import Worker, _Stopped
+from server.storage.layout import SceneFolder
 
 
 @pytest.fixture
 def worker(tmp_path):
     ours, theirs = Pipe()
-    worker = Worker(SceneSpec(tmp_path, make_rig(), preset("scas4d")), theirs)
+    worker = Worker(SceneSpec(SceneFolder(tmp_path), make_rig(), preset("scas4d")), theirs)
     worker.service = ours
     yield worker
     ours.close()
