@@ -8,6 +8,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from scas4d_core.errors import InputError
 from scas4d_core.settings import LayerRates, Settings, UpdateSettings, Weights
 
 PRESETS: dict[str, Settings] = {
@@ -53,7 +54,7 @@ PRESETS: dict[str, Settings] = {
 }
 
 
-class SettingError(ValueError):
+class SettingError(InputError):
     """A setting that is unknown, or a value that is out of its range.
 
     Attributes:
@@ -67,11 +68,10 @@ class SettingError(ValueError):
     def __init__(
         self, setting: str, value: object, fault: str, remedy: str, validation: ValidationError | None = None
     ) -> None:
-        super().__init__(f"setting {setting}={value!r}: {fault}; {remedy}")
+        super().__init__(fault, remedy)
+        self.args = (f"setting {setting}={value!r}: {fault}; {remedy}",)
         self.setting = setting
         self.value = value
-        self.fault = fault
-        self.remedy = remedy
         self.validation = validation
 
 
@@ -122,8 +122,11 @@ def _setting_error(error: ValidationError) -> SettingError:
             remedy = f"did you mean {near[0]}? {remedy}"
     elif first["type"] == "constant":  # a former setting
         fault, remedy = first["msg"], first["ctx"]["remedy"]
+    elif first["type"] == "value_error":
+        own = first["ctx"]["error"]
+        fault, remedy = (own.fault, own.remedy) if isinstance(own, InputError) and own.remedy else (str(own), remedy)
     else:
-        fault = str(first["ctx"]["error"]) if first["type"] == "value_error" else first["msg"]
+        fault = first["msg"]
     return SettingError(setting, first["input"], f"{fault}{more}", remedy, error)
 
 
