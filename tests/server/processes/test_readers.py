@@ -27,7 +27,7 @@ PATIENCE_S = 30
 @pytest.fixture(scope="module")
 def impatient(tmp_path_factory):
     """A service that soon gives up waiting for an answer; long enough for a process to start on a busy machine."""
-    with mock.patch.object(readers_module, "ANSWER_SECONDS", 10.0):
+    with mock.patch.object(readers_module, "ANSWER_SECONDS", 15.0):
         running = Running(fake_settings(tmp_path_factory.mktemp("data")))
         yield running
         running.stop()
@@ -90,7 +90,7 @@ def test_what_nobody_waits_for_does_not_keep_the_reader(scene):
     """The query that timed out never ends; the next one is answered all the same."""
     id, readers, http = scene
     refused = http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}")
-    assert problem(refused, 503)["detail"] == "no answer within 10 s"
+    assert problem(refused, 503)["detail"] == "no answer within 15 s"
     assert http.get(f"/v1/scenes/{id}/tracks?ids=0").json()["ids"] == [0]
     assert readers.bulk._at_work is None
 
