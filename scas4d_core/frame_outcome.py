@@ -89,8 +89,10 @@ def outcome_of(record: Mapping[str, Any]) -> FrameOutcome | None:
     if not record:
         return None
     if "outcome" in record:
-        known = {outcome.value: outcome for outcome in FrameOutcome}
-        return known.get(record["outcome"])
+        try:
+            return FrameOutcome(record["outcome"])
+        except ValueError:
+            return None
     text = record.get("degraded")
     if text is None:
         return FrameOutcome.STOOD if record.get("iterations") == 0 else FrameOutcome.UPDATED

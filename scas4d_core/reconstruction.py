@@ -308,8 +308,8 @@ class Reconstruction(CommittedScene):
         Raises:
             ValueError: a value out of range.
         """
-        told = {"iterations": iterations, "budget_ms": budget_ms, "stop_gain": stop_gain, "still": still}
-        changes = {name: value for name, value in told.items() if value is not None}
+        given = {"iterations": iterations, "budget_ms": budget_ms, "stop_gain": stop_gain, "still": still}
+        changes = {name: value for name, value in given.items() if value is not None}
         self._update = UpdateSettings.model_validate({**self.settings.update.model_dump(), **changes})
         self._budget.milliseconds = self._update.budget_ms
 

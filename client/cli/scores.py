@@ -14,6 +14,22 @@ Row = dict[str, Any]
 """What was measured, JSON values by name; ``key`` names the row."""
 
 
+def read_row(path: Path) -> Row | None:
+    """Reads the file of a row; None where there is none."""
+    if not path.exists():
+        return None
+    row: Row = json.loads(path.read_text())
+    return row
+
+
+def write_row(path: Path, row: Mapping[str, Any]) -> None:
+    """Writes the file of a row, and its folder where it is missing; the file is whole or not there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_suffix(f".{os.getpid()}.part")
+    beside.write_text(json.dumps(row, indent=1))
+    beside.replace(path)
+
+
 class Store:
     """The rows of one study: ``rows/<key>.json`` when done, ``frames/<key>.jsonl`` a line a frame as they come."""
 
@@ -24,11 +40,8 @@ class Store:
 
     def row(self, key: str) -> Row | None:
         """A finished row; None where there is none, or where the last attempt failed."""
-        path = self.folder / "rows" / f"{key}.json"
-        if not path.exists():
-            return None
-        row: Row = json.loads(path.read_text())
-        return None if "error" in row else row
+        row = read_row(self.folder / "rows" / f"{key}.json")
+        return None if row is None or "error" in row else row
 
     def rows(self) -> Iterator[Row]:
         """Every row on disk, failed ones too (they hold ``error``), by key."""
@@ -37,10 +50,7 @@ class Store:
 
     def put(self, row: Mapping[str, Any]) -> None:
         """Writes a row; the file is whole or not there."""
-        path = self.folder / "rows" / f"{row['key']}.json"
-        beside = path.with_suffix(f".{os.getpid()}.part")
-        beside.write_text(json.dumps(row, indent=1))
-        beside.replace(path)
+        write_row(self.folder / "rows" / f"{row['key']}.json", row)
 
     def start_frames(self, key: str) -> None:
         """Begins the per-frame lines of a row anew."""

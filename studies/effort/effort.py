@@ -4,7 +4,6 @@ a preset that spares effort spares, frame by frame in turns with the one that do
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.cli.evaluate import Report
-from client.cli.scores import Row
+from client.cli.scores import Row, write_row
 from scas4d_core.captures import Capture, open_capture
 from scas4d_core.metrics import psnr as image_psnr
 from scas4d_core.presets import preset
@@ -215,7 +214,5 @@ def leave(out: Path, name: str, capture: Capture, answer: Row) -> Row:
         "machine": {**machine(), "threads": threads()},
         **answer,
     }
-    path = out / "effort" / f"{name}.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(row, indent=1))
+    write_row(out / "effort" / f"{name}.json", row)
     return row

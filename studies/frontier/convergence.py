@@ -6,7 +6,6 @@ ends of shorter ones. The test cameras are rendered beside the update and never 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from client.cli.evaluate import Report
-from client.cli.scores import Row
+from client.cli.scores import Row, read_row, write_row
 from scas4d_core import metrics
 from scas4d_core.captures import Capture, open_capture
 from scas4d_core.gaussians import Gaussians
@@ -85,19 +84,13 @@ def measure_convergence(
         "core": core_version(),
         "curves": curves,
     }
-    path = out / "convergence" / f"{capture.name}.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(row, indent=1))
+    write_row(out / "convergence" / f"{capture.name}.json", row)
     return row
 
 
 def read_convergence(out: Path, capture: str) -> Row | None:
     """Reads the measurements of ``measure_convergence`` for a capture; None where there are none."""
-    path = out / "convergence" / f"{capture}.json"
-    if not path.exists():
-        return None
-    row: Row = json.loads(path.read_text())
-    return row
+    return read_row(out / "convergence" / f"{capture}.json")
 
 
 def _watched(capture: Capture, variant: Variant, out: Path, updates: int) -> list[dict[int, float]]:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from client.cli.evaluate import Report
-from client.cli.scores import Row
+from client.cli.scores import Row, read_row, write_row
 from scas4d_core.captures import Capture, open_capture
 from scas4d_core.settings import Settings
 from scas4d_core.warm_up import warm_up_elsewhere
@@ -110,19 +110,13 @@ def measure_times(
         "settings": [_answer(one, ratios[number]) for number, one in enumerate(timed)],
     }
     row["settings"] += _timed_before(read_times(out, capture.name), row["settings"])
-    path = out / "timing" / f"{capture.name}.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(row, indent=1))
+    write_row(out / "timing" / f"{capture.name}.json", row)
     return row
 
 
 def read_times(out: Path, capture: str) -> Row | None:
     """Reads the times of ``measure_times`` for a capture; None where there are none."""
-    path = out / "timing" / f"{capture}.json"
-    if not path.exists():
-        return None
-    row: Row = json.loads(path.read_text())
-    return row
+    return read_row(out / "timing" / f"{capture}.json")
 
 
 def _timed_before(before: Row | None, now: Sequence[Row]) -> list[Row]:
