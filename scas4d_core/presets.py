@@ -8,6 +8,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from scas4d_core.effects.switches import contradictions
 from scas4d_core.errors import InputError
 from scas4d_core.settings import LayerRates, Settings, UpdateSettings, Weights
 
@@ -95,9 +96,12 @@ def preset(name: str, *changes: Mapping[str, Any]) -> Settings:
     for change in changes:
         values = _merged(values, change)
     try:
-        return Settings.model_validate(values)
+        settings = Settings.model_validate(values)
     except ValidationError as error:
         raise _setting_error(error) from None
+    for name, fault, remedy in contradictions(settings):
+        raise SettingError(f"effects.{name}", "on", fault, remedy)
+    return settings
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,16 +13,17 @@ from math import inf, isfinite
 from time import perf_counter
 from typing import Any
 
-import numpy as np
 from numba import get_num_threads
-from numpy.typing import NDArray
 
 from scas4d_core.cameras import Rig, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
+from scas4d_core.effects.evidence import Seen
+from scas4d_core.effects.switches import first_switches, switches_of, switches_record
 from scas4d_core.first_frame.start import FirstFrame, fit_first
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.frame_report import FrameReport, Progress, report_of_first, report_of_update
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.preparation import Preparation
 from scas4d_core.query.committed import CommittedScene, View
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness, fingerprints, lit
@@ -31,9 +32,9 @@ from scas4d_core.robust.solve_frame import FrameSolver, UpdateInput
 from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.storage.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, find_commit
 from scas4d_core.storage.history import History, HistoryError
-from scas4d_core.structure.motion_mask import labelled, labels_learnt, with_reliable_labels
+from scas4d_core.structure.motion_mask import labelled, with_reliable_labels
 from scas4d_core.torch_backend.device import require_device
-from scas4d_core.update.frame_update import Updater, prepare
+from scas4d_core.update.frame_update import Updater
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import REPORT, Stopwatch
 from scas4d_core.update.schedule import TimeBudget, mask_weight
@@ -75,6 +76,7 @@ class Reconstruction(CommittedScene):
         self.settings, self._update = settings, settings.update
         self._factory = ViewFactory(self.rig, None if scale == 1.0 else rig)
         self._picture = PictureLoss(self._factory, settings.scene.background, 1.0, 0.0, limits=limits)
+        self._preparation = Preparation(self._factory, self.settings, self.world, self._picture)
         self.static: StaticResult | None = None
         self.report: FrameReport | None = None
         self.resumed: ResumePoint | None = None
@@ -124,14 +126,17 @@ class Reconstruction(CommittedScene):
         self.static = result = replace(result, gaussians=with_reliable_labels(result.gaussians))
         fitted = perf_counter()
         self._fixed = FirstFrame(len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians))
-        self._updater, structure = prepare(result.gaussians, self._factory, self.settings, self.world)
+        switches = first_switches(settings, frame.index)
+        self._updater, structure = self._preparation.updater(result.gaussians, switches)
         seen = () if self._fixed.masked else self._factory.views(self._factory.scaled(frame), {}, use_masks=False)
         load = {} if started is None else {"load": began - started}
         seconds = {**load, "fit": fitted - began, "prepare": perf_counter() - fitted}
         report = report_of_first(frame, result, self.rig.names, len(self._updater.hierarchy.rows), seconds, dropped)
         psnr = {name: fit["psnr"] for name, fit in result.cameras.items()}
         past = replace(Past.of_first(psnr, brightness(frame.images)), fitted=frame.time)
-        carried = CarryOver(seen=seen, structure=structure, past=past, shown=fingerprints(frame.images))
+        carried = CarryOver(
+            seen=seen, structure=structure, past=past, shown=fingerprints(frame.images), switches=switches
+        )
         self._commit(report, result.gaussians, carried, {**self._fixed.record(), **(notes or {})})
         return self
 
@@ -161,7 +166,7 @@ class Reconstruction(CommittedScene):
         except (HistoryError, KeyError) as error:
             raise ResumeError(f"the first frame, which every update needs, cannot be read ({error})") from error
         index, left, faults = find_commit(history, self._checkpoints, self._factory, held)
-        same = self._go_on(CarryOver(labels=self._labels_of(index)) if left is None else left)
+        same = self._go_on(self._cold(index) if left is None else left)
         if left is not None and not same:
             faults.append("clusters came out otherwise than before: the next update starts without a motion")
         self.resumed = ResumePoint(index, history.cut(index), faults, cold=left is None or not same)
@@ -193,21 +198,19 @@ class Reconstruction(CommittedScene):
             copy.append(one, history.time(one), history.gaussians(one), history.report(one))
         self = cls(rig, settings, copy)
         self._fixed = FirstFrame.of(copy)
-        self._go_on(CarryOver(labels=self._labels_of(index)))
+        self._go_on(self._cold(index))
         return self
 
     def _go_on(self, carried: CarryOver) -> bool:
         """Prepare the updates after a committed one; False: the motion that it left does not fit today's clusters."""
-        first = self.history.gaussians(self.history.indices[0])
-        self._updater, structure = prepare(labelled(first, carried.labels), self._factory, self.settings, self.world)
-        same = carried.structure == structure
-        self._carried = carried if same else replace(carried, motion=None, structure=structure)
-        return same
+        self._updater, self._carried = self._preparation.again(self.history.first, carried)
+        return self._carried.structure == carried.structure
 
-    def _labels_of(self, index: int) -> NDArray[np.bool_] | None:
-        """[N] the labels learnt, as far as the state has them; None where there are none."""
+    def _cold(self, index: int) -> CarryOver:
+        """The carry-over of a committed frame as far as its state and report have it: labels learnt, switches."""
         moving = self.history.gaussians(index).moving
-        return None if self._fixed.masked or moving.all() else moving
+        labels = None if self._fixed.masked or moving.all() else moving
+        return CarryOver(labels=labels, switches=switches_of(self.history.report(index).get("effects", {})))
 
     def step(
         self,
@@ -240,7 +243,10 @@ class Reconstruction(CommittedScene):
         watch.lap("judge")
         believed = [view for view in views if view.name not in left_out]
         steady = unusable is None and exposure == 1.0  # else nothing can be told from differences of the pictures
-        updater, carried = self._learn_motion_mask(believed if steady else [])
+        updater, carried = self._updater, self._carried
+        if steady and carried.seen and not self._fixed.masked:
+            newest = self.history.newest
+            updater, carried = self._preparation.relabelled(updater, carried, newest, self.history.first, believed)
         given = UpdateInput(
             state=self.history.newest if carried.labels is None else labelled(self.history.newest, carried.labels),
             motion=carried.motion,
@@ -255,6 +261,7 @@ class Reconstruction(CommittedScene):
             exposure=exposure,
             left_out=left_out,
             unusable=unusable,
+            carried=carried.effects,
             end=self._budget.end(watch.began),
             each=self._budget.each,
         )
@@ -266,10 +273,14 @@ class Reconstruction(CommittedScene):
 
         if result.outcome.held:  # motion that seemed to be in its pictures is as little believed as they are
             updater, carried = self._updater, self._carried
-            result = replace(result, gaussians=self.history.newest, motion=carried.motion)
+            result = replace(result, gaussians=self.history.newest, motion=carried.motion, carried=carried.effects)
         report = report_of_update(frame, result, left_out, self.rig.names, watch, dropped)
         how = {"cold": given.motion is None, "relabelled": updater is not self._updater, **(notes or {})}
         carried = carried.after(result, past, frame.time, None if self._fixed.masked else believed, shown)
+        if result.outcome.learnt:
+            learnt = [view for view in believed if view.name not in result.trace.left_out]
+            seen = Seen(frame.index, given.state, result, self.rig, learnt, self._picture)
+            updater, carried = self._preparation.switched(updater, carried, seen, self.history.first)
         self._commit(report, result.gaussians, carried, how)
         self._updater = updater
         commit = solver.judging + perf_counter() - watch.began - watch.total
@@ -319,7 +330,8 @@ class Reconstruction(CommittedScene):
             self._checkpoints.save(report.index, carried)
         began = perf_counter()
         resumed = None if self.resumed is None or self.report is not None else asdict(self.resumed)
-        record = {**report.record(), "threads": get_num_threads(), "resumed": resumed, **more}
+        effects = switches_record(carried.switches)
+        record = {**report.record(), "effects": effects, "threads": get_num_threads(), "resumed": resumed, **more}
         seconds = report.seconds  # a record cannot tell its own writing: it has that of the one before
         seconds[REPORT] = seconds.get(REPORT, 0.0) + self.history.record_seconds + perf_counter() - began
         record["seconds"] = dict(seconds)
@@ -327,20 +339,3 @@ class Reconstruction(CommittedScene):
         self._carried, self.report = carried, report
         if self._checkpoints is not None:
             self._checkpoints.clean(self.history.indices)
-
-    def _learn_motion_mask(self, believed: list[TrainingView]) -> tuple[Updater, CarryOver]:
-        """The updater and carry-over with the Gaussians that the pictures show to move, where frame 0 had no mask.
-
-        A Gaussian that has moved once stays in the hierarchy. The labels become part of the state with the commit of
-        this frame. A hierarchy of other Gaussians is a new one: the motion before does not fit it, and the update
-        starts cold.
-        """
-        carried = self._carried
-        if self._fixed.masked or not carried.seen:
-            return self._updater, carried
-        labels = labels_learnt(self.history.newest, carried.labels, carried.seen, believed, self._picture)
-        if labels is None:
-            return self._updater, carried
-        first = labelled(self.history.gaussians(self.history.indices[0]), labels)
-        updater, structure = prepare(first, self._factory, self.settings, self.world)
-        return updater, replace(carried, labels=labels, motion=None, structure=structure)

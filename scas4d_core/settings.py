@@ -6,12 +6,14 @@ that were settings once.
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from scas4d_core.effects.registry import EFFECTS, Mode
 from scas4d_core.errors import InputError
 
 Positive = Annotated[float, Field(gt=0)]
@@ -197,13 +199,13 @@ class UpdateSettings(SettingsModel):
     """
 
     constants: ClassVar[Mapping[str, Constant]] = {
-        "smallest_cluster": Constant(8, "scas4d_core.update.frame_update.SMALLEST_CLUSTER"),
+        "smallest_cluster": Constant(8, "scas4d_core.preparation.SMALLEST_CLUSTER"),
         "layer_starts": Constant((0.0, 0.2, 0.4), "scas4d_core.update.schedule.LAYER_STARTS"),
         "coarse_until": Constant(0.0),
         "coarse_scale": Constant(0.5),
         "warm_start": Constant(1.0, "scas4d_core.update.warm_start.WARM_START"),
-        "neighbours": Constant(20, "scas4d_core.update.frame_update.NEIGHBOURS"),
-        "neighbour_falloff": Constant(2000.0, "scas4d_core.update.frame_update.NEIGHBOUR_FALLOFF"),
+        "neighbours": Constant(20, "scas4d_core.preparation.NEIGHBOURS"),
+        "neighbour_falloff": Constant(2000.0, "scas4d_core.preparation.NEIGHBOUR_FALLOFF"),
         "neighbour_sample": Constant(4000, "scas4d_core.update.schedule.NEIGHBOUR_SAMPLE"),
         "max_scale": Constant(0.02, "scas4d_core.update.deformation.MAX_SCALE"),
     }
@@ -320,9 +322,27 @@ class Settings(SettingsModel):
     (50, 3000)
     >>> Settings.model_validate_json(settings.model_dump_json()) == settings
     True
+    >>> Settings(effects={"flour": "off"})
+    Traceback (most recent call last):
+    pydantic_core._pydantic_core.ValidationError: 1 validation error for Settings...
     """
 
     scene: SceneSettings = Field(default_factory=SceneSettings)
     static: StaticSettings = Field(default_factory=StaticSettings)
     update: UpdateSettings = Field(default_factory=UpdateSettings)
+    effects: dict[str, Mode] = Field(
+        default_factory=dict,
+        description='Effects (docs/effects.md) that are pinned "on" or "off", by name; the others are "auto": on where '
+        "the scene calls for them.",
+    )
     device: Literal["cpu", "cuda"] = Field("cpu", description="Where the update runs.")
+
+    @field_validator("effects")
+    @classmethod
+    def _are_known(cls, effects: dict[str, Mode]) -> dict[str, Mode]:
+        for name in effects:
+            if name not in EFFECTS:
+                near = difflib.get_close_matches(name, EFFECTS, 1)
+                remedy = f"did you mean {near[0]}? " if near else ""
+                raise InputError(f"{name} is no effect", f"{remedy}docs/effects.md lists all effects")
+        return effects

@@ -6,6 +6,7 @@ from client.wire.frames import (
     FINISHED,
     CameraFitModel,
     CurvePointModel,
+    EffectModel,
     FrameReceipt,
     FrameReportModel,
     FrameState,
@@ -27,6 +28,7 @@ from client.wire.framing import (
 from client.wire.parts import PartsModel, part_colour, parts_model
 from client.wire.rigs import CameraModel, RigModel
 from client.wire.scenes import (
+    EffectStatus,
     IngestSettings,
     PointsReceipt,
     ProgressModel,
@@ -61,6 +63,8 @@ __all__ = [
     "CameraName",
     "CurveMean",
     "CurvePointModel",
+    "EffectModel",
+    "EffectStatus",
     "EffectiveBudget",
     "FileKind",
     "FrameFile",

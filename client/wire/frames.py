@@ -76,6 +76,17 @@ class CurvePointModel(Model):
     loss: float | None = Field(description="Mean training loss of the iterations since the point before.")
 
 
+class EffectModel(Model):
+    """The switch of one effect."""
+
+    on: bool = Field(description="It takes part in the updates.")
+    since: int = Field(description="Frame after which it has been on, or off.")
+    pinned: bool = Field(default=False, description="By the scene's settings; else the evidence decides.")
+    share: float = Field(default=0.0, description="0…1, what it explains or would explain, by the last evidence.")
+    text: str = Field(default="", description="The last evidence, for people.")
+    idle: int = Field(default=0, description="Frames in a row with too little evidence to stay on.")
+
+
 class FrameReportModel(Model):
     """Report of one frame: its state, times, errors and metrics."""
 
@@ -115,6 +126,9 @@ class FrameReportModel(Model):
     exposure: float | None = Field(default=None, description="Times brighter than the light that the colours are in.")
     held_gaussians: int | None = Field(default=None, description="That stayed as they were before, one by one.")
     guards: dict[str, int] = Field(default_factory=dict, description="How often each guard acted.")
+    effects: dict[str, EffectModel] = Field(
+        default_factory=dict, description="Switches of the effects as this frame leaves them, by name."
+    )
     budget: Budget | None = Field(default=None, description="Budget of the update; nulls: as the scene was made.")
     iterations: int | None = None
     planned: list[tuple[int, int]] = Field(

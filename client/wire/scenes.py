@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from client.wire.base import MAX_CAMERAS, Model
 from client.wire.budgets import Budget
+from client.wire.frames import EffectModel
 from client.wire.rigs import RigModel
 from scas4d_core.errors import InputError
 
@@ -95,6 +96,13 @@ class ProgressModel(Model):
     detail: dict[str, float] = Field(default_factory=dict)
 
 
+class EffectStatus(EffectModel):
+    """The switch of one effect in a scene's status, with the words that describe the effect."""
+
+    group: str = Field(description="motion, coherence, appearance, cameras or presence.")
+    says: str = Field(description="A sentence that says what it does.")
+
+
 class SceneStatus(Model):
     """A scene as it is now."""
 
@@ -137,6 +145,9 @@ class SceneStatus(Model):
     frames_held: int = Field(default=0, description="Frames whose pictures are in the frame log.")
     frame_bytes: int = Field(default=0, description="Of the frame log on disk.")
     states_deleted: int = Field(default=0, description="Committed states that retention has deleted.")
+    effects: dict[str, EffectStatus] = Field(
+        default_factory=dict, description="The effects (docs/effects.md) for the next update, with their evidence."
+    )
     damage: list[str] = Field(
         default_factory=list,
         description="What was found damaged on disk, and what came of it, a sentence each: at the start of the service "

@@ -15,6 +15,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.effects.parts import Arrays
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust import outliers
@@ -48,8 +49,8 @@ class UpdateInput:
 
     Attributes:
         state: Θ_{t−1}. motion: that was found last, or None. seconds: since then. step: since the frame before.
-        views: of the frame, to learn from. suspects: views of cameras that are left out.
-        brightness: mean of each camera's picture. seed: of the update. past: the usual figures.
+        views: of the frame, to learn from. suspects: views of cameras that are left out. seed: of the update.
+        brightness: mean of each camera's picture. past: the usual figures. carried: arrays of the effects.
         lengths: [N, 3] metres, of the axes in frame 0.
         exposure, left_out, unusable: by the brightness of the pictures, see ``checks.check_brightness``.
         end: moment by which the last iteration has to be over. each: seconds of an iteration in the updates before.
@@ -68,12 +69,15 @@ class UpdateInput:
     exposure: float = 1.0
     left_out: Mapping[str, str] = field(default_factory=dict)
     unusable: str | None = None
+    carried: Mapping[str, Arrays] = field(default_factory=dict)
     end: float | None = None
     each: float | None = None
 
 
 Solved = tuple[UpdateResult, Past]
 """The result of a frame, and the usual figures after it."""
+Validated = tuple[UpdateResult, str | None]
+"""The result of an attempt, and the fault of its state, or None."""
 
 
 class FrameSolver:
@@ -169,17 +173,18 @@ class FrameSolver:
         why = f"in {light} {result.reason}"
         return self._held(given, result.outcome, result.trace, lost, result.attempts, why, given.exposure)
 
-    def _attempt(
-        self, given: UpdateInput, template: AttemptOptions, attempts: list[str]
-    ) -> tuple[UpdateResult, str | None]:
+    def _attempt(self, given: UpdateInput, template: AttemptOptions, attempts: list[str]) -> Validated:
         motion = None if template.cold else given.motion
         options = self._options(given, template)
-        result = self._updater.run(given.state, given.views, motion, given.seconds, given.seed, options)
+        result = self._run(given, given.state, motion, options)
         result, fault = self._validated(given, given.state, result)
         attempts.append(options.name if fault is None else f"{options.name}: {fault}")
         return result, fault
 
-    def _validated(self, given: UpdateInput, start: Gaussians, result: UpdateResult) -> tuple[UpdateResult, str | None]:
+    def _run(self, given: UpdateInput, start: Gaussians, motion: Motion | None, how: AttemptOptions) -> UpdateResult:
+        return self._updater.run(start, given.views, motion, given.seconds, given.seed, how, given.carried)
+
+    def _validated(self, given: UpdateInput, start: Gaussians, result: UpdateResult) -> Validated:
         with self._timed():
             return validated(start, result, self._updater.hierarchy.rows, self._rig.radius, given.lengths)
 
@@ -246,7 +251,7 @@ class FrameSolver:
                 attempts.append(f"not {name}: the budget is spent")
                 break
             options = self._options(given, replace(SEARCH, name=name))
-            result = self._updater.run(start, given.views, None, given.seconds, given.seed, options)
+            result = self._run(given, start, None, options)
             result, fault = self._validated(given, start, result)
             # A few iterations more are no excuse for meeting it less well.
             both = len(tried.trace.losses) + len(result.trace.losses)
@@ -259,7 +264,7 @@ class FrameSolver:
     def _go_on(self, given: UpdateInput, tried: UpdateResult, attempts: list[str]) -> UpdateResult:
         """On from where an update ended; the better of both."""
         options = self._options(given, replace(SEARCH, name="on from where the update ended"))
-        result = self._updater.run(tried.gaussians, given.views, None, given.seconds, given.seed, options)
+        result = self._run(given, tried.gaussians, None, options)
         result, fault = self._validated(given, given.state, result)
         after, before = (outliers.level_of(given.past, _met(one)) for one in (result, tried))
         attempts.append(options.name if fault is None else f"{options.name}: {fault}")
@@ -277,15 +282,9 @@ class FrameSolver:
     ) -> Solved:
         """A frame that is not believed: state and motion stay."""
         result = UpdateResult(
-            given.state,
-            given.motion,
-            replace(trace, kept=Candidate.STILL),
-            outcome=outcome,
-            reason=reason,
-            attempts=attempts,
-            exposure=exposure,
-            offsets=outliers.offsets(past, trace.fits),
-        )
+            given.state, given.motion, replace(trace, kept=Candidate.STILL), outcome=outcome, reason=reason,
+            attempts=attempts, exposure=exposure, offsets=outliers.offsets(past, trace.fits), carried=given.carried,
+        )  # fmt: skip
         return result, past
 
     def _committed(self, given: UpdateInput, result: UpdateResult) -> Solved:
@@ -315,7 +314,10 @@ def _standing(given: UpdateInput, trace: UpdateTrace, exposure: float, said: str
     """Θ_{t−1} shows the frame: nothing was rendered that says how any camera fits, so the usual figures stay."""
     past = replace(given.past, held=0, behind=max(1, given.past.behind))  # it may go on from here, or from further away
     outcome = FrameOutcome.STOOD
-    return UpdateResult(given.state, given.motion, trace, outcome=outcome, attempts=[said], exposure=exposure), past
+    result = UpdateResult(
+        given.state, given.motion, trace, outcome=outcome, attempts=[said], exposure=exposure, carried=given.carried
+    )
+    return result, past
 
 
 def _met(result: UpdateResult) -> dict[str, float]:

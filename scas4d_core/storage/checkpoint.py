@@ -11,6 +11,7 @@ clusters and neighbours are built again from the first frame, and a digest tells
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -20,6 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.captures.frame import Frame
+from scas4d_core.effects.parts import Arrays
+from scas4d_core.effects.switches import Switches, switches_of, switches_record
 from scas4d_core.errors import message_of
 from scas4d_core.robust.outliers import Past
 from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
@@ -48,6 +51,7 @@ class CarryOver:
         structure: digest of the clusters and neighbours that the motion belongs to.
         past: usual values of the scene and its cameras.
         shown: fingerprint of each picture of the last frame that was not held (``checks``).
+        switches: of the effects, for the next update. effects: arrays that they left, by effect.
     """
 
     motion: Motion | None = None
@@ -56,6 +60,8 @@ class CarryOver:
     structure: int = 0
     past: Past = field(default_factory=Past)
     shown: Mapping[str, int] = field(default_factory=dict)
+    switches: Switches = field(default_factory=dict)
+    effects: Mapping[str, Arrays] = field(default_factory=dict)
 
     def after(
         self,
@@ -72,7 +78,10 @@ class CarryOver:
             views: that it was updated with, or None in scenes with masks. shown: fingerprints of its pictures.
         """
         carried = replace(
-            self, motion=result.motion, past=replace(past, fitted=time) if result.outcome.learnt else past
+            self,
+            motion=result.motion,
+            past=replace(past, fitted=time) if result.outcome.learnt else past,
+            effects=result.carried,
         )
         if result.outcome.held:
             return carried
@@ -112,6 +121,10 @@ class Checkpoints:
         }
         if carry_over.labels is not None:
             arrays["labels"] = carry_over.labels
+        if carry_over.switches:
+            arrays["switches"] = np.array(json.dumps(switches_record(carry_over.switches)), np.str_)
+        for name, given in carry_over.effects.items():
+            arrays |= {f"effect.{name}.{key}": array for key, array in given.items()}
         for view in carry_over.seen:
             levels = np.rint(255 * view.target[:3]).astype(np.uint8)  # they were 8 bit: exact
             arrays[f"seen.{view.name}"] = np.moveaxis(levels, 0, -1)
@@ -142,7 +155,9 @@ class Checkpoints:
             motion = _unpacked(arrays) if "motion.seconds" in arrays else None
             past = Past.of_arrays({name[5:]: array for name, array in arrays.items() if name.startswith("past.")})
             shown = dict(zip(arrays["shown.names"].tolist(), arrays["shown.prints"].tolist(), strict=True))
-            return CarryOver(motion, arrays.get("labels"), seen, int(arrays["structure"]), past, shown)
+            switches = switches_of(json.loads(str(arrays["switches"]))) if "switches" in arrays else {}
+            labels, structure = arrays.get("labels"), int(arrays["structure"])
+            return CarryOver(motion, labels, seen, structure, past, shown, switches, _by_effect(arrays))
         except FileNotFoundError:
             raise CheckpointError(f"{file.name} is missing") from None
         except (ValueError, KeyError, TypeError) as error:
@@ -179,6 +194,17 @@ def _packed(motion: Motion) -> dict[str, Any]:
         else:
             packed[f"motion.{item.name}"] = value
     return packed
+
+
+def _by_effect(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Arrays]:
+    """The arrays of effects, by effect and name, of those in a file."""
+    found: dict[str, Arrays] = {}
+    for key, array in arrays.items():
+        kind, _, rest = key.partition(".")
+        if kind == "effect":
+            effect, _, name = rest.partition(".")
+            found.setdefault(effect, {})[name] = array
+    return found
 
 
 def _unpacked(arrays: dict[str, NDArray[Any]]) -> Motion:

@@ -179,6 +179,11 @@ class HistoryReader:
             self._frames.move_to_end(index)
         return Gaussians(**frame, **self._fixed)
 
+    @property
+    def first(self) -> Gaussians:
+        """The state of the first frame; it raises as ``gaussians`` does."""
+        return self.gaussians(self.indices[0])
+
     def stacked(
         self, name: str, indices: Sequence[int] | None = None, rows: NDArray[np.intp] | None = None
     ) -> NDArray[Any]:

@@ -72,7 +72,6 @@ class TermWeights:
     rotation: float = 4.0
     scale: float = 10.0
     soft_colour: float = 0.01
-    floor: float = 0.0
 
 
 class TorchResult(NamedTuple):

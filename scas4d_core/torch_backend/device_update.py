@@ -6,6 +6,7 @@ views, the samples, the rates, the hierarchy and the warm start are those of the
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
 from time import perf_counter
@@ -14,6 +15,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from scas4d_core.effects.appearance.colours import Colours
+from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
+from scas4d_core.effects.parts import NOTHING, Arrays, PartsBuilder
+from scas4d_core.effects.switches import joined
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.rasterize.limits import scene_limits
@@ -64,6 +69,7 @@ class DeviceUpdate:
         hierarchy: Hierarchy,
         neighbours: Neighbours | None,
         first: Gaussians,
+        parts: PartsBuilder | None = None,
         device: str = "cuda",
         dtype: torch.dtype = torch.float32,
     ) -> None:
@@ -73,6 +79,7 @@ class DeviceUpdate:
         mask = mask_weight(settings, len(hierarchy.rows), len(first))
         limits = scene_limits(scene.near, factory.rig.radius)
         self._picture = PictureLoss(factory, scene.background, schedule.IMAGE_WEIGHT, mask, limits=limits)
+        parts = parts or joined(PartsBuilder(scene, settings, factory, hierarchy, first))
         bounds = length_bounds(hierarchy, first)
         self._deformation = CpuDeformation(hierarchy, neighbours, bounds, settings.cluster_map, settings.covariance)
         self._update = TorchUpdate(
@@ -80,13 +87,13 @@ class DeviceUpdate:
             labels=[labels.astype(np.int64) for labels in hierarchy.labels],
             graph=_graph(neighbours, len(hierarchy.rows)),
             first_lengths=first_lengths(hierarchy, first),
-            rates=Rates.of(settings, len(hierarchy.sizes), factory.rig.radius),
-            weights=_weights(settings, neighbours is not None, mask),
+            rates=_rates(Rates.of(settings, len(hierarchy.sizes), factory.rig.radius), parts),
+            weights=_weights(parts, neighbours is not None, mask),
+            terms=tuple(part.twin for part in parts.parts),
             max_scale=deformation.MAX_SCALE,
             background=scene.background,
             cluster_map=settings.cluster_map,
             covariance=settings.covariance,
-            floor=scene.floor,
             near=limits.near,
             device=device,
             dtype=dtype,
@@ -100,6 +107,7 @@ class DeviceUpdate:
         seconds: float,
         seed: int,
         options: AttemptOptions = AS_SET,
+        carried: Mapping[str, Arrays] = NOTHING,
     ) -> UpdateResult:
         """Find D_t and apply it, see ``frame_update.Updater.run``; no gate is asked.
 
@@ -153,7 +161,7 @@ class DeviceUpdate:
         motion_found = Motion.of(deformation, best.seconds)
         watch.lap("commit")
         trace.seconds = watch.seconds
-        return UpdateResult(state, motion_found, trace)
+        return UpdateResult(state, motion_found, trace, carried=dict(carried))
 
     def _on_device(self, view: TrainingView) -> TorchView:
         """The view as ``TorchUpdate`` takes it."""
@@ -177,16 +185,26 @@ def _graph(neighbours: Neighbours | None, count: int) -> Graph:
     return Graph(neighbours.index.astype(np.int64), neighbours.weights, neighbours.distances)
 
 
-def _weights(settings: UpdateSettings, tied: bool, mask: float) -> TermWeights:
+def _rates(rates: Rates, parts: PartsBuilder) -> Rates:
+    """The rates with those of colours that no effect frees at 0."""
+    colours = parts.find(Colours) or Colours(parts)
+    return replace(
+        rates,
+        colour=rates.colour if colours.moving else 0.0,
+        colour_standing=rates.colour_standing if colours.standing else 0.0,
+    )
+
+
+def _weights(parts: PartsBuilder, tied: bool, mask: float) -> TermWeights:
     """The weights of the terms; those between neighbours only where there are any."""
-    given = settings.weights
+    ties = parts.find(NeighbourTerms)
+    rigidity, isometry, rotation = ties.strengths if tied and ties is not None else (0.0, 0.0, 0.0)
     return TermWeights(
         image=schedule.IMAGE_WEIGHT,
         mask=mask,
-        rigidity=given.rigidity if tied else 0.0,
-        isometry=given.isometry if tied else 0.0,
-        rotation=given.rotation if tied else 0.0,
-        scale=given.scale,
+        rigidity=rigidity,
+        isometry=isometry,
+        rotation=rotation,
+        scale=parts.length,
         soft_colour=schedule.SOFT_COLOUR_WEIGHT,
-        floor=given.floor,
     )

@@ -56,7 +56,7 @@ class TorchUpdate:
         max_scale: metres; longer axes are held at their length of frame 0.
         background: RGB behind everything.
         cluster_map: form of equation (6). covariance: what moves a Gaussian's, see ``deformation.Covariance``.
-        floor: plane inside, see ``floor.floor_inside``, or None.
+        terms: of the parts of effects (``effects.parts.Part.twin``), from the moving means [M, 3].
         near: metres; nothing nearer to a camera is drawn.
         device: "cpu" rasterizes with the twin, "cuda" with gsplat.
         dtype: torch.float32, or torch.float64 on the CPU.
@@ -72,7 +72,7 @@ class TorchUpdate:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     cluster_map: ClusterMap = "centred"
     covariance: Covariance = "entangled"
-    floor: tuple[float, float, float, float] | None = None
+    terms: tuple[Callable[[Tensor], Tensor | None], ...] = ()
     near: float = DEFAULT.near
     device: str = "cpu"
     dtype: torch.dtype = torch.float32
@@ -324,9 +324,8 @@ class _Scene:
             terms.append(weights.rotation * losses.rotation_loss(now.turns, *graph, rows))
         if weights.scale > 0:
             terms.append(weights.scale * losses.scale_loss(now.factors, self.first_lengths, self.update.max_scale))
-        if self.update.floor is not None and weights.floor > 0:
-            terms.append(weights.floor * losses.floor_loss(now.means, self.update.floor))
-        return terms
+        found = (term(now.means) for term in self.update.terms)
+        return [*terms, *(term for term in found if term is not None)]
 
     @torch.no_grad()
     def result(self, gaussians: Gaussians, history: list[float], psnr: list[float]) -> TorchResult:

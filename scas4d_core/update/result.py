@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from time import perf_counter
 from typing import TypedDict
 
+from scas4d_core.effects.parts import Arrays
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView
@@ -160,6 +161,7 @@ class UpdateResult:
         attempts: each attempt at the frame, with what came of it.
         exposure: times that the frame is brighter than usual.
         offsets: dB by camera above (+) or below its usual place among the cameras; empty where nothing was rendered.
+        carried: arrays for the next update, by effect.
     """
 
     gaussians: Gaussians
@@ -172,3 +174,4 @@ class UpdateResult:
     attempts: Sequence[str] = ()
     exposure: float = 1.0
     offsets: Mapping[str, float] = field(default_factory=dict)
+    carried: Mapping[str, Arrays] = field(default_factory=dict)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import chain
+from typing import Any
 
 from client.wire import Budget, FrameReportModel, FrameState, SceneBudget, SceneState, SceneStatus
 from scas4d_core.cameras import Camera
@@ -20,7 +21,7 @@ from server.processes.readers import Readers
 from server.repair.mending import DamageKind, DamageLog
 from server.repair.scrub import Scrub
 from server.scene.replays import Replays
-from server.scene.status import FrameReports, camera_of, effective_budget, state_of
+from server.scene.status import FrameReports, camera_of, effective_budget, effects_of, state_of
 from server.scene.supervision import Background
 from server.scene.updates import Updates
 from server.settings import ServerSettings
@@ -181,12 +182,20 @@ class Scene:
             frames_held=len(self.log.pictures),
             frame_bytes=self.log.pictures.bytes,
             states_deleted=ledger.states_deleted,
+            effects=effects_of(self.spec.settings, self._newest_record),
             damage=self._damage.sentences,
             created=self.created.isoformat(),
             ingest=self.request.ingest,
             settings=self.spec.settings.model_dump(mode="json"),
             budget=ledger.budgets[-1][1],
         )
+
+    @property
+    def _newest_record(self) -> Mapping[str, Any] | None:
+        """The record of the newest commit, where there is one in memory."""
+        frames = self.ledger.frames
+        entry = frames.get(frames.committed[-1]) if frames.committed else None
+        return None if entry is None else entry.record
 
     def camera(self, name: str) -> Camera:
         """Returns a camera of the rig; see `camera_of`."""

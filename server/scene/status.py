@@ -5,11 +5,14 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from client.wire import Budget, EffectiveBudget, FrameReportModel, FrameState, SceneState
+from client.wire import Budget, EffectiveBudget, EffectStatus, FrameReportModel, FrameState, SceneState
 from scas4d_core.cameras import Camera, Rig
+from scas4d_core.effects.effect import effect
+from scas4d_core.effects.switches import first_switches, switches_of
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History, HistoryError
 from server.problems import Problem
@@ -35,6 +38,19 @@ def effective_budget(settings: Settings, asked: Budget) -> EffectiveBudget:
     """Fills the open fields of a budget from the settings of the scene."""
     fields = {name: getattr(settings.update, name) if value is None else value for name, value in asked}
     return EffectiveBudget(**fields)
+
+
+def effects_of(settings: Settings, record: Mapping[str, Any] | None) -> dict[str, EffectStatus]:
+    """Describes the effects of a scene.
+
+    Args:
+        record: of the newest commit; None, or one that says nothing of effects: as before the first frame.
+    """
+    switches = switches_of((record or {}).get("effects", {})) or first_switches(settings, 0)
+    return {
+        name: EffectStatus(**asdict(switch), group=effect(name).group, says=effect(name).says)
+        for name, switch in switches.items()
+    }
 
 
 def camera_of(rig: Rig, name: str) -> Camera:

@@ -2,7 +2,7 @@
 
 import { Chart } from "./charts.js";
 import { TRACKS } from "./colours.js";
-import { isHeld, node, reasonOf, showCameras, showFacts, showQueue, stateWords } from "./panels.js";
+import { isHeld, node, reasonOf, showCameras, showEffects, showFacts, showQueue, stateWords } from "./panels.js";
 import { call, scenePath, token } from "./service.js";
 import { Stream } from "./stream.js";
 import { Tradeoff } from "./tradeoff.js";
@@ -164,6 +164,7 @@ function showStatus(status) {
   $("trouble").textContent = status.error ? status.error[0].toUpperCase() + status.error.slice(1) + "." : "";
   showFacts($("facts"), status);
   showQueue($("queue"), $("queue-words"), status);
+  showEffects($("effects"), $("effects-words"), status.effects);
   if (!status.committed) {
     const progress = status.progress;
     if (status.state === "failed") curtain("The scene has failed", $("trouble").textContent);

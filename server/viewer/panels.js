@@ -53,6 +53,20 @@ export function showFacts(list, status) {
   list.replaceChildren(...facts.flatMap(([name, value]) => [node("dt", {}, name), node("dd", {}, value)]));
 }
 
+const called = (name) => name[0].toUpperCase() + name.slice(1).replaceAll("_", " ");
+
+/** Lists the effects that evidence or the settings have switched; the words name those that are always on. */
+export function showEffects(list, words, effects) {
+  const all = Object.entries(effects);
+  const told = all.filter(([, one]) => one.pinned || one.text);
+  list.replaceChildren(...told.map(([name, one]) => {
+    const state = one.pinned ? `pinned ${one.on ? "on" : "off"}` : `${one.on ? "on" : "off"} since frame ${one.since}`;
+    return node("li", { title: one.says, class: one.on ? "on" : "off" }, `${called(name)}: ${state}${one.text ? `, ${one.text}` : ""}`);
+  }));
+  const usual = all.filter(([, one]) => one.on && !one.pinned && !one.text).map(([name]) => called(name).toLowerCase());
+  words.textContent = usual.length ? `In every update: ${usual.join(", ")}.` : "";
+}
+
 /** Draws one box for each place in the queue; the words say the same. */
 export function showQueue(box, words, status) {
   const places = Math.min(status.queue_limit, 24);

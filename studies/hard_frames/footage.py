@@ -43,7 +43,7 @@ class SyntheticFootage:
 
     name = "synthetic"
     count = 24
-    constants = (("scas4d_core.update.frame_update.NEIGHBOUR_FALLOFF", 200.0),)
+    constants = (("scas4d_core.preparation.NEIGHBOUR_FALLOFF", 200.0),)
     """Of the method, with another value when a scene starts or is resumed: the Gaussians lie far apart."""
 
     def __init__(self, settings: Settings | None = None) -> None:

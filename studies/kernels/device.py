@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from scas4d_core.preparation import NEIGHBOURS
 from scas4d_core.rasterize import cuda, twin
 from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
 from scas4d_core.rasterize.limits import GSPLAT
@@ -29,7 +30,7 @@ from scas4d_core.torch_backend.deformation import ClusterParams, Deltas, Layer, 
 from scas4d_core.torch_backend.device import require_device
 from scas4d_core.torch_backend.device_update import DeviceUpdate
 from scas4d_core.update.deformation import CpuDeformation, first_lengths
-from scas4d_core.update.frame_update import NEIGHBOURS, FrameUpdate
+from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.warm_start import Motion

@@ -1,4 +1,4 @@
-"""`scripts/bench quality`, `targets`, `table` and `processors`."""
+"""`scripts/bench quality`, `refit`, `targets`, `table` and `processors`."""
 
 from __future__ import annotations
 
@@ -59,6 +59,37 @@ def quality(
     )
     if any("error" in row for row in rows):
         raise typer.Exit(1)
+
+
+def refit(
+    captures: Captures,
+    out: Study = QUALITY,
+    frame: Annotated[int, typer.Option(help="Frame that is fitted; negative ones count from the end.")] = -1,
+    preset: Annotated[str, typer.Option(help="Named settings.")] = "scas4d",
+    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed, default 0. May be repeated.")] = None,
+    points: Annotated[bool, typer.Option(help="Start from the capture's cloud, that of its first frame.")] = False,
+    again: Again = False,
+    changes: Changes = None,
+) -> None:
+    """Fits a later frame from scratch: the ceiling of the updates, with how far they are below it.
+
+    The updates' figures are those of `scripts/bench quality` in the same folder, with the same settings. Leaves
+    refit.md and a JSON file a row in the study's folder.
+
+    Example: scripts/bench refit captures/visit --frame -1
+    """
+    from studies.quality.refit import run
+
+    run(
+        captures,
+        out,
+        frame=frame,
+        preset=preset,
+        seeds=seed or (0,),
+        points=points,
+        changes=changes or (),
+        again=again,
+    )
 
 
 def targets(

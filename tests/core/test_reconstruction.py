@@ -42,7 +42,7 @@ def few_iterations_do() -> Iterator[None]:
     with (
         varied(f"{static_scene}.RATE_COLOUR", 1e-2),
         varied(f"{static_scene}.RATE_POSITION", 8e-4),
-        varied("scas4d_core.update.frame_update.NEIGHBOUR_FALLOFF", 200.0),
+        varied("scas4d_core.preparation.NEIGHBOUR_FALLOFF", 200.0),
     ):
         yield
 

@@ -15,11 +15,12 @@ from law_cases import law, seeds
 
 from scas4d_core.cameras import Rig
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.neighbours import build_neighbours
 from scas4d_core.update import schedule
-from scas4d_core.update.frame_update import SMALLEST_CLUSTER, FrameUpdate
+from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.picture_loss import TrainingView, ViewFactory
 from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.schedule import ViewPlan

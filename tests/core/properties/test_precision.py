@@ -18,6 +18,7 @@ from torch import Tensor
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels import projection
 from scas4d_core.kernels.adam import EVERY_ROW, adam
+from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.rasterize import twin
 from scas4d_core.rasterize.twin import CameraParams
 from scas4d_core.settings import SceneSettings, UpdateSettings
@@ -28,7 +29,7 @@ from scas4d_core.torch_backend.deformation import ClusterParams, Deltas, Layer, 
 from scas4d_core.torch_backend.device_update import DeviceUpdate
 from scas4d_core.update import schedule
 from scas4d_core.update.deformation import CpuDeformation
-from scas4d_core.update.frame_update import SMALLEST_CLUSTER, FrameUpdate
+from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.warm_start import Motion

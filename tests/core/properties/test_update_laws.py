@@ -6,6 +6,7 @@ other turn the loss stays and its gradients turn along.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import permutations, product
 
@@ -18,6 +19,7 @@ from law_cases import doubles, law, seeds, some_rotation
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera
+from scas4d_core.effects.coherence.floor import FloorPart
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.torch_backend import deformation
 from scas4d_core.torch_backend import update as update_torch
@@ -34,6 +36,14 @@ RATES = Rates(
     layers=((0.02, 0.008, 0.002), (0.01, 0.002, 0.002)), position=5e-4, rotation=2e-3, scale=1e-3, colour=2e-3,
     colour_standing=1e-2,
 )  # fmt: skip
+FLOOR = (0.1, 1.0, 0.2, 0.05)
+
+
+def floor_twin(plane: tuple[float, ...]) -> Callable[[torch.Tensor], torch.Tensor | None]:
+    """The term of a floor with weight 2."""
+    return FloorPart(plane, np.arange(MOVING), 2.0).twin  # type: ignore[arg-type]
+
+
 AXES = [
     np.array(signs)[:, None] * np.eye(3)[list(order)]
     for order in permutations(range(3))
@@ -77,8 +87,8 @@ def some_case(seed: int) -> Case:
         graph=Graph(nearest, np.exp(-20 * lengths**2), 1.1 * lengths),
         first_lengths=np.full((MOVING, 3), 0.03),
         rates=RATES,
-        weights=TermWeights(floor=2.0),
-        floor=(0.1, 1.0, 0.2, 0.05),
+        weights=TermWeights(),
+        terms=(floor_twin(FLOOR),),
         dtype=torch.float64,
     )
     views = []
@@ -103,8 +113,8 @@ def placed(case: Case, turn: np.ndarray, shift: np.ndarray) -> Case:
         pose[:3, 3] = view.camera.translation - pose[:3, :3] @ shift
         return view._replace(camera=replace(view.camera, world_to_camera=pose))
 
-    normal = turn @ case.update.floor[:3]
-    floor = (*normal, case.update.floor[3] - normal @ shift)
+    normal = turn @ FLOOR[:3]
+    floor = (*normal, FLOOR[3] - normal @ shift)
     about = np.roll(Rotation.from_matrix(turn).as_quat(), 1)
     rotations = deformation.quaternion_product(doubles(about).expand(len(case.state), 4), doubles(case.state.rotations))
     state = case.state.replace(
@@ -113,7 +123,7 @@ def placed(case: Case, turn: np.ndarray, shift: np.ndarray) -> Case:
     start = [ClusterArrays(r @ turn.T, t @ turn.T, c @ turn.T, s) for r, t, c, s in case.start]
     dp, dr, ds = case.deltas
     return Case(
-        replace(case.update, floor=floor), state, [camera(view) for view in case.views], start,
+        replace(case.update, terms=(floor_twin(floor),)), state, [camera(view) for view in case.views], start,
         DeltaArrays(dp @ turn.T, dr @ turn.T, ds), case.rows,
     )  # fmt: skip
 

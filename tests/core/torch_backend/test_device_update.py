@@ -16,6 +16,7 @@ from scas4d_core import reconstruction
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import LayerRates, SceneSettings, Settings, UpdateSettings, Weights
 from scas4d_core.structure.hierarchy import build_hierarchy
@@ -26,7 +27,7 @@ from scas4d_core.torch_backend.device import DeviceError, require_device
 from scas4d_core.torch_backend.device_update import DeviceUpdate
 from scas4d_core.update import schedule
 from scas4d_core.update.best_state import mean_error
-from scas4d_core.update.frame_update import SMALLEST_CLUSTER, FrameUpdate
+from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.picture_loss import ViewFactory
 from scas4d_core.update.result import AttemptOptions, UpdateResult
 from scas4d_core.update.schedule import COOLING, LOOK_EVERY, Stopping, TimeBudget

@@ -12,8 +12,10 @@ import pytest
 import torch
 from box_scene import MOVING, SHIFT, TURN, make_box, make_rig, moved, take_frame
 
+from scas4d_core.effects.parts import Work
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels import neighbour_terms
+from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours
@@ -22,7 +24,7 @@ from scas4d_core.torch_backend import update as update_torch
 from scas4d_core.update import frame_update as update_module
 from scas4d_core.update import schedule
 from scas4d_core.update.deformation import MAX_SCALE, CpuDeformation
-from scas4d_core.update.frame_update import SMALLEST_CLUSTER, FrameUpdate
+from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory, view_order
 from scas4d_core.update.result import REPORT, AttemptOptions, Stopwatch, UpdateResult
 from scas4d_core.update.schedule import Adam, Rates, Stopping, ViewPlan, plan_samples
@@ -200,7 +202,7 @@ def twin_iteration(fused: Iteration, settings: UpdateSettings, masks: bool) -> t
     """Loss and gradients of the same parameters and views in float64 torch."""
     rows, weights = fused.hierarchy.rows, settings.weights
     terms = {"image": schedule.IMAGE_WEIGHT, "soft_colour": schedule.SOFT_COLOUR_WEIGHT, **weights.model_dump()}
-    del terms["mask_alone"]
+    del terms["mask_alone"], terms["floor"]
     update_of_twin = update_torch.TorchUpdate(
         moving=rows,
         labels=[labels.astype(np.int64) for labels in fused.hierarchy.labels],
@@ -302,10 +304,10 @@ def test_several_views_are_a_mean_and_one_is_as_it_is(monkeypatch: pytest.Monkey
         last[:] = [evaluate(picture, *arguments), picture.image_part + picture.mask_part]
         return last[0]
 
-    def pictures(updater: FrameUpdate, *arguments: Any) -> Any:
-        loss, gradients = inside(updater, *arguments)
-        given.append((gradients is last[0], loss - last[1]))
-        return loss, gradients
+    def pictures(updater: FrameUpdate, views: Any, work: Work, *arguments: Any) -> float:
+        loss = inside(updater, views, work, *arguments)
+        given.append((work.gradients is last[0], loss - last[1]))
+        return loss
 
     monkeypatch.setattr(PictureLoss, "evaluate", rendered)
     monkeypatch.setattr(FrameUpdate, "_pictures", pictures)

@@ -1,0 +1,52 @@
+"""The part that the colours of what moves and of what stands share: one table of RGB, with a rate for each Gaussian."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scas4d_core.effects.parts import Array, Part, PartsBuilder, Work
+from scas4d_core.frame_outcome import Candidate
+from scas4d_core.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from scas4d_core.update.schedule import Adam
+
+
+class Colours(Part):
+    """RGB of the Gaussians as parameters of an update, with a term that keeps them as they were.
+
+    Attributes:
+        moving, standing: whether those of what moves and of what stands are free.
+    """
+
+    moving = standing = False
+
+    def __init__(self, builder: PartsBuilder) -> None:
+        self._rows, self._count = builder.hierarchy.rows, len(builder.first)
+        self._optimizer: Adam
+
+    def start(self, work: Work) -> None:
+        """Moments start at zero."""
+        from scas4d_core.update import schedule  # it loads the kernels
+
+        self._soft = np.float32(schedule.SOFT_COLOUR_WEIGHT / max(work.colours.size, 1))
+        by_row = np.full(self._count, work.rates.colour_standing if self.standing else 0, np.float32)
+        by_row[self._rows] = work.rates.colour if self.moving else 0
+        self._optimizer = schedule.Adam(work.colours, [1.0] * 3, work.rates, by_row=by_row)
+        self.guards = self._optimizer.guards
+
+    def loss(self, work: Work) -> float:
+        """The mean absolute change."""
+        self._change: Array = work.colours - work.previous.colours
+        return float(self._soft * np.abs(self._change).sum(dtype=np.float64)) if work.tells else 0.0
+
+    def step(self, work: Work, iteration: int, planned: int) -> None:
+        """Steps the colours."""
+        pull: Array = self._soft * np.sign(self._change)
+        self._optimizer.step(work.gradients.features[:, :3] + pull, iteration, planned)
+
+    def end(self, work: Work, state: Gaussians) -> Gaussians:
+        """Θ_t has the colours of the end, where that is what is kept."""
+        return state.replace(colours=work.colours) if work.kept is Candidate.END else state

@@ -1,0 +1,37 @@
+"""Colours of what moves: RGB of each Gaussian follows the pictures (Dynamic3DGaussians)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from scas4d_core.effects.appearance.colours import Colours
+from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.parts import PartsBuilder
+
+if TYPE_CHECKING:
+    from scas4d_core.settings import Settings
+
+
+@dataclass(frozen=True)
+class MovingColour(Effect):
+    """RGB of the Gaussians that move, at the rate ``rate_colour``."""
+
+    def refused(self, settings: Settings) -> tuple[str, str] | None:
+        """Refused with a rate of 0."""
+        if settings.update.rate_colour > 0:
+            return None
+        return "update.rate_colour is 0", "give it a rate above 0"
+
+    def join(self, builder: PartsBuilder) -> None:
+        """Frees their colours."""
+        builder.shared(Colours).moving = True
+
+
+EFFECT = MovingColour(
+    name="moving_colour",
+    group=Group.APPEARANCE,
+    says="The colours of what moves follow the pictures, slowly: shading changes as things turn.",
+    gauge="The mean absolute change of all colours is a term: what moves or a gain explains is not put into colours.",
+    cost="one step of Adam over RGB an iteration, shared with the other colours",
+)

@@ -1,0 +1,37 @@
+"""Colours of what stands: RGB of each Gaussian follows the pictures (Dynamic3DGaussians)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from scas4d_core.effects.appearance.colours import Colours
+from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.parts import PartsBuilder
+
+if TYPE_CHECKING:
+    from scas4d_core.settings import Settings
+
+
+@dataclass(frozen=True)
+class StandingColour(Effect):
+    """RGB of the Gaussians that stand, at the rate ``rate_colour_standing``."""
+
+    def refused(self, settings: Settings) -> tuple[str, str] | None:
+        """Refused with a rate of 0."""
+        if settings.update.rate_colour_standing > 0:
+            return None
+        return "update.rate_colour_standing is 0", "give it a rate above 0"
+
+    def join(self, builder: PartsBuilder) -> None:
+        """Frees their colours."""
+        builder.shared(Colours).standing = True
+
+
+EFFECT = StandingColour(
+    name="standing_colour",
+    group=Group.APPEARANCE,
+    says="The colours of what stands follow the pictures: light and shadows wander over it.",
+    gauge="The mean absolute change of all colours is a term: what moves or a gain explains is not put into colours.",
+    cost="one step of Adam over RGB an iteration, shared with the other colours",
+)

@@ -1,0 +1,1 @@
+"""Effects that tie what moves together."""

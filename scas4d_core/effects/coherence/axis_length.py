@@ -1,0 +1,36 @@
+"""Limit of the axes' lengths (paper, scale loss). Kernel: ``kernels.deltas``; twin: ``losses.scale_loss``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.parts import PartsBuilder
+
+if TYPE_CHECKING:
+    from scas4d_core.settings import Settings
+
+
+@dataclass(frozen=True)
+class AxisLength(Effect):
+    """The term ``weights.scale``."""
+
+    def refused(self, settings: Settings) -> tuple[str, str] | None:
+        """Refused with a weight of 0."""
+        if settings.update.weights.scale > 0:
+            return None
+        return "update.weights.scale is 0", "give it a weight above 0"
+
+    def join(self, builder: PartsBuilder) -> None:
+        """The cascade's backward has the term in itself: it gets the weight."""
+        builder.length = builder.update.weights.scale
+
+
+EFFECT = AxisLength(
+    name="axis_length",
+    group=Group.COHERENCE,
+    says="No Gaussian grows longer than in frame 0, or 2 cm.",
+    gauge="Lengths of frame 0.",
+    cost="none that can be measured: the cascade's backward has it in itself",
+)

@@ -1,0 +1,37 @@
+"""Isometry of neighbours (Dynamic3DGaussians). Kernel: ``kernels.neighbour_terms``; twin: ``losses.isometry_loss``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
+from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.parts import PartsBuilder
+
+if TYPE_CHECKING:
+    from scas4d_core.settings import Settings
+
+
+@dataclass(frozen=True)
+class Isometry(Effect):
+    """The term ``weights.isometry``."""
+
+    def refused(self, settings: Settings) -> tuple[str, str] | None:
+        """Refused with a weight of 0."""
+        if settings.update.weights.isometry > 0:
+            return None
+        return "update.weights.isometry is 0", "give it a weight above 0"
+
+    def join(self, builder: PartsBuilder) -> None:
+        """Adds its strength to the terms between neighbours."""
+        builder.shared(NeighbourTerms).strengths[1] = builder.update.weights.isometry
+
+
+EFFECT = Isometry(
+    name="isometry",
+    group=Group.COHERENCE,
+    says="Neighbours keep the distance that they had in frame 0; things bend, and do not tear.",
+    gauge="Distances of frame 0; it does not see rotations.",
+    cost="one pass over 4,000 Gaussians and their neighbours an iteration, shared by rigidity, isometry and rotation",
+)

@@ -1,0 +1,37 @@
+"""Rigidity of neighbours (Dynamic3DGaussians). Kernel: ``kernels.neighbour_terms``; twin: ``losses.rigidity_loss``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
+from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.parts import PartsBuilder
+
+if TYPE_CHECKING:
+    from scas4d_core.settings import Settings
+
+
+@dataclass(frozen=True)
+class Rigidity(Effect):
+    """The term ``weights.rigidity``."""
+
+    def refused(self, settings: Settings) -> tuple[str, str] | None:
+        """Refused with a weight of 0."""
+        if settings.update.weights.rigidity > 0:
+            return None
+        return "update.weights.rigidity is 0", "give it a weight above 0"
+
+    def join(self, builder: PartsBuilder) -> None:
+        """Adds its strength to the terms between neighbours."""
+        builder.shared(NeighbourTerms).strengths[0] = builder.update.weights.rigidity
+
+
+EFFECT = Rigidity(
+    name="rigidity",
+    group=Group.COHERENCE,
+    says="What is rigid stays so: neighbours keep the offsets that they had in the frame before.",
+    gauge="It ties motion, not colour: nothing else explains it.",
+    cost="one pass over 4,000 Gaussians and their neighbours an iteration, shared by rigidity, isometry and rotation",
+)

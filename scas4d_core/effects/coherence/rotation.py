@@ -1,0 +1,37 @@
+"""Rotation of neighbours (Dynamic3DGaussians). Kernel: ``kernels.neighbour_terms``; twin: ``losses.rotation_loss``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
+from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.parts import PartsBuilder
+
+if TYPE_CHECKING:
+    from scas4d_core.settings import Settings
+
+
+@dataclass(frozen=True)
+class Rotation(Effect):
+    """The term ``weights.rotation``."""
+
+    def refused(self, settings: Settings) -> tuple[str, str] | None:
+        """Refused with a weight of 0."""
+        if settings.update.weights.rotation > 0:
+            return None
+        return "update.weights.rotation is 0", "give it a weight above 0"
+
+    def join(self, builder: PartsBuilder) -> None:
+        """Adds its strength to the terms between neighbours."""
+        builder.shared(NeighbourTerms).strengths[2] = builder.update.weights.rotation
+
+
+EFFECT = Rotation(
+    name="rotation",
+    group=Group.COHERENCE,
+    says="Neighbours turn alike.",
+    gauge="Turns since the frame before.",
+    cost="one pass over 4,000 Gaussians and their neighbours an iteration, shared by rigidity, isometry and rotation",
+)

@@ -1,0 +1,77 @@
+"""The interface of an effect: its words for users, the part that it puts into an update, the evidence for it.
+
+Modules of effects load neither Numba nor torch when they are imported: settings are checked with them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cache
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from scas4d_core.effects.registry import EFFECTS
+
+if TYPE_CHECKING:
+    from scas4d_core.effects.evidence import Evidence, Seen
+    from scas4d_core.effects.parts import PartsBuilder
+    from scas4d_core.settings import Settings
+
+
+class Group(StrEnum):
+    """The kinds of effects."""
+
+    MOTION = "motion"
+    COHERENCE = "coherence"
+    APPEARANCE = "appearance"
+    CAMERAS = "cameras"
+    PRESENCE = "presence"
+
+
+@dataclass(frozen=True)
+class Effect:
+    """An effect; its module has one instance, called ``EFFECT``.
+
+    Attributes:
+        name: as in ``registry.EFFECTS``. group: of the effects that it stands beside.
+        says: a sentence for users. gauge: that which fixes it against the effects that could explain the same pixels.
+        cost: of an update with it, against one without.
+        auto: whether it waits for evidence; else it is on wherever it is not refused.
+        on_above, off_below: share of ``Evidence`` from which it is switched on, and below which it is switched off.
+    """
+
+    name: str
+    group: Group
+    says: str
+    gauge: str
+    cost: str
+    auto: bool = False
+    on_above: float = 0.0
+    off_below: float = 0.0
+
+    def refused(self, settings: Settings) -> tuple[str, str] | None:
+        """Fault and remedy where it cannot be on under these settings; None: it can."""
+        return None
+
+    def evidence(self, seen: Seen) -> Evidence | None:
+        """The evidence of a frame that calls for it; None: the frame says nothing, and the switch stays."""
+        return None
+
+    def join(self, builder: PartsBuilder) -> None:
+        """Puts its part into the updates of a scene; called only where it is on."""
+        raise NotImplementedError
+
+
+@cache
+def effect(name: str) -> Effect:
+    """The effect of a name.
+
+    Raises:
+        KeyError: there is none.
+
+    >>> effect("floor").group
+    <Group.COHERENCE: 'coherence'>
+    """
+    found: Effect = import_module(EFFECTS[name]).EFFECT
+    return found

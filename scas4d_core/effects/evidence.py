@@ -1,0 +1,43 @@
+"""Evidence for an effect, and the committed frame that it is taken from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from scas4d_core.cameras import Rig
+    from scas4d_core.gaussians import Gaussians
+    from scas4d_core.update.picture_loss import PictureLoss, TrainingView
+    from scas4d_core.update.result import UpdateResult
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Evidence for an effect in the frames so far.
+
+    Attributes:
+        share: 0…1, what the effect explains or would explain; compared with the thresholds of the effect.
+        text: for people, as "gains of the cameras differ by 8 %".
+    """
+
+    share: float
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A frame as the evidence for effects is taken from it, once its state is committed.
+
+    Attributes:
+        index: of the frame. before: Θ_{t−1}. result: Θ_t, the trace of its update, arrays of the effects.
+        rig: the cameras inside. views: that were learnt from. picture: renders them.
+    """
+
+    index: int
+    before: Gaussians
+    result: UpdateResult
+    rig: Rig
+    views: Sequence[TrainingView]
+    picture: PictureLoss

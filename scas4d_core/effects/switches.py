@@ -1,0 +1,130 @@
+"""Switches of the effects of a scene: pinned by its settings, or by the evidence of its frames, with hysteresis.
+
+A switch changes between two frames. It is committed with the frame whose evidence changed it, and a scene that is
+resumed goes on with the switches of its checkpoint, so that a replay decides the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from scas4d_core.effects.effect import effect
+from scas4d_core.effects.registry import EFFECTS
+from scas4d_core.errors import InputError
+from scas4d_core.settings import Settings
+
+if TYPE_CHECKING:
+    from scas4d_core.effects.evidence import Seen
+    from scas4d_core.effects.parts import PartsBuilder
+
+IDLE = 8
+"""Frames in a row with too little evidence, after which an effect is switched off."""
+
+
+@dataclass(frozen=True)
+class Switch:
+    """The switch of one effect.
+
+    Attributes:
+        on: whether it takes part in the updates. since: the frame after which it does, or does not.
+        pinned: by the settings. share, text: the last evidence, see ``effect.Evidence``. idle: frames in a row in
+            which it would have been switched off.
+    """
+
+    on: bool
+    since: int
+    pinned: bool = False
+    share: float = 0.0
+    text: str = ""
+    idle: int = 0
+
+
+Switches = Mapping[str, Switch]
+
+
+def contradictions(settings: Settings) -> Iterator[tuple[str, str, str]]:
+    """Name, fault and remedy of each effect that is pinned on and that the settings contradict."""
+    for name, mode in settings.effects.items():
+        if mode == "on" and (refusal := effect(name).refused(settings)) is not None:
+            yield name, f"effects.{name} cannot be 'on': {refusal[0]}", f"{refusal[1]}, or leave it 'auto'"
+
+
+def first_switches(settings: Settings, index: int) -> dict[str, Switch]:
+    """The switches before any evidence: what is pinned, and what is on in every scene whose settings allow it.
+
+    Args:
+        index: of the first frame.
+
+    Raises:
+        InputError: an effect is pinned on that the settings contradict.
+
+    >>> from scas4d_core.settings import Settings
+    >>> switches = first_switches(Settings.model_validate({"effects": {"rigidity": "off"}}), 0)
+    >>> switches["rigidity"].on, switches["isometry"].on, switches["floor"].on  # no floor is named
+    (False, True, False)
+    """
+    for _, fault, remedy in contradictions(settings):
+        raise InputError(fault, remedy)
+    found = {}
+    for name in EFFECTS:
+        mode, one = settings.effects.get(name, "auto"), effect(name)
+        on = mode == "on" or (mode == "auto" and not one.auto and one.refused(settings) is None)
+        found[name] = Switch(on, index, pinned=mode != "auto")
+    return found
+
+
+def switches_record(switches: Switches) -> dict[str, dict[str, Any]]:
+    """The switches as JSON, for reports and checkpoints."""
+    return {name: asdict(switch) for name, switch in switches.items()}
+
+
+def switches_of(record: Mapping[str, Mapping[str, Any]]) -> dict[str, Switch]:
+    """The switches of a record; effects that this version does not know are left out.
+
+    >>> switches_of(switches_record({"floor": Switch(on=True, since=3)}))["floor"].since
+    3
+    """
+    return {name: Switch(**values) for name, values in record.items() if name in EFFECTS}
+
+
+def decided(switches: Switches, settings: Settings, seen: Seen) -> dict[str, Switch]:
+    """The switches for the frame after one that was committed.
+
+    Args:
+        switches: with which it was updated. settings: of the scene. seen: the frame.
+    """
+    return {name: _decided(name, switch, settings, seen) for name, switch in switches.items()}
+
+
+def _decided(name: str, switch: Switch, settings: Settings, seen: Seen) -> Switch:
+    one = effect(name)
+    if switch.pinned or not one.auto or one.refused(settings) is not None:
+        return switch
+    found = one.evidence(seen)
+    if found is None:
+        return switch
+    switch = replace(switch, share=found.share, text=found.text)
+    if not switch.on:
+        return replace(switch, on=True, since=seen.index, idle=0) if found.share >= one.on_above else switch
+    idle = switch.idle + 1 if found.share < one.off_below else 0
+    return replace(switch, on=False, since=seen.index, idle=0) if idle >= IDLE else replace(switch, idle=idle)
+
+
+def names_on(switches: Switches) -> tuple[str, ...]:
+    """The effects that are on, in the order of the registry."""
+    return tuple(name for name in EFFECTS if name in switches and switches[name].on)
+
+
+def joined(builder: PartsBuilder, effects: Sequence[str] | None = None) -> PartsBuilder:
+    """The builder once the effects have joined it.
+
+    Args:
+        effects: those that are on; None: those that are on in a scene that shows no evidence for any.
+    """
+    if effects is None:
+        effects = names_on(first_switches(Settings(scene=builder.scene, update=builder.update), 0))
+    for name in effects:
+        effect(name).join(builder)
+    return builder

@@ -1,0 +1,34 @@
+"""Writes the table of effects in docs/effects.md from the effects: `PYTHONPATH=. python scripts/effects_table.py`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from scas4d_core.effects.effect import effect
+from scas4d_core.effects.registry import EFFECTS
+
+PAGE = Path(__file__).parents[1] / "docs" / "effects.md"
+BEGIN, END = "<!-- effects -->\n", "<!-- end -->"
+
+
+def table() -> str:
+    """One line for each effect, in the order of the registry."""
+    lines = ["| effect | group | | on | gauge | cost |", "|---|---|---|---|---|---|"]
+    for one in map(effect, EFFECTS):
+        on = "by evidence" if one.auto else "where the settings allow it"
+        lines.append(f"| `{one.name}` | {one.group.value} | {one.says} | {on} | {one.gauge} | {one.cost} |")
+    return "\n".join(lines) + "\n"
+
+
+def written(page: str) -> str:
+    """The page with today's table."""
+    head, rest = page.split(BEGIN)
+    return head + BEGIN + table() + END + rest.split(END, 1)[1]
+
+
+if __name__ == "__main__":
+    text = PAGE.read_text()
+    if "--check" in sys.argv:
+        raise SystemExit(text != written(text))
+    PAGE.write_text(written(text))

@@ -1,0 +1,117 @@
+"""``scripts/bench refit``: the ceiling of the updates, the method of frame 0 on a later frame alone.
+
+A later frame is reconstructed from scratch, with the same settings and effects, and measured on the test cameras. How
+far the updates are below it at that frame says how much is still missing: what no effect explains, what was lost on the
+way. The updates' figures are read from the rows of ``scripts/bench quality`` in the same folder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from client.cli.evaluate import Report, check_test_cameras, recorded
+from client.cli.scores import Column, Row, Store, digest, markdown, read_row, write_row
+from scas4d_core.captures import open_capture
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.settings import Settings
+from scas4d_core.warm_up import warm_up_elsewhere
+from studies.machine import core_version, machine
+from studies.quality.settings import settings_of
+
+COLUMNS = (
+    Column("capture", "capture"),
+    Column("frame", "frame", "d"),
+    Column("seed", "seed", "d"),
+    Column("cloud", "cloud"),
+    Column("from scratch dB", "psnr"),
+    Column("fg dB", "psnr_foreground"),
+    Column("updates dB", "psnr_update"),
+    Column("below", "below", "+.2f"),
+    Column("Gaussians", "gaussians", ",d"),
+    Column("s", "seconds", ".0f"),
+)
+
+
+def run(
+    captures: Sequence[Path],
+    out: Path,
+    *,
+    frame: int = -1,
+    preset: str = "scas4d",
+    seeds: Sequence[int] = (0,),
+    points: bool = False,
+    changes: Sequence[str] = (),
+    again: bool = False,
+    report: Report = print,
+) -> list[Row]:
+    """Fits a frame of each capture from scratch; prints the table and leaves it in ``out/refit.md``.
+
+    Args:
+        captures: folders with test cameras. out: folder of the study of quality. Run again to go on.
+        frame: that is fitted; negative ones count from the end.
+        preset, changes: the settings; ``changes`` as ``"effects.direction=off"``.
+        seeds: of frame 0, each tried.
+        points: start from the capture's cloud, which is that of its first frame; else from the pictures alone.
+        again: fit anew what ``out`` holds. report: takes the printed lines.
+
+    Raises:
+        ValueError: a frame that a capture does not have, or an unknown setting.
+    """
+    store, rows = Store(out), list[Row]()
+    warm_up_elsewhere()
+    for folder in captures:
+        for seed in seeds:
+            settings = settings_of(preset, None, seed, changes)
+            row = _refitted(folder, store.folder / "refit", frame, settings, seed, points, again)
+            rows.append(row | _beside(row, settings, preset, store))
+            report(f"{row['capture']}, frame {row['frame']}, seed {seed}: {row['psnr']:.2f} dB")
+    table = markdown(rows, COLUMNS)
+    (store.folder / "refit.md").write_text(table + "\n")
+    report(table)
+    return rows
+
+
+def _refitted(folder: Path, rows: Path, frame: int, settings: Settings, seed: int, points: bool, again: bool) -> Row:
+    """The row of one frame, fitted where it is not on disk yet."""
+    capture = open_capture(folder, use_points=points)
+    check_test_cameras(capture, folder)
+    index = range(capture.frame_count)[frame] if -capture.frame_count <= frame < capture.frame_count else None
+    if index is None:
+        raise ValueError(f"{capture.name} has no frame {frame}; give one of 0 to {capture.frame_count - 1}")
+    key = f"{capture.name}-{index}-s{seed}-{digest(recorded(settings, ()), points)}"
+    found = None if again else read_row(rows / f"{key}.json")
+    if found is not None:
+        return found
+    from scas4d_core.metrics.evaluation import measure_pictures
+
+    scene = Reconstruction.start(capture.rig, capture.frame(index), settings, points=capture.points)
+    scores, _ = measure_pictures(scene, open_capture(folder, image_scale=settings.scene.image_scale), index)
+    assert scene.report is not None
+    row: Row = {
+        "key": key,
+        "capture": capture.name,
+        "frame": index,
+        "seed": seed,
+        "cloud": "given" if capture.points is not None else "from the pictures",
+        "gaussians": len(scene.history.first),
+        "seconds": sum(scene.report.seconds.values()),
+        **scores,
+        "settings": recorded(settings, ()),
+        "core": core_version(),
+        "machine": machine(),
+    }
+    write_row(rows / f"{key}.json", row)
+    return row
+
+
+def _beside(row: Row, settings: Settings, preset: str, store: Store) -> Row:
+    """The updates' figure for the same frame, and how far it is below; nothing where it was not measured."""
+    wanted = recorded(settings, ())
+    for other in store.rows():
+        frames = other.get("psnr_by_frame", [])
+        same = other.get("capture") == row["capture"] and other.get("settings") == wanted
+        if same and other.get("preset") == preset and row["frame"] < len(frames):
+            update = frames[row["frame"]]
+            return {"psnr_update": update, "below": update - row["psnr"]}
+    return {}

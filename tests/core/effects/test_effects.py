@@ -1,0 +1,174 @@
+"""Effects: what is off does not exist in an update, contradictions are refused, switches follow evidence."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from effect_cases import BEFORE, RIG, UPDATE, builder, same, updated
+from source_tree import ROOT
+
+from scas4d_core.effects import effect as effect_module
+from scas4d_core.effects.appearance.colours import Colours
+from scas4d_core.effects.coherence.floor import FloorPart
+from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
+from scas4d_core.effects.effect import Effect, Group, effect
+from scas4d_core.effects.evidence import Evidence, Seen
+from scas4d_core.effects.parts import Hooks, Part, PartsBuilder, Work
+from scas4d_core.effects.registry import EFFECTS
+from scas4d_core.effects.switches import IDLE, Switch, decided, first_switches, joined, names_on
+from scas4d_core.errors import InputError
+from scas4d_core.presets import SettingError, preset
+from scas4d_core.settings import SceneSettings, Settings
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_every_effect_describes_itself(name: str) -> None:
+    one = effect(name)
+    assert one.name == name
+    assert one.group.value in EFFECTS[name]  # it lies in the folder of its group
+    assert all(text and text[0].isalnum() and len(text) > 15 for text in (one.says, one.gauge, one.cost))
+    assert one.says.endswith(".")
+
+
+def test_the_descriptions_are_light() -> None:
+    program = f"import sys, {', '.join(EFFECTS.values())}; print('numba' in sys.modules, 'torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "False"]
+
+
+def test_an_effect_that_is_off_has_no_part() -> None:
+    assert joined(builder(), []).parts == []
+    assert joined(builder(), []).length == 0
+    parts = joined(builder(), ["isometry", "standing_colour"])
+    assert [type(part) for part in parts.parts] == [NeighbourTerms, Colours]
+    colours = parts.find(Colours)
+    assert colours is not None
+    assert (colours.moving, colours.standing) == (False, True)
+
+
+@pytest.mark.parametrize(
+    ("name", "weights"),
+    [
+        ("rigidity", {"rigidity": 0}),
+        ("isometry", {"isometry": 0}),
+        ("rotation", {"rotation": 0}),
+        ("axis_length", {"scale": 0}),
+    ],
+)
+def test_off_is_a_weight_of_nothing(name: str, weights: dict[str, float]) -> None:
+    usual = names_on(first_switches(Settings(update=UPDATE), 0))
+    without = [other for other in usual if other != name]
+    weightless = UPDATE.model_copy(update={"weights": UPDATE.weights.model_copy(update=weights)})
+    assert same(updated(without), updated(list(usual), weightless))
+    assert not same(updated(without), updated(list(usual)))
+
+
+def test_colours_that_no_effect_frees_stay() -> None:
+    usual = names_on(first_switches(Settings(update=UPDATE), 0))
+    moving = BEFORE.moving
+    held = updated([name for name in usual if name != "standing_colour"])["colours"]
+    assert np.array_equal(held[~moving], BEFORE.colours[~moving])
+    assert not np.array_equal(held[moving], BEFORE.colours[moving])
+    assert np.array_equal(updated([name for name in usual if "colour" not in name])["colours"], BEFORE.colours)
+
+
+def test_a_scene_without_a_floor_has_no_floor_term() -> None:
+    assert not first_switches(Settings(), 0)["floor"].on
+    scene = SceneSettings(floor=(0, 1, 0, -0.5))
+    assert first_switches(Settings(scene=scene), 0)["floor"].on
+    assert any(isinstance(part, FloorPart) for part in joined(builder(scene)).parts)
+
+
+@pytest.mark.parametrize(
+    ("given", "fault", "remedy"),
+    [
+        ({"effects": {"floor": "on"}}, "effects.floor cannot be 'on': the scene names no floor", "give scene.floor"),
+        (
+            {"effects": {"rigidity": "on"}, "update": {"weights": {"rigidity": 0}}},
+            "effects.rigidity cannot be 'on': update.weights.rigidity is 0",
+            "give it a weight above 0",
+        ),
+        ({"effects": {"flour": "off"}}, "flour is no effect", "did you mean floor?"),
+        ({"effects": {"floor": "maybe"}}, "Input should be 'auto', 'on' or 'off'", ""),
+    ],
+)
+def test_contradictions_are_refused(given: dict[str, object], fault: str, remedy: str) -> None:
+    with pytest.raises(SettingError) as caught:
+        preset("scas4d", given)
+    assert fault in caught.value.fault
+    assert remedy in caught.value.remedy
+    assert caught.value.setting.startswith("effects")
+
+
+def test_a_pinned_effect_is_on_or_off() -> None:
+    assert not first_switches(preset("scas4d", {"effects": {"isometry": "off"}}), 0)["isometry"].on
+    with pytest.raises(InputError, match="cannot be 'on'"):
+        first_switches(Settings(effects={"floor": "on"}), 0)
+
+
+@dataclass(frozen=True)
+class Shy(Effect):
+    """An effect that goes by the number of the frame alone."""
+
+    def evidence(self, seen: Seen) -> Evidence | None:
+        share = {0: 0.5, 1: 0.9, 2: None}.get(seen.index, 0.1)
+        return None if share is None else Evidence(share, f"frame {seen.index}")
+
+    def join(self, parts: PartsBuilder) -> None:
+        parts.parts.append(Part())
+
+
+SHY = Shy("shy", Group.MOTION, "It moves.", "none", "none", auto=True, on_above=0.8, off_below=0.3)
+
+
+@pytest.fixture
+def shy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(EFFECTS, "shy", "nowhere")
+    found = effect_module.effect
+    for module in ("scas4d_core.effects.switches",):
+        monkeypatch.setattr(sys.modules[module], "effect", lambda name: SHY if name == "shy" else found(name))
+
+
+def seen(index: int) -> Seen:
+    return Seen(index, BEFORE, None, RIG, [], None)  # type: ignore[arg-type]
+
+
+@pytest.mark.usefixtures("shy")
+def test_evidence_switches_with_hysteresis() -> None:
+    settings = Settings()
+    switches = first_switches(settings, 0)
+    assert not switches["shy"].on
+    on = []
+    for index in range(3 + IDLE):
+        switches = decided(switches, settings, seen(index))
+        on.append(switches["shy"].on)
+    assert on == [False, True, True, *[True] * (IDLE - 1), False]
+    assert switches["shy"] == Switch(False, 2 + IDLE, share=0.1, text=f"frame {2 + IDLE}")
+
+
+@pytest.mark.usefixtures("shy")
+def test_a_pinned_switch_hears_no_evidence() -> None:
+    settings = Settings(effects={"shy": "off"})
+    switches = decided(first_switches(settings, 0), settings, seen(1))
+    assert not switches["shy"].on
+    assert switches["shy"].pinned
+
+
+def test_a_hook_that_does_nothing_is_not_called() -> None:
+    class Counting(Part):
+        def loss(self, work: Work) -> float:
+            return 1.0
+
+    hooks = Hooks([Counting(), Part()])
+    assert len(hooks.loss) == 1
+    assert not any((hooks.start, hooks.show, hooks.saw, hooks.step, hooks.end, hooks.guards))
+
+
+def test_switches_stay_where_nothing_is_seen() -> None:
+    settings = Settings()
+    switches = first_switches(settings, 0)
+    assert decided(switches, settings, seen(5)) == {name: replace(switch) for name, switch in switches.items()}
