@@ -57,7 +57,9 @@ class PartLabels:
         newest = history.indices[-1]
         known = self._known.get(count) or self._read(count)
         if known is None or known.frame != newest:
-            before = None if known is None else fitted(known.labels, len(history.gaussians(newest)))
+            before = None
+            if known is not None and len(known.labels) == np.count_nonzero(history.born_at <= known.frame):
+                before = fitted(known.labels, history.count)
             known = Known(reader.parts(count, before), newest)
             self._write(count, known)
         self._known[count] = known

@@ -68,8 +68,10 @@ def _mend(
     if fault is None:
         return MendOutcome.WHOLE, ""
     index, known = frame_of(name), history.indices
-    needed = name in (FIXED_FILE, FIXED_COPY, FIRST_COPY) or born_of(name) is not None
-    if needed or (known and index == known[0]):
+    birth = born_of(name)
+    if birth is not None and birth not in history.born_at:  # of a frame that was taken back
+        return MendOutcome.GONE, ""
+    if birth is not None or name in (FIXED_FILE, FIXED_COPY, FIRST_COPY) or (known and index == known[0]):
         if name in history.mend_fixed():
             return MendOutcome.WRITTEN, fault
         return (MendOutcome.DAMAGED, fault) if known else (MendOutcome.GONE, "")
