@@ -110,7 +110,8 @@ class PartsBuilder:
 
     Attributes:
         scene, update: the settings, the floor inside. factory: of the scene's views. hierarchy: of the moving.
-        first: Θ_0. length: weight of the limit of the axes' lengths, which the cascade's kernel has in itself.
+        first: Θ_0. whole: whether a part needs whole pictures: it changes what stands, or how a camera sees it.
+        length: weight of the limit of the axes' lengths, which the cascade's kernel has in itself.
         parts: of the effects that have joined, in order.
     """
 
@@ -119,6 +120,7 @@ class PartsBuilder:
     factory: ViewFactory
     hierarchy: Hierarchy
     first: Gaussians
+    whole: bool = False
     length: float = 0.0
     parts: list[Part] = field(default_factory=list)
 

@@ -68,7 +68,21 @@ def copy_blocks(plane, y_first, x_first, state, start, step, inward):
 
 @kernel
 def blend_task(
-    task, splats, features, groups, starts, items, covers, tile_order, tasks, size, background, limits, image, rest
+    task,
+    splats,
+    features,
+    groups,
+    starts,
+    items,
+    covers,
+    wanted,
+    tile_order,
+    tasks,
+    size,
+    background,
+    limits,
+    image,
+    rest,
 ):
     """Blends the tiles of one task of ``blend``."""
     cap, stop = limits[1], limits[2]
@@ -86,7 +100,7 @@ def blend_task(
         state[:] = ZERO
         for block in range(BLOCKS):
             lanes.store(state, base + block * step, lanes.fill(ONE))
-        unfinished = np.uint64(0xFFFFFFFFFFFFFFFF)
+        unfinished = wanted[tile]
         for entry in range(starts[tile], starts[tile + 1]):
             left = covers[entry] & unfinished
             seen = left
@@ -155,16 +169,19 @@ def blend_task(
 
 
 @parallel_kernel
-def blend(splats, features, groups, starts, items, covers, tile_order, tasks, size, background, limits, image, rest):
-    """Blends every tile front to back.
+def blend(
+    splats, features, groups, starts, items, covers, wanted, tile_order, tasks, size, background, limits, image, rest
+):
+    """Blends tiles front to back.
 
     Args:
         splats: [N, 16]; features: [N, C] float32, C a multiple of 4; starts [tiles + 1], items: tile lists.
         groups: a tuple of C/4 numbers, whose length the compiler knows.
         covers: [entries] uint64, the blocks of the tile that the entry's support meets; left with those where it was
             drawn.
-        tile_order: [tiles] int64, tiles dealt to ``tasks`` in this order. size: (width, height) in pixels.
-        background: [C]. limits: [6], the fields of ``Limits``.
+        wanted: [tiles] uint64, the blocks of each tile that are drawn; the others come out as the background.
+        tile_order: int64, the tiles to blend, dealt to ``tasks`` in this order; others are left as they are.
+        size: (width, height) in pixels. background: [C]. limits: [6], the fields of ``Limits``.
         image: out [C, rows, stride] float32, padded to whole tiles. rest: out [rows, stride] transmittance left.
     """
     for task in prange(tasks):
@@ -176,6 +193,7 @@ def blend(splats, features, groups, starts, items, covers, tile_order, tasks, si
             starts,
             items,
             covers,
+            wanted,
             tile_order,
             tasks,
             size,

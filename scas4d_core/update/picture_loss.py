@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import Rig
 from scas4d_core.captures.frame import Frame
 from scas4d_core.captures.images import area_average, resize_area
+from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import SMALLEST_SQUARE
 from scas4d_core.kernels import image_loss
 from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Gradients
@@ -179,7 +180,7 @@ def view_order(count: int, iterations: int, rng: np.random.Generator) -> Sequenc
     return [int(index) for index in order]
 
 
-def _no_lap(stage: str) -> None:
+def no_lap(stage: str) -> None:
     """Nobody takes the time."""
 
 
@@ -212,6 +213,9 @@ class PictureLoss:
         self.mask_part = 0.0
         self.psnr = 0.0
 
+    def begin(self, previous: Gaussians) -> None:
+        """Takes the state that a frame starts from; here nothing hangs on it."""
+
     def evaluate(
         self,
         means: Array,
@@ -219,7 +223,7 @@ class PictureLoss:
         opacities: Array,
         features: Array,
         view: TrainingView,
-        lap: Callable[[str], None] = _no_lap,
+        lap: Callable[[str], None] = no_lap,
     ) -> Gradients:
         """Render the view, set ``image_part``, ``mask_part`` and ``psnr`` (dB), and return the gradients.
 
@@ -255,6 +259,7 @@ class PictureLoss:
             view.target,
             *view.moments,
             self._weights[:channels],
+            height * width,
             self._factory.scratch(channels, height, width),
             g_image,
             rows,

@@ -26,6 +26,7 @@ class StandingColour(Effect):
     def join(self, builder: PartsBuilder) -> None:
         """Frees their colours."""
         builder.shared(Colours).standing = True
+        builder.whole = True
 
 
 EFFECT = StandingColour(
