@@ -214,6 +214,7 @@ def blend_backward_task(
     items,
     slots,
     covers,
+    learnt,
     tile_order,
     tasks,
     size,
@@ -253,17 +254,45 @@ def blend_backward_task(
                 lanes.store(state, place + lanes.COUNT, lanes.load(state, place + lanes.COUNT) + product)
         for block in range(BLOCKS):
             lanes.store(state, base + block * step, lanes.fill(ONE))
-        for entry in range(starts[tile], starts[tile + 1]):
+        end = starts[tile + 1]
+        while end > starts[tile] and learnt[items[end - 1]] == 0:  # what lies behind is in the total already
+            end -= 1
+        for entry in range(starts[tile], end):
             cover = covers[entry]
             left = cover
-            fetch_ahead(entry, starts[tile + 1], items, splats, features)
-            lanes.fetch(records, slots[min(entry + AHEAD, starts[tile + 1] - 1)])
+            fetch_ahead(entry, end, items, splats, features)
+            lanes.fetch(records, slots[min(entry + AHEAD, end - 1)])
             i = items[entry]
             splat = splats[i]
             a, b, c = splat[CONIC_A] * HALF_LOG2_E, splat[CONIC_B] * (TWO * HALF_LOG2_E), splat[CONIC_C] * HALF_LOG2_E
             log_opacity = splat[LOG_OPACITY]
             left_x = lanes.block_columns() + (np.float32(x_first) + HALF - splat[MEAN_X])
             top_y = lanes.block_rows() + (np.float32(y_first) + HALF - splat[MEAN_Y])
+            if learnt[i] == 0:
+                while left != np.uint64(0):
+                    block = lanes.lowest_bit(left)
+                    left = opened(left)
+                    dx = left_x + BLOCK_X[block]
+                    dy = top_y + BLOCK_Y[block]
+                    power = log_opacity - (a * dx * dx + (b * dx + c * dy) * dy)
+                    place = base + block * step
+                    before = lanes.load(state, place)
+                    dot = lanes.load(state, place + 2 * lanes.COUNT) * features[i, 0]
+                    for channel in range(1, channels):
+                        dot += lanes.load(state, place + lanes.COUNT * (2 + channel)) * features[i, channel]
+                    weight = lanes.minimum(lanes.exp2(power), lanes.fill(cap)) * before
+                    after = before - weight
+                    drawn = (power >= faintest) & (after >= stop)
+                    stopped = (power >= faintest) & (after < stop)
+                    weight = lanes.choose(drawn, weight, lanes.fill(ZERO))
+                    behind = lanes.load(state, place + lanes.COUNT)
+                    lanes.store(
+                        state,
+                        place,
+                        lanes.choose(stopped, ZERO - lanes.magnitude(before), lanes.choose(drawn, after, before)),
+                    )
+                    lanes.store(state, place + lanes.COUNT, behind - weight * dot)
+                continue
             s = lanes.fill(ZERO)
             sx = sy = sxx = sxy = syy = s
             t0 = t1 = t2 = t3 = s
@@ -337,6 +366,7 @@ def blend_backward(
     items,
     slots,
     covers,
+    learnt,
     tile_order,
     tasks,
     size,
@@ -354,6 +384,7 @@ def blend_backward(
 
     Args:
         slots: [entries] the pair of each. covers: [entries] as ``blend`` left them.
+        learnt: [N] uint8, 0 for Gaussians of which no gradient is wanted; their records are not written.
         g_image: [C, rows, stride] dL/dimage. g_alpha: [rows, stride] dL/dalpha, alpha = 1 - rest.
         records: out [pairs, whole ``Lanes``] float32, columns above.
     """
@@ -367,6 +398,7 @@ def blend_backward(
             items,
             slots,
             covers,
+            learnt,
             tile_order,
             tasks,
             size,

@@ -120,13 +120,13 @@ def share_pairs(order, visible, counts, begins):
 
 @parallel_kernel
 def cover_tiles(
-    splats, rects, order, visible, tiles_x, drawn, watched, begins, ends, counts, firsts, pairs, covers, tile_counts
+    splats, rects, order, visible, tiles_x, drawn, learnt, begins, ends, counts, firsts, pairs, covers, tile_counts
 ):
     """Lists the tiles that each Gaussian's support reaches, in depth order.
 
     Args:
         drawn: [tiles] uint64, the blocks of each tile that are drawn; the others reach nobody.
-        watched: [N] uint8, 1 for Gaussians that have to stay within what is drawn.
+        learnt: [N] uint8, 1 for Gaussians that have to stay within what is drawn.
         begins: [tasks] from ``share_pairs``. ends: out [tasks] int64, where each task's pairs end.
         counts: in: tiles of each Gaussian's box; out: tiles reached. firsts: out [N] int64, each one's first pair; the
             others follow it.
@@ -134,7 +134,7 @@ def cover_tiles(
         tile_counts: out [tasks, tiles] int32.
 
     Returns:
-        How many times a watched Gaussian reached a tile outside of what is drawn.
+        How many times one of these reached a tile outside of what is drawn.
     """
     tasks = begins.shape[0]
     left = np.zeros(tasks, np.int64)
@@ -151,10 +151,10 @@ def cover_tiles(
             for tile_y in range(rects[i, 1], rects[i, 3]):
                 for tile_x in range(rects[i, 0], rects[i, 2]):
                     tile = tile_y * tiles_x + tile_x
-                    if drawn[tile] == 0 and watched[i] == 0:
+                    if drawn[tile] == 0 and learnt[i] == 0:
                         continue
                     blocks = cover(splats[i], tile_x, tile_y)
-                    outside += np.int64(watched[i] != 0 and (blocks & ~drawn[tile]) != 0)
+                    outside += np.int64(learnt[i] != 0 and (blocks & ~drawn[tile]) != 0)
                     blocks &= drawn[tile]
                     # Written in any case, kept if reached: without a branch that the processor could mispredict.
                     reached = np.int64(blocks != 0)

@@ -71,12 +71,12 @@ class Drawing(NamedTuple):
     """The blocks of a picture that are drawn; none of the others is read or written.
 
     Attributes:
-        blocks: [tiles] uint64, bits as of ``tiles.cover``. watched: [N] uint8, 1 for the Gaussians that have to stay
-            within: ``CpuRasterizer.escaped`` tells whether one did not.
+        blocks: [tiles] uint64, bits as of ``tiles.cover``. learnt: [N] uint8, 1 for the Gaussians that change: they have
+            to stay within (``CpuRasterizer.escaped`` tells whether one did not), and they alone get gradients.
     """
 
     blocks: NDArray[np.uint64]
-    watched: NDArray[np.uint8]
+    learnt: NDArray[np.uint8]
 
 
 class ForwardPass(NamedTuple):
@@ -94,6 +94,7 @@ class ForwardPass(NamedTuple):
     items: NDArray[np.int32]
     slots: NDArray[np.int32]
     covers: NDArray[np.uint64]
+    learnt: NDArray[np.uint8]
     tile_order: NDArray[np.int64]
     image: Array
     rest: Array
@@ -105,7 +106,7 @@ class CpuRasterizer:
 
     Attributes:
         guards: number of times that each guard acted since the last ``reset`` of the counts.
-        escaped: whether a watched Gaussian reached a block that the last forward pass did not draw.
+        escaped: whether a Gaussian that is learnt reached a block that the last forward pass did not draw.
 
     >>> from scas4d_core.gaussians import Gaussians
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
@@ -238,15 +239,15 @@ class CpuRasterizer:
         )  # fmt: skip
         self._last = ForwardPass(
             means, factors, features, camera, depth_channel, splats, counts, firsts, starts, items, slots, covers,
-            tile_order, image, rest, most,
+            drawing.learnt, tile_order, image, rest, most,
         )  # fmt: skip
         return Picture(image[:, :height, :width], rest[:height, :width])
 
     def _whole(self, tile_count: int, count: int) -> Drawing:
-        """A drawing of every block that watches nobody."""
-        blocks, watched = self._buffer("blocks", (tile_count,), np.uint64), self._buffer("watched", (count,), np.uint8)
-        blocks[:], watched[:] = np.uint64(2**64 - 1), 0
-        return Drawing(blocks, watched)
+        """A drawing of every block, from which every Gaussian learns."""
+        blocks, learnt = self._buffer("blocks", (tile_count,), np.uint64), self._buffer("learnt", (count,), np.uint8)
+        blocks[:], learnt[:] = np.uint64(2**64 - 1), 1
+        return Drawing(blocks, learnt)
 
     def gradient_buffers(self) -> tuple[Array, Array]:
         """dL/dfeatures [C, rows, stride] and dL/dalpha [rows, stride] to fill before ``backward``.
@@ -283,23 +284,10 @@ class CpuRasterizer:
         count, channels = features.shape
         records = self._buffer("records", (last.pairs, blend_kernels.record_columns(channels)))
         blend_kernels.blend_backward(
-            last.splats,
-            features,
-            (0,) * (channels // blend_kernels.GROUP),
-            last.starts,
-            last.items,
-            last.slots,
-            last.covers,
-            last.tile_order,
-            threads(),
-            (last.camera.width, last.camera.height),
-            self.limits,
-            image,
-            last.rest,
-            g_image,
-            g_alpha,
-            records,
-        )
+            last.splats, features, (0,) * (channels // blend_kernels.GROUP), last.starts, last.items, last.slots,
+            last.covers, last.learnt, last.tile_order, threads(), (last.camera.width, last.camera.height), self.limits,
+            image, last.rest, g_image, g_alpha, records,
+        )  # fmt: skip
         gradients = Gradients(
             self._buffer("g_means", (count, 3)),
             self._buffer("g_factors", (count, 3, 3)),
@@ -316,7 +304,7 @@ class CpuRasterizer:
             last.camera.lens,
             self.limits,
             last.splats,
-            last.counts,
+            last.counts * last.learnt,
             last.firsts,
             records,
             last.depth_channel,

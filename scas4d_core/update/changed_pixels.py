@@ -43,7 +43,7 @@ class Region:
     """That which is drawn of one camera's pictures.
 
     Attributes:
-        blocks: [tiles] uint64. rows: [R] int64, the Gaussians drawn, ascending. watched: [R] uint8, 1 for the moving.
+        blocks: [tiles] uint64. rows: [R] int64, the Gaussians drawn, ascending. learnt: [R] uint8, 1 for the moving.
         box: rows and columns of the picture that hold the blocks and ``REACH`` around. shown: [h, w] bool, the box's
             pixels that are drawn.
         view: whose pictures the following belong to; None: nobody's yet.
@@ -53,7 +53,7 @@ class Region:
 
     blocks: NDArray[np.uint64]
     rows: NDArray[np.int64]
-    watched: NDArray[np.uint8]
+    learnt: NDArray[np.uint8]
     box: tuple[slice, slice]
     shown: NDArray[np.bool_]
     view: TrainingView | None = None
@@ -120,7 +120,7 @@ class ChangedPixels(PictureLoss):
         if self._gradients is None or self._gradients.features.shape != features.shape:
             shapes = (means.shape, factors.shape, opacities.shape, features.shape, (len(means), 2))
             self._gradients = Gradients(*(np.zeros(shape, np.float32) for shape in shapes))
-        moves = np.flatnonzero(region.watched)
+        moves = np.flatnonzero(region.learnt)
         for whole, part in zip(self._gradients, found, strict=True):
             whole[self._moving] = part[moves]
         lap("render backward")
@@ -145,9 +145,7 @@ class ChangedPixels(PictureLoss):
             region = self._regions[key] = self._region(state, view, region)
         while True:
             part = self._taken(state, region.rows)
-            self.rasterizer.forward(
-                *part, view.camera, self._background, drawing=Drawing(region.blocks, region.watched)
-            )
+            self.rasterizer.forward(*part, view.camera, self._background, drawing=Drawing(region.blocks, region.learnt))
             if not self.rasterizer.escaped:
                 return region
             region = self._regions[key] = self._made(self._marks(state, view.camera) | region.blocks, view)
