@@ -18,7 +18,8 @@ from numba import get_num_threads
 from scas4d_core.cameras import Rig, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.effects.evidence import Seen
-from scas4d_core.effects.switches import first_switches, switches_of, switches_record
+from scas4d_core.effects.switches import began as effects_began
+from scas4d_core.effects.switches import first_switches, switched_by, switches_of, switches_record
 from scas4d_core.first_frame.start import FirstFrame, fit_first
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.frame_report import FrameReport, Progress, report_of_first, report_of_update
@@ -36,7 +37,7 @@ from scas4d_core.structure.motion_mask import labelled, with_reliable_labels
 from scas4d_core.torch_backend.device import require_device
 from scas4d_core.update.frame_update import Updater
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
-from scas4d_core.update.result import REPORT, Stopwatch
+from scas4d_core.update.result import REPORT, Stopwatch, UpdateResult, UpdateTrace
 from scas4d_core.update.schedule import TimeBudget, mask_weight
 
 __all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "ResumePoint", "StepError", "View"]
@@ -127,6 +128,12 @@ class Reconstruction(CommittedScene):
         fitted = perf_counter()
         self._fixed = FirstFrame(len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians))
         switches = first_switches(settings, frame.index)
+        views = self._factory.views(self._factory.scaled(frame), result.exposures, use_masks=False)
+        found = UpdateResult(result.gaussians, None, UpdateTrace())
+        effects = effects_began(
+            switches, settings, Seen(frame.index, result.gaussians, found, self.rig, views, self._picture)
+        )
+        switches = switched_by(effects, switches)
         self._updater, structure = self._preparation.updater(result.gaussians, switches)
         seen = () if self._fixed.masked else self._factory.views(self._factory.scaled(frame), {}, use_masks=False)
         load = {} if started is None else {"load": began - started}
@@ -135,8 +142,9 @@ class Reconstruction(CommittedScene):
         psnr = {name: fit["psnr"] for name, fit in result.cameras.items()}
         past = replace(Past.of_first(psnr, brightness(frame.images)), fitted=frame.time)
         carried = CarryOver(
-            seen=seen, structure=structure, past=past, shown=fingerprints(frame.images), switches=switches
-        )
+            seen=seen, structure=structure, past=past, shown=fingerprints(frame.images), switches=switches,
+            effects=effects,
+        )  # fmt: skip
         self._commit(report, result.gaussians, carried, {**self._fixed.record(), **(notes or {})})
         return self
 

@@ -71,8 +71,8 @@ class Drawing(NamedTuple):
     """The blocks of a picture that are drawn; none of the others is read or written.
 
     Attributes:
-        blocks: [tiles] uint64, bits as of ``tiles.cover``. learnt: [N] uint8, 1 for the Gaussians that change: they have
-            to stay within (``CpuRasterizer.escaped`` tells whether one did not), and they alone get gradients.
+        blocks: [tiles] uint64, bits as of ``tiles.cover``. learnt: [N] uint8, 1 for the Gaussians that change: they
+            have to stay within (``CpuRasterizer.escaped`` tells whether one did not), and they alone get gradients.
     """
 
     blocks: NDArray[np.uint64]

@@ -19,7 +19,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import SMALLEST_SQUARE
 from scas4d_core.kernels import image_loss, tiles
 from scas4d_core.kernels.projection import TILE
-from scas4d_core.rasterize.cpu import CameraArrays, Drawing, Gradients
+from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Drawing, Gradients
 from scas4d_core.rasterize.limits import DEFAULT, Limits
 from scas4d_core.update.picture_loss import LABEL, PictureLoss, TrainingView, ViewFactory, means, no_lap
 
@@ -96,7 +96,7 @@ class ChangedPixels(PictureLoss):
     def begin(self, previous: Gaussians) -> None:
         """Takes the state that a frame starts from; what stood otherwise before is rendered anew."""
         features = np.concatenate([previous.colours, previous.foreground[:, None]], axis=1)
-        state = self._taken((previous.means, previous.factors, previous.opacities, features), self._standing)
+        state = taken((previous.means, previous.factors, previous.opacities, features), self._standing)
         if self._stood is None or not all(map(np.array_equal, state, self._stood)):
             self._bases.clear()
             self._regions.clear()
@@ -144,7 +144,7 @@ class ChangedPixels(PictureLoss):
         if region is None or region.view is not view:
             region = self._regions[key] = self._region(state, view, region)
         while True:
-            part = self._taken(state, region.rows)
+            part = taken(state, region.rows)
             self.rasterizer.forward(*part, view.camera, self._background, drawing=Drawing(region.blocks, region.learnt))
             if not self.rasterizer.escaped:
                 return region
@@ -161,12 +161,7 @@ class ChangedPixels(PictureLoss):
         return self._made(marks, view)
 
     def _marks(self, state: State, camera: CameraArrays) -> NDArray[np.uint64]:
-        """[tiles] blocks that what moves reaches."""
-        splats, rects, _ = self.rasterizer.project(*self._taken(state, self._moving), camera)
-        tiles_x, tiles_y = _tiles(camera)
-        marks = np.zeros(tiles_x * tiles_y, np.uint64)
-        tiles.mark_blocks(splats, rects, tiles_x, marks)
-        return marks
+        return reached(self.rasterizer, state, self._moving, camera)
 
     def _made(self, marks: NDArray[np.uint64], view: TrainingView) -> Region:
         """A region around marks, with those of the standing Gaussians that meet it."""
@@ -176,7 +171,7 @@ class ChangedPixels(PictureLoss):
         meets = np.empty(len(self._standing), bool)
         tiles.find_meeting(splats, rects, _tiles(camera)[0], blocks, meets)
         rows = np.sort(np.concatenate([self._moving, self._standing[meets]]))
-        shown = np.repeat(np.repeat(_as_grid(blocks, camera), BLOCK, 0), BLOCK, 1)[: camera.height, : camera.width]
+        shown = np.repeat(np.repeat(as_grid(blocks, camera), BLOCK, 0), BLOCK, 1)[: camera.height, : camera.width]
         box = _box(shown)
         region = Region(blocks, rows, self._moves[rows].astype(np.uint8), box, np.ascontiguousarray(shown[box]))
         self._follow(region, view)
@@ -240,11 +235,22 @@ class ChangedPixels(PictureLoss):
         scratch[:, :, -image_loss.REACH :] = 0
         return scratch
 
-    @staticmethod
-    def _taken(state: State, rows: NDArray[np.int64]) -> State:
-        """The rows of a state's arrays."""
-        one, two, three, four = (np.take(array, rows, axis=0) for array in state)
-        return one, two, three, four
+
+def taken(state: State, rows: NDArray[np.int64]) -> State:
+    """The rows of a state's arrays."""
+    one, two, three, four = (np.take(array, rows, axis=0) for array in state)
+    return one, two, three, four
+
+
+def reached(
+    rasterizer: CpuRasterizer, state: State, rows: NDArray[np.int64], camera: CameraArrays
+) -> NDArray[np.uint64]:
+    """[tiles] blocks of a picture that the supports of some Gaussians meet."""
+    splats, rects, _ = rasterizer.project(*taken(state, rows), camera)
+    tiles_x, tiles_y = _tiles(camera)
+    marks = np.zeros(tiles_x * tiles_y, np.uint64)
+    tiles.mark_blocks(splats, rects, tiles_x, marks)
+    return marks
 
 
 def _tiles(camera: CameraArrays) -> tuple[int, int]:
@@ -252,7 +258,7 @@ def _tiles(camera: CameraArrays) -> tuple[int, int]:
     return -(-camera.width // TILE), -(-camera.height // TILE)
 
 
-def _as_grid(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bool_]:
+def as_grid(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bool_]:
     """[rows, columns] of blocks, from bits 8 x + y of each tile."""
     tiles_x, tiles_y = _tiles(camera)
     side = TILE // BLOCK
@@ -272,7 +278,7 @@ def _as_blocks(grid: NDArray[np.bool_], camera: CameraArrays) -> NDArray[np.uint
 
 def _widened(marks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.uint64]:
     """The marks and ``MARGIN`` blocks around them."""
-    grid = _as_grid(marks, camera)
+    grid = as_grid(marks, camera)
     for _ in range(MARGIN):
         wider = grid.copy()
         wider[1:] |= grid[:-1]

@@ -115,7 +115,8 @@ class FrameUpdate:
         probes = ProbeViews(self._factory, self._picture, views if options.compare else [])
         best = BestState(probes, deformation, previous, motion, seconds, settings.momentum)
         best.start(options.step)
-        work = Work(previous, deformation, self._attempted(options, cold=motion is None), views, dict(carried))
+        rates = self._attempted(options, cold=motion is None)
+        work = Work(previous, deformation, rates, views, self._picture, dict(carried))
         work.tells = self.tells
         optimizers = self._optimizers(work.rates)
         for start in self._hooks.start:
@@ -147,6 +148,7 @@ class FrameUpdate:
             if options.gate is not None and met < len(trace.first) == len(views):  # each camera was rendered once
                 trace.left_out.update(options.gate(trace.first))
                 plan.leave_out(trace.left_out)
+                work.views = [view for view in views if view.name not in trace.left_out]
                 watch.lap("judge")
             if stopping.looks(trace.iterations):
                 stopping.saw(trace.iterations, best.error(work.colours))
