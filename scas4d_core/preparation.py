@@ -15,12 +15,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.cameras import WorldFrame
+from scas4d_core.captures.frame import Frame
 from scas4d_core.effects.coherence.floor import floor_inside
 from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
 from scas4d_core.effects.effect import Effect, effect
 from scas4d_core.effects.evidence import Seen
-from scas4d_core.effects.parts import PartsBuilder
-from scas4d_core.effects.switches import Switches, decided, first_switches, joined, names_on
+from scas4d_core.effects.parts import Arrays, PartsBuilder
+from scas4d_core.effects.switches import (
+    Switch,
+    Switches,
+    began,
+    decided,
+    first_switches,
+    joined,
+    names_on,
+    switched_by,
+)
+from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.gaussians import UNBORN, Gaussians
 from scas4d_core.settings import Settings
@@ -31,7 +42,7 @@ from scas4d_core.structure.motion_mask import labelled, labels_learnt
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours
 from scas4d_core.update.frame_update import FrameUpdate, Updater
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
-from scas4d_core.update.result import UpdateResult
+from scas4d_core.update.result import UpdateResult, UpdateTrace
 from scas4d_core.update.warm_start import motion_between
 
 SMALLEST_CLUSTER = 8
@@ -54,6 +65,19 @@ class Preparation:
         self._scene = settings.scene
         if self._scene.floor is not None:
             self._scene = self._scene.model_copy(update={"floor": floor_inside(self._scene.floor, world)})
+
+    def begun(self, frame: Frame, result: StaticResult) -> tuple[dict[str, Switch], dict[str, Arrays]]:
+        """The switches of the effects after the first frame, and the arrays that they keep of it.
+
+        Args:
+            frame: the first, at the size of the rig. result: its fit.
+        """
+        switches = first_switches(self._settings, frame.index)
+        views = self._factory.views(frame, result.exposures, use_masks=False)
+        found = UpdateResult(result.gaussians, None, UpdateTrace())
+        seen = Seen(frame.index, result.gaussians, found, self._factory.rig, views, self._picture)
+        arrays = began(switches, self._settings, seen)
+        return switched_by(arrays, switches), arrays
 
     def updater(self, first: Gaussians, switches: Switches) -> tuple[Updater, int]:
         """The updater of ``settings.device``, and the digest of its clusters and neighbours.

@@ -18,7 +18,7 @@ from numba import get_num_threads
 from scas4d_core.cameras import Rig, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.effects.evidence import Seen
-from scas4d_core.effects.switches import first_switches, switches_of, switches_record
+from scas4d_core.effects.switches import switches_of, switches_record
 from scas4d_core.first_frame.start import FirstFrame, fit_first
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.frame_report import FrameReport, Progress, report_of_first, report_of_update
@@ -127,8 +127,8 @@ class Reconstruction(CommittedScene):
         self.static = result = replace(result, gaussians=with_reliable_labels(result.gaussians))
         fitted = perf_counter()
         self._fixed = FirstFrame(len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians))
-        switches = first_switches(settings, frame.index)
         self._roots = result.gaussians
+        switches, effects = self._preparation.begun(self._factory.scaled(frame), result)
         self._updater, structure = self._preparation.updater(result.gaussians, switches)
         seen = () if self._fixed.masked else self._factory.views(self._factory.scaled(frame), {}, use_masks=False)
         load = {} if started is None else {"load": began - started}
@@ -136,9 +136,8 @@ class Reconstruction(CommittedScene):
         report = report_of_first(frame, result, self.rig.names, len(self._updater.hierarchy.rows), seconds, dropped)
         psnr = {name: fit["psnr"] for name, fit in result.cameras.items()}
         past = replace(Past.of_first(psnr, brightness(frame.images)), fitted=frame.time)
-        carried = CarryOver(
-            seen=seen, structure=structure, past=past, shown=fingerprints(frame.images), switches=switches
-        )
+        shown = fingerprints(frame.images)
+        carried = CarryOver(seen=seen, structure=structure, past=past, shown=shown, switches=switches, effects=effects)
         self._commit(report, result.gaussians, carried, {**self._fixed.record(), **(notes or {})})
         return self
 

@@ -15,7 +15,7 @@ from scas4d_core.effects.registry import EFFECTS
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Evidence, Seen
-    from scas4d_core.effects.parts import PartsBuilder
+    from scas4d_core.effects.parts import Arrays, PartsBuilder
     from scas4d_core.settings import Settings
     from scas4d_core.update.result import UpdateResult
 
@@ -39,6 +39,7 @@ class Effect:
         says: a sentence for users. gauge: that which fixes it against the effects that could explain the same pixels.
         cost: of an update with it, against one without.
         auto: whether it waits for evidence; else it is on wherever it is not refused.
+        at_first: one that waits is on from frame 0 until it is idle, where it keeps arrays of frame 0.
         on_above, off_below: share of ``Evidence`` from which it is switched on, and below which it is switched off.
     """
 
@@ -48,11 +49,16 @@ class Effect:
     gauge: str
     cost: str
     auto: bool = False
+    at_first: bool = False
     on_above: float = 0.0
     off_below: float = 0.0
 
     def refused(self, settings: Settings) -> tuple[str, str] | None:
         """Fault and remedy where it cannot be on under these settings; None: it can."""
+        return None
+
+    def began(self, seen: Seen) -> Arrays | None:
+        """Arrays of frame 0 that evidence or part look back to; None: none. Not asked where it is pinned off."""
         return None
 
     def evidence(self, seen: Seen) -> Evidence | None:

@@ -41,6 +41,7 @@ class Work:
 
     Attributes:
         previous: Θ_{t−1}. deformation: has taken it. rates: of this attempt. views: that it learns from.
+        picture: renders them.
         colours: [N, 3] RGB now. features: [N, 4] as they are rendered, RGB and label.
         sample: entries of the hierarchy's order whose neighbours this iteration looks at.
         gradients: of the pictures of the iteration; parts add to them. carried: arrays that the part left at the frame
@@ -60,10 +61,11 @@ class Work:
         deformation: CpuDeformation,
         rates: Rates,
         views: list[TrainingView],
+        picture: PictureLoss,
         carried: dict[str, Arrays],
     ) -> None:
         self.previous, self.deformation, self.rates, self.views = previous, deformation, rates, views
-        self.carried = carried
+        self.picture, self.carried = picture, carried
         self.colours = previous.colours.copy()
         self.features = np.concatenate([previous.colours, previous.foreground[:, None]], axis=1)
 
@@ -110,7 +112,8 @@ class PartsBuilder:
 
     Attributes:
         scene, update: the settings, the floor inside. factory: of the scene's views. hierarchy: of the moving.
-        first: the roots, Θ_0 with all born since (``preparation``).
+        first: the roots, Θ_0 with all born since (``preparation``). whole: whether a part needs whole pictures: it
+            changes what stands, or how a camera sees it.
         length: weight of the limit of the axes' lengths, which the cascade's kernel has in itself.
         parts: of the effects that have joined, in order.
     """
@@ -120,6 +123,7 @@ class PartsBuilder:
     factory: ViewFactory
     hierarchy: Hierarchy
     first: Gaussians
+    whole: bool = False
     length: float = 0.0
     parts: list[Part] = field(default_factory=list)
 

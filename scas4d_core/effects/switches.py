@@ -17,7 +17,7 @@ from scas4d_core.settings import Settings
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Seen
-    from scas4d_core.effects.parts import PartsBuilder
+    from scas4d_core.effects.parts import Arrays, PartsBuilder
 
 IDLE = 8
 """Frames in a row with too little evidence, after which an effect is switched off."""
@@ -110,6 +110,30 @@ def _decided(name: str, switch: Switch, settings: Settings, seen: Seen) -> Switc
         return replace(switch, on=True, since=seen.index, idle=0) if found.share >= one.on_above else switch
     idle = switch.idle + 1 if found.share < one.off_below else 0
     return replace(switch, on=False, since=seen.index, idle=0) if idle >= IDLE else replace(switch, idle=idle)
+
+
+def began(switches: Switches, settings: Settings, seen: Seen) -> dict[str, Arrays]:
+    """Arrays that the effects keep of the first frame, by effect."""
+    found = {}
+    for name, switch in switches.items():
+        one = effect(name)
+        if (switch.on or not switch.pinned) and one.refused(settings) is None:
+            arrays = one.began(seen)
+            if arrays is not None:
+                found[name] = arrays
+    return found
+
+
+def switched_by(found: Mapping[str, Arrays], switches: Switches) -> dict[str, Switch]:
+    """The switches after the first frame.
+
+    Args:
+        found: from ``began``.
+    """
+    return {
+        name: replace(switch, on=True) if name in found and effect(name).at_first else switch
+        for name, switch in switches.items()
+    }
 
 
 def names_on(switches: Switches) -> tuple[str, ...]:

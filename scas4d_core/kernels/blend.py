@@ -68,7 +68,21 @@ def copy_blocks(plane, y_first, x_first, state, start, step, inward):
 
 @kernel
 def blend_task(
-    task, splats, features, groups, starts, items, covers, tile_order, tasks, size, background, limits, image, rest
+    task,
+    splats,
+    features,
+    groups,
+    starts,
+    items,
+    covers,
+    wanted,
+    tile_order,
+    tasks,
+    size,
+    background,
+    limits,
+    image,
+    rest,
 ):
     """Blends the tiles of one task of ``blend``."""
     cap, stop = limits[1], limits[2]
@@ -86,7 +100,7 @@ def blend_task(
         state[:] = ZERO
         for block in range(BLOCKS):
             lanes.store(state, base + block * step, lanes.fill(ONE))
-        unfinished = np.uint64(0xFFFFFFFFFFFFFFFF)
+        unfinished = wanted[tile]
         for entry in range(starts[tile], starts[tile + 1]):
             left = covers[entry] & unfinished
             seen = left
@@ -155,16 +169,19 @@ def blend_task(
 
 
 @parallel_kernel
-def blend(splats, features, groups, starts, items, covers, tile_order, tasks, size, background, limits, image, rest):
-    """Blends every tile front to back.
+def blend(
+    splats, features, groups, starts, items, covers, wanted, tile_order, tasks, size, background, limits, image, rest
+):
+    """Blends tiles front to back.
 
     Args:
         splats: [N, 16]; features: [N, C] float32, C a multiple of 4; starts [tiles + 1], items: tile lists.
         groups: a tuple of C/4 numbers, whose length the compiler knows.
         covers: [entries] uint64, the blocks of the tile that the entry's support meets; left with those where it was
             drawn.
-        tile_order: [tiles] int64, tiles dealt to ``tasks`` in this order. size: (width, height) in pixels.
-        background: [C]. limits: [6], the fields of ``Limits``.
+        wanted: [tiles] uint64, the blocks of each tile that are drawn; the others come out as the background.
+        tile_order: int64, the tiles to blend, dealt to ``tasks`` in this order; others are left as they are.
+        size: (width, height) in pixels. background: [C]. limits: [6], the fields of ``Limits``.
         image: out [C, rows, stride] float32, padded to whole tiles. rest: out [rows, stride] transmittance left.
     """
     for task in prange(tasks):
@@ -176,6 +193,7 @@ def blend(splats, features, groups, starts, items, covers, tile_order, tasks, si
             starts,
             items,
             covers,
+            wanted,
             tile_order,
             tasks,
             size,
@@ -196,6 +214,7 @@ def blend_backward_task(
     items,
     slots,
     covers,
+    learnt,
     tile_order,
     tasks,
     size,
@@ -235,17 +254,45 @@ def blend_backward_task(
                 lanes.store(state, place + lanes.COUNT, lanes.load(state, place + lanes.COUNT) + product)
         for block in range(BLOCKS):
             lanes.store(state, base + block * step, lanes.fill(ONE))
-        for entry in range(starts[tile], starts[tile + 1]):
+        end = starts[tile + 1]
+        while end > starts[tile] and learnt[items[end - 1]] == 0:  # what lies behind is in the total already
+            end -= 1
+        for entry in range(starts[tile], end):
             cover = covers[entry]
             left = cover
-            fetch_ahead(entry, starts[tile + 1], items, splats, features)
-            lanes.fetch(records, slots[min(entry + AHEAD, starts[tile + 1] - 1)])
+            fetch_ahead(entry, end, items, splats, features)
+            lanes.fetch(records, slots[min(entry + AHEAD, end - 1)])
             i = items[entry]
             splat = splats[i]
             a, b, c = splat[CONIC_A] * HALF_LOG2_E, splat[CONIC_B] * (TWO * HALF_LOG2_E), splat[CONIC_C] * HALF_LOG2_E
             log_opacity = splat[LOG_OPACITY]
             left_x = lanes.block_columns() + (np.float32(x_first) + HALF - splat[MEAN_X])
             top_y = lanes.block_rows() + (np.float32(y_first) + HALF - splat[MEAN_Y])
+            if learnt[i] == 0:
+                while left != np.uint64(0):
+                    block = lanes.lowest_bit(left)
+                    left = opened(left)
+                    dx = left_x + BLOCK_X[block]
+                    dy = top_y + BLOCK_Y[block]
+                    power = log_opacity - (a * dx * dx + (b * dx + c * dy) * dy)
+                    place = base + block * step
+                    before = lanes.load(state, place)
+                    dot = lanes.load(state, place + 2 * lanes.COUNT) * features[i, 0]
+                    for channel in range(1, channels):
+                        dot += lanes.load(state, place + lanes.COUNT * (2 + channel)) * features[i, channel]
+                    weight = lanes.minimum(lanes.exp2(power), lanes.fill(cap)) * before
+                    after = before - weight
+                    drawn = (power >= faintest) & (after >= stop)
+                    stopped = (power >= faintest) & (after < stop)
+                    weight = lanes.choose(drawn, weight, lanes.fill(ZERO))
+                    behind = lanes.load(state, place + lanes.COUNT)
+                    lanes.store(
+                        state,
+                        place,
+                        lanes.choose(stopped, ZERO - lanes.magnitude(before), lanes.choose(drawn, after, before)),
+                    )
+                    lanes.store(state, place + lanes.COUNT, behind - weight * dot)
+                continue
             s = lanes.fill(ZERO)
             sx = sy = sxx = sxy = syy = s
             t0 = t1 = t2 = t3 = s
@@ -319,6 +366,7 @@ def blend_backward(
     items,
     slots,
     covers,
+    learnt,
     tile_order,
     tasks,
     size,
@@ -336,6 +384,7 @@ def blend_backward(
 
     Args:
         slots: [entries] the pair of each. covers: [entries] as ``blend`` left them.
+        learnt: [N] uint8, 0 for Gaussians of which no gradient is wanted; their records are not written.
         g_image: [C, rows, stride] dL/dimage. g_alpha: [rows, stride] dL/dalpha, alpha = 1 - rest.
         records: out [pairs, whole ``Lanes``] float32, columns above.
     """
@@ -349,6 +398,7 @@ def blend_backward(
             items,
             slots,
             covers,
+            learnt,
             tile_order,
             tasks,
             size,

@@ -191,7 +191,7 @@ def clear(rows):
 
 @kernel
 def loss_of_row(
-    image, exposure, target, target_means, target_squares, weights, scratch, spans, rows, losses, channel, y
+    image, exposure, target, target_means, target_squares, weights, pixels, scratch, spans, rows, losses, channel, y
 ):
     """Second pass: the loss of a row, and its gradients by the windowed quantities, filtered along the row."""
     channels, height, width = target.shape
@@ -224,18 +224,18 @@ def loss_of_row(
         difference = lanes.only_first(difference - lanes.load_first(target, there + x, width - x), width - x)
         squared += difference * difference
         loss += L1_SHARE * lanes.magnitude(difference) + SSIM_SHARE * lanes.only_first(ONE - ssim, width - x)
-    losses[channel, y, 0] = lanes.sum_of(loss) * (weights[channel] / np.float32(height * width))
+    losses[channel, y, 0] = lanes.sum_of(loss) * (weights[channel] / np.float32(pixels))
     losses[channel, y, 1] = lanes.sum_of(squared)
     filtered, cleared = hull(spans[channel], 2, y, REACH), hull(spans[channel], 2, y, 3 * REACH)
     filter_rows(rows, 3, scratch, 3, channel, y, filtered, cleared)
 
 
 @kernel
-def gradient_of_row(image, exposure, target, weights, scratch, spans, g_image, g_exposure, channel, y):
+def gradient_of_row(image, exposure, target, weights, pixels, scratch, spans, g_image, g_exposure, channel, y):
     """Third pass: the gradient of a row."""
     channels, height, width = target.shape
     pitch = scratch.shape[3]
-    share = weights[channel] / np.float32(height * width)
+    share = weights[channel] / np.float32(pixels)
     gain, offset = exposure[channel, 0], exposure[channel, 1]
     first, last = hull(spans[channel], 2, y, 2 * REACH)
     here, there, out = start_of(image, channel, y), start_of(target, channel, y), start_of(g_image, channel, y)
@@ -265,12 +265,15 @@ def gradient_of_row(image, exposure, target, weights, scratch, spans, g_image, g
 
 
 @parallel_kernel
-def image_loss(image, exposure, target, target_means, target_squares, weights, scratch, g_image, losses, g_exposure):
-    """Loss of a rendered picture and its gradient.
+def image_loss(
+    image, exposure, target, target_means, target_squares, weights, pixels, scratch, g_image, losses, g_exposure
+):
+    """Loss of a rendered picture, or of a part of one, and its gradient.
 
     Args:
         image: [>= C, >= H, >= W] rendered planes. exposure: [C, 2] gain and offset of the camera per channel.
         target, target_means, target_squares: [C, H, W]. weights: [C] weight of each channel's mean.
+        pixels: that the mean is taken over; H W for a whole picture.
         scratch: [6, C, H + 10, stride(W)], its upper and lower 5 rows 0: three windowed quantities, their gradients.
         g_image: out [>= C, >= H, >= W] dL/dimage. losses: out [C, H, 2], each row's share of the loss and its sum
             of squared differences.
@@ -295,10 +298,10 @@ def image_loss(image, exposure, target, target_means, target_squares, weights, s
         rows = np.empty((3, pitch + 2 * PAD), np.float32)
         for y in range(first, min(height, first + BAND)):
             loss_of_row(
-                image, exposure, target, target_means, target_squares, weights, scratch, spans, rows, losses,
+                image, exposure, target, target_means, target_squares, weights, pixels, scratch, spans, rows, losses,
                 channel, y,
             )  # fmt: skip
     for task in prange(channels * bands):
         channel, first = task // bands, task % bands * BAND
         for y in range(first, min(height, first + BAND)):
-            gradient_of_row(image, exposure, target, weights, scratch, spans, g_image, g_exposure, channel, y)
+            gradient_of_row(image, exposure, target, weights, pixels, scratch, spans, g_image, g_exposure, channel, y)

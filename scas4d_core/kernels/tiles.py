@@ -119,20 +119,29 @@ def share_pairs(order, visible, counts, begins):
 
 
 @parallel_kernel
-def cover_tiles(splats, rects, order, visible, tiles_x, begins, ends, counts, firsts, pairs, covers, tile_counts):
+def cover_tiles(
+    splats, rects, order, visible, tiles_x, drawn, learnt, begins, ends, counts, firsts, pairs, covers, tile_counts
+):
     """Lists the tiles that each Gaussian's support reaches, in depth order.
 
     Args:
+        drawn: [tiles] uint64, the blocks of each tile that are drawn; the others reach nobody.
+        learnt: [N] uint8, 1 for Gaussians that have to stay within what is drawn.
         begins: [tasks] from ``share_pairs``. ends: out [tasks] int64, where each task's pairs end.
         counts: in: tiles of each Gaussian's box; out: tiles reached. firsts: out [N] int64, each one's first pair; the
             others follow it.
         pairs: out [pairs, 2] int32, Gaussian and tile. covers: out [pairs] uint64, blocks of the tile, see ``cover``.
         tile_counts: out [tasks, tiles] int32.
+
+    Returns:
+        How many times one of these reached a tile outside of what is drawn.
     """
     tasks = begins.shape[0]
+    left = np.zeros(tasks, np.int64)
     for task in prange(tasks):
         tile_counts[task] = 0
         pair = begins[task]
+        outside = 0
         for k in range(visible * task // tasks, visible * (task + 1) // tasks):
             i = order[k]
             ahead = order[min(k + AHEAD, visible - 1)]
@@ -141,8 +150,12 @@ def cover_tiles(splats, rects, order, visible, tiles_x, begins, ends, counts, fi
             firsts[i] = pair
             for tile_y in range(rects[i, 1], rects[i, 3]):
                 for tile_x in range(rects[i, 0], rects[i, 2]):
-                    blocks = cover(splats[i], tile_x, tile_y)
                     tile = tile_y * tiles_x + tile_x
+                    if drawn[tile] == 0 and learnt[i] == 0:
+                        continue
+                    blocks = cover(splats[i], tile_x, tile_y)
+                    outside += np.int64(learnt[i] != 0 and (blocks & ~drawn[tile]) != 0)
+                    blocks &= drawn[tile]
                     # Written in any case, kept if reached: without a branch that the processor could mispredict.
                     reached = np.int64(blocks != 0)
                     pairs[pair, 0] = i
@@ -152,6 +165,37 @@ def cover_tiles(splats, rects, order, visible, tiles_x, begins, ends, counts, fi
                     pair += reached
             counts[i] = pair - firsts[i]
         ends[task] = pair
+        left[task] = outside
+    return left.sum()
+
+
+@kernel
+def mark_blocks(splats, rects, tiles_x, marks):
+    """Marks the blocks that the supports of Gaussians meet.
+
+    Args:
+        splats, rects: of ``projection.project``. marks: [tiles] uint64, added to.
+    """
+    for i in range(rects.shape[0]):
+        for tile_y in range(rects[i, 1], rects[i, 3]):
+            for tile_x in range(rects[i, 0], rects[i, 2]):
+                marks[tile_y * tiles_x + tile_x] |= cover(splats[i], tile_x, tile_y)
+
+
+@kernel
+def find_meeting(splats, rects, tiles_x, drawn, meets):
+    """Finds the Gaussians whose support meets a block that is drawn.
+
+    Args:
+        drawn: [tiles] uint64. meets: out [N] bool.
+    """
+    for i in range(rects.shape[0]):
+        meets[i] = False
+        for tile_y in range(rects[i, 1], rects[i, 3]):
+            for tile_x in range(rects[i, 0], rects[i, 2]):
+                tile = tile_y * tiles_x + tile_x
+                if drawn[tile] != 0 and (cover(splats[i], tile_x, tile_y) & drawn[tile]) != 0:
+                    meets[i] = True
 
 
 @kernel

@@ -67,6 +67,18 @@ class Gradients(NamedTuple):
     screen: Array
 
 
+class Drawing(NamedTuple):
+    """The blocks of a picture that are drawn; none of the others is read or written.
+
+    Attributes:
+        blocks: [tiles] uint64, bits as of ``tiles.cover``. learnt: [N] uint8, 1 for the Gaussians that change: they
+            have to stay within (``CpuRasterizer.escaped`` tells whether one did not), and they alone get gradients.
+    """
+
+    blocks: NDArray[np.uint64]
+    learnt: NDArray[np.uint8]
+
+
 class ForwardPass(NamedTuple):
     """Inputs and buffers of a forward pass that ``backward`` reads; valid until the next forward pass."""
 
@@ -82,6 +94,7 @@ class ForwardPass(NamedTuple):
     items: NDArray[np.int32]
     slots: NDArray[np.int32]
     covers: NDArray[np.uint64]
+    learnt: NDArray[np.uint8]
     tile_order: NDArray[np.int64]
     image: Array
     rest: Array
@@ -93,6 +106,7 @@ class CpuRasterizer:
 
     Attributes:
         guards: number of times that each guard acted since the last ``reset`` of the counts.
+        escaped: whether a Gaussian that is learnt reached a block that the last forward pass did not draw.
 
     >>> from scas4d_core.gaussians import Gaussians
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
@@ -113,6 +127,7 @@ class CpuRasterizer:
     def __init__(self, limits: Limits = DEFAULT) -> None:
         self.guards = GuardCounts(*projection.ACTED, *projection.ACTED_BACKWARD)
         self.limits = np.array(limits, dtype=np.float32)
+        self.escaped = False
         self._last: ForwardPass
         self._buffers: dict[str, NDArray[Any]] = {}
         self._views: dict[str, NDArray[Any]] = {}
@@ -132,6 +147,27 @@ class CpuRasterizer:
         self._views[name] = flat[:size].reshape(shape)
         return self._views[name]
 
+    def project(
+        self, means: Array, factors: Array, opacities: Array, features: Array, camera: CameraArrays
+    ) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
+        """Projects alone; buffers, see ``projection.project``: splats [N, 16], rects [N, 4], counts [N].
+
+        Args:
+            means, factors, opacities, features, camera: as of ``forward``.
+        """
+        count = len(means)
+        # Projection writes whole groups of sixteen.
+        splats = self._buffer("splats", (count + 15, projection.SPLAT_COLUMNS))[:count]
+        rects = self._buffer("rects", (count, 4), np.int32)
+        counts = self._buffer("counts", (count,), np.int32)
+        acted = self._buffer("acted", (-(-count // projection.CHUNK), len(projection.ACTED)), np.int64)
+        projection.project(
+            means, factors, opacities, features, camera.pose, camera.lens, self.limits, splats, rects, counts, acted
+        )
+        if acted.any():
+            self.guards.add(projection.ACTED, acted)
+        return splats, rects, counts
+
     def forward(
         self,
         means: Array,
@@ -141,6 +177,7 @@ class CpuRasterizer:
         camera: CameraArrays,
         background: Array,
         depth_channel: int = -1,
+        drawing: Drawing | None = None,
     ) -> Picture:
         """Renders features and transmittance of one view.
 
@@ -151,34 +188,17 @@ class CpuRasterizer:
             background: [C] float32.
             depth_channel: a channel of ``features`` that this call fills with the depth of the centres (metres
                 along z), or −1.
+            drawing: what is drawn; None: the whole picture.
         """
         count, channels = features.shape
         width, height = camera.width, camera.height
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-        # Projection writes whole groups of sixteen.
-        splats = self._buffer("splats", (count + 15, projection.SPLAT_COLUMNS))[:count]
-        rects = self._buffer("rects", (count, 4), np.int32)
-        counts = self._buffer("counts", (count,), np.int32)
         if depth_channel >= 0:
             features[:, depth_channel] = 0
-        acted = self._buffer("acted", (-(-count // projection.CHUNK), len(projection.ACTED)), np.int64)
-        projection.project(
-            means,
-            factors,
-            opacities,
-            features,
-            camera.pose,
-            camera.lens,
-            self.limits,
-            splats,
-            rects,
-            counts,
-            acted,
-        )
-        if acted.any():
-            self.guards.add(projection.ACTED, acted)
+        splats, rects, counts = self.project(means, factors, opacities, features, camera)
         if depth_channel >= 0:
             features[:, depth_channel] = splats[:, projection.DEPTH]
+        drawing = drawing or self._whole(tiles_x * tiles_y, count)
         visible, order = tiles.depth_order(
             splats,
             counts,
@@ -196,9 +216,11 @@ class CpuRasterizer:
         pairs = self._buffer("pairs", (most, 2), np.int32)
         pair_covers = self._buffer("pair_covers", (most,), np.uint64)
         tile_counts = self._buffer("tile_counts", (tasks, tiles_x * tiles_y), np.int32)
-        tiles.cover_tiles(
-            splats, rects, order, visible, tiles_x, begins, ends, counts, firsts, pairs, pair_covers, tile_counts
-        )
+        left = tiles.cover_tiles(
+            splats, rects, order, visible, tiles_x, *drawing, begins, ends, counts, firsts, pairs, pair_covers,
+            tile_counts,
+        )  # fmt: skip
+        self.escaped = left > 0
         starts = self._buffer("starts", (tiles_x * tiles_y + 1,), np.int64)
         cursors = self._buffer("cursors", (tasks, tiles_x * tiles_y), np.int64)
         entries = tiles.tile_offsets(tile_counts, starts, cursors)
@@ -208,42 +230,24 @@ class CpuRasterizer:
         tiles.fill_tiles(begins, ends, pairs, pair_covers, cursors, items, slots, covers)
         # Heavy tiles first, dealt out in turn: the tasks end together.
         tile_order = np.argsort(starts[:-1] - starts[1:], kind="stable")
+        tile_order = tile_order[drawing.blocks[tile_order] != 0]
         image = self._buffer("image", (channels, tiles_y * TILE, tiles_x * TILE))
         rest = self._buffer("rest", (tiles_y * TILE, tiles_x * TILE))
         blend_kernels.blend(
-            splats,
-            features,
-            (0,) * (channels // blend_kernels.GROUP),
-            starts,
-            items,
-            covers,
-            tile_order,
-            tasks,
-            (width, height),
-            background,
-            self.limits,
-            image,
-            rest,
-        )
+            splats, features, (0,) * (channels // blend_kernels.GROUP), starts, items, covers, drawing.blocks,
+            tile_order, tasks, (width, height), background, self.limits, image, rest,
+        )  # fmt: skip
         self._last = ForwardPass(
-            means,
-            factors,
-            features,
-            camera,
-            depth_channel,
-            splats,
-            counts,
-            firsts,
-            starts,
-            items,
-            slots,
-            covers,
-            tile_order,
-            image,
-            rest,
-            most,
-        )
+            means, factors, features, camera, depth_channel, splats, counts, firsts, starts, items, slots, covers,
+            drawing.learnt, tile_order, image, rest, most,
+        )  # fmt: skip
         return Picture(image[:, :height, :width], rest[:height, :width])
+
+    def _whole(self, tile_count: int, count: int) -> Drawing:
+        """A drawing of every block, from which every Gaussian learns."""
+        blocks, learnt = self._buffer("blocks", (tile_count,), np.uint64), self._buffer("learnt", (count,), np.uint8)
+        blocks[:], learnt[:] = np.uint64(2**64 - 1), 1
+        return Drawing(blocks, learnt)
 
     def gradient_buffers(self) -> tuple[Array, Array]:
         """dL/dfeatures [C, rows, stride] and dL/dalpha [rows, stride] to fill before ``backward``.
@@ -280,23 +284,10 @@ class CpuRasterizer:
         count, channels = features.shape
         records = self._buffer("records", (last.pairs, blend_kernels.record_columns(channels)))
         blend_kernels.blend_backward(
-            last.splats,
-            features,
-            (0,) * (channels // blend_kernels.GROUP),
-            last.starts,
-            last.items,
-            last.slots,
-            last.covers,
-            last.tile_order,
-            threads(),
-            (last.camera.width, last.camera.height),
-            self.limits,
-            image,
-            last.rest,
-            g_image,
-            g_alpha,
-            records,
-        )
+            last.splats, features, (0,) * (channels // blend_kernels.GROUP), last.starts, last.items, last.slots,
+            last.covers, last.learnt, last.tile_order, threads(), (last.camera.width, last.camera.height), self.limits,
+            image, last.rest, g_image, g_alpha, records,
+        )  # fmt: skip
         gradients = Gradients(
             self._buffer("g_means", (count, 3)),
             self._buffer("g_factors", (count, 3, 3)),
@@ -313,7 +304,7 @@ class CpuRasterizer:
             last.camera.lens,
             self.limits,
             last.splats,
-            last.counts,
+            last.counts * last.learnt,
             last.firsts,
             records,
             last.depth_channel,

@@ -23,6 +23,7 @@ from scas4d_core.structure.hierarchy import Hierarchy
 from scas4d_core.structure.neighbours import Neighbours
 from scas4d_core.update import schedule
 from scas4d_core.update.best_state import BestState, ProbeViews
+from scas4d_core.update.changed_pixels import MOST, ChangedPixels
 from scas4d_core.update.deformation import CpuDeformation, length_bounds
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import AS_SET, REPORT, AttemptOptions, Stopwatch, UpdateResult, UpdateTrace
@@ -83,7 +84,10 @@ class FrameUpdate:
         self._hooks, self._length = Hooks(parts.parts), parts.length
         mask = mask_weight(settings, len(hierarchy.rows), int(first.present.sum()))
         limits = scene_limits(scene.near, factory.rig.radius)
-        self._picture = PictureLoss(factory, scene.background, schedule.IMAGE_WEIGHT, mask, limits=limits)
+        given = (factory, scene.background, schedule.IMAGE_WEIGHT, mask)
+        self._picture = PictureLoss(*given, limits=limits)
+        if not parts.whole and len(hierarchy.rows) <= MOST * len(first):
+            self._picture = ChangedPixels(*given, hierarchy.rows, len(first), limits)
         bounds = length_bounds(hierarchy, first)
         self._deformation = CpuDeformation(hierarchy, neighbours, bounds, settings.cluster_map, settings.covariance)
 
@@ -107,10 +111,12 @@ class FrameUpdate:
         deformation.guards.reset()
         self._picture.rasterizer.guards.reset()
         deformation.start(previous)
+        self._picture.begin(previous)
         probes = ProbeViews(self._factory, self._picture, views if options.compare else [])
         best = BestState(probes, deformation, previous, motion, seconds, settings.momentum)
         best.start(options.step)
-        work = Work(previous, deformation, self._attempted(options, cold=motion is None), views, dict(carried))
+        rates = self._attempted(options, cold=motion is None)
+        work = Work(previous, deformation, rates, views, self._picture, dict(carried))
         work.tells = self.tells
         optimizers = self._optimizers(work.rates)
         for start in self._hooks.start:
@@ -142,6 +148,7 @@ class FrameUpdate:
             if options.gate is not None and met < len(trace.first) == len(views):  # each camera was rendered once
                 trace.left_out.update(options.gate(trace.first))
                 plan.leave_out(trace.left_out)
+                work.views = [view for view in views if view.name not in trace.left_out]
                 watch.lap("judge")
             if stopping.looks(trace.iterations):
                 stopping.saw(trace.iterations, best.error(work.colours))

@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import Rig
 from scas4d_core.captures.frame import Frame
 from scas4d_core.captures.images import area_average, resize_area
+from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import SMALLEST_SQUARE
 from scas4d_core.kernels import image_loss
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Gradients
+from scas4d_core.kernels.projection import TILE
+from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Drawing, Gradients
 from scas4d_core.rasterize.limits import DEFAULT, Limits
 
 Array = NDArray[np.float32]
@@ -179,7 +181,7 @@ def view_order(count: int, iterations: int, rng: np.random.Generator) -> Sequenc
     return [int(index) for index in order]
 
 
-def _no_lap(stage: str) -> None:
+def no_lap(stage: str) -> None:
     """Nobody takes the time."""
 
 
@@ -212,6 +214,9 @@ class PictureLoss:
         self.mask_part = 0.0
         self.psnr = 0.0
 
+    def begin(self, previous: Gaussians) -> None:
+        """Takes the state that a frame starts from; here nothing hangs on it."""
+
     def evaluate(
         self,
         means: Array,
@@ -219,7 +224,7 @@ class PictureLoss:
         opacities: Array,
         features: Array,
         view: TrainingView,
-        lap: Callable[[str], None] = _no_lap,
+        lap: Callable[[str], None] = no_lap,
     ) -> Gradients:
         """Render the view, set ``image_part``, ``mask_part`` and ``psnr`` (dB), and return the gradients.
 
@@ -255,6 +260,7 @@ class PictureLoss:
             view.target,
             *view.moments,
             self._weights[:channels],
+            height * width,
             self._factory.scratch(channels, height, width),
             g_image,
             rows,
@@ -273,6 +279,39 @@ class PictureLoss:
         shown = view.exposure[:3, 0] * rendered + view.exposure[:3, 1]
         red, green, blue = (view.mean - shown).tolist()
         return red, green, blue
+
+    def residuals(
+        self,
+        means: Array,
+        factors: Array,
+        opacities: Array,
+        features: Array,
+        view: TrainingView,
+        learnt: NDArray[np.uint8],
+        pixels: NDArray[np.bool_],
+    ) -> tuple[Array, Array]:
+        """Sums over the pixels of what the view's picture has more than is rendered, and of 1, by blending weight.
+
+        Args:
+            learnt: [N] 1 for the Gaussians that the sums are wanted of.
+            pixels: [h, w] that count with what they have more; up to H, W.
+
+        Returns:
+            [N, 3] RGB in pixels' worth, without the camera's exposure, and [N] pixels' worth of all pixels.
+        """
+        height, width = view.camera.height, view.camera.width
+        blocks = np.full(-(-width // TILE) * -(-height // TILE), 2**64 - 1, np.uint64)
+        drawing = Drawing(blocks, learnt)
+        self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background, drawing=drawing)
+        g_image, g_alpha = self.rasterizer.gradient_buffers()
+        gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
+        here = (slice(None, 3), slice(min(height, len(pixels))), slice(min(width, pixels.shape[1])))
+        g_image[:3] = 0
+        g_image[here] = (view.target[here] - offset) / gain - self.rasterizer.planes[here]
+        g_image[here] *= pixels[here[1:]]
+        g_image[LABEL, :height, :width] = 1
+        found = self.rasterizer.backward(g_image, g_alpha, LABEL).features
+        return found[:, :3].copy(), found[:, LABEL].copy()
 
     def coverage(
         self,

@@ -227,7 +227,9 @@ def _pictures(rendered: Any, target: Any, size: tuple[int, int] = (40, 37), agre
         by_exposure = np.empty((3, height, 2), np.float32)
         exposure = np.tile(np.array([1, 0], np.float32), (3, 1))
         weights = np.full(3, 1 / 3, np.float32)
-        image_loss.image_loss(image, exposure, truth, means, squares, weights, scratch, gradient, rows, by_exposure)
+        image_loss.image_loss(
+            image, exposure, truth, means, squares, weights, truth[0].size, scratch, gradient, rows, by_exposure
+        )
         return BackendResult({"loss": rows[..., 0].sum(dtype=np.float64)[None]}, {"picture": gradient})
 
     def in_torch() -> BackendResult:

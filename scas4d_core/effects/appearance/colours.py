@@ -32,20 +32,28 @@ class Colours(Part):
         from scas4d_core.update import schedule  # it loads the kernels
 
         self._soft = np.float32(schedule.SOFT_COLOUR_WEIGHT / max(work.colours.size, 1))
-        by_row = np.full(self._count, work.rates.colour_standing if self.standing else 0, np.float32)
-        by_row[self._rows] = work.rates.colour if self.moving else 0
-        self._optimizer = schedule.Adam(work.colours, [1.0] * 3, work.rates, by_row=by_row)
+        if self.standing:
+            self._table, by_row = work.colours, np.full(self._count, work.rates.colour_standing, np.float32)
+            by_row[self._rows] = work.rates.colour if self.moving else 0
+        else:
+            self._table = work.colours[self._rows]
+            by_row = np.full(len(self._rows), work.rates.colour, np.float32)
+        self._optimizer = schedule.Adam(self._table, [1.0] * 3, work.rates, by_row=by_row)
         self.guards = self._optimizer.guards
 
     def loss(self, work: Work) -> float:
         """The mean absolute change."""
-        self._change: Array = work.colours - work.previous.colours
+        before = work.previous.colours if self.standing else work.previous.colours[self._rows]
+        self._change: Array = self._table - before
         return float(self._soft * np.abs(self._change).sum(dtype=np.float64)) if work.tells else 0.0
 
     def step(self, work: Work, iteration: int, planned: int) -> None:
         """Steps the colours."""
         pull: Array = self._soft * np.sign(self._change)
-        self._optimizer.step(work.gradients.features[:, :3] + pull, iteration, planned)
+        found = work.gradients.features if self.standing else work.gradients.features[self._rows]
+        self._optimizer.step(found[:, :3] + pull, iteration, planned)
+        if not self.standing:
+            work.colours[self._rows] = self._table
 
     def end(self, work: Work, state: Gaussians) -> Gaussians:
         """Θ_t has the colours of the end, where that is what is kept."""

@@ -26,12 +26,14 @@ class StandingColour(Effect):
     def join(self, builder: PartsBuilder) -> None:
         """Frees their colours."""
         builder.shared(Colours).standing = True
+        builder.whole = True
 
 
 EFFECT = StandingColour(
     name="standing_colour",
     group=Group.APPEARANCE,
-    says="The colours of what stands follow the pictures: light and shadows wander over it.",
+    says="The colours of what stands follow the pictures in every iteration; only where it is pinned on.",
     gauge="The mean absolute change of all colours is a term: what moves or a gain explains is not put into colours.",
-    cost="one step of Adam over RGB an iteration, shared with the other colours",
+    cost="whole pictures are rendered, and one step of Adam over RGB an iteration",
+    auto=True,
 )

@@ -44,7 +44,9 @@ def test_loss_and_gradients_agree_with_the_twin(height: int, width: int, shown: 
     g_image = np.full_like(image, np.nan)
     rows = np.empty((3, height, 2), np.float32)
     g_exposure = np.empty((3, height, 2), np.float32)
-    image_loss.image_loss(image, exposure, target, means, squares, weights, scratch, g_image, rows, g_exposure)
+    image_loss.image_loss(
+        image, exposure, target, means, squares, weights, target[0].size, scratch, g_image, rows, g_exposure
+    )
 
     np.testing.assert_allclose(rows[..., 0].sum(dtype=np.float64), total.item(), rtol=1e-5, atol=1e-9)
     seen = exposure[:, :1, None] * image[:3, :height, :width] + exposure[:, 1:, None]
@@ -66,6 +68,8 @@ def test_a_picture_equal_to_its_target_has_no_loss() -> None:
     g_image = np.empty_like(target)
     rows, g_exposure = np.empty((2, 1, 20, 2), np.float32)
     exposure, weights = np.array([[1.0, 0.0]], np.float32), np.ones(1, np.float32)
-    image_loss.image_loss(target, exposure, target, means, squares, weights, scratch, g_image, rows, g_exposure)
+    image_loss.image_loss(
+        target, exposure, target, means, squares, weights, target[0].size, scratch, g_image, rows, g_exposure
+    )
     assert abs(rows[..., 0].sum()) < 1e-6
     assert np.abs(g_image).max() < 1e-6

@@ -1,0 +1,144 @@
+"""Shadows and light that wander over what stands: its colours follow the pictures once a frame, in closed form.
+
+At the end of an update each standing Gaussian's colour takes steps to the mean, over the pixels of some views, of what
+the pictures have more than the render, weighted by the Gaussian's share of each pixel: SIRT with ordered subsets
+(Gilbert 1972; Hudson and Larkin 1994), whose steps of 1 do not overshoot, because the shares of a pixel add up to at
+most 1. Only pixels count that look other than in frame 0: what frame 0 could not fit is none of the shadows' business.
+The kernels are those of the rasterizer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.evidence import Evidence
+from scas4d_core.effects.parts import Array, Arrays, Part, PartsBuilder, Work
+from scas4d_core.frame_outcome import Candidate
+from scas4d_core.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from scas4d_core.effects.evidence import Seen
+    from scas4d_core.update.picture_loss import PictureLoss, TrainingView
+
+NAME = "shadows"
+SUBSETS = 4
+"""Steps a frame, each from as many of the views as the others."""
+FEW = 1.0
+"""Pixels' worth of blending weight that is added to each Gaussian's: what is hardly seen stays as it is."""
+SIDE = 8
+"""Pixels of the side of the squares whose mean colours are compared with frame 0's: their noise is small."""
+CHANGED = 0.02
+"""Difference of a mean colour, RGB in 0…1, from which a square looks other than in frame 0."""
+HARDLY = 0.005
+"""Share of the squares of what stands up to which nothing is learnt from a picture."""
+STANDS = 0.05
+"""Share of Gaussians that stand, below which there is nothing for shadows to wander over."""
+
+
+class ShadowsPart(Part):
+    """Steps the colours of what stands at the end of an update."""
+
+    def __init__(self, builder: PartsBuilder) -> None:
+        self._stands = np.ones(len(builder.first), np.uint8)
+        self._stands[builder.hierarchy.rows] = 0
+
+    def end(self, work: Work, state: Gaussians) -> Gaussians:
+        """Steps them, where the end of the update is what is kept."""
+        if work.kept is not Candidate.END or not self._stands.any():
+            return state
+        before: Arrays = work.carried.get(NAME, {})
+        known = [view for view in work.views if view.name in before]
+        compared = [(view, *_compared(before[view.name], view, state, work.picture)) for view in known]
+        changed = [(view, one) for view, one, stands in compared if (one & stands).sum() > HARDLY * stands.sum()]
+        for first in range(min(SUBSETS, len(changed))):
+            features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
+            sums, weights = np.zeros((len(features), 3)), np.full(len(features), FEW)
+            for view, squares in changed[first::SUBSETS]:
+                more, seen = work.picture.residuals(
+                    state.means, state.factors, state.opacities, features, view, self._stands,
+                    np.repeat(np.repeat(squares, SIDE, 0), SIDE, 1),
+                )  # fmt: skip
+                sums += more
+                weights += seen
+            step: Array = (sums / weights[:, None]).astype(np.float32)
+            state = state.replace(colours=state.colours + step)
+        return state
+
+
+@dataclass(frozen=True)
+class Shadows(Effect):
+    """A closed-form step of the colours of what stands."""
+
+    def began(self, seen: Seen) -> Arrays | None:
+        """[h, w, 4] float16 of each view: mean colours of squares, and 1 where what moves reaches."""
+        state = seen.result.gaussians
+        if not (~state.moving).mean() >= STANDS:
+            return None
+        found = {}
+        for view in seen.views:
+            hidden = _hidden(view, state, seen.picture)[..., None]
+            found[view.name] = np.concatenate([_means(view), hidden], axis=-1).astype(np.float16)
+        return found
+
+    def evidence(self, seen: Seen) -> Evidence | None:
+        """Share of what stands, seen in frame 0 and now, that looks other than then."""
+        before: Arrays = seen.result.carried.get(NAME, {})
+        changed = compared = 0
+        for view in seen.views:
+            if view.name in before:
+                squares, stands = _compared(before[view.name], view, seen.result.gaussians, seen.picture)
+                changed += int((squares & stands).sum())
+                compared += int(stands.sum())
+        if compared == 0:
+            return None
+        share = changed / compared
+        return Evidence(share, f"{100 * share:.0f} % of what stands looks other than in frame 0")
+
+    def join(self, builder: PartsBuilder) -> None:
+        """Adds the part."""
+        builder.parts.append(ShadowsPart(builder))
+
+
+def _means(view: TrainingView) -> Array:
+    """[h, w, 3] mean colours of the picture's whole squares, without the camera's exposure."""
+    height, width = view.target.shape[1] // SIDE, view.target.shape[2] // SIDE
+    part = view.target[:3, : height * SIDE, : width * SIDE].reshape(3, height, SIDE, width, SIDE)
+    gain, offset = view.exposure[:3, 0, None, None], view.exposure[:3, 1, None, None]
+    return np.ascontiguousarray(np.moveaxis((part.mean(axis=(2, 4)) - offset) / gain, 0, -1))
+
+
+def _compared(
+    before: NDArray[Any], view: TrainingView, state: Gaussians, picture: PictureLoss
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """[h, w] squares that look other than before, and those that what moves reaches neither then nor now."""
+    changed: NDArray[np.bool_] = np.abs(_means(view) - before[..., :3].astype(np.float32)).max(axis=-1) >= CHANGED
+    return changed, (before[..., 3] == 0) & ~_hidden(view, state, picture)
+
+
+def _hidden(view: TrainingView, state: Gaussians, picture: PictureLoss) -> NDArray[np.bool_]:
+    """[h, w] squares that what moves reaches."""
+    from scas4d_core.update.changed_pixels import BLOCK, as_grid, reached  # it loads the kernels
+
+    given = (state.means, state.factors, state.opacities, np.zeros((len(state), 4), np.float32))
+    blocks = reached(picture.rasterizer, given, np.flatnonzero(state.moving), view.camera)
+    height, width, each = view.target.shape[1] // SIDE, view.target.shape[2] // SIDE, SIDE // BLOCK
+    grid = as_grid(blocks, view.camera)[: height * each, : width * each]
+    return np.asarray(grid.reshape(height, each, width, each).any(axis=(1, 3)))
+
+
+EFFECT = Shadows(
+    name=NAME,
+    group=Group.APPEARANCE,
+    says="Shadows and light wander over what stands: its colours follow the pictures once a frame.",
+    gauge="It is of what stands, where that looks other than in frame 0; gains of cameras are taken out before.",
+    cost="one render of each view and its backward, a frame",
+    auto=True,
+    at_first=True,
+    on_above=0.02,
+    off_below=0.005,
+)

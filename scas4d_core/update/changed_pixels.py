@@ -1,0 +1,301 @@
+"""The picture loss of the pixels that moving Gaussians reach, where what stands is not learnt: the rest stays as it is.
+
+What moves changes the blocks (4×4 pixels) that its supports meet. There, the moving Gaussians and those of the standing
+that meet these blocks are drawn, in the order of the whole picture, so that each pixel and each gradient has the bits
+that it has there. All other pixels show what stands alone: they were rendered once, when that last changed. The image
+loss is computed in the box around the changed blocks; that of the rest is a number a frame and view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import log10
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.guards import SMALLEST_SQUARE
+from scas4d_core.kernels import image_loss, tiles
+from scas4d_core.kernels.projection import TILE
+from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Drawing, Gradients
+from scas4d_core.rasterize.limits import DEFAULT, Limits
+from scas4d_core.update.picture_loss import LABEL, PictureLoss, TrainingView, ViewFactory, means, no_lap
+
+Array = NDArray[np.float32]
+State = tuple[Array, Array, Array, Array]
+
+BLOCK = 4
+"""Pixels of a block's side."""
+MARGIN = 2
+"""Blocks by which what is drawn reaches further than what moves at the start: it will move on."""
+REACH = 2 * image_loss.REACH
+"""Pixels around what is drawn that its gradient depends on: a window of SSIM has windows of pixels."""
+ROOMY = 2.0
+"""Drawn blocks for each that is reached, above which a region of the frame before is made anew."""
+MOST = 0.6
+"""Share of moving Gaussians above which whole pictures are cheaper: little of them stands."""
+
+
+@dataclass(eq=False)
+class Region:
+    """That which is drawn of one camera's pictures.
+
+    Attributes:
+        blocks: [tiles] uint64. rows: [R] int64, the Gaussians drawn, ascending. learnt: [R] uint8, 1 for the moving.
+        box: rows and columns of the picture that hold the blocks and ``REACH`` around. shown: [h, w] bool, the box's
+            pixels that are drawn.
+        view: whose pictures the following belong to; None: nobody's yet.
+        target: [C, h, w], moments: twice the same, of the view in the box. rest: image loss, mask loss and squared
+            error of the view outside of the box.
+    """
+
+    blocks: NDArray[np.uint64]
+    rows: NDArray[np.int64]
+    learnt: NDArray[np.uint8]
+    box: tuple[slice, slice]
+    shown: NDArray[np.bool_]
+    view: TrainingView | None = None
+    target: Array = field(default_factory=lambda: np.empty((0, 0, 0), np.float32))
+    moments: tuple[Array, Array] = ()  # type: ignore[assignment]
+    rest: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+
+
+class ChangedPixels(PictureLoss):
+    """A ``PictureLoss`` for states in which nothing but the moving Gaussians changes while ``begin`` is not called.
+
+    The gradients of standing Gaussians are 0.
+
+    Args:
+        moving: [M] int64 rows that move. count: N. The others are those of ``PictureLoss``.
+    """
+
+    def __init__(
+        self,
+        factory: ViewFactory,
+        background: tuple[float, float, float],
+        image_weight: float,
+        mask_weight: float,
+        moving: NDArray[np.int64],
+        count: int,
+        limits: Limits = DEFAULT,
+    ) -> None:
+        super().__init__(factory, background, image_weight, mask_weight, limits=limits)
+        self._moving = np.sort(moving)
+        self._moves = np.zeros(count, bool)
+        self._moves[moving] = True
+        self._standing = np.flatnonzero(~self._moves)
+        self._stood: State | None = None
+        self._bases: dict[tuple[str, int, int], Array] = {}
+        self._regions: dict[tuple[str, int, int], Region] = {}
+        self._gradients: Gradients | None = None
+        self._scratch = np.empty(0, np.float32)
+        self._shown_mean = np.zeros(3)
+
+    def begin(self, previous: Gaussians) -> None:
+        """Takes the state that a frame starts from; what stood otherwise before is rendered anew."""
+        features = np.concatenate([previous.colours, previous.foreground[:, None]], axis=1)
+        state = taken((previous.means, previous.factors, previous.opacities, features), self._standing)
+        if self._stood is None or not all(map(np.array_equal, state, self._stood)):
+            self._bases.clear()
+            self._regions.clear()
+            self._stood = state
+
+    def evaluate(
+        self,
+        means: Array,
+        factors: Array,
+        opacities: Array,
+        features: Array,
+        view: TrainingView,
+        lap: Callable[[str], None] = no_lap,
+    ) -> Gradients:
+        """Renders what changed; sets the losses and ``psnr`` of the whole picture; see ``PictureLoss``."""
+        region = self._drawn((means, factors, opacities, features), view)
+        lap("render")
+        self._compare_box(region, view)
+        lap("picture loss")
+        found = self.rasterizer.backward(*self.rasterizer.gradient_buffers(), self._detached)
+        if self._gradients is None or self._gradients.features.shape != features.shape:
+            shapes = (means.shape, factors.shape, opacities.shape, features.shape, (len(means), 2))
+            self._gradients = Gradients(*(np.zeros(shape, np.float32) for shape in shapes))
+        moves = np.flatnonzero(region.learnt)
+        for whole, part in zip(self._gradients, found, strict=True):
+            whole[self._moving] = part[moves]
+        lap("render backward")
+        return self._gradients
+
+    def measure(self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView) -> None:
+        """As ``evaluate``, without gradients."""
+        region = self._drawn((means, factors, opacities, features), view)
+        self._compare_box(region, view)
+
+    def colour_shift(self, view: TrainingView) -> tuple[float, float, float]:
+        """See ``PictureLoss``."""
+        shown = view.exposure[:3, 0] * self._shown_mean + view.exposure[:3, 1]
+        red, green, blue = (view.mean - shown).tolist()
+        return red, green, blue
+
+    def _drawn(self, state: State, view: TrainingView) -> Region:
+        """Renders the region of a view; widens it until it holds all that moves."""
+        key = (view.name, view.camera.width, view.camera.height)
+        region = self._regions.get(key)
+        if region is None or region.view is not view:
+            region = self._regions[key] = self._region(state, view, region)
+        while True:
+            part = taken(state, region.rows)
+            self.rasterizer.forward(*part, view.camera, self._background, drawing=Drawing(region.blocks, region.learnt))
+            if not self.rasterizer.escaped:
+                return region
+            region = self._regions[key] = self._made(self._marks(state, view.camera) | region.blocks, view)
+
+    def _region(self, state: State, view: TrainingView, before: Region | None) -> Region:
+        """The region of a view at the start of its frame: that of the frame before where it serves."""
+        marks = self._marks(state, view.camera)
+        if before is not None and not (marks & ~before.blocks).any():
+            reached = np.bitwise_count(_widened(marks, view.camera)).sum()
+            if np.bitwise_count(before.blocks).sum() <= ROOMY * reached:
+                self._follow(before, view)
+                return before
+        return self._made(marks, view)
+
+    def _marks(self, state: State, camera: CameraArrays) -> NDArray[np.uint64]:
+        return reached(self.rasterizer, state, self._moving, camera)
+
+    def _made(self, marks: NDArray[np.uint64], view: TrainingView) -> Region:
+        """A region around marks, with those of the standing Gaussians that meet it."""
+        assert self._stood is not None
+        blocks, camera = _widened(marks, view.camera), view.camera
+        splats, rects, _ = self.rasterizer.project(*self._stood, camera)
+        meets = np.empty(len(self._standing), bool)
+        tiles.find_meeting(splats, rects, _tiles(camera)[0], blocks, meets)
+        rows = np.sort(np.concatenate([self._moving, self._standing[meets]]))
+        shown = np.repeat(np.repeat(as_grid(blocks, camera), BLOCK, 0), BLOCK, 1)[: camera.height, : camera.width]
+        box = _box(shown)
+        region = Region(blocks, rows, self._moves[rows].astype(np.uint8), box, np.ascontiguousarray(shown[box]))
+        self._follow(region, view)
+        return region
+
+    def _follow(self, region: Region, view: TrainingView) -> None:
+        """Takes the pictures of a view: its box, and what the rest of the picture adds to the losses."""
+        base = self._base(view)
+        where = (slice(None), *region.box)
+        region.view, region.target = view, np.ascontiguousarray(view.target[where])
+        region.moments = (np.ascontiguousarray(view.moments[0][where]), np.ascontiguousarray(view.moments[1][where]))
+        whole = self._losses(base, view, view.target, view.moments, np.empty_like(base))
+        part = np.ascontiguousarray(base[where])
+        region.rest = whole - self._losses(part, view, region.target, region.moments, np.empty_like(part))
+
+    def _base(self, view: TrainingView) -> Array:
+        """[4, H, W] of what stands alone."""
+        key = (view.name, view.camera.width, view.camera.height)
+        if key not in self._bases:
+            assert self._stood is not None
+            picture = self.rasterizer.forward(*self._stood, view.camera, self._background)
+            self._bases[key] = picture.features.copy()
+        return self._bases[key]
+
+    def _compare_box(self, region: Region, view: TrainingView) -> None:
+        """Fills the losses of what was rendered, and the gradient of what is drawn."""
+        where = (slice(None), *region.box)
+        base, planes = self._base(view)[where], self.rasterizer.planes[where]
+        part = np.where(region.shown, planes, base)
+        g_part = np.empty_like(part)
+        sums = region.rest + self._losses(part, view, region.target, region.moments, g_part)
+        g_image, _ = self.rasterizer.gradient_buffers()
+        g_image[where] = g_part
+        self.image_part, self.mask_part = float(sums[0]), float(sums[1])
+        pixels = view.camera.height * view.camera.width
+        self.psnr = 10 * log10(3 * pixels / max(float(sums[2]), SMALLEST_SQUARE))
+        self._shown_mean = means(self._base(view)[:3]) + (part[:3] - base[:3]).sum(axis=(1, 2)) / pixels
+
+    def _losses(
+        self, planes: Array, view: TrainingView, target: Array, moments: tuple[Array, Array], gradient: Array
+    ) -> NDArray[np.float64]:
+        """Image loss, mask loss and squared error of a part of a view's picture; its gradient is filled."""
+        channels, height, width = target.shape
+        rows, g_exposure = np.empty((channels, height, 2), np.float32), np.empty((channels, height, 2), np.float32)
+        image_loss.image_loss(
+            planes, view.exposure, target, *moments, self._weights[:channels], view.camera.height * view.camera.width,
+            self._cleared(channels, height, width), gradient, rows, g_exposure,
+        )  # fmt: skip
+        gradient[channels:] = 0
+        sums = rows.sum(axis=1, dtype=np.float64)
+        return np.array([sums[:3, 0].sum(), sums[LABEL:, 0].sum(), sums[:3, 1].sum()])
+
+    def _cleared(self, channels: int, height: int, width: int) -> Array:
+        """Scratch of the image loss for a box, its border 0."""
+        shape = (6, channels, height + 2 * image_loss.REACH, image_loss.stride(width))
+        size = int(np.prod(shape))
+        if self._scratch.size < size:
+            self._scratch = np.empty(size + size // 4, np.float32)
+        scratch: Array = self._scratch[:size].reshape(shape)
+        scratch[:, :, : image_loss.REACH] = 0
+        scratch[:, :, -image_loss.REACH :] = 0
+        return scratch
+
+
+def taken(state: State, rows: NDArray[np.int64]) -> State:
+    """The rows of a state's arrays."""
+    one, two, three, four = (np.take(array, rows, axis=0) for array in state)
+    return one, two, three, four
+
+
+def reached(
+    rasterizer: CpuRasterizer, state: State, rows: NDArray[np.int64], camera: CameraArrays
+) -> NDArray[np.uint64]:
+    """[tiles] blocks of a picture that the supports of some Gaussians meet."""
+    splats, rects, _ = rasterizer.project(*taken(state, rows), camera)
+    tiles_x, tiles_y = _tiles(camera)
+    marks = np.zeros(tiles_x * tiles_y, np.uint64)
+    tiles.mark_blocks(splats, rects, tiles_x, marks)
+    return marks
+
+
+def _tiles(camera: CameraArrays) -> tuple[int, int]:
+    """Columns and rows of tiles."""
+    return -(-camera.width // TILE), -(-camera.height // TILE)
+
+
+def as_grid(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bool_]:
+    """[rows, columns] of blocks, from bits 8 x + y of each tile."""
+    tiles_x, tiles_y = _tiles(camera)
+    side = TILE // BLOCK
+    bits = np.unpackbits(blocks.astype("<u8").view(np.uint8).reshape(-1, 8), axis=1, bitorder="little")
+    grid = bits.reshape(tiles_y, tiles_x, side, side).transpose(0, 3, 1, 2)
+    return grid.reshape(tiles_y * side, tiles_x * side).astype(bool)
+
+
+def _as_blocks(grid: NDArray[np.bool_], camera: CameraArrays) -> NDArray[np.uint64]:
+    """[tiles] bits, from a grid of blocks."""
+    tiles_x, tiles_y = _tiles(camera)
+    side = TILE // BLOCK
+    bits = grid.reshape(tiles_y, side, tiles_x, side).transpose(0, 2, 3, 1).reshape(-1, side * side)
+    packed = np.packbits(bits, axis=1, bitorder="little")
+    return np.ascontiguousarray(packed).view("<u8").reshape(-1).astype(np.uint64)
+
+
+def _widened(marks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.uint64]:
+    """The marks and ``MARGIN`` blocks around them."""
+    grid = as_grid(marks, camera)
+    for _ in range(MARGIN):
+        wider = grid.copy()
+        wider[1:] |= grid[:-1]
+        wider[:-1] |= grid[1:]
+        grid = wider.copy()
+        grid[:, 1:] |= wider[:, :-1]
+        grid[:, :-1] |= wider[:, 1:]
+    return _as_blocks(grid, camera)
+
+
+def _box(shown: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Smallest box around what is shown, with ``REACH`` pixels around; of nothing a corner."""
+    rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
+    if len(rows) == 0:
+        return slice(0, 1), slice(0, 1)
+    height, width = shown.shape
+    return (
+        slice(max(0, rows[0] - REACH), min(height, rows[-1] + 1 + REACH)),
+        slice(max(0, columns[0] - REACH), min(width, columns[-1] + 1 + REACH)),
+    )
