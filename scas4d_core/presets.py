@@ -99,8 +99,8 @@ def preset(name: str, *changes: Mapping[str, Any]) -> Settings:
         settings = Settings.model_validate(values)
     except ValidationError as error:
         raise _setting_error(error) from None
-    for name, fault, remedy in contradictions(settings):
-        raise SettingError(f"effects.{name}", "on", fault, remedy)
+    for name, mode, fault, remedy in contradictions(settings):
+        raise SettingError(f"effects.{name}", mode, fault, remedy)
     return settings
 
 

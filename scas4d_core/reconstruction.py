@@ -37,7 +37,7 @@ from scas4d_core.torch_backend.device import require_device
 from scas4d_core.update.frame_update import Updater
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import REPORT, Stopwatch
-from scas4d_core.update.schedule import TimeBudget, mask_weight
+from scas4d_core.update.schedule import TimeBudget
 
 __all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "ResumePoint", "StepError", "View"]
 
@@ -128,7 +128,7 @@ class Reconstruction(CommittedScene):
         self._fixed = FirstFrame(len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians))
         switches = first_switches(settings, frame.index)
         self._updater, structure = self._preparation.updater(result.gaussians, switches)
-        seen = () if self._fixed.masked else self._factory.views(self._factory.scaled(frame), {}, use_masks=False)
+        seen = self._factory.views(self._factory.scaled(frame), {}, use_masks=False) if self._learns_labels else ()
         load = {} if started is None else {"load": began - started}
         seconds = {**load, "fit": fitted - began, "prepare": perf_counter() - fitted}
         report = report_of_first(frame, result, self.rig.names, len(self._updater.hierarchy.rows), seconds, dropped)
@@ -244,7 +244,7 @@ class Reconstruction(CommittedScene):
         believed = [view for view in views if view.name not in left_out]
         steady = unusable is None and exposure == 1.0  # else nothing can be told from differences of the pictures
         updater, carried = self._updater, self._carried
-        if steady and carried.seen and not self._fixed.masked:
+        if steady and carried.seen and self._learns_labels:
             newest = self.history.newest
             updater, carried = self._preparation.relabelled(updater, carried, newest, self.history.first, believed)
         given = UpdateInput(
@@ -276,7 +276,7 @@ class Reconstruction(CommittedScene):
             result = replace(result, gaussians=self.history.newest, motion=carried.motion, carried=carried.effects)
         report = report_of_update(frame, result, left_out, self.rig.names, watch, dropped)
         how = {"cold": given.motion is None, "relabelled": updater is not self._updater, **(notes or {})}
-        carried = carried.after(result, past, frame.time, None if self._fixed.masked else believed, shown)
+        carried = carried.after(result, past, frame.time, believed if self._learns_labels else None, shown)
         if result.outcome.learnt:
             learnt = [view for view in believed if view.name not in result.trace.left_out]
             seen = Seen(frame.index, given.state, result, self.rig, learnt, self._picture)
@@ -286,6 +286,11 @@ class Reconstruction(CommittedScene):
         commit = solver.judging + perf_counter() - watch.began - watch.total
         self._budget.learn(result.trace.moments, result.trace.seconds, commit)
         return report
+
+    @property
+    def _learns_labels(self) -> bool:
+        """True where motion tells what moves: no masks do, and the effects ask for it."""
+        return self._preparation.parts.learns_labels and not self._fixed.masked
 
     def _seconds_to(self, frame: Frame) -> float:
         """Seconds from the last committed frame to one that comes after it."""
@@ -299,9 +304,8 @@ class Reconstruction(CommittedScene):
 
     def _views(self, frame: Frame) -> list[TrainingView]:
         """The views of a frame; without masks where no term asks for them: they are not even read."""
-        settings, moving = self.settings.update, len(self._updater.hierarchy.rows)
         try:
-            use_masks = settings.use_masks and mask_weight(settings, moving, len(self.history.newest)) > 0
+            use_masks = self._preparation.parts.mask > 0
             return self._factory.views(self._factory.scaled(frame), self._fixed.exposures, use_masks)
         except ValueError as error:
             raise StepError(str(error)) from error

@@ -54,6 +54,10 @@ class Effect:
         """Fault and remedy where it cannot be on under these settings; None: it can."""
         return None
 
+    def needed(self, settings: Settings) -> tuple[str, str] | None:
+        """Fault and remedy where these settings pin it off and nothing else does its work; None: it can be off."""
+        return None
+
     def evidence(self, seen: Seen) -> Evidence | None:
         """The evidence of a frame that calls for it; None: the frame says nothing, and the switch stays."""
         return None

@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.effects.freedom import Freedom
 from scas4d_core.structure.hierarchy import Hierarchy
 
 Array = NDArray[np.float32]
@@ -112,6 +113,26 @@ class Motion:
                 shifts[below] = rotate(turns[k][parents], shifts[below])
             shifts[k] = rotate(turns[k], shifts[k])
         return cls(turns, shifts, rest, deformation.deltas[:, 3:6].astype(np.float64), seconds)
+
+
+def predicted(motion: Motion | None, freedom: Freedom) -> Motion | None:
+    """A motion without that which is not free in the update that it starts; None: the update starts from no motion.
+
+    >>> motion = Motion([np.ones((1, 3))], [np.ones((1, 3))], np.ones((2, 3)), np.ones((2, 3)), 0.1)
+    >>> predicted(motion, Freedom(cluster_rotation=True, prediction=True)).shifts
+    [array([[0., 0., 0.]])]
+    >>> predicted(motion, Freedom(cluster_rotation=True)) is None
+    True
+    """
+    if motion is None or not freedom.prediction:
+        return None
+    return replace(
+        motion,
+        turns=motion.turns if freedom.cluster_rotation else [np.zeros_like(turns) for turns in motion.turns],
+        shifts=motion.shifts if freedom.cluster_translation else [np.zeros_like(shifts) for shifts in motion.shifts],
+        rest=motion.rest if freedom.own_position else np.zeros_like(motion.rest),
+        own_turns=motion.own_turns if freedom.own_rotation else np.zeros_like(motion.own_turns),
+    )
 
 
 def warm_start(deformation: Parameters, motion: Motion | None, seconds: float, momentum: float) -> None:
