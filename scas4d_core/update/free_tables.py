@@ -53,7 +53,8 @@ class FreeTable:
         self._table, self._gradients = table, gradients
         self._free = np.flatnonzero(columns)
         whole = len(self._free) == len(columns)
-        self._values = table if whole else table[:, self._free]
+        # A copy in rows: the kernel is compiled for these.
+        self._values = table if whole else np.take(table, self._free, axis=1)
         self._adam = Adam(self._values, [rate for rate in columns if rate], plan, start)
         self.guards: GuardCounts = self._adam.guards
 

@@ -121,6 +121,7 @@ def test_what_is_off_is_in_no_optimizer() -> None:
     assert isinstance(made, FrameUpdate)
     tables = frame_update.free_tables(made._deformation, made._rates)
     assert [table._adam._first.shape[1] for table in tables] == [3, 3, 3]
+    assert all(table._values.flags.c_contiguous for table in tables)  # else the kernel is compiled again for them
     clusters_off = updater(["own_position"])
     assert isinstance(clusters_off, FrameUpdate)
     assert len(frame_update.free_tables(clusters_off._deformation, clusters_off._rates)) == 1
