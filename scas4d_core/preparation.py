@@ -21,6 +21,7 @@ from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
 from scas4d_core.effects.effect import Effect, effect
 from scas4d_core.effects.evidence import Seen
 from scas4d_core.effects.parts import Arrays, PartsBuilder
+from scas4d_core.effects.registry import EFFECTS
 from scas4d_core.effects.switches import (
     Switch,
     Switches,
@@ -58,7 +59,12 @@ class Preparation:
 
     Args:
         factory: of its views. settings: of the scene. world: user's to inside. picture: renders.
+
+    Attributes:
+        parts: of the updater that was made last.
     """
+
+    parts: PartsBuilder
 
     def __init__(self, factory: ViewFactory, settings: Settings, world: WorldFrame, picture: PictureLoss) -> None:
         self._factory, self._settings, self._picture = factory, settings, picture
@@ -88,6 +94,9 @@ class Preparation:
         update = self._settings.update
         hierarchy = build_hierarchy(first.means, first.moving, update.clusters, SMALLEST_CLUSTER, update.seed)
         parts = joined(PartsBuilder(self._scene, update, self._factory, hierarchy, first), names_on(switches))
+        self.parts = parts
+        if not parts.freedom.clusters:  # no cascade either
+            hierarchy = hierarchy.without_layers
         tied = parts.find(NeighbourTerms) is not None
         neighbours = build_neighbours(first.means[hierarchy.rows], NEIGHBOURS, NEIGHBOUR_FALLOFF) if tied else None
         given = (self._factory, self._scene, update, hierarchy, neighbours, first, parts)
@@ -104,8 +113,9 @@ class Preparation:
         Args:
             first: the roots.
         """
-        if not carried.switches:  # that an earlier version left
-            carried = replace(carried, switches=first_switches(self._settings, 0))
+        # An earlier version left no switches, or not those of effects that are new.
+        switches = {**first_switches(self._settings, 0), **carried.switches}
+        carried = replace(carried, switches={name: switches[name] for name in EFFECTS})
         updater, structure = self.updater(labelled(first, carried.labels), carried.switches)
         same = carried.structure == structure
         return updater, carried if same else replace(carried, motion=None, structure=structure)

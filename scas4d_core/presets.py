@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from pydantic import ValidationError
 
+from scas4d_core.effects.registry import Mode
 from scas4d_core.effects.switches import contradictions
 from scas4d_core.errors import InputError
 from scas4d_core.settings import LayerRates, Settings, UpdateSettings, Weights
+
+TIES = ("rigidity", "isometry", "rotation")
+"""Effects that tie neighbours together."""
+
+
+def _pinned(on: Iterable[str] = (), off: Iterable[str] = ()) -> dict[str, Mode]:
+    """Effects as ``Settings.effects`` has them."""
+    return {**dict.fromkeys(on, "on"), **dict.fromkeys(off, "off")}
+
 
 PRESETS: dict[str, Settings] = {
     "scas4d": Settings(),
@@ -52,6 +62,13 @@ PRESETS: dict[str, Settings] = {
             weights=Weights(mask=3.0, mask_alone=3.0, isometry=2.0, scale=0.0),
         )
     ),
+    # By kind of scene: effects that are pinned, all others "auto"; no weight, no rate (figures: docs/effects.md).
+    # A new effect that a kind of scene always or never calls for is pinned here.
+    "rigid": Settings(effects=_pinned(on=TIES, off=("cluster_scaling", "own_rotation", "own_scale"))),
+    "articulated": Settings(effects=_pinned(on=("cluster_rotation", "own_position", *TIES))),
+    "cloth": Settings(effects=_pinned(on=("cluster_scaling", "isometry", "own_position"), off=("rotation",))),
+    "people": Settings(effects=_pinned(on=("motion_labels", "standing_colour", "own_position", *TIES))),
+    "lights": Settings(effects=_pinned(on=("motion_labels", "moving_colour", "standing_colour"))),
 }
 
 
@@ -99,8 +116,8 @@ def preset(name: str, *changes: Mapping[str, Any]) -> Settings:
         settings = Settings.model_validate(values)
     except ValidationError as error:
         raise _setting_error(error) from None
-    for name, fault, remedy in contradictions(settings):
-        raise SettingError(f"effects.{name}", "on", fault, remedy)
+    for name, mode, fault, remedy in contradictions(settings):
+        raise SettingError(f"effects.{name}", mode, fault, remedy)
     return settings
 
 

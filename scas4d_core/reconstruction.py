@@ -37,7 +37,7 @@ from scas4d_core.torch_backend.device import require_device
 from scas4d_core.update.frame_update import Updater
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import REPORT, Stopwatch
-from scas4d_core.update.schedule import TimeBudget, mask_weight
+from scas4d_core.update.schedule import TimeBudget
 
 __all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "ResumePoint", "StepError", "View"]
 
@@ -130,7 +130,7 @@ class Reconstruction(CommittedScene):
         self._roots = result.gaussians
         switches, effects = self._preparation.begun(self._factory.scaled(frame), result)
         self._updater, structure = self._preparation.updater(result.gaussians, switches)
-        seen = () if self._fixed.masked else self._factory.views(self._factory.scaled(frame), {}, use_masks=False)
+        seen = self._factory.views(self._factory.scaled(frame), {}, False) if self._learns_labels else ()
         load = {} if started is None else {"load": began - started}
         seconds = {**load, "fit": fitted - began, "prepare": perf_counter() - fitted}
         report = report_of_first(frame, result, self.rig.names, len(self._updater.hierarchy.rows), seconds, dropped)
@@ -247,9 +247,10 @@ class Reconstruction(CommittedScene):
         believed = [view for view in views if view.name not in left_out]
         steady = unusable is None and exposure == 1.0  # else nothing can be told from differences of the pictures
         updater, carried = self._updater, self._carried
-        if steady and carried.seen and not self._fixed.masked:
-            newest = self.history.newest
-            updater, carried = self._preparation.relabelled(updater, carried, newest, self._roots, believed)
+        if steady and carried.seen and self._learns_labels:
+            updater, carried = self._preparation.relabelled(
+                updater, carried, self.history.newest, self._roots, believed
+            )
         given = UpdateInput(
             state=self.history.newest if carried.labels is None else labelled(self.history.newest, carried.labels),
             motion=carried.motion,
@@ -257,17 +258,10 @@ class Reconstruction(CommittedScene):
             step=seconds,
             views=believed,
             suspects=[view for view in views if past.is_out(view.name)],
-            brightness=bright,
-            seed=frame.index,
-            past=past,
-            lengths=self._fixed.lengths,
-            exposure=exposure,
-            left_out=left_out,
-            unusable=unusable,
-            carried=carried.effects,
-            end=self._budget.end(watch.began),
+            brightness=bright, seed=frame.index, past=past, lengths=self._fixed.lengths, exposure=exposure,
+            left_out=left_out, unusable=unusable, carried=carried.effects, end=self._budget.end(watch.began),
             each=self._budget.each,
-        )
+        )  # fmt: skip
         solver = FrameSolver(updater, self._factory, self._picture, self._update)
         shown = fingerprints(frame.images)
         result, past = solver.run(given, repeated=shown == carried.shown and self._update.still > -1)
@@ -277,7 +271,7 @@ class Reconstruction(CommittedScene):
             updater, carried = self._updater, self._carried
             result = replace(result, gaussians=self.history.newest, motion=carried.motion, carried=carried.effects)
         how = {"cold": given.motion is None, "relabelled": updater is not self._updater, **(notes or {})}
-        carried = carried.after(result, past, frame.time, None if self._fixed.masked else believed, shown)
+        carried = carried.after(result, past, frame.time, believed if self._learns_labels else None, shown)
         roots = self._roots
         if result.outcome.learnt:
             learnt = [view for view in believed if view.name not in result.trace.left_out]
@@ -291,6 +285,11 @@ class Reconstruction(CommittedScene):
         self._budget.learn(result.trace.moments, result.trace.seconds, commit)
         return report
 
+    @property
+    def _learns_labels(self) -> bool:
+        """True where motion tells what moves: no masks do, and the effects ask for it."""
+        return self._preparation.parts.learns_labels and not self._fixed.masked
+
     def _seconds_to(self, frame: Frame) -> float:
         """Seconds from the last committed frame to one that comes after it."""
         last = self.history.indices[-1]
@@ -303,10 +302,10 @@ class Reconstruction(CommittedScene):
 
     def _views(self, frame: Frame) -> list[TrainingView]:
         """The views of a frame; without masks where no term asks for them: they are not even read."""
-        settings, moving = self.settings.update, len(self._updater.hierarchy.rows)
         try:
-            use_masks = settings.use_masks and mask_weight(settings, moving, int(self._roots.present.sum())) > 0
-            return self._factory.views(self._factory.scaled(frame), self._fixed.exposures, use_masks)
+            return self._factory.views(
+                self._factory.scaled(frame), self._fixed.exposures, self._preparation.parts.mask > 0
+            )
         except ValueError as error:
             raise StepError(str(error)) from error
 

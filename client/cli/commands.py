@@ -96,7 +96,7 @@ def push(
     capture_fps: CaptureFps = None,
     masks: Masks = True,
     encoding: Encode = Encoding.JPEG,
-    preset: Annotated[str, typer.Option(help="Preset of settings: scas4d, adaptive or dynamic3dgs.")] = "scas4d",
+    preset: Annotated[str, typer.Option(help="Preset of settings, as scas4d, adaptive or cloth.")] = "scas4d",
     changes: Annotated[
         list[str] | None,
         typer.Option(

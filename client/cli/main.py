@@ -24,7 +24,7 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, help="Online 4D re
 commands.register(app)
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture.")]
-Preset = Annotated[str, typer.Option(help="Preset of settings: scas4d, adaptive or dynamic3dgs.")]
+Preset = Annotated[str, typer.Option(help="Preset of settings, as scas4d, adaptive or cloth.")]
 Changes = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE", help="Change a setting, as update.iterations=200. May be repeated."),

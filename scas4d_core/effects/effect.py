@@ -61,6 +61,10 @@ class Effect:
         """Arrays of frame 0 that evidence or part look back to; None: none. Not asked where it is pinned off."""
         return None
 
+    def needed(self, settings: Settings) -> tuple[str, str] | None:
+        """Fault and remedy where these settings pin it off and nothing else does its work; None: it can be off."""
+        return None
+
     def evidence(self, seen: Seen) -> Evidence | None:
         """The evidence of a frame that calls for it; None: the frame says nothing, and the switch stays."""
         return None

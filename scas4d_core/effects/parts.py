@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.effects.freedom import Freedom
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import GuardCounts
@@ -115,6 +116,9 @@ class PartsBuilder:
         first: the roots, Θ_0 with all born since (``preparation``). whole: whether a part needs whole pictures: it
             changes what stands, or how a camera sees it.
         length: weight of the limit of the axes' lengths, which the cascade's kernel has in itself.
+        mask: weight of the term of masks, which the comparison of pictures has in itself. learns_labels: whether what
+            moves is learnt from motion where no masks are given.
+        freedom: the parameters of the deformation that are free.
         parts: of the effects that have joined, in order.
     """
 
@@ -125,6 +129,9 @@ class PartsBuilder:
     first: Gaussians
     whole: bool = False
     length: float = 0.0
+    mask: float = 0.0
+    learns_labels: bool = False
+    freedom: Freedom = field(default_factory=Freedom)
     parts: list[Part] = field(default_factory=list)
 
     def shared(self, kind: type[P]) -> P:

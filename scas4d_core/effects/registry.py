@@ -11,11 +11,20 @@ Mode = Literal["auto", "on", "off"]
 """Left to the evidence, pinned on, pinned off."""
 
 EFFECTS = {
+    "cluster_rotation": "scas4d_core.effects.motion.cluster_rotation",
+    "cluster_translation": "scas4d_core.effects.motion.cluster_translation",
+    "cluster_scaling": "scas4d_core.effects.motion.cluster_scaling",
+    "own_position": "scas4d_core.effects.motion.own_position",
+    "own_rotation": "scas4d_core.effects.motion.own_rotation",
+    "own_scale": "scas4d_core.effects.motion.own_scale",
+    "prediction": "scas4d_core.effects.motion.prediction",
     "rigidity": "scas4d_core.effects.coherence.rigidity",
     "isometry": "scas4d_core.effects.coherence.isometry",
     "rotation": "scas4d_core.effects.coherence.rotation",
     "axis_length": "scas4d_core.effects.coherence.axis_length",
     "floor": "scas4d_core.effects.coherence.floor",
+    "mask_term": "scas4d_core.effects.presence.mask_term",
+    "motion_labels": "scas4d_core.effects.presence.motion_labels",
     "moving_colour": "scas4d_core.effects.appearance.moving_colour",
     "standing_colour": "scas4d_core.effects.appearance.standing_colour",
     "shadows": "scas4d_core.effects.appearance.shadows",

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from scas4d_core.effects.effect import effect
-from scas4d_core.effects.registry import EFFECTS
+from scas4d_core.effects.registry import EFFECTS, Mode
 from scas4d_core.errors import InputError
 from scas4d_core.settings import Settings
 
@@ -44,11 +44,13 @@ class Switch:
 Switches = Mapping[str, Switch]
 
 
-def contradictions(settings: Settings) -> Iterator[tuple[str, str, str]]:
-    """Name, fault and remedy of each effect that is pinned on and that the settings contradict."""
+def contradictions(settings: Settings) -> Iterator[tuple[str, Mode, str, str]]:
+    """Name, mode, fault and remedy of each effect whose pin the settings contradict."""
     for name, mode in settings.effects.items():
         if mode == "on" and (refusal := effect(name).refused(settings)) is not None:
-            yield name, f"effects.{name} cannot be 'on': {refusal[0]}", f"{refusal[1]}, or leave it 'auto'"
+            yield name, mode, f"effects.{name} cannot be 'on': {refusal[0]}", f"{refusal[1]}, or leave it 'auto'"
+        if mode == "off" and (refusal := effect(name).needed(settings)) is not None:
+            yield name, mode, f"effects.{name} cannot be 'off': {refusal[0]}", refusal[1]
 
 
 def first_switches(settings: Settings, index: int) -> dict[str, Switch]:
@@ -58,14 +60,14 @@ def first_switches(settings: Settings, index: int) -> dict[str, Switch]:
         index: of the first frame.
 
     Raises:
-        InputError: an effect is pinned on that the settings contradict.
+        InputError: the settings contradict what is pinned.
 
     >>> from scas4d_core.settings import Settings
     >>> switches = first_switches(Settings.model_validate({"effects": {"rigidity": "off"}}), 0)
     >>> switches["rigidity"].on, switches["isometry"].on, switches["floor"].on  # no floor is named
     (False, True, False)
     """
-    for _, fault, remedy in contradictions(settings):
+    for _, _, fault, remedy in contradictions(settings):
         raise InputError(fault, remedy)
     found = {}
     for name in EFFECTS:

@@ -46,6 +46,11 @@ class Hierarchy:
         """Clusters per layer."""
         return tuple(len(starts) - 1 for starts in self.starts)
 
+    @property
+    def without_layers(self) -> Hierarchy:
+        """The same Gaussians in the same order, each alone."""
+        return Hierarchy(self.rows, (), (), self.left_out)
+
 
 def build_hierarchy(
     means: NDArray[Any], moving: NDArray[np.bool_], clusters: tuple[int, ...], smallest: int, seed: int = 0

@@ -30,10 +30,11 @@ from scas4d_core.torch_backend.update import TorchUpdate
 from scas4d_core.update import deformation, schedule
 from scas4d_core.update.best_state import BestState, ProbeViews
 from scas4d_core.update.deformation import CpuDeformation, first_lengths, length_bounds
+from scas4d_core.update.free_tables import freed
 from scas4d_core.update.picture_loss import LABEL, PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import AS_SET, AttemptOptions, Stopwatch, UpdateResult, UpdateTrace, camera_fit
-from scas4d_core.update.schedule import Rates, Stopping, ViewPlan, mask_weight, plan_samples
-from scas4d_core.update.warm_start import Motion
+from scas4d_core.update.schedule import Rates, Stopping, ViewPlan, plan_samples
+from scas4d_core.update.warm_start import Motion, predicted
 
 Array = NDArray[np.float32]
 
@@ -76,10 +77,10 @@ class DeviceUpdate:
         self.settings = settings
         self.hierarchy = hierarchy
         self._factory = factory
-        mask = mask_weight(settings, len(hierarchy.rows), len(first))
         limits = scene_limits(scene.near, factory.rig.radius)
-        self._picture = PictureLoss(factory, scene.background, schedule.IMAGE_WEIGHT, mask, limits=limits)
         parts = parts or joined(PartsBuilder(scene, settings, factory, hierarchy, first))
+        self._picture = PictureLoss(factory, scene.background, schedule.IMAGE_WEIGHT, parts.mask, limits=limits)
+        self._freedom = parts.freedom
         bounds = length_bounds(hierarchy, first)
         self._deformation = CpuDeformation(hierarchy, neighbours, bounds, settings.cluster_map, settings.covariance)
         self._update = TorchUpdate(
@@ -88,7 +89,7 @@ class DeviceUpdate:
             graph=_graph(neighbours, len(hierarchy.rows)),
             first_lengths=first_lengths(hierarchy, first),
             rates=_rates(Rates.of(settings, len(hierarchy.sizes), factory.rig.radius), parts),
-            weights=_weights(parts, neighbours is not None, mask),
+            weights=_weights(parts, neighbours is not None),
             terms=tuple(part.twin for part in parts.parts),
             max_scale=deformation.MAX_SCALE,
             background=scene.background,
@@ -115,7 +116,7 @@ class DeviceUpdate:
         """
         settings, hierarchy, deformation = self.settings, self.hierarchy, self._deformation
         stopping = options.stopping or Stopping(settings.iterations)
-        most = stopping.most
+        most, motion = stopping.most, predicted(motion, self._freedom)
         rng = np.random.default_rng([settings.seed, seed])
         watch, trace = Stopwatch(), UpdateTrace()
         deformation.start(previous)
@@ -186,22 +187,22 @@ def _graph(neighbours: Neighbours | None, count: int) -> Graph:
 
 
 def _rates(rates: Rates, parts: PartsBuilder) -> Rates:
-    """The rates with those of colours that no effect frees at 0."""
+    """The rates with those of parameters that no effect frees at 0: these are in no group of Adam."""
     colours = parts.find(Colours) or Colours(parts)
     return replace(
-        rates,
+        freed(rates, parts.freedom),
         colour=rates.colour if colours.moving else 0.0,
         colour_standing=rates.colour_standing if colours.standing else 0.0,
     )
 
 
-def _weights(parts: PartsBuilder, tied: bool, mask: float) -> TermWeights:
+def _weights(parts: PartsBuilder, tied: bool) -> TermWeights:
     """The weights of the terms; those between neighbours only where there are any."""
     ties = parts.find(NeighbourTerms)
     rigidity, isometry, rotation = ties.strengths if tied and ties is not None else (0.0, 0.0, 0.0)
     return TermWeights(
         image=schedule.IMAGE_WEIGHT,
-        mask=mask,
+        mask=parts.mask,
         rigidity=rigidity,
         isometry=isometry,
         rotation=rotation,

@@ -25,10 +25,11 @@ from scas4d_core.update import schedule
 from scas4d_core.update.best_state import BestState, ProbeViews
 from scas4d_core.update.changed_pixels import MOST, ChangedPixels
 from scas4d_core.update.deformation import CpuDeformation, length_bounds
+from scas4d_core.update.free_tables import free_tables, freed
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import AS_SET, REPORT, AttemptOptions, Stopwatch, UpdateResult, UpdateTrace
-from scas4d_core.update.schedule import Adam, Rates, Stopping, ViewPlan, mask_weight, plan_samples
-from scas4d_core.update.warm_start import Motion
+from scas4d_core.update.schedule import Rates, Stopping, ViewPlan, plan_samples
+from scas4d_core.update.warm_start import Motion, predicted
 
 Array = NDArray[np.float32]
 
@@ -79,12 +80,11 @@ class FrameUpdate:
         self.settings = settings
         self.hierarchy = hierarchy
         self._factory = factory
-        self._rates = Rates.of(settings, len(hierarchy.sizes), factory.rig.radius)
         parts = parts or joined(PartsBuilder(scene, settings, factory, hierarchy, first))
-        self._hooks, self._length = Hooks(parts.parts), parts.length
-        mask = mask_weight(settings, len(hierarchy.rows), int(first.present.sum()))
+        self._hooks, self._length, self._freedom = Hooks(parts.parts), parts.length, parts.freedom
+        self._rates = freed(Rates.of(settings, len(hierarchy.sizes), factory.rig.radius), parts.freedom)
         limits = scene_limits(scene.near, factory.rig.radius)
-        given = (factory, scene.background, schedule.IMAGE_WEIGHT, mask)
+        given = (factory, scene.background, schedule.IMAGE_WEIGHT, parts.mask)
         self._picture = PictureLoss(*given, limits=limits)
         if not parts.whole and len(hierarchy.rows) <= MOST * len(first):
             self._picture = ChangedPixels(*given, hierarchy.rows, len(first), limits)
@@ -103,6 +103,7 @@ class FrameUpdate:
     ) -> UpdateResult:
         """Find D_t and apply it, see ``Updater.run``."""
         settings, deformation = self.settings, self._deformation
+        motion = predicted(motion, self._freedom)
         stopping = options.stopping or Stopping(settings.iterations)
         rng = np.random.default_rng([settings.seed, seed])
         watch, trace = Stopwatch(), UpdateTrace()
@@ -118,7 +119,7 @@ class FrameUpdate:
         rates = self._attempted(options, cold=motion is None)
         work = Work(previous, deformation, rates, views, self._picture, dict(carried))
         work.tells = self.tells
-        optimizers = self._optimizers(work.rates)
+        tables = free_tables(deformation, work.rates)
         for start in self._hooks.start:
             start(work)
         if best.stands(options.enough):
@@ -136,9 +137,8 @@ class FrameUpdate:
             watch.lap("effects")
             loss += self._length * deformation.backward(work.gradients.means, work.gradients.factors, self._length)
             watch.lap("cascade backward")
-            tables = [*deformation.cluster_gradients, deformation.delta_gradients]
-            for optimizer, table in zip(optimizers, tables, strict=True):
-                optimizer.step(table, iteration, planned)
+            for table in tables:
+                table.step(iteration, planned)
             for step in self._hooks.step:
                 step(work, iteration, planned)
             watch.lap("adam")
@@ -162,7 +162,7 @@ class FrameUpdate:
             state = end(work, state)
         found = Motion.of(deformation, best.seconds)
         counts = [deformation.guards, self._picture.rasterizer.guards, *self._hooks.guards]
-        acted = summed([*counts, *(optimizer.guards for optimizer in optimizers)])
+        acted = summed([*counts, *(table.guards for table in tables)])
         trace.guards = {name: count for name, count in acted.items() if count}
         watch.lap("commit")
         trace.seconds = watch.seconds
@@ -172,15 +172,6 @@ class FrameUpdate:
         """The rates of an attempt; without a motion to start from there is further to go."""
         rates = self._rates.tried(options.rates, options.rigid, options.hold_colours)
         return rates.hurried(self.settings.cold_start if cold else 1.0)
-
-    def _optimizers(self, rates: Rates) -> list[Adam]:
-        """One per table: each layer of clusters, the Gaussians' own deltas. Moments start at zero."""
-        deformation = self._deformation
-        columns = [[r] * 3 + [t] * 3 + [scaling] * 4 for r, t, scaling in rates.layers]
-        columns.append([rates.position] * 3 + [rates.rotation] * 3 + [rates.scale] * 3)
-        starts = [rates.start_of(layer) for layer in range(len(rates.layers))] + [rates.start]
-        tables = [*deformation.clusters, deformation.deltas]
-        return [Adam(table, given, rates, start) for table, given, start in zip(tables, columns, starts, strict=True)]
 
     def _pictures(self, views: list[TrainingView], work: Work, trace: UpdateTrace, watch: Stopwatch) -> float:
         """Image and mask loss, the mean over the views; ``work`` gets the gradients, of a single view the buffers."""

@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.effects.freedom import Freedom
 from scas4d_core.gaussians import Gaussians, quaternion_products
 from scas4d_core.structure.hierarchy import Hierarchy
 
@@ -147,6 +148,26 @@ def _averages(values: Float, labels: NDArray[np.int32], chosen: NDArray[np.bool_
     sums = np.stack([np.bincount(own, weights=column, minlength=count) for column in values[chosen].T], axis=1)
     means: Float = sums / np.maximum(np.bincount(own, minlength=count), 1)[:, None]
     return means
+
+
+def predicted(motion: Motion | None, freedom: Freedom) -> Motion | None:
+    """A motion without that which is not free in the update that it starts; None: the update starts from no motion.
+
+    >>> motion = Motion([np.ones((1, 3))], [np.ones((1, 3))], np.ones((2, 3)), np.ones((2, 3)), 0.1)
+    >>> predicted(motion, Freedom(cluster_rotation=True, prediction=True)).shifts
+    [array([[0., 0., 0.]])]
+    >>> predicted(motion, Freedom(cluster_rotation=True)) is None
+    True
+    """
+    if motion is None or not freedom.prediction:
+        return None
+    return replace(
+        motion,
+        turns=motion.turns if freedom.cluster_rotation else [np.zeros_like(turns) for turns in motion.turns],
+        shifts=motion.shifts if freedom.cluster_translation else [np.zeros_like(shifts) for shifts in motion.shifts],
+        rest=motion.rest if freedom.own_position else np.zeros_like(motion.rest),
+        own_turns=motion.own_turns if freedom.own_rotation else np.zeros_like(motion.own_turns),
+    )
 
 
 def warm_start(deformation: Parameters, motion: Motion | None, seconds: float, momentum: float) -> None:

@@ -82,7 +82,7 @@ AXES: Mapping[str, tuple[Variant, ...]] = {
     "adaptive": tuple(
         Variant(f"{name} {PRESETS[name].update.iterations}", name, PRESETS[name].update.iterations)
         for name in PRESETS
-        if name not in METHODS
+        if name not in METHODS and not PRESETS[name].effects  # those by kind of scene have a figure in docs/effects.md
     ),
     "layers": (
         _changed("K=1: 64", "update.clusters", [64]),

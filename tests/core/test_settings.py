@@ -12,6 +12,7 @@ import pytest
 from pydantic import BaseModel, ValidationError
 
 from scas4d_core import settings as module
+from scas4d_core.effects.switches import contradictions
 from scas4d_core.presets import PRESETS, SettingError, preset
 from scas4d_core.settings import Settings, UpdateSettings, Weights
 
@@ -51,6 +52,25 @@ def test_presets_are_what_they_are_called() -> None:
     assert preset("scas4d").update.clusters == (64, 320, 1280)
     assert preset("dynamic3dgs").update.clusters == ()
     assert set(PRESETS) >= {"scas4d", "dynamic3dgs"}
+
+
+KINDS = ("rigid", "articulated", "cloth", "people", "lights")
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_preset_of_a_kind_of_scene_pins_effects_and_nothing_else(name: str) -> None:
+    found = preset(name)
+    assert found.effects
+    assert found.model_copy(update={"effects": {}}) == Settings()
+    assert list(contradictions(found)) == []
+    assert preset(name, {"effects": dict.fromkeys(found.effects, "auto")}).effects == dict.fromkeys(
+        found.effects, "auto"
+    )
+
+
+def test_what_contradicts_a_preset_is_refused() -> None:
+    with pytest.raises(SettingError, match=r"effects\.rotation='on': .* update\.weights\.rotation is 0"):
+        preset("rigid", {"update": {"weights": {"rotation": 0}}})
 
 
 def test_an_unknown_preset_names_those_there_are() -> None:

@@ -21,7 +21,6 @@ from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours
 from scas4d_core.torch_backend import arrays
 from scas4d_core.torch_backend import update as update_torch
-from scas4d_core.update import frame_update as update_module
 from scas4d_core.update import schedule
 from scas4d_core.update.deformation import MAX_SCALE, CpuDeformation
 from scas4d_core.update.frame_update import FrameUpdate
@@ -189,7 +188,7 @@ class Iteration:
             self.sample = sample.copy()
             return neighbour_losses(deformation, sample, *given)
 
-        monkeypatch.setattr(update_module.Adam, "step", step)
+        monkeypatch.setattr(Adam, "step", step)
         monkeypatch.setattr(PictureLoss, "evaluate", rendered)
         monkeypatch.setattr(CpuDeformation, "neighbour_losses", looked_at)
         self.loss = updater.run(BEFORE, views, None, 1.0, seed=9).trace.losses[1]

@@ -1,0 +1,14 @@
+"""Δp of each Gaussian (paper, equation 7). Kernel: ``kernels.deltas``; twin: ``torch_backend.deformation``."""
+
+from __future__ import annotations
+
+from scas4d_core.effects.effect import Group
+from scas4d_core.effects.motion.free_columns import FreeColumns
+
+EFFECT = FreeColumns(
+    name="own_position",
+    group=Group.MOTION,
+    says="Each Gaussian may leave the place that its clusters give it.",
+    gauge="It begins once all layers of clusters have begun, at a small rate: it finds what they leave.",
+    cost="a third of the step of Adam over 9 numbers of each moving Gaussian an iteration",
+)

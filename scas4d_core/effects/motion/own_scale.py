@@ -1,0 +1,32 @@
+"""Δs of each Gaussian (paper, equation 7). Kernel: ``kernels.deltas``; twin: ``torch_backend.deformation``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from scas4d_core.effects.effect import Group
+from scas4d_core.effects.motion.free_columns import FreeColumns
+
+if TYPE_CHECKING:
+    from scas4d_core.settings import Settings
+
+
+@dataclass(frozen=True)
+class OwnScale(FreeColumns):
+    """Δs, at the rate ``rate_scale``."""
+
+    def refused(self, settings: Settings) -> tuple[str, str] | None:
+        """Refused with a rate of 0."""
+        if settings.update.rate_scale > 0:
+            return None
+        return "update.rate_scale is 0", "give it a rate above 0"
+
+
+EFFECT = OwnScale(
+    name="own_scale",
+    group=Group.MOTION,
+    says="Each Gaussian's axes may grow and shrink.",
+    gauge="The limit of the axes' lengths; it begins once all layers of clusters have begun.",
+    cost="a third of the step of Adam over 9 numbers of each moving Gaussian an iteration",
+)

@@ -1,0 +1,44 @@
+"""Prediction from the frame before: an update starts from the motion going on (paper, Optimization Pipeline).
+
+The motion is carried on by ``update.warm_start``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.parts import PartsBuilder
+
+if TYPE_CHECKING:
+    from scas4d_core.settings import Settings
+
+CLUSTERS = ("cluster_rotation", "cluster_translation")
+OWN = ("own_position", "own_rotation")
+"""The effects whose parameters are carried on; those of Gaussians by the share ``update.momentum``."""
+
+
+@dataclass(frozen=True)
+class Prediction(Effect):
+    """The motion before as the start."""
+
+    def refused(self, settings: Settings) -> tuple[str, str] | None:
+        """Refused where all that it carries on is pinned off."""
+        carried = CLUSTERS if settings.update.momentum == 0 else CLUSTERS + OWN
+        if any(settings.effects.get(name) != "off" for name in carried):
+            return None
+        return f"{' and '.join(carried)} are 'off'", "leave one of them 'auto'"
+
+    def join(self, builder: PartsBuilder) -> None:
+        """Lets the update start from the motion before."""
+        builder.freedom = replace(builder.freedom, prediction=True)
+
+
+EFFECT = Prediction(
+    name="prediction",
+    group=Group.MOTION,
+    says="Motion goes on: an update starts where the motion of the frame before leads, if that shows the frame better.",
+    gauge="The start alone: the pictures decide where the update ends.",
+    cost="one comparison of small pictures of four views before each update",
+)

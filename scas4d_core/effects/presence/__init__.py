@@ -1,0 +1,1 @@
+"""Effects on what is there: what moves and what stands, what enters and what leaves."""

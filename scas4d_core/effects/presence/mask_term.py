@@ -1,0 +1,41 @@
+"""The mask term: rendered labels look like the masks. Kernel: ``kernels.image_loss``; twin: ``losses.image_loss``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.parts import PartsBuilder
+
+if TYPE_CHECKING:
+    from scas4d_core.settings import Settings
+
+
+@dataclass(frozen=True)
+class MaskTerm(Effect):
+    """The term ``weights.mask``, or ``weights.mask_alone``, in frames that come with masks."""
+
+    def refused(self, settings: Settings) -> tuple[str, str] | None:
+        """Refused where masks are not used, and with both weights 0."""
+        update = settings.update
+        if not update.use_masks:
+            return "update.use_masks is false", "give true"
+        if update.weights.mask > 0 or update.weights.mask_alone > 0:
+            return None
+        return "update.weights.mask and update.weights.mask_alone are 0", "give one of them a weight above 0"
+
+    def join(self, builder: PartsBuilder) -> None:
+        """The comparison of pictures has the term in itself: it gets the weight."""
+        from scas4d_core.update.schedule import mask_weight  # it loads the kernels
+
+        builder.mask = mask_weight(builder.update, len(builder.hierarchy.rows), int(builder.first.present.sum()))
+
+
+EFFECT = MaskTerm(
+    name="mask_term",
+    group=Group.PRESENCE,
+    says="Where masks are given, what moves and what stands must cover the pixels that the masks say.",
+    gauge="Labels are those of frame 0 and no parameter: the term moves Gaussians, and relabels none.",
+    cost="a fourth channel beside RGB, rendered forward and backward; without masks nothing",
+)

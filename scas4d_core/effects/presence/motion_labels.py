@@ -1,0 +1,29 @@
+"""Labels of what moves, learnt from changed pixels where no masks are given; all else is a background that stands.
+
+They are found by ``structure.motion_mask`` between two updates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.parts import PartsBuilder
+
+
+@dataclass(frozen=True)
+class MotionLabels(Effect):
+    """Labels from motion, in scenes without masks."""
+
+    def join(self, builder: PartsBuilder) -> None:
+        """Asks for them."""
+        builder.learns_labels = True
+
+
+EFFECT = MotionLabels(
+    name="motion_labels",
+    group=Group.PRESENCE,
+    says="Without masks only Gaussians that most cameras have seen in changed pixels move; all else stands.",
+    gauge="What has moved once may always move: a label is given and never taken back.",
+    cost="a comparison of each view with the one before, two pictures of weights a view; it saves what stands",
+)
