@@ -267,7 +267,7 @@ def as_grid(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bool
     return grid.reshape(tiles_y * side, tiles_x * side).astype(bool)
 
 
-def _as_blocks(grid: NDArray[np.bool_], camera: CameraArrays) -> NDArray[np.uint64]:
+def as_blocks(grid: NDArray[np.bool_], camera: CameraArrays) -> NDArray[np.uint64]:
     """[tiles] bits, from a grid of blocks."""
     tiles_x, tiles_y = _tiles(camera)
     side = TILE // BLOCK
@@ -286,7 +286,7 @@ def _widened(marks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.uint
         grid = wider.copy()
         grid[:, 1:] |= wider[:, :-1]
         grid[:, :-1] |= wider[:, 1:]
-    return _as_blocks(grid, camera)
+    return as_blocks(grid, camera)
 
 
 def _box(shown: NDArray[np.bool_]) -> tuple[slice, slice]:

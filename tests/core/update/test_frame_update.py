@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from box_scene import MOVING, SHIFT, TURN, make_box, make_rig, moved, take_frame
+from effect_cases import of_whole_pictures
 
 from scas4d_core.effects.parts import Work
 from scas4d_core.gaussians import Gaussians
@@ -49,7 +50,8 @@ def prepare(
     """The updater of the box and the views of a frame that shows ``truth``."""
     factory = ViewFactory(RIG)
     hierarchy, neighbours = tied(settings, BEFORE, count)
-    updater = FrameUpdate(factory, SceneSettings(), settings, hierarchy, neighbours, BEFORE)
+    parts = of_whole_pictures(factory, settings, hierarchy, BEFORE)
+    updater = FrameUpdate(factory, SceneSettings(), settings, hierarchy, neighbours, BEFORE, parts)
     return updater, factory.views(take_frame(1, 1.0, truth, RIG, masks), {})
 
 
@@ -127,7 +129,8 @@ def test_nothing_moving_only_changes_colours() -> None:
     settings = SETTINGS.model_copy(update={"iterations": 5})
     factory = ViewFactory(RIG)
     hierarchy, neighbours = tied(settings, still)
-    updater = FrameUpdate(factory, SceneSettings(), settings, hierarchy, neighbours, still)
+    parts = of_whole_pictures(factory, settings, hierarchy, still)
+    updater = FrameUpdate(factory, SceneSettings(), settings, hierarchy, neighbours, still, parts)
     after = updater.run(still, factory.views(take_frame(1, 1.0, AFTER, RIG), {}), None, 1.0, 1).gaussians
     np.testing.assert_array_equal(after.means, still.means)
     np.testing.assert_array_equal(after.rotations, still.rotations)
@@ -360,7 +363,9 @@ def test_without_a_graph_no_neighbour_term_is_computed(monkeypatch: pytest.Monke
     updater, views = prepare(settings)
     with pytest.raises(AssertionError, match="computed"):
         updater.run(BEFORE, views, None, 1.0, seed=1)
-    bare = FrameUpdate(ViewFactory(RIG), SceneSettings(), settings, updater.hierarchy, None, BEFORE)
+    factory = ViewFactory(RIG)
+    parts = of_whole_pictures(factory, settings, updater.hierarchy, BEFORE)
+    bare = FrameUpdate(factory, SceneSettings(), settings, updater.hierarchy, None, BEFORE, parts)
     assert len(bare.run(BEFORE, views, None, 1.0, seed=1).trace.losses) == 2
 
 
