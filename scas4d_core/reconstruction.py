@@ -26,7 +26,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import Preparation
 from scas4d_core.query.committed import CommittedScene, View
 from scas4d_core.rasterize.limits import scene_limits
-from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness, fingerprints, lit
+from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness, fingerprints, goes_on, lit, noted
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import FrameSolver, UpdateInput
 from scas4d_core.settings import Settings, UpdateSettings
@@ -239,7 +239,8 @@ class Reconstruction(CommittedScene):
         bright = brightness(frame.images)
         judged = bright if self.settings.update.judge else {}  # of no picture nothing is found
         exposure, left_out, unusable = check_brightness(self._carried.past, judged)
-        past = lit(self._carried.past, exposure)
+        moves = exposure != 1.0 and goes_on(self._carried.past, judged)
+        past = noted(lit(self._carried.past, exposure), bright)
         watch.lap("judge")
         believed = [view for view in views if view.name not in left_out]
         steady = unusable is None and exposure == 1.0  # else nothing can be told from differences of the pictures
@@ -259,6 +260,7 @@ class Reconstruction(CommittedScene):
             past=past,
             lengths=self._fixed.lengths,
             exposure=exposure,
+            light_moves=moves,
             left_out=left_out,
             unusable=unusable,
             carried=carried.effects,
