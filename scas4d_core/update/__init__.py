@@ -1,9 +1,9 @@
 """Update of one frame (paper, algorithm 1): Θ_{t−1} and the pictures of frame t in, Θ_t out.
 
 ``frame_update`` has the loop; it uses ``schedule`` (iterations, views, samples, rates, Adam),
-``warm_start``, ``deformation`` (the cascade and the neighbour terms), ``picture_loss`` (render and compare), ``floor``
-and ``best_state`` (the better of start and end). ``robust`` decides around it which
-pictures and which results are believed.
+``warm_start``, ``deformation`` (the cascade and the neighbour terms), ``picture_loss`` (render and compare) and
+``best_state`` (the better of start and end), and calls the parts that the ``effects`` of the scene put into it.
+``robust`` decides around it which pictures and which results are believed.
 
 The values that one update passes through, from ``Reconstruction.step`` to the commit:
 

@@ -23,9 +23,10 @@ def scene_settings(request: SceneCreate) -> Settings:
     except SettingError as error:
         if error.validation is not None:
             raise validation.first_of(error.validation, model=Settings, prefix="settings") from None
-        raise Problem(
-            422, f"there is no preset {request.preset!r}", field="preset", value=request.preset, remedy=error.remedy
-        ) from None
+        unknown = error.setting == "preset"
+        fault = f"there is no preset {request.preset!r}" if unknown else error.fault
+        field = error.setting if unknown else f"settings.{error.setting}"
+        raise Problem(422, fault, field=field, value=str(error.value), remedy=error.remedy) from None
 
 
 def check_unit(request: SceneCreate, settings: Settings) -> None:

@@ -1,7 +1,8 @@
 """Files of the three packages that one frame crosses between PUT and commit, and one render between request and answer.
 
 Both bound how much a reader has to open to follow a frame. A file counts when a function of it runs, in whatever
-process; `__init__` files and the kernels are left aside. The service runs as usual, with a profiler in each process.
+process; `__init__` files, the kernels and the groups of effects (those that a scene has: a few of many) are left aside.
+The service runs as usual, with a profiler in each process.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from scas4d_core.captures import Capture, open_capture
 from studies.service.process import Service
 
 PACKAGES = ("scas4d_core", "server", "client")
-MOST_OF_A_FRAME, MOST_OF_A_RENDER = 45, 18
+MOST_OF_A_FRAME, MOST_OF_A_RENDER = 48, 18
 LATER = 3
 """The frame that is followed: frame 0 and the first updates have work of their own."""
 SETTINGS = {
@@ -132,7 +133,9 @@ def _files(folder: Path, phase: str, root: Path) -> Iterator[str]:
             path = Path(name)
             if path.is_relative_to(root):
                 inside = path.relative_to(root)
-                if inside.parts[0] in PACKAGES and path.name != "__init__.py" and "kernels" not in inside.parts:
+                aside = path.name == "__init__.py" or "kernels" in inside.parts
+                aside = aside or ("effects" in inside.parts and inside.parts[-2] != "effects")
+                if inside.parts[0] in PACKAGES and not aside:
                     yield inside.as_posix()
 
 

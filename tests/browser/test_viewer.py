@@ -57,6 +57,21 @@ def test_a_scene_is_picked_and_shown_with_its_figures(page, service, finished):
     assert page.faults == []
 
 
+def test_the_effects_are_listed_with_what_switched_them(page, service):
+    with Client(service.url, patience=30) as sdk:
+        id = start_scene(sdk, settings={"effects": {"standing_colour": "off"}})
+        push(sdk, id, 0)
+        sdk.wait(id, 0)
+        opened(page, service, id)
+        page.locator("#effects li").wait_for()
+        assert page.locator("#effects li").all_inner_texts() == ["Standing colour: pinned off"]
+        usual = page.locator("#effects-words").inner_text()
+        assert "rigidity" in usual
+        assert "floor" not in usual
+        assert "standing" not in usual
+        sdk.delete_scene(id)
+
+
 def test_dragging_turns_the_wheel_zooms_and_home_goes_back(page, service, finished):
     opened(page, service, finished)
     first = rests(page)

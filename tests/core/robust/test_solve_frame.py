@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from scas4d_core.cameras import Rig
+from scas4d_core.effects.parts import NOTHING, Arrays
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust import outliers as judge
@@ -62,6 +63,7 @@ class Fake:
         seconds: float,
         seed: int,
         options: AttemptOptions = AS_SET,
+        carried: Mapping[str, Arrays] = NOTHING,
     ) -> UpdateResult:
         self.options.append(options)
         self.starts.append(previous)

@@ -49,6 +49,24 @@ def test_a_scene_is_created_listed_and_deleted(http, service):
             process.is_alive()
 
 
+def test_the_status_has_the_effects_before_any_frame(http):
+    settings = {"effects": {"isometry": "off", "rigidity": "on"}}
+    created = http.post("/v1/scenes", json={"rig": rig_json(), "settings": settings})
+    assert created.status_code == 201
+    effects = created.json()["effects"]
+    told = {
+        name: (effects[name]["on"], effects[name]["pinned"]) for name in ("rigidity", "isometry", "rotation", "floor")
+    }
+    assert told == {
+        "rigidity": (True, True),
+        "isometry": (False, True),
+        "rotation": (True, False),
+        "floor": (False, False),
+    }
+    assert effects["floor"]["says"].endswith(".")
+    http.delete(created.headers["Location"])
+
+
 def edited(change):
     body = {"rig": rig_json()}
     change(body)
@@ -85,6 +103,15 @@ BAD = {
     "setting out of range": (lambda b: b.__setitem__("settings", {"update": {"iterations": 0}}), "iterations"),
     "setting of another kind": (lambda b: b.__setitem__("settings", {"update": 3}), "settings.update"),
     "unit of one camera": (one_camera, "settings.scene.metres_per_unit"),
+    "unknown effect": (lambda b: b.__setitem__("settings", {"effects": {"flor": "on"}}), "settings.effects"),
+    "effect of another mode": (
+        lambda b: b.__setitem__("settings", {"effects": {"floor": "maybe"}}),
+        "settings.effects.floor",
+    ),
+    "effect that the settings contradict": (
+        lambda b: b.__setitem__("settings", {"effects": {"floor": "on"}}),
+        "settings.effects.floor",
+    ),
     "misspelt": (lambda b: b.__setitem__("rigg", 1), "rigg"),
 }
 

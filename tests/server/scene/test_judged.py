@@ -21,6 +21,7 @@ BOX, RIG = make_box(), make_rig()
 SETTINGS = {
     "static": {"iterations": 200, "max_gaussians": 800},
     "update": {"iterations": 20, "clusters": [2, 12], "still": -1},
+    "effects": {"rotation": "off"},
 }
 
 
@@ -77,6 +78,10 @@ def test_a_frame_that_is_met_carries_its_report(served):
     assert report.seconds["decode"] > 0
     assert report.write_seconds > 0
     assert not sdk.scene(id).degraded
+    assert (report.effects["rotation"].on, report.effects["rotation"].pinned) == (False, True)
+    assert report.effects["rigidity"].on
+    status = sdk.scene(id).effects
+    assert {name: one.on for name, one in status.items()} == {name: one.on for name, one in report.effects.items()}
 
 
 def test_a_black_frame_is_held_explained_and_over_with_the_next_good_one(served):
