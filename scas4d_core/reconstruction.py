@@ -17,6 +17,7 @@ from numba import get_num_threads
 
 from scas4d_core.cameras import Rig, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
+from scas4d_core.effects.appearance.camera_gain import known_gains
 from scas4d_core.effects.evidence import Seen
 from scas4d_core.effects.switches import first_switches, switches_of, switches_record
 from scas4d_core.first_frame.start import FirstFrame, fit_first
@@ -304,7 +305,8 @@ class Reconstruction(CommittedScene):
         settings, moving = self.settings.update, len(self._updater.hierarchy.rows)
         try:
             use_masks = settings.use_masks and mask_weight(settings, moving, len(self.history.newest)) > 0
-            return self._factory.views(self._factory.scaled(frame), self._fixed.exposures, use_masks)
+            exposures = known_gains(self._fixed.exposures, self._carried.effects, self.rig.names)
+            return self._factory.views(self._factory.scaled(frame), exposures, use_masks)
         except ValueError as error:
             raise StepError(str(error)) from error
 

@@ -18,5 +18,7 @@ EFFECTS = {
     "floor": "scas4d_core.effects.coherence.floor",
     "moving_colour": "scas4d_core.effects.appearance.moving_colour",
     "standing_colour": "scas4d_core.effects.appearance.standing_colour",
+    "camera_gain": "scas4d_core.effects.appearance.camera_gain",
+    "light": "scas4d_core.effects.appearance.light",
 }
 """The module of each effect, by its name; in the order in which they take part in an iteration."""

@@ -118,7 +118,7 @@ class Past:
         bright = {name: value for name, (_, value, _) in rows}
         outs = {name: int(out) for name, (_, _, out) in rows}
         level, updates, held, fitted, behind, iterations, *light = arrays["scene"].tolist()
-        light, lit, step = [*light, *(1.0, 0, 1.0)[len(light) :]]  # older checkpoints know nothing of the light
+        light, lit, step = (*light, *(1.0, 0.0, 1.0)[len(light) :])  # older checkpoints know nothing of the light
         error = dict(zip(arrays["witnesses"].tolist(), arrays["error"].tolist(), strict=True))
         last = dict(zip(arrays["shown"].tolist(), arrays["last"].tolist(), strict=True)) if "last" in arrays else {}
         return cls(
