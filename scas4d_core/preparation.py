@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures.frame import Frame
+from scas4d_core.effects.appearance.camera_gain import known_gains
 from scas4d_core.effects.coherence.floor import floor_inside
 from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
 from scas4d_core.effects.effect import Effect, effect
@@ -84,6 +85,10 @@ class Preparation:
         seen = Seen(frame.index, result.gaussians, found, self._factory.rig, views, self._picture)
         arrays = began(switches, self._settings, seen)
         return switched_by(arrays, switches), arrays
+
+    def exposures(self, fixed: dict[str, NDArray[np.float32]], carried: CarryOver) -> dict[str, NDArray[np.float32]]:
+        """[3, 2] gain and offset of each camera: those that frame 0 found, or as they are known by now."""
+        return known_gains(fixed, carried.effects, self._factory.rig.names)
 
     def updater(self, first: Gaussians, switches: Switches) -> tuple[Updater, int]:
         """The updater of ``settings.device``, and the digest of its clusters and neighbours.

@@ -26,7 +26,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import Preparation
 from scas4d_core.query.committed import CommittedScene, View
 from scas4d_core.rasterize.limits import scene_limits
-from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness, fingerprints, lit
+from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness, fingerprints, goes_on, lit, noted
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import FrameSolver, UpdateInput
 from scas4d_core.settings import Settings, UpdateSettings
@@ -242,7 +242,8 @@ class Reconstruction(CommittedScene):
         bright = brightness(frame.images)
         judged = bright if self.settings.update.judge else {}  # of no picture nothing is found
         exposure, left_out, unusable = check_brightness(self._carried.past, judged)
-        past = lit(self._carried.past, exposure)
+        moves = exposure != 1.0 and goes_on(self._carried.past, judged)
+        past = noted(lit(self._carried.past, exposure), bright)
         watch.lap("judge")
         believed = [view for view in views if view.name not in left_out]
         steady = unusable is None and exposure == 1.0  # else nothing can be told from differences of the pictures
@@ -259,8 +260,8 @@ class Reconstruction(CommittedScene):
             views=believed,
             suspects=[view for view in views if past.is_out(view.name)],
             brightness=bright, seed=frame.index, past=past, lengths=self._fixed.lengths, exposure=exposure,
-            left_out=left_out, unusable=unusable, carried=carried.effects, end=self._budget.end(watch.began),
-            each=self._budget.each,
+            light_moves=moves, left_out=left_out, unusable=unusable, carried=carried.effects,
+            end=self._budget.end(watch.began), each=self._budget.each,
         )  # fmt: skip
         solver = FrameSolver(updater, self._factory, self._picture, self._update)
         shown = fingerprints(frame.images)
@@ -303,9 +304,8 @@ class Reconstruction(CommittedScene):
     def _views(self, frame: Frame) -> list[TrainingView]:
         """The views of a frame; without masks where no term asks for them: they are not even read."""
         try:
-            return self._factory.views(
-                self._factory.scaled(frame), self._fixed.exposures, self._preparation.parts.mask > 0
-            )
+            exposures = self._preparation.exposures(self._fixed.exposures, self._carried)
+            return self._factory.views(self._factory.scaled(frame), exposures, self._preparation.parts.mask > 0)
         except ValueError as error:
             raise StepError(str(error)) from error
 

@@ -28,5 +28,7 @@ EFFECTS = {
     "moving_colour": "scas4d_core.effects.appearance.moving_colour",
     "standing_colour": "scas4d_core.effects.appearance.standing_colour",
     "shadows": "scas4d_core.effects.appearance.shadows",
+    "camera_gain": "scas4d_core.effects.appearance.camera_gain",
+    "light": "scas4d_core.effects.appearance.light",
 }
 """The module of each effect, by its name; in the order in which they take part in an iteration."""

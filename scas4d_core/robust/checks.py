@@ -3,8 +3,8 @@
 A black frame is finite, and 100 iterations would paint the scene black. Lights flicker, and cameras that choose their
 own exposure do it together: learnt as colours, that would be unlearnt a frame later, so the gain is taken out of the
 pictures. It is read against the scene as it stood: the median over the pixels is that of the many in which nothing but
-the light changed. A light that stays is another one (``solve_frame``): then the scene's colours take the gain, and its
-pictures are as they are.
+the light changed. A light that stays, or that goes on from frame to frame as a lamp that dims, is another one
+(``solve_frame``): then the scene's colours take the gain, and its pictures are as they are.
 
 A frame that shows the pictures of the one before comes from a camera at half the rate of its rig, or from a rig that
 sends its last frame while it waits. Nothing is learnt from it, and that nothing moved is not believed either: the next
@@ -33,6 +33,9 @@ Array = NDArray[np.float32]
 
 EXPOSURE = 1.05
 """Times brighter or darker, median over the cameras, from which a frame is exposed otherwise; clean captures: 1.04."""
+ALIKE = 1.03
+"""Times that the light's step to a frame differs at most from the step before, where it goes on: a lamp that crosses a
+room and dims to a half in ten frames: 1.017; of lights that flicker, no step is like the one before."""
 ENOUGH = 8
 """Cameras that the exposure needs: an object that turns changes the brightness of one picture by a third."""
 UNUSABLE = 2.0
@@ -95,6 +98,28 @@ def check_brightness(past: Past, bright: Mapping[str, float]) -> tuple[float, di
     if not enough or 1 / EXPOSURE <= common <= EXPOSURE:
         common = 1.0
     return common, few(left_out, len(bright)), None
+
+
+def step_of(past: Past, bright: Mapping[str, float]) -> float:
+    """Times that a frame is brighter than the one before, median over the cameras; 1 where too few can tell."""
+    ratios = [value / past.last[name] for name, value in bright.items() if past.last.get(name, 0.0) > DARKEST]
+    return float(np.median(ratios)) if len(ratios) >= ENOUGH else 1.0
+
+
+def goes_on(past: Past, bright: Mapping[str, float]) -> bool:
+    """True where a frame's light goes on as it went to the frame before, faster than is told from noise.
+
+    The scene's own light does so, and is followed at once. A flicker comes back, and a jump has no step before it.
+    """
+    step = step_of(past, bright)
+    if 1 / EXPOSURE <= step <= EXPOSURE or (step > 1) != (past.step > 1):
+        return False
+    return 1 / ALIKE <= step / past.step <= ALIKE
+
+
+def noted(past: Past, bright: Mapping[str, float]) -> Past:
+    """The past with how bright the pictures of a frame are, and how much brighter than the frame before."""
+    return replace(past, last={**past.last, **bright}, step=step_of(past, bright))
 
 
 def lit(past: Past, light: float) -> Past:

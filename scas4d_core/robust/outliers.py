@@ -62,6 +62,8 @@ class Past:
         iterations: of the last update. error: usual at the end of an update, by probe view.
         light: times that the last frame was brighter, see ``checks.check_brightness``. lit: frames in a row
             that were brighter, or that were darker.
+        last: by camera, mean of its picture in the last frame, in whatever light. step: times that the last frame was
+            brighter than the one before it.
     """
 
     places: Mapping[str, float] = field(default_factory=dict)
@@ -76,6 +78,8 @@ class Past:
     error: Mapping[str, float] = field(default_factory=dict)
     light: float = 1.0
     lit: int = 0
+    last: Mapping[str, float] = field(default_factory=dict)
+    step: float = 1.0
 
     @classmethod
     def of_first(cls, psnr: Mapping[str, float], bright: Mapping[str, float]) -> Past:
@@ -83,18 +87,21 @@ class Past:
         psnr = _capped(psnr)
         level = float(np.median(list(psnr.values()))) if psnr else nan
         places = {name: psnr.get(name, nan) - level for name in bright}
-        return cls(places, dict(bright), dict.fromkeys(bright, 0), level)
+        return cls(places, dict(bright), dict.fromkeys(bright, 0), level, last=dict(bright))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """As arrays, for a checkpoint."""
         rows = [(place, self.brightness[name], self.out[name]) for name, place in self.places.items()]
         scene = [self.level, self.updates, self.held, self.fitted, self.behind, self.iterations, self.light, self.lit]
+        scene.append(self.step)
         return {
             "names": np.array(list(self.places), np.str_),
             "cameras": np.array(rows, np.float64).reshape(-1, 3),
             "scene": np.array(scene, np.float64),
             "witnesses": np.array(list(self.error), np.str_),
             "error": np.array(list(self.error.values()), np.float64),
+            "shown": np.array(list(self.last), np.str_),
+            "last": np.array(list(self.last.values()), np.float64),
         }
 
     @classmethod
@@ -110,12 +117,13 @@ class Past:
         places = {name: place for name, (place, _, _) in rows}
         bright = {name: value for name, (_, value, _) in rows}
         outs = {name: int(out) for name, (_, _, out) in rows}
-        level, updates, held, fitted, behind, iterations, *light = arrays["scene"].tolist()
-        light, lit = light or (1.0, 0)  # an older checkpoint knows nothing of the light
+        level, updates, held, fitted, behind, iterations, *more = arrays["scene"].tolist()
+        light, lit, step = [*more, *(1.0, 0.0, 1.0)[len(more) :]]  # older checkpoints know less of the light
         error = dict(zip(arrays["witnesses"].tolist(), arrays["error"].tolist(), strict=True))
+        last = dict(zip(arrays["shown"].tolist(), arrays["last"].tolist(), strict=True)) if "last" in arrays else {}
         return cls(
             places, bright, outs, level,
-            int(updates), int(held), fitted, int(behind), int(iterations), error, light, int(lit),
+            int(updates), int(held), fitted, int(behind), int(iterations), error, light, int(lit), last, step,
         )  # fmt: skip
 
     def place(self, name: str) -> float:

@@ -53,6 +53,7 @@ class UpdateInput:
         brightness: mean of each camera's picture. past: the usual figures. carried: arrays of the effects.
         lengths: [N, 3] metres, of the axes in frame 0.
         exposure, left_out, unusable: by the brightness of the pictures, see ``checks.check_brightness``.
+        light_moves: whether it goes on from frame to frame, see ``checks.goes_on``.
         end: moment by which the last iteration has to be over. each: seconds of an iteration in the updates before.
     """
 
@@ -67,6 +68,7 @@ class UpdateInput:
     past: Past
     lengths: NDArray[np.float32]
     exposure: float = 1.0
+    light_moves: bool = False
     left_out: Mapping[str, str] = field(default_factory=dict)
     unusable: str | None = None
     carried: Mapping[str, Arrays] = field(default_factory=dict)
@@ -105,7 +107,8 @@ class FrameSolver:
         """
         if repeated and given.unusable is None:
             return _standing(given, UpdateTrace(kept=Candidate.STILL), given.exposure, "the same pictures again")
-        if given.past.lit >= self._settings.patience and (solved := self._relit(given)) is not None:
+        stays = given.light_moves or given.past.lit >= self._settings.patience
+        if stays and (solved := self._relit(given)) is not None:
             return solved
         if given.unusable is not None:  # nothing is tried, and no patience is lost with it
             past = replace(given.past, behind=max(1, given.past.behind))
@@ -150,22 +153,17 @@ class FrameSolver:
         return self._committed(given, result)
 
     def _relit(self, given: UpdateInput) -> Solved | None:
-        """A frame in a light that has stayed: the colours take it on; None where the cameras tell of no other light.
+        """A frame in a light that stays or moves: the colours take it on; None where the cameras tell of no other.
 
         Where the scene is shown as bright as it was, something new makes the pictures brighter: no reason to hold them.
         """
         gain = gain_of(self._picture, given.state, given.views)
-        same = gain is not None and 1 / EXPOSURE <= gain <= EXPOSURE
+        same = gain is not None and not given.light_moves and 1 / EXPOSURE <= gain <= EXPOSURE
         if gain is None or (same and given.unusable is None):
             return None
         gain, light = (1.0, "the same light") if same else (gain, f"{gain:.2g} times the light")
-        in_light = replace(
-            given,
-            state=relit(given.state, gain),
-            past=outliers.relit(given.past, gain),
-            exposure=1.0,
-            unusable=None,
-        )
+        state, past = relit(given.state, gain), outliers.relit(given.past, gain)
+        in_light = replace(given, state=state, past=past, exposure=1.0, light_moves=False, unusable=None)
         result, past = self.run(in_light)
         if not result.outcome.held:
             return replace(result, attempts=[f"{light}, for good", *result.attempts]), past

@@ -188,12 +188,8 @@ def _graph(neighbours: Neighbours | None, count: int) -> Graph:
 
 def _rates(rates: Rates, parts: PartsBuilder) -> Rates:
     """The rates with those of parameters that no effect frees at 0: these are in no group of Adam."""
-    colours = parts.find(Colours) or Colours(parts)
-    return replace(
-        freed(rates, parts.freedom),
-        colour=rates.colour if colours.moving else 0.0,
-        colour_standing=rates.colour_standing if colours.standing else 0.0,
-    )
+    moving, standing = (parts.find(Colours) or Colours(parts)).freed(rates)
+    return replace(freed(rates, parts.freedom), colour=moving, colour_standing=standing)
 
 
 def _weights(parts: PartsBuilder, tied: bool) -> TermWeights:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.metrics import psnr
 from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.robust.checks import ALIKE, EXPOSURE, goes_on, noted
 from scas4d_core.robust.checks import lit as with_light
 from scas4d_core.robust.outliers import Past
 from scas4d_core.settings import Settings
@@ -26,7 +28,8 @@ FROM = 4
 LAST = FROM + PATIENCE + 1
 """The third one in which it is the usual light."""
 WITHIN_DB = 0.5
-
+GOING_DB = 1.5
+"""The same of a light that still goes on: divided out of the pictures it would be 10 dB and more."""
 
 NOISE = 1.0
 """Levels of 255: with more of it, what seems to move without masks differs from light to light."""
@@ -102,6 +105,7 @@ def test_the_light_is_part_of_what_is_carried_on() -> None:
     assert (again.light, again.lit) == (1.41, 2)
     older = {name: array[:6] if name == "scene" else array for name, array in past.arrays().items()}
     assert (Past.of_arrays(older).light, Past.of_arrays(older).lit) == (1.0, 0)
+    assert Past.of_arrays({name: array for name, array in older.items() if name not in ("shown", "last")}).last == {}
 
 
 def test_frames_that_were_held_or_stood_are_told_as_they_are() -> None:
@@ -121,3 +125,38 @@ def test_frames_that_were_held_or_stood_are_told_as_they_are() -> None:
     assert str(held.degraded).startswith("held as it was: ")
     assert held.exposure > 1.0
     assert held.errors[Candidate.END] < held.errors[Candidate.STILL]
+
+
+DIMS = [1.0, 0.99, 0.97, 0.94, 0.90, 0.85, 0.79, 0.73, 0.68]
+"""A lamp that dims slowly at first; its steps are as fast as those of one that crosses a room, and a little faster."""
+
+
+@pytest.mark.parametrize(
+    "light", [DIMS, [1.0, 1.0, 1.0, *(0.9**k for k in range(1, 5))], [1.1**-k for k in range(4, 0, -1)]]
+)
+def test_a_light_that_goes_on_is_followed_at_once(light: list[float]) -> None:
+    """Slow or fast, darker or brighter: of a step that is like the one before nothing is taken out of the pictures."""
+    found, reports, _ = run(light, masks=True)
+    usual, _, _ = run([light[-1]] * len(light), masks=True)
+    steps = [now / before for before, now in pairwise(light)]
+    alike = [1 / EXPOSURE < steps[0] < EXPOSURE] + [1 / ALIKE < now / before < ALIKE for before, now in pairwise(steps)]
+    assert any("for good" in report.attempts[0] for report in reports)
+    assert all(report.exposure == 1.0 for report, like in zip(reports, alike, strict=True) if like)
+    assert found[-1] >= usual[-1] - GOING_DB
+
+
+def test_lights_that_flicker_or_jump_do_not_go_on() -> None:
+    bright = dict.fromkeys("abcdefgh", 0.4)
+    for lights, goes in (
+        ([1, 1.3, 1, 1.3, 1], [False, False, False, False]),
+        ([1, 1.1, 1 / 1.1, 1.1, 1 / 1.1], [False, False, False, False]),
+        ([1, 1.4, 1.4, 1.4, 1.41], [False, False, False, False]),
+        ([1, 0.96, 0.93, 0.9], [False, False, False]),  # each step is too small to be told from noise
+        ([1, 0.9, 0.81, 0.73, 0.73], [False, True, True, False]),
+    ):
+        past, found = noted(Past(), bright), []
+        for light in lights[1:]:
+            pictures = {name: light * value for name, value in bright.items()}
+            found.append(goes_on(past, pictures))
+            past = Past.of_arrays(noted(past, pictures).arrays())
+        assert found == goes

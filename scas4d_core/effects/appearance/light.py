@@ -1,0 +1,105 @@
+"""Light over time: while it changes, colours follow faster, those of what moves as fast as those of what stands.
+
+What a lamp that crosses a room or dims does to colours is a few numbers: surfaces that face alike and lie together
+become brighter or darker together. That is the evidence. The colours themselves take it on one by one: a relative
+change linear or quadratic in orientation and place, learnt beside them, made pictures no better once they were free to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.effects.appearance.colours import Colours
+from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.evidence import Evidence, Seen
+from scas4d_core.effects.parts import PartsBuilder
+
+if TYPE_CHECKING:
+    from scas4d_core.gaussians import Gaussians
+    from scas4d_core.settings import Settings
+
+# Thresholds of the effect: 0.015 a frame at most on the five objects (robot, as it turns fastest), 0.009 on stage,
+# whose shadows wander, 0.027 to 0.065 while the lamp of lamps crosses the room.
+SAMPLE = 2000
+"""Gaussians at most that the evidence is taken from: it has seven numbers to find."""
+OPAQUE = 0.3
+"""Opacity from which a Gaussian's colour is that of a surface."""
+
+
+Double = NDArray[np.float64]
+
+
+def orientation_and_place(state: Gaussians, rows: NDArray[np.int64], centre: Double) -> Double:
+    """[R, 7] 1, the normal, the place: what the relative change of a Gaussian's light is taken to be linear in.
+
+    The normal is the shortest axis, on the side of the cameras. The place is in metres from the mean of all.
+
+    Args:
+        rows: [R] of the Gaussians that are asked for. centre: of the cameras, metres.
+    """
+    factors, means = state.factors[rows].astype(np.float64), state.means[rows].astype(np.float64)
+    axes = np.linalg.eigh(factors @ factors.transpose(0, 2, 1)).eigenvectors
+    normals = axes[:, :, 0]
+    normals *= np.where((normals * (centre - means)).sum(axis=1) < 0, -1, 1)[:, None]
+    return np.concatenate([np.ones((len(rows), 1)), normals, means - means.mean(axis=0)], axis=1)
+
+
+def change_of_light(before: Gaussians, after: Gaussians, centre: Double) -> float:
+    """Relative change of the colours from a state to the next that orientation and place explain, root mean square.
+
+    Args:
+        centre: [3] of the cameras, metres.
+    """
+    rows = np.flatnonzero(before.opacities > OPAQUE)
+    rows = rows[:: max(1, len(rows) // SAMPLE)]
+    if len(rows) == 0:
+        return 0.0
+    terms = orientation_and_place(after, rows, centre)
+    explained = total = 0.0
+    for channel in range(3):
+        old = before.colours[rows, channel].astype(np.float64)
+        change = after.colours[rows, channel] - old
+        weighed = terms * old[:, None]
+        found = np.linalg.lstsq(weighed, change, rcond=None)[0]
+        explained += float(np.square(weighed @ found).sum())
+        total += float(np.square(old).sum())
+    return float(np.sqrt(explained / max(total, 1e-12)))
+
+
+@dataclass(frozen=True)
+class Light(Effect):
+    """Faster colours."""
+
+    def refused(self, settings: Settings) -> tuple[str, str] | None:
+        """Refused where no colours of what moves are learnt."""
+        if settings.update.rate_colour > 0:
+            return None
+        return "update.rate_colour is 0", "give it a rate above 0"
+
+    def evidence(self, seen: Seen) -> Evidence | None:
+        """How much the colours change together from a frame to the next."""
+        if not seen.views:
+            return None
+        centre = np.mean([camera.centre for camera in seen.rig.cameras], axis=0)
+        change = change_of_light(seen.before, seen.result.gaussians, centre)
+        return Evidence(min(1.0, change), f"the light changes by {change:.1%} a frame")
+
+    def join(self, builder: PartsBuilder) -> None:
+        """Frees the colours that are learnt."""
+        builder.shared(Colours).lit = True
+
+
+EFFECT = Light(
+    name="light",
+    group=Group.APPEARANCE,
+    says="While the light changes colours follow faster, those of what moves as fast as those of what stands.",
+    gauge="Colours are in the light of their frame; what differs from camera to camera is gain, and what flickers too.",
+    cost="none that can be measured",
+    auto=True,
+    on_above=0.02,
+    off_below=0.01,
+)
