@@ -148,6 +148,13 @@ class ViewFactory:
         """The view with other planes [C, H, W] of the same size."""
         return self._view(view.name, view.camera, target, view.exposure)
 
+    def cropped(self, view: TrainingView, left: int, top: int, right: int, bottom: int) -> TrainingView:
+        """The part of a view in a rectangle of whole pixels, ``right`` and ``bottom`` excluded."""
+        lens = view.camera.lens.copy()
+        lens[2:] = lens[2] - left, lens[3] - top, right - left, bottom - top
+        camera = view.camera._replace(lens=lens, width=right - left, height=bottom - top)
+        return self._view(view.name, camera, np.ascontiguousarray(view.target[:, top:bottom, left:right]), view.exposure)
+
     def _view(self, name: str, camera: CameraArrays, target: Array, exposure: Array) -> TrainingView:
         return TrainingView(name, camera, target, exposure, self.scratch(*target.shape))
 
@@ -211,6 +218,12 @@ class PictureLoss:
         self.image_part = 0.0
         self.mask_part = 0.0
         self.psnr = 0.0
+
+    def apart(self, factory: ViewFactory) -> PictureLoss:
+        """The image loss with the same background and limits, and buffers of its own: for views of other sizes."""
+        red, green, blue, _ = self._background.tolist()
+        limits = Limits(*self.rasterizer.limits.tolist())
+        return PictureLoss(factory, (red, green, blue), 1.0, 0.0, limits=limits)
 
     def evaluate(
         self,

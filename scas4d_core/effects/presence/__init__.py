@@ -1,0 +1,1 @@
+"""Effects on what is there: things that enter the scene, and things that leave it."""

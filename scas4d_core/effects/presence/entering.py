@@ -1,0 +1,148 @@
+"""Things that enter: where cameras agree that nothing the state has explains the pictures, Gaussians are born."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.evidence import Evidence
+from scas4d_core.effects.presence.carving import Hull, carve_new, footprint
+from scas4d_core.effects.presence.novelty import Novelty, novelties
+from scas4d_core.first_frame.posed_pictures import look_at_point
+
+if TYPE_CHECKING:
+    from scas4d_core.effects.evidence import Seen
+    from scas4d_core.effects.parts import Arrays, PartsBuilder
+    from scas4d_core.update.result import UpdateResult
+
+NAME = "entering"
+GLANCE = 6
+"""Cameras that are looked at each frame, others each time; all of them where these find something new."""
+GLANCED = 2
+"""Of these, that have to."""
+SMALLEST = 0.003
+"""Share of a camera's pixels that it must see as new to have a say: 200 of 256 x 256. What an update leaves behind of
+things that move is smaller."""
+SHARE = 0.05
+"""Of the squared error of all pictures that a thing explains, from which it is one."""
+GONE = 0.01
+"""The same, below which the effect may be switched off."""
+BUDGET = 0.1
+"""Gaussians that are born in a frame at most, as a share of those that are there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What has entered.
+
+    Attributes:
+        seen: what the cameras say. hull: of the things that count. share: of the squared error that they explain.
+        cameras: that see them.
+    """
+
+    seen: Sequence[Novelty]
+    hull: Hull
+    share: float
+    cameras: int
+
+
+def entered(seen: Seen) -> Found | None:
+    """What a frame shows that the state does not have; None where there is nothing of the kind."""
+    colours = seen.before.colours  # what is new may be painted on what stands by now
+    state = seen.result.gaussians
+    if len(colours) != len(state):
+        return None
+    count = len(seen.views)
+    some = [seen.views[(seen.index + round(k * count / GLANCE)) % count] for k in range(min(GLANCE, count))]
+    glance = novelties(state, colours, some, seen.rig, seen.picture)
+    if sum(_says(one) for one in glance) < GLANCED:
+        return None
+    known = {view.name: one for view, one in zip(some, glance, strict=True)}
+    others = [view for view in seen.views if view.name not in known]
+    known |= {
+        view.name: one
+        for view, one in zip(others, novelties(state, colours, others, seen.rig, seen.picture), strict=True)
+    }
+    everyone = [known[view.name] for view in seen.views]
+    middle = look_at_point(everyone)  # type: ignore[arg-type]
+    reach = max(float(np.linalg.norm(one.camera.centre - middle)) for one in everyone)
+    hull = carve_new(everyone, middle, reach)
+    total = sum(float(one.error.sum()) for one in everyone)
+    kept, share, cameras = np.zeros(len(hull.points), np.bool_), 0.0, 0
+    for thing in np.unique(hull.things):
+        mine = hull.things == thing
+        prints = [footprint(one, hull.points[mine], hull.voxel) for one in everyone]
+        explains = sum(float(one.error[one.new & where].sum()) for one, where in zip(everyone, prints, strict=True))
+        see = sum(int((one.new & where).sum()) >= SMALLEST * where.size for one, where in zip(everyone, prints, strict=True))
+        if total > 0 and explains / total >= GONE:
+            kept |= mine
+            share += explains / total
+            cameras = max(cameras, see)
+    if not kept.any():
+        return None
+    return Found(everyone, hull.only(kept), share, cameras)
+
+
+def _says(one: Novelty) -> bool:
+    return one.surplus >= SMALLEST * one.new.size
+
+
+@dataclass(frozen=True)
+class Entering(Effect):
+    """Births, in frames that show more than the state has."""
+
+    def evidence(self, seen: Seen) -> Evidence | None:
+        """What is new explains so much; once something was born, what that explained, for as long as it is there."""
+        left = seen.result.carried.get(NAME)
+        if left is not None and seen.result.gaussians.present[left["rows"]].any():
+            return _evidence(float(left["share"]), int(left["cameras"]))
+        found = entered(seen)
+        return Evidence(0.0, "") if found is None else _evidence(found.share, found.cameras)
+
+    def populated(self, seen: Seen) -> UpdateResult:
+        """The result with the Gaussians that are born."""
+        result = seen.result
+        found = entered(seen)
+        if found is None:
+            return result
+        from scas4d_core.effects.presence.growing import grown, seeds
+
+        rng = np.random.default_rng([seen.index, len(result.gaussians)])
+        points, colours = seeds(found.seen, found.hull, int(BUDGET * len(result.gaussians)), rng)
+        if not len(points):
+            return result
+        state = result.gaussians
+        born = grown(state, points, colours, seen.views, seen.rig, seen.picture, rng)
+        left = result.carried.get(NAME)
+        rows = np.arange(len(state), len(state) + len(born))
+        arrays: Arrays = {
+            "rows": rows if left is None else np.concatenate([left["rows"], rows]),
+            "share": np.array(found.share if left is None else max(found.share, float(left["share"]))),
+            "cameras": np.array(found.cameras if left is None else max(found.cameras, int(left["cameras"]))),
+        }
+        joins = np.full(len(born), -1, np.int64)
+        return replace(result, gaussians=state.joined(born), joins=joins, carried={**result.carried, NAME: arrays})
+
+    def join(self, builder: PartsBuilder) -> None:
+        """Adds nothing: births come after the update of a frame."""
+
+
+def _evidence(share: float, cameras: int) -> Evidence:
+    return Evidence(share, f"a thing entered: {cameras} cameras agree, it explains {100 * share:.0f} % of the error")
+
+
+EFFECT = Entering(
+    name=NAME,
+    group=Group.PRESENCE,
+    says="Things enter the scene: where cameras agree that nothing explains the pictures, Gaussians are born.",
+    gauge="Only what no Gaussian covers is new, and only beyond what has moved away elsewhere.",
+    cost="six pictures rendered a frame; where something enters, about an update more",
+    auto=True,
+    on_above=SHARE,
+    off_below=GONE,
+)
