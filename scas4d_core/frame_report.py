@@ -15,6 +15,7 @@ import numpy as np
 from scas4d_core.captures.frame import Frame
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.frame_outcome import Candidate, FrameOutcome, degraded_text
+from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust.outliers import health
 from scas4d_core.update.best_state import mean_error
 from scas4d_core.update.result import REPORT, CameraFit, Stopwatch, UpdateResult
@@ -63,7 +64,7 @@ class FrameReport:
         seconds: by stage; ``report`` is what this report costs, and the writing of the one before.
         loss: each iteration's weighted sum; of frame 0 at most ``REPORTED_LOSSES`` means.
         psnr: dB, over the training views of the last iterations, each as it was rendered then; NaN where not measured.
-        moving, gaussians: how many Gaussians move, and are.
+        moving, gaussians: how many Gaussians move, and are there. born, retired, revived: how many were, in this frame.
         cameras: by name, how well each camera's picture was met when it was last rendered: a bumped camera shows.
         used: cameras whose pictures were learnt from; none of a frame that was held or stood. dropped: cameras left
             out, with the reason.
@@ -99,6 +100,9 @@ class FrameReport:
     curve: list[CurvePoint] = field(default_factory=list)
     errors: dict[Candidate, float] = field(default_factory=dict)
     kept: Candidate = Candidate.END
+    born: int = 0
+    retired: int = 0
+    revived: int = 0
 
     def record(self) -> dict[str, Any]:
         """The report as JSON: numbers that are not finite are None."""
@@ -149,6 +153,7 @@ def report_of_first(
 def report_of_update(
     frame: Frame,
     result: UpdateResult,
+    before: Gaussians,
     left_out: Mapping[str, str],
     names: Sequence[str],
     watch: Stopwatch,
@@ -157,7 +162,8 @@ def report_of_update(
     """The report of an update.
 
     Args:
-        result: that is committed. left_out: cameras whose pictures were not believed at first sight, with the reason.
+        result: that is committed. before: the state committed before.
+        left_out: cameras whose pictures were not believed at first sight, with the reason.
         names: of the rig's cameras. watch: with the stages "decode", "judge" and "update".
         dropped: cameras that the caller has left out, with the reason.
     """
@@ -176,7 +182,7 @@ def report_of_update(
         loss=trace.losses,
         psnr=_last(trace.psnr),
         moving=int(gaussians.moving.sum()),
-        gaussians=len(gaussians),
+        gaussians=int(gaussians.present.sum()),
         cameras={
             name: CameraFit(psnr=fit["psnr"], colour_shift=fit["colour_shift"], health=health(result.offsets.get(name)))
             for name, fit in trace.cameras.items()
@@ -193,6 +199,9 @@ def report_of_update(
         curve=curve(trace.losses, trace.moments),
         errors={candidate: mean_error(errors, list(errors)) for candidate, errors in trace.errors.items()},
         kept=trace.kept,
+        born=len(gaussians) - len(before),
+        retired=int((gaussians.retired[: len(before)] & before.present).sum()),
+        revived=int((gaussians.present[: len(before)] & before.retired).sum()),
     )
     stages[REPORT] = watch.seconds[REPORT] + trace.seconds.get(REPORT, 0.0) + perf_counter() - began
     return report

@@ -1,12 +1,14 @@
 """Prepares the updates of a scene: clusters and neighbours of what moves, and the parts of the effects that are on.
 
-They are made anew where more is found to move, and where an effect is switched.
+They are made anew where more is found to move, where an effect is switched, and where Gaussians come and go. They are
+made of the scene's *roots*: Θ_0, with the Gaussians born since at the places that they would have had in it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -15,17 +17,22 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.effects.coherence.floor import floor_inside
 from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
+from scas4d_core.effects.effect import Effect, effect
 from scas4d_core.effects.evidence import Seen
 from scas4d_core.effects.parts import PartsBuilder
 from scas4d_core.effects.switches import Switches, decided, first_switches, joined, names_on
-from scas4d_core.gaussians import Gaussians
+from scas4d_core.frame_outcome import FrameOutcome
+from scas4d_core.gaussians import UNBORN, Gaussians
 from scas4d_core.settings import Settings
+from scas4d_core.storage.births import FOUNDERLESS, grown_roots
 from scas4d_core.storage.checkpoint import CarryOver
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.motion_mask import labelled, labels_learnt
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours
 from scas4d_core.update.frame_update import FrameUpdate, Updater
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
+from scas4d_core.update.result import UpdateResult
+from scas4d_core.update.warm_start import motion_between
 
 SMALLEST_CLUSTER = 8
 """Gaussians of a cluster, on average, that the layers are capped to: the motion of fewer is noise."""
@@ -52,7 +59,7 @@ class Preparation:
         """The updater of ``settings.device``, and the digest of its clusters and neighbours.
 
         Args:
-            first: Θ_0, with the labels to go by. switches: of the effects.
+            first: the roots, with the labels to go by. switches: of the effects.
         """
         update = self._settings.update
         hierarchy = build_hierarchy(first.means, first.moving, update.clusters, SMALLEST_CLUSTER, update.seed)
@@ -71,7 +78,7 @@ class Preparation:
         """The updater for a carry-over; a motion that belongs to other clusters is dropped from that.
 
         Args:
-            first: Θ_0.
+            first: the roots.
         """
         if not carried.switches:  # that an earlier version left
             carried = replace(carried, switches=first_switches(self._settings, 0))
@@ -94,7 +101,7 @@ class Preparation:
         starts cold.
 
         Args:
-            newest: Θ_{t−1}. first: Θ_0. believed: views of the frame.
+            newest: Θ_{t−1}. first: the roots. believed: views of the frame.
         """
         labels = labels_learnt(newest, carried.labels, carried.seen, believed, self._picture)
         if labels is None:
@@ -105,11 +112,99 @@ class Preparation:
         """The updater and carry-over of the next frame, with the effects that a frame calls for.
 
         Args:
-            seen: the frame. first: Θ_0.
+            seen: the frame. first: the roots.
         """
         switches = decided(carried.switches, self._settings, seen)
         before, carried = names_on(carried.switches), replace(carried, switches=switches)
         return (updater, carried) if names_on(switches) == before else self.again(first, carried)
+
+    def followed(
+        self, updater: Updater, carried: CarryOver, seen: Seen, first: Gaussians, populates: bool
+    ) -> tuple[UpdateResult, Updater, CarryOver, Gaussians]:
+        """What follows from a frame that was learnt: its result, and the updater, carry-over and roots of the next.
+
+        Args:
+            seen: the frame. first: the roots before. populates: whether Gaussians may come and go.
+        """
+        on = names_on(carried.switches)
+        updater, carried = self.switched(updater, carried, seen, first)
+        if not populates:
+            return seen.result, updater, carried, first
+        result = self.populated(on, seen)
+        return result, *self.regrown(updater, carried, seen, result, first)
+
+    def populated(self, names: Sequence[str], seen: Seen) -> UpdateResult:
+        """The result of a frame with all that is born, retired or revived in it.
+
+        Args:
+            names: of the effects that took part in its update. seen: the frame.
+
+        Raises:
+            ValueError: an effect has changed rows otherwise.
+        """
+        for name in names:
+            one = effect(name)
+            if type(one).populated is not Effect.populated:
+                result = one.populated(seen)
+                _check_rows(name, seen.result, result)
+                seen = replace(seen, result=result)
+        return seen.result
+
+    def regrown(
+        self, updater: Updater, carried: CarryOver, seen: Seen, result: UpdateResult, first: Gaussians
+    ) -> tuple[Updater, CarryOver, Gaussians]:
+        """The updater, carry-over and roots after a frame in which Gaussians have come or gone.
+
+        Args:
+            seen: the frame before they did. result: after. first: the roots before.
+        """
+        before, now = seen.result.gaussians, result.gaussians
+        if result is seen.result:
+            return updater, carried, first
+        effects = {
+            name: {key: _lengthened(array, len(before), result.joins) for key, array in arrays.items()}
+            for name, arrays in result.carried.items()
+        }
+        carried = replace(carried, effects=effects)
+        if len(now) == len(before) and np.array_equal(now.retired, before.retired):
+            return updater, carried, first
+        roots, labels = grown_roots(first, now, result.joins), carried.labels
+        if labels is not None:
+            labels = np.concatenate([labels, now.foreground[len(labels) :] > 0.5])
+        updater, carried = self.again(roots, replace(carried, labels=labels))
+        if carried.motion is None and seen.result.motion is not None and self._goes_on(result):
+            rows = updater.hierarchy.rows
+            known = np.zeros(len(now), np.bool_)
+            known[: len(before)] = seen.before.moving & before.moving
+            moved = motion_between(updater.hierarchy, seen.before, now, known[rows], seen.result.motion.seconds)
+            carried = replace(carried, motion=moved)
+        return updater, carried, roots
+
+    def _goes_on(self, result: UpdateResult) -> bool:
+        """Whether the difference of two states is a motion; a jump is none."""
+        return self._settings.update.cluster_map == "centred" and result.outcome is not FrameOutcome.RELOCATED
+
+
+def _check_rows(name: str, before: UpdateResult, after: UpdateResult) -> None:
+    """Raises where an effect has changed rows that it may not change."""
+    count, born = len(before.gaussians), len(after.gaussians) - len(before.gaussians)
+    kept = born >= 0 and np.array_equal(after.gaussians.ids[:count], before.gaussians.ids)
+    if not kept or (after.gaussians.ids[count:] != UNBORN).any():
+        raise ValueError(f"effect {name}: rows were lost or moved; append with Gaussians.joined, retire the others")
+    had = 0 if before.joins is None else len(before.joins)
+    if (0 if after.joins is None else len(after.joins)) != had + born:
+        raise ValueError(f"effect {name}: joins has not one founder for each of {had + born} that are born")
+    if after.joins is not None and not ((after.joins >= FOUNDERLESS) & (after.joins < count - had)).all():
+        raise ValueError(f"effect {name}: a founder is no row of the frame before")
+
+
+def _lengthened(array: NDArray[Any], count: int, joins: NDArray[np.int64] | None) -> NDArray[Any]:
+    """An array of an effect with rows for the born, where it has one for each Gaussian."""
+    if joins is None or not array.ndim or len(array) != count:
+        return array
+    rows = array[np.maximum(joins, 0)]
+    rows[joins == FOUNDERLESS] = 0
+    return np.concatenate([array, rows])
 
 
 def digest(hierarchy: Hierarchy, neighbours: Neighbours | None) -> int:

@@ -54,6 +54,7 @@ class Reconstruction(CommittedScene):
     Attributes:
         rig: the training cameras inside, image-scaled. world: user's world to inside. history: the committed states.
         report: of the last frame committed by this object. resumed: where it was taken up again, or None.
+        populates: whether effects may add, retire and revive Gaussians.
 
     >>> from scas4d_core.captures import open_capture
     >>> capture = open_capture("samples/robot")
@@ -77,6 +78,7 @@ class Reconstruction(CommittedScene):
         self._factory = ViewFactory(self.rig, None if scale == 1.0 else rig)
         self._picture = PictureLoss(self._factory, settings.scene.background, 1.0, 0.0, limits=limits)
         self._preparation = Preparation(self._factory, self.settings, self.world, self._picture)
+        self.populates = True
         self.static: StaticResult | None = None
         self.report: FrameReport | None = None
         self.resumed: ResumePoint | None = None
@@ -127,6 +129,7 @@ class Reconstruction(CommittedScene):
         fitted = perf_counter()
         self._fixed = FirstFrame(len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians))
         switches = first_switches(settings, frame.index)
+        self._roots = result.gaussians
         self._updater, structure = self._preparation.updater(result.gaussians, switches)
         seen = () if self._fixed.masked else self._factory.views(self._factory.scaled(frame), {}, use_masks=False)
         load = {} if started is None else {"load": began - started}
@@ -166,7 +169,7 @@ class Reconstruction(CommittedScene):
         except (HistoryError, KeyError) as error:
             raise ResumeError(f"the first frame, which every update needs, cannot be read ({error})") from error
         index, left, faults = find_commit(history, self._checkpoints, self._factory, held)
-        same = self._go_on(self._cold(index) if left is None else left)
+        same = self._go_on(index, self._cold(index) if left is None else left)
         if left is not None and not same:
             faults.append("clusters came out otherwise than before: the next update starts without a motion")
         self.resumed = ResumePoint(index, history.cut(index), faults, cold=left is None or not same)
@@ -193,22 +196,24 @@ class Reconstruction(CommittedScene):
         Raises:
             HistoryError: the frame or the first one cannot be read.
         """
-        first, copy = history.indices[0], History()
-        for one in sorted({first, index}):
-            copy.append(one, history.time(one), history.gaussians(one), history.report(one))
+        copy = history.copied((history.indices[0], index))
         self = cls(rig, settings, copy)
         self._fixed = FirstFrame.of(copy)
-        self._go_on(self._cold(index))
+        self._go_on(index, self._cold(index))
         return self
 
-    def _go_on(self, carried: CarryOver) -> bool:
+    def _go_on(self, index: int, carried: CarryOver) -> bool:
         """Prepare the updates after a committed one; False: the motion that it left does not fit today's clusters."""
-        self._updater, self._carried = self._preparation.again(self.history.first, carried)
+        self._take_roots(self.history.roots(index))
+        self._updater, self._carried = self._preparation.again(self._roots, carried)
         return self._carried.structure == carried.structure
+
+    def _take_roots(self, roots: Gaussians) -> None:
+        self._roots, self._fixed = roots, replace(self._fixed, lengths=axis_lengths(roots))
 
     def _cold(self, index: int) -> CarryOver:
         """The carry-over of a committed frame as far as its state and report have it: labels learnt, switches."""
-        moving = self.history.gaussians(index).moving
+        moving = self.history.gaussians(index).foreground > 0.5
         labels = None if self._fixed.masked or moving.all() else moving
         return CarryOver(labels=labels, switches=switches_of(self.history.report(index).get("effects", {})))
 
@@ -246,7 +251,7 @@ class Reconstruction(CommittedScene):
         updater, carried = self._updater, self._carried
         if steady and carried.seen and not self._fixed.masked:
             newest = self.history.newest
-            updater, carried = self._preparation.relabelled(updater, carried, newest, self.history.first, believed)
+            updater, carried = self._preparation.relabelled(updater, carried, newest, self._roots, believed)
         given = UpdateInput(
             state=self.history.newest if carried.labels is None else labelled(self.history.newest, carried.labels),
             motion=carried.motion,
@@ -270,18 +275,19 @@ class Reconstruction(CommittedScene):
         result, past = solver.run(given, repeated=shown == carried.shown and self._update.still > -1)
         watch.lap("update")
         watch.move("update", "judge", solver.judging)
-
         if result.outcome.held:  # motion that seemed to be in its pictures is as little believed as they are
             updater, carried = self._updater, self._carried
             result = replace(result, gaussians=self.history.newest, motion=carried.motion, carried=carried.effects)
-        report = report_of_update(frame, result, left_out, self.rig.names, watch, dropped)
         how = {"cold": given.motion is None, "relabelled": updater is not self._updater, **(notes or {})}
         carried = carried.after(result, past, frame.time, None if self._fixed.masked else believed, shown)
+        roots = self._roots
         if result.outcome.learnt:
             learnt = [view for view in believed if view.name not in result.trace.left_out]
             seen = Seen(frame.index, given.state, result, self.rig, learnt, self._picture)
-            updater, carried = self._preparation.switched(updater, carried, seen, self.history.first)
-        self._commit(report, result.gaussians, carried, how)
+            result, updater, carried, roots = self._preparation.followed(updater, carried, seen, roots, self.populates)
+        report = report_of_update(frame, result, self.history.newest, left_out, self.rig.names, watch, dropped)
+        birth = {} if roots is self._roots else {"roots": roots, "joins": result.joins}
+        self._commit(report, result.gaussians, carried, how, **birth)
         self._updater = updater
         commit = solver.judging + perf_counter() - watch.began - watch.total
         self._budget.learn(result.trace.moments, result.trace.seconds, commit)
@@ -301,7 +307,7 @@ class Reconstruction(CommittedScene):
         """The views of a frame; without masks where no term asks for them: they are not even read."""
         settings, moving = self.settings.update, len(self._updater.hierarchy.rows)
         try:
-            use_masks = settings.use_masks and mask_weight(settings, moving, len(self.history.newest)) > 0
+            use_masks = settings.use_masks and mask_weight(settings, moving, int(self._roots.present.sum())) > 0
             return self._factory.views(self._factory.scaled(frame), self._fixed.exposures, use_masks)
         except ValueError as error:
             raise StepError(str(error)) from error
@@ -324,8 +330,10 @@ class Reconstruction(CommittedScene):
         self._update = UpdateSettings.model_validate({**self.settings.update.model_dump(), **changes})
         self._budget.milliseconds = self._update.budget_ms
 
-    def _commit(self, report: FrameReport, gaussians: Gaussians, carried: CarryOver, more: Mapping[str, Any]) -> None:
-        """The checkpoint first, then state and report in one rename."""
+    def _commit(
+        self, report: FrameReport, gaussians: Gaussians, carried: CarryOver, more: Mapping[str, Any], **birth: Any
+    ) -> None:
+        """The checkpoint first, then state and report in one rename; ``birth``: see ``History.append``."""
         if self._checkpoints is not None:
             self._checkpoints.save(report.index, carried)
         began = perf_counter()
@@ -335,7 +343,9 @@ class Reconstruction(CommittedScene):
         seconds = report.seconds  # a record cannot tell its own writing: it has that of the one before
         seconds[REPORT] = seconds.get(REPORT, 0.0) + self.history.record_seconds + perf_counter() - began
         record["seconds"] = dict(seconds)
-        self.history.append(report.index, report.time, gaussians, record)
+        self.history.append(report.index, report.time, gaussians, record, **birth)
+        if birth:
+            self._take_roots(self.history.roots())
         self._carried, self.report = carried, report
         if self._checkpoints is not None:
             self._checkpoints.clean(self.history.indices)

@@ -12,9 +12,10 @@ from typing import Any
 from scas4d_core.cameras import Rig
 from scas4d_core.captures.frame import Frame
 from scas4d_core.frame_outcome import outcome_of
+from scas4d_core.gaussians import PER_FRAME, WHOLES
 from scas4d_core.reconstruction import Reconstruction, StepError
 from scas4d_core.settings import Settings
-from scas4d_core.storage.history import PER_FRAME, History
+from scas4d_core.storage.history import History
 
 REMADE = "remade"
 """In the report of a state that was made again: true."""
@@ -48,12 +49,14 @@ def remake(
         StepError: the frame does not follow ``base``, or does not fit it.
     """
     aside = Reconstruction.aside(rig, settings, history, base)
+    aside.populates = False  # what came and went in it is known, and states after it have it
     aside.set_budget(**budget)
     aside.step(frame, dropped=dropped, notes={**(notes or {}), REMADE: True})
     report = aside.history.report(frame.index)
     outcome = outcome_of(report)
     if outcome is not None and outcome.held:  # nothing was learnt from the pictures
         raise StepError(f"frame {frame.index} does not fit the frame before it: {report['degraded']}")
-    arrays = aside.history.gaussians(frame.index).arrays()
-    history.replace(frame.index, frame.time, {name: arrays[name] for name in PER_FRAME}, report)
+    arrays = history.completed(frame.index, aside.history.gaussians(frame.index)).arrays()
+    kept = {name: arrays[name] for name in (*PER_FRAME, *WHOLES) if name in arrays}
+    history.replace(frame.index, frame.time, kept, report)
     return report

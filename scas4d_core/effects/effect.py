@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Evidence, Seen
     from scas4d_core.effects.parts import PartsBuilder
     from scas4d_core.settings import Settings
+    from scas4d_core.update.result import UpdateResult
 
 
 class Group(StrEnum):
@@ -57,6 +58,17 @@ class Effect:
     def evidence(self, seen: Seen) -> Evidence | None:
         """The evidence of a frame that calls for it; None: the frame says nothing, and the switch stays."""
         return None
+
+    def populated(self, seen: Seen) -> UpdateResult:
+        """The result of a frame with the Gaussians that are born, retired or revived in it.
+
+        Called where it is on, after each frame that was learnt and before its commit; nowhere else may rows change.
+        Rows stay where they are: ``replace(seen.result, gaussians=..., joins=..., carried=...)``, the Gaussians made
+        by ``Gaussians.joined``, ``retire`` and ``revive``. ``joins`` has those of effects before, too. Arrays in
+        ``carried`` with a row for each Gaussian are lengthened afterwards: the born have the rows of their founders,
+        or zeros.
+        """
+        return seen.result
 
     def join(self, builder: PartsBuilder) -> None:
         """Puts its part into the updates of a scene; called only where it is on."""

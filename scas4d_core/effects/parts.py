@@ -110,7 +110,8 @@ class PartsBuilder:
 
     Attributes:
         scene, update: the settings, the floor inside. factory: of the scene's views. hierarchy: of the moving.
-        first: Θ_0. length: weight of the limit of the axes' lengths, which the cascade's kernel has in itself.
+        first: the roots, Θ_0 with all born since (``preparation``).
+        length: weight of the limit of the axes' lengths, which the cascade's kernel has in itself.
         parts: of the effects that have joined, in order.
     """
 

@@ -3,7 +3,8 @@
 ``fixed.npz``, written once, holds what all frames share; ``frame_<index>.npz`` a committed frame. Every file is written
 beside its place, synced and renamed: a file with its final name is whole, and the listing of the directory is the only
 index. ``fixed.npz`` and the first frame, which everything needs, have a copy: a reader that finds the original damaged
-or gone reads the copy.
+or gone reads the copy. So has ``born_<index>.npz``, the Gaussians born in a frame, which all later frames need; it is
+written before that frame, and stays when the frame is deleted or taken back.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ INDEX = "index"
 FIXED_FILE, FIXED_COPY, FIRST_COPY = "fixed.npz", "fixed.copy.npz", "first.copy.npz"
 _CHECKPOINT_FILE = re.compile(r"checkpoint_(\d{6,})\.npz")
 _FRAME_FILE = re.compile(r"frame_(\d{6,})\.npz")
+_BORN_FILE = re.compile(r"born_(\d{6,})(\.copy)?\.npz")
 
 
 class HistoryError(ValueError):
@@ -123,21 +125,24 @@ class FrameFiles:
         """
         return float(self.read(index, ("time",))["time"])
 
-    def read(self, index: int, names: Sequence[str]) -> Arrays:
+    def read(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
         """Named arrays of a frame; of the first frame from its copy, where only that can be read.
+
+        Args:
+            optional: arrays that are read as well where there are any.
 
         Raises:
             FileNotFoundError: it is not there. UnreadableFrameError: it is damaged.
         """
         try:
-            return _read(self.path(index), names)
+            return _read(self.path(index), names, optional)
         except (FileNotFoundError, UnreadableFrameError) as error:
             first = self._first()
             if first is None or first[1] != index:
                 if isinstance(error, UnreadableFrameError):
                     self.faults[self.path(index).name] = str(error)
                 raise
-            found = _read(self.first_copy, names)
+            found = _read(self.first_copy, names, optional)
             self.faults[self.path(index).name] = _reason(self.path(index), error)
             return found
 
@@ -147,29 +152,53 @@ class FrameFiles:
         Raises:
             UnreadableFrameError: it is damaged or gone, and its copy too.
         """
+        return self._either(self.fixed, self.fixed_copy, names)
+
+    def write_born(self, index: int, arrays: Mapping[str, Any]) -> None:
+        """Writes what is known of the Gaussians born in a frame, and the copy; before the frame is committed."""
+        write_npz(self.directory / born_file(index), arrays)
+        write_npz(self.directory / born_file(index, copy=True), arrays)
+
+    def read_born(self, index: int, names: Sequence[str] | None = None) -> Arrays:
+        """Arrays of the Gaussians born in a frame, all or the named.
+
+        Raises:
+            UnreadableFrameError: it is damaged or gone, and its copy too.
+        """
+        return self._either(self.directory / born_file(index), self.directory / born_file(index, copy=True), names)
+
+    def births(self) -> list[int]:
+        """Frames with a file of the born, committed or not, rising."""
+        return sorted({index for name in os.listdir(self.directory) if (index := born_of(name)) is not None})
+
+    def _either(self, path: Path, copy: Path, names: Sequence[str] | None) -> Arrays:
         try:
-            return _read(self.fixed, names)
+            return _read(path, names)
         except (FileNotFoundError, UnreadableFrameError) as error:
-            reason = _reason(self.fixed, error)
-            self.faults[self.fixed.name] = reason
+            reason = _reason(path, error)
+            self.faults[path.name] = reason
             try:
-                return _read(self.fixed_copy, names)
+                return _read(copy, names)
             except FileNotFoundError:
                 raise UnreadableFrameError(reason) from error
 
-    def mend_copies(self, first: int, fixed: Arrays) -> dict[str, str]:
-        """Writes ``fixed.npz``, the first frame and their copies anew where they are damaged or gone.
+    def mend_copies(self, first: int, fixed: Arrays, born: Mapping[int, Arrays]) -> dict[str, str]:
+        """Writes ``fixed.npz``, the born, the first frame and their copies anew where they are damaged or gone.
 
         Args:
             first: index of the first committed frame. fixed: the arrays that all frames share, as they were read.
+            born: those of the births, by frame.
 
         Returns:
             The fault of each file that was written, by name. A file without a whole copy is left.
         """
         mended: dict[str, str] = {}
-        for file in (self.fixed, self.fixed_copy):
+        needed = {self.fixed: fixed, self.fixed_copy: fixed}
+        for index, arrays in born.items():
+            needed |= {self.directory / born_file(index, copy): arrays for copy in (False, True)}
+        for file, arrays in needed.items():
             if reason := fault_of(file):
-                write_npz(file, fixed)
+                write_npz(file, arrays)
                 mended[file.name] = reason
         own, copy = self.path(first), self.first_copy
         own_fault, copy_fault = fault_of(own), fault_of(copy)
@@ -203,6 +232,17 @@ def frame_of(name: str) -> int | None:
     return int(match[1]) if match else None
 
 
+def born_file(index: int, copy: bool = False) -> str:
+    """Name of the file of the Gaussians born in a frame, or of its copy."""
+    return f"born_{index:06d}{'.copy' if copy else ''}.npz"
+
+
+def born_of(name: str) -> int | None:
+    """Index of the frame whose born are in a file of this name, or in its copy; None for other files."""
+    match = _BORN_FILE.fullmatch(name)
+    return int(match[1]) if match else None
+
+
 def checkpoint_file(index: int) -> str:
     """Name of the file of a frame's checkpoint."""
     return f"checkpoint_{index:06d}.npz"
@@ -231,8 +271,8 @@ def _stamp(status: os.stat_result) -> Stamp:
     return status.st_size, status.st_mtime_ns
 
 
-def _read(path: Path, names: Sequence[str]) -> Arrays:
+def _read(path: Path, names: Sequence[str] | None, optional: Sequence[str] = ()) -> Arrays:
     try:
-        return read_npz(path, names)
+        return read_npz(path, names, optional)
     except ValueError as error:
         raise UnreadableFrameError(str(error)) from error

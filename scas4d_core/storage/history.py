@@ -1,23 +1,27 @@
 """Keeps the committed states of a scene, Θ_0 … Θ_t, in memory or in a directory. Numpy only.
 
-On disk (``frame_files``) a history is one file with opacities and ids, written once, and one file for each committed
-frame, which holds its state, its time and its report; the rename of that file to its final name is the commit. One
-process appends and deletes, through a ``History``; others read, and pick up its changes with ``refresh``.
+On disk (``frame_files``) a history is one file with opacities and ids, written once, one file for each committed
+frame, which holds its state, its time and its report, and one for each frame in which Gaussians were born; the rename
+of a frame's file to its final name is the commit. One process appends and deletes, through a ``History``; others read,
+and pick up its changes with ``refresh``.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from scas4d_core.gaussians import Gaussians
+from scas4d_core.gaussians import FIXED, PER_FRAME, UNBORN, WHOLES, Gaussians
+from scas4d_core.storage.births import FOUNDERLESS, Event, Int, births_in, events_of, retired_after
 from scas4d_core.storage.frame_files import Arrays, DamagedFrameError, FrameFiles, HistoryError, UnreadableFrameError
-from scas4d_core.storage.history_reader import FIXED, FRAMES_KEPT, PER_FRAME, HistoryReader
+from scas4d_core.storage.frames_reader import EVENTS, FRAMES_KEPT
+from scas4d_core.storage.history_reader import ROOT, ROOTS, HistoryReader
 from scas4d_core.storage.npz import clear_parts
 
 __all__ = [
@@ -81,22 +85,42 @@ class History(HistoryReader):
 
     def save(self, directory: Path | str) -> None:
         """Writes a copy of this history into another directory, one frame at a time."""
-        copy = History(directory)
-        for index in self.indices:
-            copy.append(index, self._times[index], self.gaussians(index), self.report(index))
+        self.copied(self.indices, directory)
 
-    def append(self, index: int, time: float, gaussians: Gaussians, report: Mapping[str, Any] | None = None) -> None:
+    def copied(self, indices: Iterable[int], directory: Path | str | None = None) -> History:
+        """A copy of some committed frames, in memory or in another directory; ids, births and lives are the same."""
+        copy = History(directory)
+        for index in sorted(set(indices)):
+            arrays, log = self.gaussians(index).arrays(), self._log_at(index)
+            frame = {name: np.array(arrays[name]) for name in (*PER_FRAME, *WHOLES) if name in arrays}
+            births = {birth[0]: self._born(birth) for birth in births_in(log)}
+            copy._write(index, self._times[index], frame, json.dumps(self.report(index)), log, births, self._fixed)
+        return copy
+
+    def append(
+        self,
+        index: int,
+        time: float,
+        gaussians: Gaussians,
+        report: Mapping[str, Any] | None = None,
+        *,
+        joins: Int | None = None,
+        roots: Gaussians | None = None,
+    ) -> None:
         """Commits the state of one frame with its report; when this returns both are on disk (if there is a directory).
 
         Args:
             index: frame number, above every index before it.
             time: seconds.
-            gaussians: the state; same ids and opacities as in the first frame. The arrays are copied.
+            gaussians: the state; same ids and opacities as in the frame before. Rows after those are born in this one:
+                they have no ids yet, and get theirs here. The arrays are copied.
             report: made of JSON values (finite numbers, strings, lists, mappings).
+            joins: [B] rows of the founders of the born; None: none has one.
+            roots: of all Gaussians (``births.grown_roots``); None: the born have theirs where they are.
 
         Raises:
-            HistoryError: index not above the last, another number of Gaussians, other ids or opacities, or a report
-                that is no JSON.
+            HistoryError: index not above the last, fewer Gaussians, other ids or opacities, or a report that is no
+                JSON.
         """
         if index <= self._newest():
             raise HistoryError(f"frame {index} comes after frame {self._newest()}; append frames in rising order")
@@ -108,33 +132,88 @@ class History(HistoryReader):
                 f"frame {index}: the report is no JSON ({error}); give finite numbers, strings, lists, mappings"
             ) from error
         self.record_seconds = perf_counter() - began
-        arrays = gaussians.arrays()
-        fixed = self._fixed or {name: np.array(arrays[name]) for name in FIXED}
+        arrays, before = gaussians.arrays(), self._events()
+        fixed = self._fixed_after(births_in(before)) if self._fixed else {n: np.array(arrays[n]) for n in FIXED}
+        count, rows = len(fixed["ids"]), len(arrays["ids"])
         for name in FIXED:
-            if not np.array_equal(arrays[name], fixed[name]):
+            if not np.array_equal(arrays[name][:count], fixed[name]):
                 raise HistoryError(
                     f"frame {index}: {name} differ from those of the first frame; they are fixed within one history"
                 )
-        count = len(fixed["ids"])
+        if not (arrays["ids"][count:] == UNBORN).all():
+            raise HistoryError(f"frame {index}: the born have ids; leave them {UNBORN}: the commit gives them theirs")
         for name in PER_FRAME:
-            if len(arrays[name]) != count:
-                raise HistoryError(f"frame {index}: {name} has {len(arrays[name])} rows; give {count}, one a Gaussian")
-        frame = {name: np.array(arrays[name]) for name in PER_FRAME}
+            if len(arrays[name]) != rows:
+                raise HistoryError(f"frame {index}: {name} has {len(arrays[name])} rows; give {rows}, one a Gaussian")
+        frame = {name: np.array(arrays[name]) for name in (*PER_FRAME, *WHOLES) if name in arrays}
+        births: dict[int, Arrays] = {}
+        ids = fixed["ids"]
+        if rows > count:
+            births[index] = self._birth(index, gaussians.rows(np.arange(count, rows)), joins, roots)
+            ids = np.concatenate([ids, births[index]["ids"]])
+        retired = np.zeros(rows, np.bool_)
+        retired[:count] = retired_after(before, fixed["ids"])
+        log = np.concatenate(
+            [
+                before,
+                events_of(index, Event.BORN, np.arange(count, rows), ids),
+                events_of(index, Event.RETIRED, np.flatnonzero(gaussians.retired & ~retired), ids),
+                events_of(index, Event.REVIVED, np.flatnonzero(retired & ~gaussians.retired), ids),
+            ]
+        )
+        self._write(index, time, frame, text, log if len(log) > len(before) else before, births, self._fixed or fixed)
+
+    def _birth(self, index: int, born: Gaussians, joins: Int | None, roots: Gaussians | None) -> Arrays:
+        """All that is kept of a birth.
+
+        A birth that a frame had before it was taken back, and has again, is the same one, with the same ids. Any other
+        gets ids that no Gaussian ever had, not even one of a frame that was taken back.
+        """
+        count = len(born)
+        origin = born if roots is None else roots.rows(np.arange(len(roots) - count, len(roots)))
+        founders = np.full(count, FOUNDERLESS, np.int64) if joins is None else np.array(joins, np.int64)
+        arrays = {name: np.array(getattr(born, name)) for name in PER_FRAME}
+        arrays |= {name: np.array(born.arrays()[name]) for name in FIXED}
+        arrays |= {"joins": founders, **{ROOT + name: np.array(getattr(origin, name)) for name in ROOTS}}
+        spent = self._births.get(index)
+        if self._files is not None:
+            spent = None
+            if index in self._files.births():
+                with suppress(UnreadableFrameError):
+                    spent = self._files.read_born(index)
+        same = spent is not None and all(
+            name == "ids" or (name in spent and np.array_equal(array, spent[name])) for name, array in arrays.items()
+        )
+        first = self.highest_id + 1
+        return arrays | {"ids": spent["ids"] if same and spent else np.arange(first, first + count, dtype=np.int64)}
+
+    def _write(
+        self, index: int, time: float, frame: Arrays, text: str, log: Int, births: Mapping[int, Arrays], fixed: Arrays
+    ) -> None:
+        """Commits a frame that fits those before.
+
+        Args:
+            log: up to it. births: those that may not have been written yet, by frame. fixed: of the first frame.
+        """
         if self._files is not None:
             encoded = text.encode()
-            written = _as_written(frame, time, encoded)
+            written = _as_written(frame, time, encoded, log)
             if not self._fixed:
                 self._files.write_fixed(fixed, index, written)
+            for born_in, arrays in births.items():
+                if born_in not in self._births or born_in == index:
+                    self._files.write_born(born_in, arrays)
             began = perf_counter()
             self._stamps[index] = self._files.write(index, written)
             self.record_seconds += (perf_counter() - began) * len(text) / self._stamps[index][0]
             self._texts[index] = encoded
         else:
             self._stamps[index] = (sum(array.nbytes for array in frame.values()), 0)
+            self._reports[index] = json.loads(text)
+        self._births.update(births)
         self._fixed = fixed
         self._times[index] = float(time)
-        if self._files is None:
-            self._reports[index] = json.loads(text)
+        self._log = (index, log)
         self.damaged.pop(index, None)
         self._keep(index, frame)
 
@@ -201,7 +280,11 @@ class History(HistoryReader):
         if self._files is None or not self._times or not self._fixed:
             return {}
         first = next(iter(self._times))
-        mended = self._files.mend_copies(first, self._fixed)
+        births = {}
+        for birth in births_in(self._events()):
+            with suppress(DamagedFrameError):  # neither in memory nor whole in one of its files
+                births[birth[0]] = self._born(birth)
+        mended = self._files.mend_copies(first, self._fixed, births)
         if self._files.path(first).name in mended:
             self._stamps.update(self._files.stamped((first,)))
         return mended
@@ -215,29 +298,43 @@ class History(HistoryReader):
         frame, text = self._frames.get(index), self._texts.get(index)
         if self._files is None or frame is None or text is None or index not in self._times:
             return False
-        self._stamps[index] = self._files.write(index, _as_written(frame, self._times[index], text))
+        self._stamps[index] = self._files.write(
+            index, _as_written(frame, self._times[index], text, self._log_at(index))
+        )
         return True
 
     def replace(self, index: int, time: float, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:
         """Writes the state of a frame anew whose file is damaged or gone.
 
         Args:
-            index: of a frame before the newest. time: seconds. arrays: ``PER_FRAME``. report: as for ``append``.
+            index: of a frame before the newest. time: seconds. arrays: ``PER_FRAME``, and ``WHOLES`` if there are any.
+            report: as for ``append``.
 
         Raises:
             HistoryError: the frame is not before the newest, or has another number of Gaussians.
         """
         assert self._files is not None
-        if index >= self._newest() or len(arrays["means"]) != len(self._fixed["ids"]):
+        log = self._log_at(index)
+        if index >= self._newest() or len(arrays["means"]) != len(self._fixed_after(births_in(log))["ids"]):
             raise HistoryError(f"frame {index} cannot take the place of one that was committed")
-        frame = {name: np.asarray(arrays[name]) for name in PER_FRAME}
+        frame = {name: np.asarray(arrays[name]) for name in (*PER_FRAME, *WHOLES) if name in arrays}
         text = json.dumps(dict(report), allow_nan=False).encode()
         self._forget(index)
-        self._stamps[index] = self._files.write(index, _as_written(frame, time, text))
+        self._stamps[index] = self._files.write(index, _as_written(frame, time, text, log))
         self.damaged.pop(index, None)
         self._times = dict(sorted([*self._times.items(), (index, float(time))]))
 
+    def completed(self, index: int, state: Gaussians) -> Gaussians:
+        """A state that was made again for a frame, with the Gaussians that were born in it, as they were then."""
+        for birth in births_in(self._log_at(index)):
+            born = self._born(birth)
+            if self.rows_of(birth[1:2])[0] >= len(state):
+                state = state.joined(Gaussians(**{name: born[name] for name in (*FIXED, *PER_FRAME)}))
+        return state
 
-def _as_written(frame: Arrays, time: float, report: bytes) -> dict[str, Any]:
+
+def _as_written(frame: Arrays, time: float, report: bytes, log: Int) -> dict[str, Any]:
     """The arrays of a frame's file."""
+    if len(log):
+        frame = {**frame, EVENTS: log}
     return {**frame, "time": np.float64(time), "report": np.frombuffer(report, np.uint8)}

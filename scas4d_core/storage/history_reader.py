@@ -1,163 +1,31 @@
-"""Reads the committed states of a scene: Θ_0 … Θ_t with their times and reports. Numpy only."""
+"""Reads the committed states of a scene: Θ_0 … Θ_t, and which Gaussians there were when. Numpy only."""
 
 from __future__ import annotations
 
-import json
-from collections import OrderedDict
-from collections.abc import Iterable, Sequence
-from pathlib import Path
-from typing import Any, Self
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from scas4d_core.gaussians import Gaussians
-from scas4d_core.storage.frame_files import (
-    Arrays,
-    DamagedFrameError,
-    FrameFiles,
-    HistoryError,
-    Stamp,
-    UnreadableFrameError,
-)
+from scas4d_core.gaussians import FIXED, PER_FRAME, WHOLES, Gaussians
+from scas4d_core.storage.births import Int, Life, births_in, lives_of, retired_after, rows_among
+from scas4d_core.storage.frame_files import DamagedFrameError, HistoryError, UnreadableFrameError
+from scas4d_core.storage.frames_reader import FramesReader
 
-PER_FRAME = ("means", "rotations", "factors", "colours", "foreground")
-"""Arrays of ``Gaussians`` that may differ from frame to frame."""
-FIXED = ("opacities", "ids")
-"""Arrays of ``Gaussians`` that a scene keeps after frame 0."""
-FRAMES_KEPT = 4
-"""Frames of a history on disk that stay in memory: the newest, and the last ones read."""
+ROOT = "root."
+"""Before the names of the arrays of a birth that say where the born would have been in the first frame (``roots``)."""
+ROOTS = ("means", "factors", "rotations")
+"""Arrays of ``Gaussians`` that the roots of the born have of their own."""
 
 
-class HistoryReader:
+class HistoryReader(FramesReader):
     """Reads committed states, from the memory of this process or from a directory that another process writes.
 
     Attributes:
         damaged: frames whose file cannot be read, with the reason; they are not among ``indices``.
     """
-
-    def __init__(self, directory: Path | None = None) -> None:
-        self._files = None if directory is None else FrameFiles(directory)
-        self.damaged: dict[int, str] = {}
-        self._fixed: Arrays = {}
-        self._times: dict[int, float] = {}
-        self._reports: dict[int, dict[str, Any]] = {}
-        self._stamps: dict[int, Stamp] = {}
-        self._texts: dict[int, bytes] = {}
-        """Reports on disk of the frames that are in memory."""
-        self._frames: OrderedDict[int, Arrays] = OrderedDict()
-
-    @classmethod
-    def load(cls, directory: Path | str, only: Iterable[int] | None = None) -> Self:
-        """Opens the history in a directory. A frame that cannot be read is left out and named in ``damaged``.
-
-        Args:
-            directory: of the history.
-            only: the frames that are read, where these are known; else every file of the directory is looked at.
-
-        Raises:
-            HistoryError: no history there, or the file that all frames need is damaged.
-        """
-        files = FrameFiles(Path(directory))
-        if not files.exists:
-            raise HistoryError(f"{files.directory.name} holds no history: {files.fixed.name} is missing")
-        history = cls()
-        history._files = files
-        history.refresh(only)
-        if history._stamps:
-            history._fixed = files.read_fixed(FIXED)
-        return history
-
-    def refresh(self, only: Iterable[int] | None = None) -> tuple[list[int], list[int]]:
-        """Picks up what the process that writes this directory has committed and deleted; known frames stay unopened.
-
-        Args:
-            only: the frames that may have changed, where these are known: listing the states of a day takes a while.
-
-        Returns:
-            The indices that are new (or written anew), and those that are gone.
-        """
-        if self._files is None:
-            return [], []
-        looked_at = {*self._times, *self.damaged} if only is None else set(only)
-        listed = self._files.listed() if only is None else self._files.stamped(looked_at)
-        gone = sorted(index for index in looked_at if index in self._times and index not in listed)
-        changed = [index for index, stamp in listed.items() if self._stamps.get(index) != stamp]
-        for index in [*gone, *changed]:
-            self._forget(index)
-        for index in looked_at - listed.keys():
-            self.damaged.pop(index, None)
-        newest = self._newest()
-        added = []
-        for index in changed:
-            try:
-                self._times[index] = self._files.time(index)
-            except FileNotFoundError:  # deleted since it was listed
-                continue
-            except ValueError as error:
-                self.damaged[index] = str(error)
-            else:
-                self.damaged.pop(index, None)
-                added.append(index)
-            self._stamps[index] = listed[index]
-        if added and added[0] < newest:
-            self._times = dict(sorted(self._times.items()))
-        if added and not self._fixed:
-            self._fixed = self._files.read_fixed(FIXED)
-        return added, gone
-
-    def take_faults(self) -> dict[str, str]:
-        """Files found damaged or gone since the last call, by name with the reason."""
-        if self._files is None:
-            return {}
-        faults, self._files.faults = self._files.faults, {}
-        return faults
-
-    @property
-    def directory(self) -> Path | None:
-        """Directory of the states; None in memory."""
-        return None if self._files is None else self._files.directory
-
-    def __len__(self) -> int:
-        return len(self._times)
-
-    def __contains__(self, index: object) -> bool:
-        return index in self._times
-
-    @property
-    def indices(self) -> list[int]:
-        """The committed frame numbers, rising."""
-        return list(self._times)
-
-    @property
-    def times(self) -> NDArray[np.float64]:
-        """[T] float64 seconds, in the order of ``indices``."""
-        return np.array(list(self._times.values()), dtype=np.float64)
-
-    def time(self, index: int) -> float:
-        """Seconds of one committed frame."""
-        self._require(index)
-        return self._times[index]
-
-    def report(self, index: int) -> dict[str, Any]:
-        """The report that was committed with the state of a frame; empty where there was none.
-
-        Raises:
-            HistoryError: the frame was not committed, or its file is damaged.
-        """
-        self._require(index)
-        if self._files is None:
-            return dict(self._reports[index])
-        text = self._texts.get(index)
-        if text is None:
-            text = self._from_file(index, ("report",))["report"].tobytes()
-        try:
-            report: dict[str, Any] = json.loads(text)
-        except ValueError as error:
-            raise HistoryError(f"{self._files.path(index).name}: its report is no JSON ({error})") from error
-        if index in self._frames:
-            self._texts[index] = text
-        return report
 
     @property
     def newest(self) -> Gaussians:
@@ -173,23 +41,103 @@ class HistoryReader:
         self._require(index)
         frame = self._frames.get(index)
         if frame is None:
-            frame = self._from_file(index, PER_FRAME)
+            frame = self._from_file(index, PER_FRAME, WHOLES)
             self._keep(index, frame)
         else:
             self._frames.move_to_end(index)
-        return Gaussians(**frame, **self._fixed)
+        log = self._log_at(index)
+        if not len(log):
+            return Gaussians(**frame, **self._fixed)
+        fixed = self._fixed_after(births_in(log))
+        if len(frame["means"]) != len(fixed["ids"]):
+            raise DamagedFrameError(f"frame {index}: {len(frame['means'])} Gaussians, its log says {len(fixed['ids'])}")
+        return Gaussians(**frame, **fixed, retired=retired_after(log, fixed["ids"]))
 
     @property
     def first(self) -> Gaussians:
         """The state of the first frame; it raises as ``gaussians`` does."""
         return self.gaussians(self.indices[0])
 
+    def roots(self, index: int | None = None) -> Gaussians:
+        """The first frame, with the Gaussians born since where they would have been in it (``births.grown_roots``).
+
+        Args:
+            index: of a frame: those born by then, and retired as then; None: the newest.
+
+        Raises:
+            HistoryError: the first frame cannot be read, or what is kept of a birth.
+        """
+        log = self._events() if index is None else self._log_at(index)
+        if not len(log):
+            return self.first
+        roots, births = self.gaussians(self.indices[0]), births_in(log)
+        for birth in births:
+            born = self._born(birth)
+            given = {name: born[name] for name in (*FIXED, *PER_FRAME)}
+            roots = roots.joined(Gaussians(**given | {name: born[ROOT + name] for name in ROOTS}))
+        fixed = self._fixed_after(births)
+        return roots.replace(ids=fixed["ids"], retired=retired_after(log, fixed["ids"]))
+
+    @property
+    def ids(self) -> Int:
+        """[count] ids of all Gaussians that there have been, by row."""
+        ids: Int = self._fixed_after(births_in(self._events())).get("ids", np.zeros(0, np.int64))
+        return ids
+
+    @property
+    def count(self) -> int:
+        """Gaussians that there have been."""
+        return len(self.ids)
+
+    @property
+    def born_at(self) -> Int:
+        """[count] frame in which each Gaussian, by row, was born; the first one, for those that it began with."""
+        first = np.full(len(self._fixed.get("ids", ())), next(iter(self._times), -1), np.int64)
+        later = [np.full(last - begin + 1, index, np.int64) for index, begin, last in births_in(self._events())]
+        return np.concatenate([first, *later])
+
+    @property
+    def highest_id(self) -> int:
+        """The highest id that any Gaussian has or had, also in frames that were taken back; −1 without one."""
+        known = [self.ids, *(arrays["ids"] for arrays in self._births.values())]
+        if (files := self._files) is not None:
+            for index in set(files.births()) - self._births.keys():
+                with suppress(UnreadableFrameError):
+                    known.append(files.read_born(index, ("ids",))["ids"])
+        return max((int(ids.max()) for ids in known if len(ids)), default=-1)
+
+    def rows_of(self, ids: ArrayLike) -> Int:
+        """[Q] rows of ids; −1 for an id that no Gaussian has."""
+        return rows_among(self.ids, np.asarray(ids, np.int64).reshape(-1))
+
+    def present(self, index: int) -> NDArray[np.bool_]:
+        """[count] bool, by row: the Gaussians that are there in a committed frame, born before or in it, not retired.
+
+        Raises:
+            HistoryError: the frame was not committed.
+        """
+        self._require(index)
+        log, ids = self._log_at(index), self.ids
+        there = ~retired_after(log, ids)
+        there[len(self._fixed_after(births_in(log))["ids"]) :] = False
+        return there
+
+    def lives(self, ids: ArrayLike) -> list[Life]:
+        """The frames in which Gaussians were born, retired and revived.
+
+        Args:
+            ids: [Q] of Gaussians of this scene; see ``rows_of``.
+        """
+        wanted = np.asarray(ids, np.int64).reshape(-1).tolist()
+        return lives_of(self._events(), wanted, next(iter(self._times), -1))
+
     def stacked(
         self, name: str, indices: Sequence[int] | None = None, rows: NDArray[np.intp] | None = None
     ) -> NDArray[Any]:
         """One array of several frames, [T, N, ...], in the order of ``indices`` (default: every frame).
 
-        Only that array is read from the files: a long history needs no more memory than the answer.
+        Where a Gaussian is not born yet it is NaN; where one is retired, as it was when it was there last. Only that
+        array is read from the files: a long history needs no more memory than the answer.
 
         Args:
             name: one of ``PER_FRAME``.
@@ -210,53 +158,22 @@ class HistoryReader:
             frame = self._frames.get(index)
             array = frame[name] if frame is not None else self._from_file(index, (name,))[name]
             if rows is not None:
-                array = array[rows]
+                array = _taken(array, rows)
             if result is None:
                 result = np.empty((len(chosen), *array.shape), dtype=array.dtype)
-            result[row] = array
+            if len(array) > result.shape[1]:
+                more = np.full((len(chosen), len(array) - result.shape[1], *array.shape[1:]), np.nan, array.dtype)
+                result = np.concatenate([result, more], axis=1)
+            result[row, : len(array)], result[row, len(array) :] = array, np.nan
         assert result is not None
         return result
 
-    def _require(self, index: int) -> None:
-        if index in self._times:
-            return
-        if index in self.damaged:
-            raise DamagedFrameError(f"frame {index} cannot be read: {self.damaged[index]}")
-        held = f"{next(iter(self._times))} to {self._newest()}" if self._times else "none yet"
-        raise UnreadableFrameError(f"frame {index} is not in the history; committed frames: {held}")
 
-    def _newest(self) -> int:
-        """Index of the last frame, -1 without one; ``indices`` copies all of them."""
-        return next(reversed(self._times), -1)
-
-    def _from_file(self, index: int, names: Sequence[str]) -> Arrays:
-        assert self._files is not None
-        try:
-            return self._files.read(index, names)
-        except FileNotFoundError:
-            self._forget(index)  # deleted, by the process that appends or by another
-            self._files.faults[self._files.path(index).name] = f"{self._files.path(index).name} is gone"
-            self._require(index)
-            raise
-        except UnreadableFrameError as error:
-            stamp = self._stamps.get(index)
-            self._forget(index)
-            self.damaged[index] = str(error)
-            if stamp is not None:  # until another file is there
-                self._stamps[index] = stamp
-            raise DamagedFrameError(str(error)) from error
-
-    def _forget(self, index: int) -> None:
-        self._times.pop(index, None)
-        self._reports.pop(index, None)
-        self._stamps.pop(index, None)
-        self._texts.pop(index, None)
-        self._frames.pop(index, None)
-
-    def _keep(self, index: int, frame: Arrays) -> None:
-        self._frames[index] = frame
-        if self._files is not None:
-            newest = self._newest()
-            for old in [i for i in self._frames if i != newest][: max(0, len(self._frames) - FRAMES_KEPT)]:
-                del self._frames[old]
-                self._texts.pop(old, None)
+def _taken(array: NDArray[Any], rows: NDArray[np.intp]) -> NDArray[Any]:
+    """Rows of an array, any shape; NaN for those that it does not have."""
+    if not rows.size or int(rows.max()) < len(array):
+        return array[rows]
+    found = np.full((*rows.shape, *array.shape[1:]), np.nan, array.dtype)
+    inside = rows < len(array)
+    found[inside] = array[rows[inside]]
+    return found

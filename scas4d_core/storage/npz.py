@@ -123,8 +123,11 @@ def sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-def read_npz(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
+def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
     """Reads named arrays of an npz, or all, and compares each with its checksum; nothing is unpickled.
+
+    Args:
+        optional: arrays that are read as well where the file was written with them.
 
     Raises:
         FileNotFoundError: it is not there.
@@ -143,7 +146,8 @@ def read_npz(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArra
         # Opened here, because numpy leaves a damaged file open.
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             checksums = _checksums(file.zip)
-            found = {name: np.asarray(file[name]) for name in (file.files if names is None else names)}
+            wanted = file.files if names is None else [*names, *(name for name in optional if name in file.files)]
+            found = {name: np.asarray(file[name]) for name in wanted}
             if checksums is not None:
                 for name, array in found.items():
                     if not _agrees(checksums[name], _digest(array)):

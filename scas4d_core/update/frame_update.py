@@ -81,7 +81,7 @@ class FrameUpdate:
         self._rates = Rates.of(settings, len(hierarchy.sizes), factory.rig.radius)
         parts = parts or joined(PartsBuilder(scene, settings, factory, hierarchy, first))
         self._hooks, self._length = Hooks(parts.parts), parts.length
-        mask = mask_weight(settings, len(hierarchy.rows), len(first))
+        mask = mask_weight(settings, len(hierarchy.rows), int(first.present.sum()))
         limits = scene_limits(scene.near, factory.rig.radius)
         self._picture = PictureLoss(factory, scene.background, schedule.IMAGE_WEIGHT, mask, limits=limits)
         bounds = length_bounds(hierarchy, first)

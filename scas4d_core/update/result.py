@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from time import perf_counter
 from typing import TypedDict
 
+import numpy as np
+from numpy.typing import NDArray
+
 from scas4d_core.effects.parts import Arrays
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
@@ -162,6 +165,8 @@ class UpdateResult:
         exposure: times that the frame is brighter than usual.
         offsets: dB by camera above (+) or below its usual place among the cameras; empty where nothing was rendered.
         carried: arrays for the next update, by effect.
+        joins: [B] int64 of the Gaussians born in this frame, which are the last rows: the row of the founder that each
+            joins in the hierarchy and the graph, or −1 where it starts a structure of its own. None: none is born.
     """
 
     gaussians: Gaussians
@@ -175,3 +180,4 @@ class UpdateResult:
     exposure: float = 1.0
     offsets: Mapping[str, float] = field(default_factory=dict)
     carried: Mapping[str, Arrays] = field(default_factory=dict)
+    joins: NDArray[np.int64] | None = None

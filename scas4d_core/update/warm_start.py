@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.gaussians import Gaussians
 from scas4d_core.structure.hierarchy import Hierarchy
 
 Array = NDArray[np.float32]
@@ -20,6 +21,9 @@ Float = NDArray[np.float64]
 
 WARM_START = 1.0
 """Share of the previous deformation that starts the next (paper: all of it; without, 0.6 dB are lost on `robot`)."""
+
+LEAST_COSINE = 0.5
+"""Of half the mean turn of a cluster's Gaussians, below which it says nothing."""
 
 LONGEST_PREDICTION = 3.0
 """Times the interval it was found in that a motion is carried on for: after a longer gap it says little."""
@@ -112,6 +116,52 @@ class Motion:
                 shifts[below] = rotate(turns[k][parents], shifts[below])
             shifts[k] = rotate(turns[k], shifts[k])
         return cls(turns, shifts, rest, deformation.deltas[:, 3:6].astype(np.float64), seconds)
+
+
+def motion_between(
+    hierarchy: Hierarchy, before: Gaussians, after: Gaussians, known: NDArray[np.bool_], seconds: float
+) -> Motion:
+    """The motion from one state to another as a hierarchy would have found it: for one that was made in between.
+
+    All of it is in the finest layer, whose clusters turn and shift as their known Gaussians did, in the mean.
+
+    Args:
+        before: with the first rows of ``after``. known: [M] in the order of the hierarchy; only of these Gaussians the
+            motion between is known, and all have a row in ``before``; the others go on with their cluster.
+        seconds: between.
+    """
+    layers = [np.zeros((count, 3)) for count in hierarchy.sizes]
+    turns, shifts = layers, [array.copy() for array in layers]
+    rows = hierarchy.rows
+    rest = np.zeros((len(rows), 3))
+    starts = np.where(known, rows, 0)
+    there, now = before.means[starts].astype(np.float64), after.means[rows].astype(np.float64)
+    if layers:
+        labels, count = hierarchy.labels[-1], hierarchy.sizes[-1]
+        back = before.rotations[starts] * np.array([1, -1, -1, -1], np.float32)
+        turned = quaternion_products(after.rotations[rows], back).astype(np.float64)
+        turned *= np.where(turned[:, :1] < 0, -1.0, 1.0)
+        turn = _averages(turned, labels, known, count)
+        none = turn[:, 0] < LEAST_COSINE  # no Gaussian of it is known, or they turned every way
+        turn = np.where(none[:, None], 0.0, turn[:, 1:] / np.where(none, 1.0, turn[:, 0])[:, None])
+        shift = rotate(turn, _averages(now - there, labels, known, count))
+        # The cluster turns about the middle of all of its Gaussians, which need not be that of the known ones.
+        apart = _averages(now, labels, np.ones_like(known), count) - _averages(now, labels, known, count)
+        empty = np.bincount(labels, weights=known, minlength=count) == 0
+        apart[empty] = 0
+        turns[-1], shifts[-1] = turn, shift + rotate(turn, apart) - apart
+        middle = _averages(there, labels, known, count)[labels]
+        led = rotate(turn[labels], there - middle) + middle + _averages(now - there, labels, known, count)[labels]
+        rest = np.where(known[:, None], rotate(turn[labels], now - led), 0.0)
+    return Motion(turns, shifts, rest, np.zeros_like(rest), seconds)
+
+
+def _averages(values: Float, labels: NDArray[np.int32], chosen: NDArray[np.bool_], count: int) -> Float:
+    """[count, C] mean of the chosen rows of each cluster; 0 where none is."""
+    own = labels[chosen]
+    sums = np.stack([np.bincount(own, weights=column, minlength=count) for column in values[chosen].T], axis=1)
+    means: Float = sums / np.maximum(np.bincount(own, minlength=count), 1)[:, None]
+    return means
 
 
 def warm_start(deformation: Parameters, motion: Motion | None, seconds: float, momentum: float) -> None:

@@ -1,0 +1,166 @@
+"""Births, retirements and revivals of Gaussians: their log, the lives that follow from it, the place of the born.
+
+Each frame's file holds the log of all frames up to it, so that retention, which deletes files, takes nothing from it.
+A birth has a file of its own, which all later frames need. Numpy only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.gaussians import Gaussians, quaternions_to_matrices
+
+Int = NDArray[np.int64]
+
+COLUMNS = 4
+"""Of the log: frame, kind, first id, last id."""
+NO_EVENTS: Int = np.zeros((0, COLUMNS), np.int64)
+FOUNDERLESS = -1
+"""Founder of a Gaussian that starts a structure of its own."""
+
+
+class Event(IntEnum):
+    """The kinds of events in a log."""
+
+    BORN = 0
+    RETIRED = 1
+    REVIVED = 2
+
+
+@dataclass(frozen=True)
+class Life:
+    """The frames in which a Gaussian came and went.
+
+    Attributes:
+        id: of the Gaussian. born: the first frame, for those that it began with. retired, revived: rising; it is there
+            from its birth or a revival on, and from a retirement on it is not.
+    """
+
+    id: int
+    born: int
+    retired: tuple[int, ...] = ()
+    revived: tuple[int, ...] = ()
+
+
+def events_of(index: int, kind: Event, rows: NDArray[np.intp], ids: Int) -> Int:
+    """[E, 4] log of one kind of event in a frame; where rows and ids follow one another they are one row of the log.
+
+    Args:
+        rows: of the Gaussians, rising. ids: [N] of all, by row.
+
+    >>> events_of(5, Event.RETIRED, np.array([0, 1, 3]), ids=np.array([3, 4, 5, 7])).tolist()
+    [[5, 1, 3, 4], [5, 1, 7, 7]]
+    """
+    if not len(rows):
+        return NO_EVENTS
+    ids = ids[rows]
+    ends = np.flatnonzero((np.diff(ids) != 1) | (np.diff(rows) != 1))
+    first, last = ids[np.concatenate([[0], ends + 1])], ids[np.concatenate([ends, [len(ids) - 1]])]
+    return np.stack([np.full(len(first), index), np.full(len(first), int(kind)), first, last], axis=1).astype(np.int64)
+
+
+def births_in(events: Int) -> list[tuple[int, int, int]]:
+    """Frame, first id and last id of each birth in a log, in the order of their rows."""
+    return [(int(frame), int(first), int(last)) for frame, kind, first, last in events if kind == Event.BORN]
+
+
+def retired_after(events: Int, ids: Int) -> NDArray[np.bool_]:
+    """[N] bool: the Gaussians that are retired at the end of a log.
+
+    Args:
+        ids: [N] of all Gaussians, by row; those of one event lie in rows that follow one another.
+
+    >>> events = np.array([[5, 1, 3, 4], [6, 2, 4, 4]])
+    >>> retired_after(events, np.array([2, 3, 4]))
+    array([False,  True, False])
+    """
+    retired = np.zeros(len(ids), np.bool_)
+    changes = events[events[:, 1] != Event.BORN]
+    if len(changes):
+        begins = rows_among(ids, changes[:, 2])
+        for (_, kind, first, last), begin in zip(changes.tolist(), begins.tolist(), strict=True):
+            retired[begin : begin + last - first + 1] = kind == Event.RETIRED
+    return retired
+
+
+def rows_among(ids: Int, wanted: Int) -> Int:
+    """[Q] rows of ids; −1 for one that is not among them.
+
+    >>> rows_among(np.array([7, 3, 5]), np.array([5, 4, 7]))
+    array([ 2, -1,  0])
+    """
+    if not len(ids):
+        return np.full(len(wanted), -1, np.int64)
+    order = np.argsort(ids, kind="stable")
+    place = order[np.minimum(np.searchsorted(ids, wanted, sorter=order), len(ids) - 1)]
+    return np.where(ids[place] == wanted, place, -1).astype(np.int64)
+
+
+def lives_of(events: Int, wanted: Iterable[int], first: int) -> list[Life]:
+    """The lives of Gaussians, by id, as a log tells them.
+
+    Args:
+        events: the log. first: the first frame, in which those are born that no event bears.
+    """
+    found = []
+    for id in wanted:
+        own = events[(events[:, 2] <= id) & (id <= events[:, 3])]
+        born, retired, revived = (tuple(own[own[:, 1] == kind, 0].tolist()) for kind in Event)
+        found.append(Life(int(id), born[0] if born else first, retired, revived))
+    return found
+
+
+def grown_roots(roots: Gaussians, state: Gaussians, joins: Int | None) -> Gaussians:
+    """The roots of a state: Θ_0 with each Gaussian born since at the place that it would have had there.
+
+    Clusters and neighbours are made of them. A born Gaussian goes back as its founder has come, rigidly; one without
+    a founder has its place where it was born.
+
+    Args:
+        roots: before this frame, [N]. state: after it, [N + B]. joins: [B] founders; None: none has one.
+    """
+    count, born = len(roots), state.rows(np.arange(len(roots), len(state)))
+    if len(born):
+        founders = np.full(len(born), FOUNDERLESS, np.int64) if joins is None else joins
+        means, factors, rotations = (
+            getattr(born, name).astype(np.float64) for name in ("means", "factors", "rotations")
+        )
+        which = np.flatnonzero(founders != FOUNDERLESS)
+        rows = founders[which]
+        back = _product(roots.rotations[rows].astype(np.float64), _inverse(state.rotations[rows].astype(np.float64)))
+        turn = quaternions_to_matrices(back)
+        means[which] = roots.means[rows] + _turned(turn, means[which] - state.means[rows])
+        factors[which] = turn @ factors[which]
+        rotations[which] = _product(back, rotations[which])
+        roots = roots.joined(
+            born.replace(
+                means=means.astype(np.float32),
+                factors=factors.astype(np.float32),
+                rotations=rotations.astype(np.float32),
+            )
+        )
+        assert len(roots) == count + len(born)
+    return roots.replace(retired=state.retired.copy())
+
+
+def _turned(turns: NDArray[Any], vectors: NDArray[Any]) -> NDArray[Any]:
+    found: NDArray[Any] = (turns @ vectors[:, :, None])[:, :, 0]
+    return found
+
+
+def _inverse(quaternions: NDArray[Any]) -> NDArray[Any]:
+    found: NDArray[Any] = quaternions * np.array([1, -1, -1, -1])
+    return found
+
+
+def _product(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
+    """[M, 4] a∘b (w, x, y, z): first b, then a."""
+    scalar = a[:, :1] * b[:, :1] - (a[:, 1:] * b[:, 1:]).sum(axis=1, keepdims=True)
+    vector = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])
+    return np.concatenate([scalar, vector], axis=1)
