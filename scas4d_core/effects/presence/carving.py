@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, distance_transform_edt, label
 
-from scas4d_core.first_frame.posed_pictures import front_depth, pixels_inside
+from scas4d_core.first_frame.posed_pictures import front_depth, look_at_point, pixels_inside
 
 if TYPE_CHECKING:
     from scas4d_core.effects.presence.novelty import Novelty
@@ -56,12 +56,14 @@ class Hull:
         return Hull(self.points[kept], self.surface[kept], self.things[kept], self.voxel)
 
 
-def carve_new(seen: Sequence[Novelty], middle: Float, reach: float) -> Hull:
-    """Carves what is new.
+def carve_new(seen: Sequence[Novelty]) -> Hull:
+    """Carves what is new, out of the stage: a cube about its middle that holds all cameras.
 
     Args:
-        seen: what the cameras say. middle, reach: [3] centre of the stage, metres to its ends.
+        seen: what the cameras say.
     """
+    middle = look_at_point(seen)
+    reach = max(float(np.linalg.norm(one.camera.centre - middle)) for one in seen)
     pixel = float(np.median([_depth_of(one, middle) / one.camera.fx for one in seen]))
     voxel = 2 * reach / COARSE
     origin = middle - reach + voxel / 2

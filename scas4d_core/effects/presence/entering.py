@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from scas4d_core.effects.effect import Effect, Group
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.effects.presence.carving import Hull, carve_new, footprint
+from scas4d_core.effects.presence.catching import Catching
 from scas4d_core.effects.presence.novelty import Novelty, novelties
-from scas4d_core.first_frame.posed_pictures import look_at_point
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Seen
@@ -69,9 +69,7 @@ def entered(seen: Seen) -> Found | None:
         for view, one in zip(others, novelties(state, colours, others, seen.rig, seen.picture), strict=True)
     }
     everyone = [known[view.name] for view in seen.views]
-    middle = look_at_point(everyone)  # type: ignore[arg-type]
-    reach = max(float(np.linalg.norm(one.camera.centre - middle)) for one in everyone)
-    hull = carve_new(everyone, middle, reach)
+    hull = carve_new(everyone)
     total = sum(float(one.error.sum()) for one in everyone)
     kept, share, cameras = np.zeros(len(hull.points), np.bool_), 0.0, 0
     for thing in np.unique(hull.things):
@@ -107,9 +105,12 @@ class Entering(Effect):
     def populated(self, seen: Seen) -> UpdateResult:
         """The result with the Gaussians that are born."""
         result = seen.result
-        found = entered(seen)
+        found, left = entered(seen), result.carried.get(NAME)
         if found is None:
-            return result
+            if left is None or not len(left["young"]):
+                return result
+            grown_up = {**left, "young": left["young"][:0], "thing": left["thing"][:0]}
+            return replace(result, carried={**result.carried, NAME: grown_up})
         from scas4d_core.effects.presence.growing import grown, seeds
 
         rng = np.random.default_rng([seen.index, len(result.gaussians)])
@@ -118,9 +119,14 @@ class Entering(Effect):
             return result
         state = result.gaussians
         born = grown(state, points, colours, seen.views, seen.rig, seen.picture, rng)
-        left = result.carried.get(NAME)
         rows = np.arange(len(state), len(state) + len(born))
+        things = np.unique(found.hull.things)
+        nearest = cKDTree(found.hull.points).query(born.means)[1]
         arrays: Arrays = {
+            "young": rows,
+            "thing": np.searchsorted(things, found.hull.things[nearest]),
+            "centres": np.array([found.hull.points[found.hull.things == number].mean(axis=0) for number in things]),
+            "volumes": np.array([(found.hull.things == number).sum() * found.hull.voxel**3 for number in things]),
             "rows": rows if left is None else np.concatenate([left["rows"], rows]),
             "share": np.array(found.share if left is None else max(found.share, float(left["share"]))),
             "cameras": np.array(found.cameras if left is None else max(found.cameras, int(left["cameras"]))),
@@ -129,7 +135,8 @@ class Entering(Effect):
         return replace(result, gaussians=state.joined(born), joins=joins, carried={**result.carried, NAME: arrays})
 
     def join(self, builder: PartsBuilder) -> None:
-        """Adds nothing: births come after the update of a frame."""
+        """Adds the search for what was born in the frame before."""
+        builder.parts.append(Catching(builder, NAME))
 
 
 def _evidence(share: float, cameras: int) -> Evidence:
