@@ -189,6 +189,21 @@ def quaternions_to_matrices(quaternions: NDArray[Any]) -> NDArray[Any]:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def quaternion_products(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
+    """[M, 4] a∘b (w, x, y, z): first b, then a."""
+    aw, ax, ay, az = a.T
+    bw, bx, by, bz = b.T
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=1,
+    )
+
+
 def moving_extent(gaussians: Gaussians) -> float:
     """Longest side, in metres, of the box that holds 98 % of the moving Gaussians on each axis.
 

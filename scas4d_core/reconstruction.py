@@ -72,8 +72,7 @@ class Reconstruction(CommittedScene):
         require_device(settings.device)
         world, scale = rig.world_frame(settings.scene.metres_per_unit), settings.scene.image_scale
         self.rig = rig_inside(world, rig.scaled(scale).cameras)
-        limits = scene_limits(settings.scene.near, self.rig.radius)
-        super().__init__(history, world, limits)
+        super().__init__(history, world, limits := scene_limits(settings.scene.near, self.rig.radius))
         self.settings, self._update = settings, settings.update
         self._factory = ViewFactory(self.rig, None if scale == 1.0 else rig)
         self._picture = PictureLoss(self._factory, settings.scene.background, 1.0, 0.0, limits=limits)

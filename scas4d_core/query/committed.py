@@ -83,7 +83,8 @@ class CommittedScene:
         Args:
             camera: user's world. index: a committed frame.
             background: RGB in 0…1 behind everything.
-            labels: [N] part of each Gaussian, −1 for none; given where ``View.parts`` is wanted.
+            labels: [N] part of each Gaussian, −1 for none; given where ``View.parts`` is wanted. Those of the newest
+                frame are for any: of Gaussians born later nothing is shown.
 
         Raises:
             HistoryError: the frame was not committed. ValueError: labels of another shape or range.
@@ -105,6 +106,8 @@ class CommittedScene:
 
     def _parts_picture(self, gaussians: Gaussians, labels: NDArray[Any], inside: Camera) -> NDArray[np.uint8]:
         """[H, W] uint8: the label whose Gaussians weigh most in the pixel, plus 1. A pass renders ``GROUP`` labels."""
+        if labels.shape == (self.history.count,):
+            labels = labels[: len(gaussians)]
         if labels.shape != (len(gaussians),) or not ((labels >= -1) & (labels <= MOST_LABEL)).all():
             raise ValueError(
                 f"labels {labels.shape} must be [{len(gaussians)}], one a Gaussian, each in -1...{MOST_LABEL}"

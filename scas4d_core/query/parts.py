@@ -18,7 +18,8 @@ from scipy.optimize import linear_sum_assignment
 from threadpoolctl import threadpool_limits
 
 from scas4d_core.errors import InputError
-from scas4d_core.gaussians import Gaussians, moving_extent, quaternions_to_matrices
+from scas4d_core.gaussians import Gaussians, moving_extent, quaternion_products, quaternions_to_matrices
+from scas4d_core.storage.births import FOUNDERLESS
 from scas4d_core.storage.history import History
 
 Features = NDArray[np.float32]
@@ -159,11 +160,39 @@ def match_labels(labels: NDArray[Any], previous: NDArray[Any], weights: NDArray[
 
 
 def motion(history: History, rows: NDArray[np.intp], frames: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Positions [T, M, 3] and material rotations [T, M, 4] of some Gaussians at up to ``frames`` even frames."""
+    """Positions [T, M, 3] and material rotations [T, M, 4] of some Gaussians at up to ``frames`` even frames.
+
+    Before its birth a Gaussian moves as if it had been there: with its founder, or not at all.
+    """
     indices = np.array(history.indices)
     even = np.unique(np.linspace(0, len(indices) - 1, min(frames, len(indices))).round().astype(np.intp))
     chosen = [int(index) for index in indices[even]]
-    return history.stacked("means", chosen, rows), history.stacked("rotations", chosen, rows)
+    positions, rotations = history.stacked("means", chosen, rows), history.stacked("rotations", chosen, rows)
+    unborn = np.isnan(positions[..., 0]) & (history.born_at[rows] > np.array(chosen)[:, None])
+    late = np.flatnonzero(unborn.any(axis=0))
+    if len(late):
+        found = _before_birth(history, rows[late], chosen)
+        for array, earlier in zip((positions, rotations), found, strict=True):
+            array[:, late] = np.where(unborn[:, late, None], earlier, array[:, late])
+    return positions, rotations
+
+
+def _before_birth(history: History, rows: NDArray[np.intp], indices: list[int]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Positions [T, M, 3] and rotations [T, M, 4] of Gaussians that are led by what they descend from."""
+    roots, founders, ancestors = history.roots(), history.founders, rows.copy()
+    while (up := founders[ancestors] != FOUNDERLESS).any():
+        ancestors = np.where(up, founders[ancestors], ancestors)
+    leads, turned = history.stacked("means", indices, ancestors), history.stacked("rotations", indices, ancestors)
+    positions = np.broadcast_to(roots.means[rows], leads.shape).copy()
+    rotations = np.broadcast_to(roots.rotations[rows], turned.shape).copy()
+    led = np.isfinite(leads[..., 0])
+    which = np.nonzero(led)[1]
+    back = roots.rotations[ancestors] * np.array([1, -1, -1, -1], np.float32)
+    turns = quaternion_products(turned[led], back[which])
+    offsets = roots.means[rows] - roots.means[ancestors]
+    positions[led] = leads[led] + np.einsum("nij,nj->ni", quaternions_to_matrices(turns), offsets[which])
+    rotations[led] = quaternion_products(turns, roots.rotations[rows][which])
+    return positions, rotations
 
 
 def part_features(positions: NDArray[Any], rotations: NDArray[Any], extent: float) -> Features:

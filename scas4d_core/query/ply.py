@@ -71,7 +71,7 @@ class Splats:
 
 
 def write_ply(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None:
-    """Writes one frame atomically.
+    """Writes one frame atomically; without the Gaussians that are retired in it.
 
     Args:
         path: of the file. gaussians: in the inside world. world: user's world to inside.
@@ -86,6 +86,7 @@ def write_ply(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None
     ...     read_ply(f"{folder}/a.ply").means
     array([[0., 0., 4.]])
     """
+    gaussians = gaussians.rows(gaussians.present) if gaussians.retired.any() else gaussians
     data = np.zeros(len(gaussians), dtype=[(name, "<f4") for name in _FIELDS])
     for name, column in _columns(splats(gaussians, world)).items():
         data[name] = column

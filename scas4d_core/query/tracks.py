@@ -18,7 +18,8 @@ from scipy.ndimage import distance_transform_edt, maximum_filter
 
 from scas4d_core.cameras import Camera, WorldFrame
 from scas4d_core.errors import InputError
-from scas4d_core.gaussians import Gaussians, moving_extent, quaternions_to_matrices
+from scas4d_core.gaussians import moving_extent, quaternions_to_matrices
+from scas4d_core.query.carriers import carriers, geometric_median, of_those_there
 from scas4d_core.query.ray_depth import ray_depths
 from scas4d_core.rasterize.limits import DEFAULT, Limits
 from scas4d_core.storage.history import History
@@ -29,11 +30,6 @@ RenderDepth = Callable[[Camera, int], tuple[NDArray[Any], NDArray[Any]]]
 
 ALPHA_OF_A_SURFACE = 0.5
 """A pixel shows a surface where at least half of it is covered."""
-WEISZFELD_ROUNDS = 12
-"""Rounds of the geometric median: by then it moves by a small part of the carriers' spread."""
-BYTES_AT_ONCE = 64e6
-"""Working memory of the search for carriers."""
-
 CARRIERS = 32
 """Gaussians that carry a point; 1 is the single nearest. Against 1, the median 3D error falls by 6 % (cloth) to 25 %
 (stage)."""
@@ -57,10 +53,12 @@ class Tracks:
     """Trajectories of Q points over T frames.
 
     Attributes:
-        positions: [T, Q, 3] float64, user's world and units; NaN for a pixel query that met no surface.
+        positions: [T, Q, 3] float64, user's world and units; NaN for a pixel query that met no surface, and in frames
+            in which none of the Gaussians that carry the point is there (not born yet, or retired).
         confidence: [T, Q] float64 in 0…1: (1 − Π(1 − oᵢ exp(−½ mᵢ²))) / (1 + (s/a)²), the opacity of the carriers at
             the query point (m the Mahalanobis distance) over what their disagreement s in that frame takes away: the
-            weighted mean distance of their answers from the track (a = ``AGREEMENT``). 0 for a query that met nothing.
+            weighted mean distance of their answers from the track (a = ``AGREEMENT``). 0 for a query that met nothing,
+            and where the position is NaN.
         ids: [Q] int64: the Gaussian that carries the point most; −1 for a pixel query that met no surface.
         indices: [T] int64 frames.
         visibility: by camera name, [T, Q] bool, for the cameras queried; see ``seen``.
@@ -104,6 +102,7 @@ def tracks_of_points(
         ValueError: points not [Q, 3] or not finite.
         HistoryError: a frame was not committed.
 
+    >>> from scas4d_core.gaussians import Gaussians
     >>> history = History()
     >>> state = Gaussians.of_points([[0, 0, 0], [1, 0, 0]], radius=0.2)
     >>> for index in range(2):
@@ -133,10 +132,11 @@ def tracks_of_points(
     for t, frame in enumerate(indices):
         means = history.stacked("means", [frame], rows)[0].astype(np.float64)
         turned = np.einsum("qkij,qkj->qki", _matrices(history.stacked("rotations", [frame], rows)[0]), offsets)
-        answers = means + turned
-        result[t] = geometric_median(answers, weights)
-        apart = np.einsum("qk,qk->q", weights, np.linalg.norm(answers - result[t][:, None], axis=-1))
+        answers, shares, there = of_those_there(means + turned, weights, history.present(frame)[rows])
+        result[t] = geometric_median(answers, shares)
+        apart = np.einsum("qk,qk->q", shares, np.linalg.norm(answers - result[t][:, None], axis=-1))
         confidence[t] = covered / (1 + np.square(apart / max(AGREEMENT * extent, 1e-12)))
+        result[t][~there], confidence[t][~there] = np.nan, 0
     return Tracks(world.to_user(result), confidence, theta.ids[rows[:, 0]], np.asarray(indices, dtype=np.int64))
 
 
@@ -167,6 +167,7 @@ def tracks_of_pixels(
     Raises:
         ValueError: uv not [Q, 2], not finite or outside the picture.
 
+    >>> from scas4d_core.gaussians import Gaussians
     >>> history = History()
     >>> history.append(0, 0.0, Gaussians.of_points([[0, 0, 2]], radius=0.1))
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
@@ -211,28 +212,39 @@ def tracks_of_pixels(
 
 
 def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indices: Sequence[int]) -> Tracks:
-    """The trajectories of Gaussians' means by id; their confidence is 1.
+    """The trajectories of Gaussians' means by id; their confidence is 1, and 0 where they are not there.
 
     Raises:
         ValueError: an unknown id. HistoryError: a frame was not committed.
 
+    >>> from scas4d_core.gaussians import Gaussians
     >>> history = History()
     >>> history.append(7, 0.0, Gaussians.of_points([[0, 0, 0], [1, 0, 0]], radius=0.2))
     >>> tracks_of_ids(history, WorldFrame(np.zeros(3)), np.array([1]), indices=[7]).positions
     array([[[1., 0., 0.]]])
     """
     wanted = np.asarray(ids, dtype=np.int64).reshape(-1)
-    held = history.gaussians(history.indices[0]).ids if len(history) else np.empty(0, dtype=np.int64)
-    order = np.argsort(held, kind="stable")
-    place = np.minimum(np.searchsorted(held, wanted, sorter=order), len(held) - 1)
-    unknown = wanted[held[order[place]] != wanted] if len(held) else wanted
+    rows = known_rows(history, wanted)
+    positions = world.to_user(history.stacked("means", indices, rows))
+    there = np.stack([history.present(index)[rows] for index in indices])
+    positions[~there] = np.nan
+    return Tracks(positions, there.astype(np.float64), wanted, np.asarray(indices, dtype=np.int64))
+
+
+def known_rows(history: History, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    """[Q] rows of ids.
+
+    Raises:
+        ValueError: an id that no Gaussian of the scene has.
+    """
+    rows = history.rows_of(ids)
+    unknown = ids[rows < 0]
     if len(unknown):
         raise InputError(
             f"ids {unknown[:5].tolist()} are no Gaussians of this scene",
-            f"take ids out of an answer, or of its {len(held)} Gaussians",
+            f"take ids out of an answer, or of its {history.count} Gaussians",
         )
-    positions = world.to_user(history.stacked("means", indices, order[place]))
-    return Tracks(positions, np.ones(positions.shape[:2]), wanted, np.asarray(indices, dtype=np.int64))
+    return rows
 
 
 def depth_tolerance(history: History, world: WorldFrame, index: int) -> float:
@@ -267,72 +279,6 @@ def seen(
         front[front == -np.inf] = np.inf
         visible[t, inside[t]] = ~(z[t][inside[t]] > front + tolerance)
     return visible
-
-
-def carriers(
-    gaussians: Gaussians, points: Float, count: int, softening: float
-) -> tuple[NDArray[np.intp], Float, Float]:
-    """Gaussians that points lie in most: those of largest o·exp(−½ m²), m the Mahalanobis distance.
-
-    Args:
-        gaussians: the state, N Gaussians.
-        points: [Q, 3] metres, inside world.
-        count: K, Gaussians that carry a point (N where there are fewer).
-        softening: metres; m is taken in Σ + softening²·I.
-
-    Returns:
-        Rows [Q, K], heaviest first; weights [Q, K] that sum to 1, in proportion to o·exp(−½ m²) (far from all,
-        the nearest alone carries); the opacity 1 − Π(1 − o·exp(−½ m²)) of the K at the point, [Q].
-
-    >>> state = Gaussians.of_points([[0, 0, 0], [1, 0, 0]], radius=0.2)
-    >>> rows, weights, opacity = carriers(state, np.array([[0.1, 0, 0]]), count=1, softening=0.0)
-    >>> rows, opacity.round(2)
-    (array([[0]]), array([0.79]))
-    """
-    count = min(count, len(gaussians))
-    factors = gaussians.factors.astype(np.float64)
-    covariance = factors @ factors.transpose(0, 2, 1)
-    covariance += (softening**2 + 1e-12) * np.eye(3)
-    whiten = np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)  # m² = |whiten (p − μ)|²
-    whitened_means = np.einsum("nij,nj->ni", whiten, gaussians.means)[:, :, None]
-    log_opacity = np.log(np.maximum(gaussians.opacities.astype(np.float64), 1e-12))
-
-    rows = np.empty((len(points), count), dtype=np.intp)
-    logs = np.empty((len(points), count))
-    step = max(1, int(BYTES_AT_ONCE / (48 * len(gaussians))))
-    for start in range(0, len(points), step):
-        part = points[start : start + step]
-        whitened = (whiten.reshape(-1, 3) @ part.T).reshape(len(gaussians), 3, len(part))
-        score = (log_opacity[:, None] - 0.5 * np.square(whitened - whitened_means).sum(axis=1)).T
-        best = np.argpartition(-score, count - 1, axis=1)[:, :count]
-        best = np.take_along_axis(best, np.argsort(-np.take_along_axis(score, best, 1), axis=1, kind="stable"), 1)
-        rows[start : start + step] = best
-        logs[start : start + step] = np.take_along_axis(score, best, 1)
-    weights = np.exp(logs - logs[:, :1])
-    weights /= weights.sum(axis=1, keepdims=True)
-    covered = 1 - np.prod(1 - np.exp(logs), axis=1)
-    return rows, weights, covered
-
-
-def geometric_median(points: Float, weights: Float) -> Float:
-    """Geometric median [Q, 3]: the point of least weighted distance to K others, by Weiszfeld's iteration.
-
-    Args:
-        points: [Q, K, 3].
-        weights: [Q, K], sum 1.
-
-    >>> points = np.array([[[0, 0, 0], [0.1, 0, 0], [9, 9, 9]]])
-    >>> bool(np.linalg.norm(geometric_median(points, np.full((1, 3), 1 / 3))) < 0.2)  # the stray does not count
-    True
-    """
-    centre: Float = np.einsum("qk,qki->qi", weights, points)
-    if points.shape[1] < 3:
-        return centre  # of two points every point between is a median
-    for _ in range(WEISZFELD_ROUNDS):
-        distance = np.linalg.norm(points - centre[:, None], axis=-1)
-        pull = weights / np.maximum(distance, 1e-9)
-        centre = np.einsum("qk,qki->qi", pull, points) / pull.sum(axis=1, keepdims=True)
-    return centre
 
 
 def _covered_near(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.gaussians import Gaussians, quaternions_to_matrices
+from scas4d_core.gaussians import Gaussians, quaternion_products, quaternions_to_matrices
 
 Int = NDArray[np.int64]
 
@@ -133,11 +133,13 @@ def grown_roots(roots: Gaussians, state: Gaussians, joins: Int | None) -> Gaussi
         )
         which = np.flatnonzero(founders != FOUNDERLESS)
         rows = founders[which]
-        back = _product(roots.rotations[rows].astype(np.float64), _inverse(state.rotations[rows].astype(np.float64)))
+        back = quaternion_products(
+            roots.rotations[rows].astype(np.float64), _inverse(state.rotations[rows].astype(np.float64))
+        )
         turn = quaternions_to_matrices(back)
         means[which] = roots.means[rows] + _turned(turn, means[which] - state.means[rows])
         factors[which] = turn @ factors[which]
-        rotations[which] = _product(back, rotations[which])
+        rotations[which] = quaternion_products(back, rotations[which])
         roots = roots.joined(
             born.replace(
                 means=means.astype(np.float32),
@@ -157,10 +159,3 @@ def _turned(turns: NDArray[Any], vectors: NDArray[Any]) -> NDArray[Any]:
 def _inverse(quaternions: NDArray[Any]) -> NDArray[Any]:
     found: NDArray[Any] = quaternions * np.array([1, -1, -1, -1])
     return found
-
-
-def _product(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
-    """[M, 4] a∘b (w, x, y, z): first b, then a."""
-    scalar = a[:, :1] * b[:, :1] - (a[:, 1:] * b[:, 1:]).sum(axis=1, keepdims=True)
-    vector = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])
-    return np.concatenate([scalar, vector], axis=1)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scas4d_core.gaussians import FIXED, PER_FRAME, WHOLES, Gaussians
-from scas4d_core.storage.births import Int, Life, births_in, lives_of, retired_after, rows_among
+from scas4d_core.storage.births import FOUNDERLESS, Int, Life, births_in, lives_of, retired_after, rows_among
 from scas4d_core.storage.frame_files import DamagedFrameError, HistoryError, UnreadableFrameError
 from scas4d_core.storage.frames_reader import FramesReader
 
@@ -95,6 +95,12 @@ class HistoryReader(FramesReader):
         first = np.full(len(self._fixed.get("ids", ())), next(iter(self._times), -1), np.int64)
         later = [np.full(last - begin + 1, index, np.int64) for index, begin, last in births_in(self._events())]
         return np.concatenate([first, *later])
+
+    @property
+    def founders(self) -> Int:
+        """[count] row of the founder that each Gaussian, by row, joined at its birth; −1 for one without."""
+        none = np.full(len(self._fixed.get("ids", ())), FOUNDERLESS, np.int64)
+        return np.concatenate([none, *(self._born(birth)["joins"] for birth in births_in(self._events()))])
 
     @property
     def highest_id(self) -> int:

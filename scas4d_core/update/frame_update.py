@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scas4d_core.effects.parts import NOTHING, Arrays, Hooks, PartsBuilder, Work
 from scas4d_core.effects.switches import joined
 from scas4d_core.frame_outcome import Candidate
-from scas4d_core.gaussians import Gaussians
+from scas4d_core.gaussians import Gaussians, quaternion_products
 from scas4d_core.guards import summed
 from scas4d_core.rasterize.cpu import Gradients
 from scas4d_core.rasterize.limits import scene_limits
@@ -27,7 +27,7 @@ from scas4d_core.update.deformation import CpuDeformation, length_bounds
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import AS_SET, REPORT, AttemptOptions, Stopwatch, UpdateResult, UpdateTrace
 from scas4d_core.update.schedule import Adam, Rates, Stopping, ViewPlan, mask_weight, plan_samples
-from scas4d_core.update.warm_start import Motion, quaternion_products
+from scas4d_core.update.warm_start import Motion
 
 Array = NDArray[np.float32]
 

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.gaussians import Gaussians
+from scas4d_core.gaussians import Gaussians, quaternion_products
 from scas4d_core.structure.hierarchy import Hierarchy
 
 Array = NDArray[np.float32]
@@ -27,21 +27,6 @@ LEAST_COSINE = 0.5
 
 LONGEST_PREDICTION = 3.0
 """Times the interval it was found in that a motion is carried on for: after a longer gap it says little."""
-
-
-def quaternion_products(a: Array, b: Array) -> Array:
-    """[M, 4] a∘b (w, x, y, z): first b, then a."""
-    aw, ax, ay, az = a.T
-    bw, bx, by, bz = b.T
-    return np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=1,
-    )
 
 
 def rotate(r: NDArray[np.floating], vectors: NDArray[np.floating]) -> Float:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from box_scene import SIZE, held_out_camera, make_box, moved, photograph
+from box_scene import MOVING, SIZE, held_out_camera, make_box, moved, photograph
 
 from scas4d_core.cameras import Camera, WorldFrame, rig_inside
 from scas4d_core.gaussians import Gaussians
@@ -175,3 +175,19 @@ def test_tracks_of_ids_are_the_means_in_the_users_world() -> None:
     tracks = committed(box, moved(box)).tracks_of_ids(np.array([5, 2]), [1, 0])
     np.testing.assert_allclose(tracks.positions[0], WORLD.to_user(moved(box).means[[5, 2]]))
     np.testing.assert_allclose(tracks.positions[1], WORLD.to_user(box.means[[5, 2]]))
+
+
+def test_views_with_parts_where_gaussians_were_born_later() -> None:
+    box, camera = make_box(), user_camera(held_out_camera())
+    scene = committed(box)
+    before = scene.render(camera, labels=np.zeros(len(box), np.int64))
+    first = scene.history.indices[-1]
+    scene.history.append(first + 1, 1.0, box.joined(box.rows(np.arange(40))).retire(np.arange(MOVING)))
+    after = scene.render(camera, first, labels=np.zeros(len(box) + 40, np.int64))
+    np.testing.assert_array_equal(before.colour, after.colour)
+    np.testing.assert_array_equal(before.parts, after.parts)
+    gone = scene.render(camera)
+    assert not np.array_equal(gone.alpha, after.alpha)
+    there = scene.history.newest.present
+    alone = committed(box.joined(box.rows(np.arange(40))).rows(there)).render(camera)
+    np.testing.assert_array_equal(gone.colour, alone.colour)

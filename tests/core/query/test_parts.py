@@ -6,6 +6,7 @@ from sklearn.metrics import adjusted_rand_score
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query import parts as module
 from scas4d_core.query.parts import STANDING, match_labels, part_features, parts
+from scas4d_core.storage.births import grown_roots
 from scas4d_core.storage.history import History
 
 
@@ -174,3 +175,41 @@ def test_refusals():
         parts(still, 2)
     with pytest.raises(ValueError, match=r"previous labels \(3,\) must be \[12\]"):
         parts(history, 2, previous=np.zeros(3))
+
+
+def test_gaussians_born_later_belong_to_the_part_of_their_founders():
+    whole, which = bodies()
+    born, count, birth = np.arange(0, len(which), 3), len(which), 5
+    founders = np.array([int(np.flatnonzero(which == which[row])[1]) for row in born])
+    history, roots = History(), None
+    for t in whole.indices:
+        state = whole.gaussians(t)
+        if t >= birth:
+            there = state.rows(born)
+            ids = np.full(len(born), -1) if t == birth else history.ids[count:]
+            state = state.joined(there).replace(ids=np.concatenate([state.ids, ids]))
+            roots = grown_roots(history.roots(), state, founders) if t == birth else None
+        given = {} if t != birth else {"joins": founders, "roots": roots}
+        history.append(t, t / 30, state.retire([0, 1]) if t == whole.indices[-1] else state, **given)
+    positions, rotations = module.motion(history, np.arange(count, count + len(born)), 12)
+    then, turned = module.motion(whole, born, 12)
+    np.testing.assert_allclose(positions, then, atol=1e-5)  # before their birth they were where their founders led
+    assert np.abs(np.sum(rotations * turned, axis=-1)).min() > 1 - 1e-5
+    labels = parts(history, 3)
+    assert np.array_equal(labels[2:count], which[2:])
+    assert np.array_equal(labels[count:], which[born])
+    assert (labels[:2] == STANDING).all()
+
+
+def test_gaussians_born_without_a_founder_stay_where_they_were_born():
+    whole, _ = bodies(frames=4)
+    history = History()
+    for t in whole.indices:
+        state = whole.gaussians(t)
+        if t >= 2:
+            state = state.joined(state.rows([7]))
+            state = state if t == 2 else state.replace(ids=history.ids)
+        history.append(t, t / 30, state)
+    positions, _ = module.motion(history, np.array([len(whole.newest)]), 4)
+    np.testing.assert_array_equal(positions[:3, 0], np.repeat(whole.gaussians(2).means[[7]], 3, axis=0))
+    assert np.isfinite(positions).all()

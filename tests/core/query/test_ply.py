@@ -105,3 +105,10 @@ def test_bad_rows_are_named_and_nothing_is_written(tmp_path):
     (tmp_path / "not.ply").write_bytes(b"hello")
     with pytest.raises(PlyError, match=r"not\.ply"):
         read_ply(tmp_path / "not.ply")
+
+
+def test_retired_ones_are_left_out(tmp_path):
+    theta = state(random_factors(6))
+    write_ply(tmp_path / "frame.ply", theta.retire([1, 4]), WORLD)
+    write_ply(tmp_path / "others.ply", theta.rows([0, 2, 3, 5]), WORLD)
+    assert (tmp_path / "frame.ply").read_bytes() == (tmp_path / "others.ply").read_bytes()

@@ -232,3 +232,44 @@ def test_refusals():
         tracks_of_points(history, WORLD, np.zeros(3), 0, FRAMES)
     with pytest.raises(HistoryError, match="frame 9"):
         tracks_of_points(history, WORLD, np.zeros((1, 3)), 0, [9])
+
+
+def living_history() -> tuple[History, np.ndarray]:
+    """The body, half of which is born in frame 2; the other half is retired in frames 3 and 4."""
+    whole, rest = rigid_history()
+    history, rows = History(), np.arange(200, 400)
+    for t in FRAMES:
+        state = whole.gaussians(t)
+        if t < 2:
+            state = state.rows(np.arange(200))
+        else:
+            ids = np.where(np.arange(400) < 200, state.ids, -1)
+            state = state.replace(ids=ids if t == 2 else np.concatenate([state.ids[:200], history.ids[200:]]))
+        if t in (3, 4):
+            state = state.retire(np.arange(200))
+        history.append(t, t / 30, state, joins=np.zeros(200, np.int64) if t == 2 else None)
+    assert history.born_at[rows].tolist() == [2] * 200
+    return history, rest
+
+
+def test_tracks_where_gaussians_are_absent():
+    history, rest = living_history()
+    early, late = history.ids[0], history.ids[250]
+    tracks = tracks_of_ids(history, WORLD, np.array([early, late]), FRAMES)
+    there = np.array([[True, False], [True, False], [True, True], [False, True], [False, True], [True, True]])
+    np.testing.assert_array_equal(np.isfinite(tracks.positions).all(axis=-1), there)
+    np.testing.assert_array_equal(tracks.confidence, there)
+    np.testing.assert_allclose(tracks.positions[there], truth(rest[[0, 250]])[there], atol=1e-4)
+
+    # Of a point, those of its carriers tell that are there; without any it is nowhere, and seen by nobody.
+    tracks = tracks_of_points(history, WORLD, truth(rest[:1])[0], 0, FRAMES)
+    np.testing.assert_array_equal(np.isfinite(tracks.positions[:, 0, 0]), there[:, 0])
+    assert (tracks.confidence[:, 0] > 0).tolist() == there[:, 0].tolist()
+    depths = np.full((48, 64), np.inf), np.zeros((48, 64))
+    visible = tracks.with_visibility(CAMERA, lambda camera, index: depths, 1.0).visibility[CAMERA.name]
+    assert not visible[3:5].any()
+
+    # Retired Gaussians carry nothing, wherever they were: the born take the point.
+    tracks = tracks_of_points(history, WORLD, truth(rest[:1])[3], 3, FRAMES)
+    assert tracks.ids[0] >= history.ids[200]
+    np.testing.assert_array_equal(np.isfinite(tracks.positions[:, 0, 0]), [False, False, True, True, True, True])

@@ -1,0 +1,97 @@
+"""The Gaussians that carry a point, and the point that follows from where they say that it is. Numpy only."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.gaussians import Gaussians
+
+Float = NDArray[np.float64]
+
+WEISZFELD_ROUNDS = 12
+"""Rounds of the geometric median: by then it moves by a small part of the carriers' spread."""
+BYTES_AT_ONCE = 64e6
+"""Working memory of the search for carriers."""
+NOT_THERE = -1e9
+"""Logarithm of the opacity of a retired Gaussian: it carries nothing, wherever it was."""
+LEAST_THERE = 0.05
+"""Of the weight of a point's carriers, that has to be there: the few at its edge do not tell where it is."""
+
+
+def carriers(
+    gaussians: Gaussians, points: Float, count: int, softening: float
+) -> tuple[NDArray[np.intp], Float, Float]:
+    """Gaussians that points lie in most: those of largest o·exp(−½ m²), m the Mahalanobis distance.
+
+    Args:
+        gaussians: the state, N Gaussians.
+        points: [Q, 3] metres, inside world.
+        count: K, Gaussians that carry a point (N where there are fewer).
+        softening: metres; m is taken in Σ + softening²·I.
+
+    Returns:
+        Rows [Q, K], heaviest first; weights [Q, K] that sum to 1, in proportion to o·exp(−½ m²) (far from all,
+        the nearest alone carries); the opacity 1 − Π(1 − o·exp(−½ m²)) of the K at the point, [Q].
+
+    >>> state = Gaussians.of_points([[0, 0, 0], [1, 0, 0]], radius=0.2)
+    >>> rows, weights, opacity = carriers(state, np.array([[0.1, 0, 0]]), count=1, softening=0.0)
+    >>> rows, opacity.round(2)
+    (array([[0]]), array([0.79]))
+    """
+    count = min(count, len(gaussians))
+    factors = gaussians.factors.astype(np.float64)
+    covariance = factors @ factors.transpose(0, 2, 1)
+    covariance += (softening**2 + 1e-12) * np.eye(3)
+    whiten = np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)  # m² = |whiten (p − μ)|²
+    whitened_means = np.einsum("nij,nj->ni", whiten, gaussians.means)[:, :, None]
+    log_opacity = np.log(np.maximum(gaussians.opacities.astype(np.float64), 1e-12))
+    log_opacity[gaussians.retired] = NOT_THERE
+
+    rows = np.empty((len(points), count), dtype=np.intp)
+    logs = np.empty((len(points), count))
+    step = max(1, int(BYTES_AT_ONCE / (48 * len(gaussians))))
+    for start in range(0, len(points), step):
+        part = points[start : start + step]
+        whitened = (whiten.reshape(-1, 3) @ part.T).reshape(len(gaussians), 3, len(part))
+        score = (log_opacity[:, None] - 0.5 * np.square(whitened - whitened_means).sum(axis=1)).T
+        best = np.argpartition(-score, count - 1, axis=1)[:, :count]
+        best = np.take_along_axis(best, np.argsort(-np.take_along_axis(score, best, 1), axis=1, kind="stable"), 1)
+        rows[start : start + step] = best
+        logs[start : start + step] = np.take_along_axis(score, best, 1)
+    weights = np.exp(logs - logs[:, :1])
+    weights /= weights.sum(axis=1, keepdims=True)
+    covered = 1 - np.prod(1 - np.exp(logs), axis=1)
+    return rows, weights, covered
+
+
+def geometric_median(points: Float, weights: Float) -> Float:
+    """Geometric median [Q, 3]: the point of least weighted distance to K others, by Weiszfeld's iteration.
+
+    Args:
+        points: [Q, K, 3].
+        weights: [Q, K], sum 1.
+
+    >>> points = np.array([[[0, 0, 0], [0.1, 0, 0], [9, 9, 9]]])
+    >>> bool(np.linalg.norm(geometric_median(points, np.full((1, 3), 1 / 3))) < 0.2)  # the stray does not count
+    True
+    """
+    centre: Float = np.einsum("qk,qki->qi", weights, points)
+    if points.shape[1] < 3:
+        return centre  # of two points every point between is a median
+    for _ in range(WEISZFELD_ROUNDS):
+        distance = np.linalg.norm(points - centre[:, None], axis=-1)
+        pull = weights / np.maximum(distance, 1e-9)
+        centre = np.einsum("qk,qki->qi", pull, points) / pull.sum(axis=1, keepdims=True)
+    return centre
+
+
+def of_those_there(answers: Float, weights: Float, there: NDArray[np.bool_]) -> tuple[Float, Float, NDArray[np.bool_]]:
+    """Answers [Q, K, 3] and weights of the carriers that are there, and [Q] whether any is that weighs."""
+    if there.all():
+        return answers, weights, np.ones(len(answers), np.bool_)
+    shares = np.where(there, weights, 0)
+    total = shares.sum(axis=1)
+    some: NDArray[np.bool_] = total > LEAST_THERE
+    shares = np.where(some[:, None], shares / np.where(some, total, 1)[:, None], weights)
+    return np.where(there[..., None], answers, 0), shares, some
