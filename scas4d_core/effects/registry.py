@@ -18,6 +18,7 @@ EFFECTS = {
     "floor": "scas4d_core.effects.coherence.floor",
     "moving_colour": "scas4d_core.effects.appearance.moving_colour",
     "standing_colour": "scas4d_core.effects.appearance.standing_colour",
+    "uncovered": "scas4d_core.effects.presence.uncovered",
     "entering": "scas4d_core.effects.presence.entering",
 }
 """The module of each effect, by its name; in the order in which they take part in an iteration."""

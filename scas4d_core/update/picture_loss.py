@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import Rig
 from scas4d_core.captures.frame import Frame
 from scas4d_core.captures.images import area_average, resize_area
+from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import SMALLEST_SQUARE
 from scas4d_core.kernels import image_loss
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Gradients
+from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Gradients, Picture
 from scas4d_core.rasterize.limits import DEFAULT, Limits
 
 Array = NDArray[np.float32]
@@ -250,6 +251,11 @@ class PictureLoss:
         gradients = self.rasterizer.backward(g_image, g_alpha, self._detached)
         lap("render backward")
         return gradients
+
+    def render(self, state: Gaussians, features: Array, view: TrainingView, depth_channel: int = -1) -> Picture:
+        """The view without a comparison; see ``CpuRasterizer.forward``."""
+        given = (state.means, state.factors, state.opacities, features, view.camera, self._background)
+        return self.rasterizer.forward(*given, depth_channel)
 
     def measure(self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView) -> None:
         """Render the view and set ``image_part``, ``mask_part`` and ``psnr``, without gradients; see ``evaluate``."""

@@ -36,7 +36,12 @@ class Catching(Part):
     """
 
     def __init__(self, builder: PartsBuilder, name: str) -> None:
-        self._hierarchy, self._factory, self._scene, self._name = builder.hierarchy, builder.factory, builder.scene, name
+        self._hierarchy, self._factory, self._scene, self._name = (
+            builder.hierarchy,
+            builder.factory,
+            builder.scene,
+            name,
+        )
         self._picture: PictureLoss | None = None
 
     def start(self, work: Work) -> None:

@@ -13,7 +13,7 @@ from scas4d_core.effects.effect import Effect, Group
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.effects.presence.carving import Hull, carve_new, footprint
 from scas4d_core.effects.presence.catching import Catching
-from scas4d_core.effects.presence.novelty import Novelty, novelties
+from scas4d_core.effects.presence.novelty import Novelty, glance, said
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Seen
@@ -21,10 +21,8 @@ if TYPE_CHECKING:
     from scas4d_core.update.result import UpdateResult
 
 NAME = "entering"
-GLANCE = 6
-"""Cameras that are looked at each frame, others each time; all of them where these find something new."""
 GLANCED = 2
-"""Of these, that have to."""
+"""Cameras of a glance that have to see something new before all are asked."""
 SMALLEST = 0.003
 """Share of a camera's pixels that it must see as new to have a say: 200 of 256 x 256. What an update leaves behind of
 things that move is smaller."""
@@ -53,22 +51,9 @@ class Found:
 
 def entered(seen: Seen) -> Found | None:
     """What a frame shows that the state does not have; None where there is nothing of the kind."""
-    colours = seen.before.colours  # what is new may be painted on what stands by now
-    state = seen.result.gaussians
-    if len(colours) != len(state):
+    if sum(_says(one) for one in glance(seen)) < GLANCED:
         return None
-    count = len(seen.views)
-    some = [seen.views[(seen.index + round(k * count / GLANCE)) % count] for k in range(min(GLANCE, count))]
-    glance = novelties(state, colours, some, seen.rig, seen.picture)
-    if sum(_says(one) for one in glance) < GLANCED:
-        return None
-    known = {view.name: one for view, one in zip(some, glance, strict=True)}
-    others = [view for view in seen.views if view.name not in known]
-    known |= {
-        view.name: one
-        for view, one in zip(others, novelties(state, colours, others, seen.rig, seen.picture), strict=True)
-    }
-    everyone = [known[view.name] for view in seen.views]
+    everyone = said(seen, seen.views)
     hull = carve_new(everyone)
     total = sum(float(one.error.sum()) for one in everyone)
     kept, share, cameras = np.zeros(len(hull.points), np.bool_), 0.0, 0
@@ -76,7 +61,9 @@ def entered(seen: Seen) -> Found | None:
         mine = hull.things == thing
         prints = [footprint(one, hull.points[mine], hull.voxel) for one in everyone]
         explains = sum(float(one.error[one.new & where].sum()) for one, where in zip(everyone, prints, strict=True))
-        see = sum(int((one.new & where).sum()) >= SMALLEST * where.size for one, where in zip(everyone, prints, strict=True))
+        see = sum(
+            int((one.new & where).sum()) >= SMALLEST * where.size for one, where in zip(everyone, prints, strict=True)
+        )
         if total > 0 and explains / total >= GONE:
             kept |= mine
             share += explains / total
@@ -118,7 +105,7 @@ class Entering(Effect):
         if not len(points):
             return result
         state = result.gaussians
-        born = grown(state, points, colours, seen.views, seen.rig, seen.picture, rng)
+        born = grown(state, points, colours, seen.views, seen.rig, seen.picture, rng, moves=True)
         rows = np.arange(len(state), len(state) + len(born))
         things = np.unique(found.hull.things)
         nearest = cKDTree(found.hull.points).query(born.means)[1]

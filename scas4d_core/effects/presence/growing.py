@@ -61,19 +61,21 @@ def grown(
     rig: Rig,
     picture: PictureLoss,
     rng: np.random.Generator,
+    *,
+    moves: bool,
 ) -> Gaussians:
-    """Gaussians on points, fitted to the views beside those of the state. They move.
+    """Gaussians on points, fitted to the views beside those of the state.
 
     Args:
         state: Θ_t, all of whose Gaussians stay as they are. points: [P, 3] inside. colours: [P, 3].
         views: of the frame. rig: the cameras inside. picture: has background and limits of the scene.
-        rng: of the order of views.
+        rng: of the order of views. moves: whether they do, or stand.
     """
-    from scas4d_core.first_frame.initial_gaussians import LABEL, OPACITY as LOGITS, initial_parameters, logit
+    from scas4d_core.first_frame import initial_gaussians as made
 
-    parameters = initial_parameters(points, colours, None, len(points), rng)
-    parameters[:, LOGITS] = logit(np.array(OPACITY))
-    parameters[:, LABEL] = logit(np.array(1.0))
+    parameters = made.initial_parameters(points, colours, None, len(points), rng)
+    parameters[:, made.OPACITY] = made.logit(np.array(OPACITY))
+    parameters[:, made.LABEL] = made.logit(np.array(float(moves)))
     fit = _Fit(state, parameters, views, rig, picture)
     fit.run(ITERATIONS, rng)
     return fit.gaussians()
@@ -120,7 +122,8 @@ class _Fit:
             view, n, np.empty((count, 3), np.float32), np.empty((count, 3, 3), np.float32),
             np.empty(count, np.float32), np.empty((count, 4), np.float32),
         )  # fmt: skip
-        made.means[:n], made.factors[:n], made.opacities[:n] = state.means[rows], state.factors[rows], state.opacities[rows]
+        made.means[:n], made.factors[:n] = state.means[rows], state.factors[rows]
+        made.opacities[:n] = state.opacities[rows]
         made.features[:n, :3], made.features[:n, 3] = state.colours[rows], state.foreground[rows]
         return made
 
@@ -154,7 +157,7 @@ class _Fit:
             )  # fmt: skip
 
     def gaussians(self) -> Gaussians:
-        """The fitted Gaussians, which move."""
+        """The fitted Gaussians."""
         from scas4d_core.gaussians import Gaussians
         from scas4d_core.kernels import activation
 
@@ -162,7 +165,7 @@ class _Fit:
         made = Gaussians.of_points(self._parameters[:, :3], 0.0)
         features = np.empty((count, 4), np.float32)
         activation.activate(self._parameters, made.means, made.factors, made.opacities, features)
-        return made.replace(colours=features[:, :3].copy())
+        return made.replace(colours=features[:, :3].copy(), foreground=np.round(features[:, 3]))
 
 
 def _box(camera: Camera, points: Float) -> tuple[int, int, int, int] | None:
