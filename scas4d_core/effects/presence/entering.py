@@ -7,17 +7,20 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scas4d_core.effects.effect import Effect, Group
 from scas4d_core.effects.evidence import Evidence
+from scas4d_core.effects.parts import Arrays
 from scas4d_core.effects.presence.carving import Hull, carve_new, footprint
 from scas4d_core.effects.presence.catching import Catching
 from scas4d_core.effects.presence.novelty import Novelty, glance, said
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Seen
-    from scas4d_core.effects.parts import Arrays, PartsBuilder
+    from scas4d_core.effects.parts import PartsBuilder
+    from scas4d_core.gaussians import Gaussians
     from scas4d_core.update.result import UpdateResult
 
 NAME = "entering"
@@ -30,6 +33,20 @@ SHARE = 0.05
 """Of the squared error of all pictures that a thing explains, from which it is one."""
 GONE = 0.01
 """The same, below which the effect may be switched off."""
+SETTLED = 4
+"""Frames after its birth in which a Gaussian is still fitted beside the update."""
+NONE = np.zeros(0, np.int64)
+NOBODY: Arrays = {
+    "rows": NONE,
+    "age": NONE,
+    "young": NONE,
+    "thing": NONE,
+    "centres": np.zeros((0, 3)),
+    "volumes": np.zeros(0),
+    "share": np.array(0.0),
+    "cameras": np.array(0),
+}
+"""What is left before anything was born."""
 BUDGET = 0.1
 """Gaussians that are born in a frame at most, as a share of those that are there."""
 
@@ -77,6 +94,22 @@ def _says(one: Novelty) -> bool:
     return one.surplus >= SMALLEST * one.new.size
 
 
+def _remembered(found: Found, born: Gaussians, rows: NDArray[np.int64], left: Arrays) -> Arrays:
+    """The arrays that the births of a frame add to those that were left."""
+    things = np.unique(found.hull.things)
+    nearest = cKDTree(found.hull.points).query(born.means)[1]
+    return {
+        "rows": np.concatenate([left["rows"], rows]),
+        "age": np.concatenate([left["age"], np.zeros(len(rows), np.int64)]),
+        "young": rows,
+        "thing": np.searchsorted(things, found.hull.things[nearest]),
+        "centres": np.array([found.hull.points[found.hull.things == number].mean(axis=0) for number in things]),
+        "volumes": np.array([(found.hull.things == number).sum() * found.hull.voxel**3 for number in things]),
+        "share": np.maximum(found.share, left["share"]),
+        "cameras": np.maximum(found.cameras, left["cameras"]),
+    }
+
+
 @dataclass(frozen=True)
 class Entering(Effect):
     """Births, in frames that show more than the state has."""
@@ -90,36 +123,29 @@ class Entering(Effect):
         return Evidence(0.0, "") if found is None else _evidence(found.share, found.cameras)
 
     def populated(self, seen: Seen) -> UpdateResult:
-        """The result with the Gaussians that are born."""
-        result = seen.result
-        found, left = entered(seen), result.carried.get(NAME)
-        if found is None:
-            if left is None or not len(left["young"]):
-                return result
-            grown_up = {**left, "young": left["young"][:0], "thing": left["thing"][:0]}
-            return replace(result, carried={**result.carried, NAME: grown_up})
-        from scas4d_core.effects.presence.growing import grown, seeds
+        """The result with the Gaussians that are born, and the young ones settled."""
+        from scas4d_core.effects.presence.growing import grown, seeds, settled
 
-        rng = np.random.default_rng([seen.index, len(result.gaussians)])
-        points, colours = seeds(found.seen, found.hull, int(BUDGET * len(result.gaussians)), rng)
-        if not len(points):
+        result, found = seen.result, entered(seen)
+        left = result.carried.get(NAME, NOBODY)
+        state, rng = result.gaussians, np.random.default_rng([seen.index, len(result.gaussians)])
+        young = left["age"] < SETTLED
+        settling = left["rows"][young & state.present[left["rows"]]]
+        if len(settling):
+            state = settled(state, settling, seen.views, seen.rig, seen.picture, rng)
+        arrays = {**left, "young": NONE, "thing": NONE, "age": left["age"] + 1}
+        joins = result.joins
+        if found is not None:
+            points, colours = seeds(found.seen, found.hull, int(BUDGET * len(state)), rng)
+            born = grown(state, points, colours, seen.views, seen.rig, seen.picture, rng, moves=True)
+            rows = np.arange(len(state), len(state) + len(born))
+            state = state.joined(born)
+            arrays |= _remembered(found, born, rows, arrays)
+            alone = np.full(len(born), -1, np.int64)
+            joins = alone if joins is None else np.concatenate([joins, alone])
+        if found is None and left is NOBODY:
             return result
-        state = result.gaussians
-        born = grown(state, points, colours, seen.views, seen.rig, seen.picture, rng, moves=True)
-        rows = np.arange(len(state), len(state) + len(born))
-        things = np.unique(found.hull.things)
-        nearest = cKDTree(found.hull.points).query(born.means)[1]
-        arrays: Arrays = {
-            "young": rows,
-            "thing": np.searchsorted(things, found.hull.things[nearest]),
-            "centres": np.array([found.hull.points[found.hull.things == number].mean(axis=0) for number in things]),
-            "volumes": np.array([(found.hull.things == number).sum() * found.hull.voxel**3 for number in things]),
-            "rows": rows if left is None else np.concatenate([left["rows"], rows]),
-            "share": np.array(found.share if left is None else max(found.share, float(left["share"]))),
-            "cameras": np.array(found.cameras if left is None else max(found.cameras, int(left["cameras"]))),
-        }
-        joins = np.full(len(born), -1, np.int64)
-        return replace(result, gaussians=state.joined(born), joins=joins, carried={**result.carried, NAME: arrays})
+        return replace(result, gaussians=state, joins=joins, carried={**result.carried, NAME: arrays})
 
     def join(self, builder: PartsBuilder) -> None:
         """Adds the search for what was born in the frame before."""

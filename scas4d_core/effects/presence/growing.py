@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from scas4d_core.effects.presence.carving import Hull, colours_of
 
@@ -26,6 +27,10 @@ Int = NDArray[np.int64]
 
 ITERATIONS = 400
 """Of a fit: on the part of the pictures that shows the thing they take less time than an update of 100."""
+SETTLING = 150
+"""Of the fit of what was born some frames ago, after each update."""
+SHORTEST = 1e-6
+"""Metres, of an axis."""
 OPACITY = 0.6
 """Of a Gaussian when it is born: on a surface that is known, more than the 0.1 of a cloud of which half is wrong."""
 CONFIRMED = 2
@@ -81,6 +86,42 @@ def grown(
     return fit.gaussians()
 
 
+def settled(
+    state: Gaussians,
+    rows: Int,
+    views: Sequence[TrainingView],
+    rig: Rig,
+    picture: PictureLoss,
+    rng: np.random.Generator,
+) -> Gaussians:
+    """The state with means, factors and colours of some rows fitted to the views; opacities stay for ever.
+
+    Args:
+        rows: of young Gaussians: their hull was rough, and their first update as well.
+    """
+    from scas4d_core.first_frame import initial_gaussians as made
+
+    mine, others = state.rows(rows), state.retire(rows)
+    sides, lengths, axes = np.linalg.svd(mine.factors.astype(np.float64))
+    handed = np.sign(np.linalg.det(sides))
+    sides[:, :, 2] *= handed[:, None]
+    axes[:, 2] *= handed[:, None]
+    parameters = np.zeros((len(rows), 15), np.float32)
+    parameters[:, made.MEAN] = mine.means
+    parameters[:, made.QUATERNION] = Rotation.from_matrix(sides).as_quat()[:, [3, 0, 1, 2]]
+    parameters[:, made.SCALE] = np.log(np.maximum(lengths, SHORTEST))
+    parameters[:, made.OPACITY] = made.logit(mine.opacities[:, None])
+    parameters[:, made.COLOUR] = mine.colours
+    parameters[:, made.LABEL] = made.logit(mine.foreground[:, None])
+    fit = _Fit(others, parameters, views, rig, picture)
+    fit.run(SETTLING, rng, opacities=False)
+    found = fit.gaussians()
+    means, factors, colours = state.means.copy(), state.factors.copy(), state.colours.copy()
+    means[rows], colours[rows] = found.means, found.colours
+    factors[rows] = found.factors @ axes.astype(np.float32)  # the axes that were transported stay the same ones
+    return state.replace(means=means, factors=factors, colours=colours)
+
+
 class _Crop(NamedTuple):
     """The part of a view that is rendered, the others that reach into it, and the arrays that hold them all."""
 
@@ -127,8 +168,8 @@ class _Fit:
         made.features[:n, :3], made.features[:n, 3] = state.colours[rows], state.foreground[rows]
         return made
 
-    def run(self, iterations: int, rng: np.random.Generator) -> None:
-        """Steps the parameters so many times, each with a part of one view."""
+    def run(self, iterations: int, rng: np.random.Generator, opacities: bool = True) -> None:
+        """Steps the parameters so many times, each with a part of one view; ``opacities``: whether these change."""
         from scas4d_core.first_frame import initial_gaussians as columns
         from scas4d_core.kernels import activation
         from scas4d_core.kernels.adam import EVERY_ROW, adam
@@ -140,7 +181,7 @@ class _Fit:
         gradients, first, second = (np.zeros_like(parameters) for _ in range(3))
         rates = np.zeros(activation.COLUMNS, np.float32)
         rates[columns.MEAN], rates[columns.COLOUR] = POSITION * self._radius, COLOUR
-        rates[columns.OPACITY], rates[columns.SCALE], rates[columns.QUATERNION] = LOGIT, SCALE, ROTATION
+        rates[columns.OPACITY], rates[columns.SCALE], rates[columns.QUATERNION] = LOGIT * opacities, SCALE, ROTATION
         for iteration, index in enumerate(view_order(len(self._crops), iterations, rng)):
             crop = self._crops[index]
             n, born = crop.others, crop.born
