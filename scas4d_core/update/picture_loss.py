@@ -154,7 +154,8 @@ class ViewFactory:
         lens = view.camera.lens.copy()
         lens[2:] = lens[2] - left, lens[3] - top, right - left, bottom - top
         camera = view.camera._replace(lens=lens, width=right - left, height=bottom - top)
-        return self._view(view.name, camera, np.ascontiguousarray(view.target[:, top:bottom, left:right]), view.exposure)
+        target = np.ascontiguousarray(view.target[:, top:bottom, left:right])
+        return self._view(view.name, camera, target, view.exposure)
 
     def _view(self, name: str, camera: CameraArrays, target: Array, exposure: Array) -> TrainingView:
         return TrainingView(name, camera, target, exposure, self.scratch(*target.shape))

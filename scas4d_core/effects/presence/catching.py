@@ -1,4 +1,4 @@
-"""Catches what was born in the frame before: nothing is known of its motion yet, and it may fall further than it is wide.
+"""Catches what was born in the frame before: its motion is not known yet, and it may fall further than its width.
 
 Its hull is carved out of the pictures of the frame once more, without it; the way from the one hull to the other is
 where its clusters start from.

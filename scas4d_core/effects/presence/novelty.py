@@ -79,7 +79,7 @@ def glance(seen: Seen) -> list[Novelty]:
 
 
 def said(seen: Seen, views: Sequence[TrainingView]) -> list[Novelty]:
-    """What some of a frame's views say, in the colours of the frame before: what is new may be painted on what stands."""
+    """What some views say, in the colours of the frame before: what is new may be painted on what stands by now."""
     state = seen.result.gaussians
     known = _said.setdefault(state, {})
     missing = [view for view in views if view.name not in known]
