@@ -20,5 +20,6 @@ EFFECTS = {
     "standing_colour": "scas4d_core.effects.appearance.standing_colour",
     "uncovered": "scas4d_core.effects.presence.uncovered",
     "entering": "scas4d_core.effects.presence.entering",
+    "leaving": "scas4d_core.effects.presence.leaving",
 }
 """The module of each effect, by its name; in the order in which they take part in an iteration."""
