@@ -28,6 +28,7 @@ from server.routes import (
     budget,
     estimate,
     frames,
+    gaussians,
     health,
     ingest,
     inspect,
@@ -96,7 +97,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         app.add_middleware(ClientLimit, guard=app.state.guard)
     app.add_middleware(AccessLog)
     resources = (
-        *(scenes, inspect, points, frames, ingest, render, tracks, parts, stream, budget, tradeoff),
+        *(scenes, inspect, points, frames, ingest, render, tracks, parts, gaussians, stream, budget, tradeoff),
         *(estimate, tickets, health, metrics, viewer),
     )
     for resource in resources:

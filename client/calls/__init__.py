@@ -8,6 +8,7 @@ is numpy.
 from client.calls.budgets import budget, end_replay, replay, set_budget, tradeoff
 from client.calls.call import Call
 from client.calls.frames import close_frame, declare_missing, frame, frames, ply, put_camera, put_frame
+from client.calls.gaussians import gaussians
 from client.calls.parts import parts
 from client.calls.scenes import create_scene, delete_scene, estimate, pause, put_points, resume, rig, scene, scenes
 from client.calls.service import live, metrics, ready, ticket
@@ -25,6 +26,7 @@ __all__ = [
     "estimate",
     "frame",
     "frames",
+    "gaussians",
     "live",
     "metrics",
     "parts",

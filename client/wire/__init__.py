@@ -39,7 +39,7 @@ from client.wire.scenes import (
     SceneStatus,
 )
 from client.wire.service import Health, ProblemDetails, Ticket
-from client.wire.tracks import TracksModel, TracksRequest, tracks_model
+from client.wire.tracks import GaussianModel, GaussiansModel, TracksModel, TracksRequest, tracks_model
 from client.wire.tradeoff import (
     CurveMean,
     PointKind,
@@ -73,6 +73,8 @@ __all__ = [
     "FrameReportModel",
     "FrameState",
     "FramingError",
+    "GaussianModel",
+    "GaussiansModel",
     "Health",
     "IngestAnswer",
     "IngestSettings",

@@ -154,4 +154,7 @@ class FrameReportModel(Model):
     psnr: float | None = Field(default=None, description="dB, training views of the last iterations.")
     cameras: dict[str, CameraFitModel] = Field(default_factory=dict, description="By camera that the update saw.")
     moving: int | None = None
-    gaussians: int | None = None
+    gaussians: int | None = Field(default=None, description="That are there; those retired are not counted.")
+    born: int = Field(default=0, description="Gaussians that were born in this frame.")
+    retired: int = Field(default=0, description="Gaussians that left the scene in this frame; their ids stay theirs.")
+    revived: int = Field(default=0, description="Retired Gaussians that came back in this frame, as themselves.")

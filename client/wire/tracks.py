@@ -40,15 +40,35 @@ class TracksModel(Model):
     times: list[float] = Field(description="[T] seconds.")
     ids: list[int] = Field(description="[Q] the Gaussian that carries the point; −1 where the query met nothing.")
     confidence: list[list[float]] = Field(
-        description="[Q][T] 0…1: how much the Gaussians that carry the point agree in that frame; docs/tracks.md."
+        description="[Q][T] 0…1: how much the Gaussians that carry the point agree in that frame; docs/tracks.md. 0 "
+        "where there is no position."
     )
-    positions: list[list[list[float] | None]] = Field(description="[Q][T] x y z; null where there is none.")
+    positions: list[list[list[float] | None]] = Field(
+        description="[Q][T] x y z; null where there is none: the query met nothing, or what carries it is not there, "
+        "not born yet or retired."
+    )
     visible: dict[str, list[list[bool]]] = Field(
         default_factory=dict, description="By camera asked for, [Q][T]: in the picture and nothing in front."
     )
     pixels: dict[str, list[list[list[float] | None]]] = Field(
         default_factory=dict, description="By camera asked for, [Q][T] u v; null behind the camera."
     )
+
+
+class GaussianModel(Model):
+    """The life of one Gaussian. It is there from its birth and from each revival on, until it is retired."""
+
+    id: int
+    born: int = Field(description="Frame; the first one, for those that the scene began with.")
+    retired: list[int] = Field(description="Frames from which on it was not there.")
+    revived: list[int] = Field(description="Frames in which it came back.")
+
+
+class GaussiansModel(Model):
+    """The lives of Gaussians, in the order asked for."""
+
+    frame: int = Field(description="The newest committed frame: the lives are told up to it.")
+    gaussians: list[GaussianModel]
 
 
 def tracks_model(

@@ -224,27 +224,11 @@ def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indice
     array([[[1., 0., 0.]]])
     """
     wanted = np.asarray(ids, dtype=np.int64).reshape(-1)
-    rows = known_rows(history, wanted)
+    rows = history.known_rows(wanted)
     positions = world.to_user(history.stacked("means", indices, rows))
     there = np.stack([history.present(index)[rows] for index in indices])
     positions[~there] = np.nan
     return Tracks(positions, there.astype(np.float64), wanted, np.asarray(indices, dtype=np.int64))
-
-
-def known_rows(history: History, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-    """[Q] rows of ids.
-
-    Raises:
-        ValueError: an id that no Gaussian of the scene has.
-    """
-    rows = history.rows_of(ids)
-    unknown = ids[rows < 0]
-    if len(unknown):
-        raise InputError(
-            f"ids {unknown[:5].tolist()} are no Gaussians of this scene",
-            f"take ids out of an answer, or of its {history.count} Gaussians",
-        )
-    return rows
 
 
 def depth_tolerance(history: History, world: WorldFrame, index: int) -> float:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scas4d_core.errors import InputError
 from scas4d_core.gaussians import FIXED, PER_FRAME, WHOLES, Gaussians
 from scas4d_core.storage.births import FOUNDERLESS, Int, Life, births_in, lives_of, retired_after, rows_among
 from scas4d_core.storage.frame_files import DamagedFrameError, HistoryError, UnreadableFrameError
@@ -128,13 +129,28 @@ class HistoryReader(FramesReader):
         there[len(self._fixed_after(births_in(log))["ids"]) :] = False
         return there
 
-    def lives(self, ids: ArrayLike) -> list[Life]:
-        """The frames in which Gaussians were born, retired and revived.
+    def known_rows(self, ids: ArrayLike) -> Int:
+        """[Q] rows of ids.
 
-        Args:
-            ids: [Q] of Gaussians of this scene; see ``rows_of``.
+        Raises:
+            InputError: an id that no Gaussian has.
         """
-        wanted = np.asarray(ids, np.int64).reshape(-1).tolist()
+        wanted, rows = np.asarray(ids, np.int64).reshape(-1), self.rows_of(ids)
+        unknown = wanted[rows < 0]
+        if len(unknown):
+            raise InputError(
+                f"ids {unknown[:5].tolist()} are no Gaussians of this scene",
+                f"take ids out of an answer, or of its {self.count} Gaussians",
+            )
+        return rows
+
+    def lives(self, ids: ArrayLike) -> list[Life]:
+        """The frames in which Gaussians were born, retired and revived, by id.
+
+        Raises:
+            InputError: an id that no Gaussian has.
+        """
+        wanted = self.ids[self.known_rows(ids)].tolist()
         return lives_of(self._events(), wanted, next(iter(self._times), -1))
 
     def stacked(

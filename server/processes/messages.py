@@ -273,6 +273,14 @@ class LabelsQuery:
 
 
 @dataclass(frozen=True)
+class GaussiansQuery:
+    """Lives of Gaussians by id."""
+
+    kind: ClassVar[str] = "gaussians"
+    ids: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class PlyQuery:
     """A committed frame as a 3DGS .ply."""
 
@@ -280,7 +288,18 @@ class PlyQuery:
     frame: int
 
 
-Query = RenderQuery | TracksQuery | PartsQuery | LabelsQuery | PlyQuery
+Query = RenderQuery | TracksQuery | PartsQuery | LabelsQuery | GaussiansQuery | PlyQuery
+
+
+def asked(query: Query) -> tuple[str, object]:
+    """Returns field and value of the part of a query that only the reader can check."""
+    if isinstance(query, TracksQuery | GaussiansQuery) and query.ids is not None:
+        return "ids", list(query.ids)
+    if isinstance(query, TracksQuery):
+        return "at", query.at
+    if isinstance(query, LabelsQuery | PartsQuery):
+        return "count", query.count if query.count is not None else "chosen by rule"
+    return "frame", query.frame
 
 
 @dataclass(frozen=True)

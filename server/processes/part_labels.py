@@ -24,6 +24,11 @@ if TYPE_CHECKING:
 log = logging.getLogger("scas4d.renderer")
 
 
+def fitted(labels: NDArray[Any], count: int) -> NDArray[Any]:
+    """Returns labels for so many Gaussians: those born since have none, and rows only ever come at the end."""
+    return np.concatenate([labels, np.full(max(0, count - len(labels)), -1, labels.dtype)])[:count]
+
+
 @dataclass(frozen=True, eq=False)
 class Known:
     """Labels [N] and the newest frame that they were found from."""
@@ -52,9 +57,9 @@ class PartLabels:
         newest = history.indices[-1]
         known = self._known.get(count) or self._read(count)
         if known is None or known.frame != newest:
-            before = None if known is None else known.labels
-            if before is not None and len(before) != len(history.gaussians(newest)):
-                before = None
+            before = None
+            if known is not None and len(known.labels) == np.count_nonzero(history.born_at <= known.frame):
+                before = fitted(known.labels, history.count)
             known = Known(reader.parts(count, before), newest)
             self._write(count, known)
         self._known[count] = known

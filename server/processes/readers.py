@@ -25,13 +25,14 @@ from server.processes.messages import (
     Answer,
     AskedQuery,
     Damaged,
+    GaussiansQuery,
     LabelsQuery,
-    PartsQuery,
     Query,
     Refused,
     RenderQuery,
     SceneSpec,
     TracksQuery,
+    asked,
 )
 from server.processes.placement import Entry, Placement, Process
 
@@ -332,18 +333,10 @@ class Readers:
 def _checked(answer: Answer | Refused, query: Query) -> Answer:
     if isinstance(answer, Answer):
         return answer
-    if answer.status != 422:
+    if answer.status != 422 and not (answer.status == 404 and isinstance(query, GaussiansQuery)):
         remedy = answer.remedy or REMEDIES[answer.status]
         headers = {"Retry-After": "1"} if answer.status == 503 else None
         raise Problem(answer.status, answer.fault, remedy=remedy, headers=headers)
-    field, value = _asked(query)
-    raise Problem(422, answer.fault, field=field, value=value, remedy=answer.remedy or f"give another {field}")
-
-
-def _asked(query: Query) -> tuple[str, object]:
-    """Returns field and value of the part of a query that only the reader can check."""
-    if isinstance(query, TracksQuery):
-        return ("ids", list(query.ids)) if query.ids is not None else ("at", query.at)
-    if isinstance(query, LabelsQuery | PartsQuery):
-        return "count", query.count if query.count is not None else "chosen by rule"
-    return "frame", query.frame
+    field, value = asked(query)
+    remedy = answer.remedy or f"give another {field}"
+    raise Problem(answer.status, answer.fault, field=field, value=value, remedy=remedy)

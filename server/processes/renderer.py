@@ -10,6 +10,7 @@ import logging
 import os
 import signal
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from client.wire import part_colour, parts_model
+from client.wire import GaussianModel, GaussiansModel, part_colour, parts_model
 from scas4d_core.cameras import rig_inside
 from scas4d_core.errors import InputError, message_of, without_paths
 from scas4d_core.rasterize.limits import scene_limits
@@ -28,6 +29,7 @@ from server.processes.messages import (
     Answer,
     AskedQuery,
     Damaged,
+    GaussiansQuery,
     LabelsQuery,
     PartsQuery,
     PlyQuery,
@@ -38,7 +40,7 @@ from server.processes.messages import (
     Stop,
     TracksQuery,
 )
-from server.processes.part_labels import PartLabels
+from server.processes.part_labels import PartLabels, fitted
 from server.processes.placement import use_one_thread
 
 if TYPE_CHECKING:
@@ -158,7 +160,8 @@ class Renderer:
                 return Refused(ask.number, message_of(error), status=404)
             except InputError as error:
                 log.warning("scene %s refused %s: %s", self.spec.folder.name, asked, error)
-                return Refused(ask.number, without_paths(error.fault), without_paths(error.remedy))
+                status = 404 if isinstance(ask.query, GaussiansQuery) else 422
+                return Refused(ask.number, without_paths(error.fault), without_paths(error.remedy), status)
             except ValueError as error:
                 log.warning("scene %s refused %s: %s", self.spec.folder.name, asked, error)
                 return Refused(ask.number, message_of(error))
@@ -170,7 +173,10 @@ class Renderer:
     def _answer(self, number: int, query: Query) -> Answer:
         match query:
             case RenderQuery():
-                view = self.reader.render(query.camera, query.frame, background=query.background, labels=query.labels)
+                painted = query.labels
+                if painted is not None:
+                    painted = fitted(painted, len(self.history.gaussians(query.frame)))
+                view = self.reader.render(query.camera, query.frame, background=query.background, labels=painted)
                 body, media_type, headers = encode_view(view, query.kinds, query.format, query.quality)
                 return Answer(number, body, media_type, {**headers, "X-Frame": str(query.frame)})
             case TracksQuery():
@@ -185,6 +191,10 @@ class Renderer:
                 body = labels.astype("<i2").tobytes()
                 headers = {"X-Parts-Frame": str(self.history.indices[-1])}
                 return Answer(number, body, "application/octet-stream", headers)
+            case GaussiansQuery():
+                lives = [GaussianModel.model_validate(asdict(life)) for life in self.history.lives(query.ids)]
+                told = GaussiansModel(frame=self.history.indices[-1], gaussians=lives)
+                return Answer(number, told.model_dump_json().encode(), "application/json")
             case PlyQuery():
                 file = self.spec.folder.export
                 self.reader.write_ply(file, query.frame)

@@ -9,16 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 from scas4d_core.captures import Frame
 from scas4d_core.errors import message_of
+from scas4d_core.gaussians import PER_FRAME, WHOLES
 from scas4d_core.storage.frame_files import (
     FIRST_COPY,
     FIXED_COPY,
     FIXED_FILE,
     FrameFiles,
+    born_of,
     checkpoint_of,
     fault_of,
     frame_of,
 )
-from scas4d_core.storage.history import NEWEST_KEPT, PER_FRAME, History
+from scas4d_core.storage.history import NEWEST_KEPT, History
 from server.processes.messages import Mend, Mended, MendOutcome, Remake, SceneSpec
 from server.storage.disk import no_room
 
@@ -66,7 +68,10 @@ def _mend(
     if fault is None:
         return MendOutcome.WHOLE, ""
     index, known = frame_of(name), history.indices
-    if name in (FIXED_FILE, FIXED_COPY, FIRST_COPY) or (known and index == known[0]):
+    birth = born_of(name)
+    if birth is not None and birth not in history.born_at:  # of a frame that was taken back
+        return MendOutcome.GONE, ""
+    if birth is not None or name in (FIXED_FILE, FIXED_COPY, FIRST_COPY) or (known and index == known[0]):
         if name in history.mend_fixed():
             return MendOutcome.WRITTEN, fault
         return (MendOutcome.DAMAGED, fault) if known else (MendOutcome.GONE, "")
@@ -86,7 +91,7 @@ def _mend(
 def _written_in_part(history: History, files: FrameFiles, index: int, message: Mend) -> MendOutcome:
     """Writes a file again of which only the report or the time is damaged: the state is whole in it."""
     try:
-        arrays = files.read(index, PER_FRAME)
+        arrays = files.read(index, PER_FRAME, WHOLES)
         report = message.reports.get(index)
         time = message.times[index] if index in message.times else files.time(index)
     except (ValueError, FileNotFoundError):

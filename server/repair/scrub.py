@@ -21,6 +21,7 @@ from scas4d_core.storage.frame_files import (
     FIXED_COPY,
     FIXED_FILE,
     FrameFiles,
+    born_file,
     checkpoint_file,
     checkpoint_of,
 )
@@ -134,13 +135,16 @@ class Scrub:
             return
         for name in (FIXED_FILE, FIXED_COPY, FIRST_COPY):
             await self._state(folder / name, lambda: True)
+        files = FrameFiles(folder)
+        for index in await asyncio.to_thread(files.births):
+            for copy in (False, True):
+                await self._state(folder / born_file(index, copy), lambda: True)
         listed = await asyncio.to_thread(_checkpoints, folder)
         for name in listed:
             await self._state(folder / name, lambda: False)
         newest = checkpoint_file(ledger.committed[-1])
         if listed and not self._at_work() and not await asyncio.to_thread((folder / newest).exists):
             self._noticed({newest: f"{newest} is gone"})
-        files = FrameFiles(folder)
         for index in reversed(committed):
             await self._state(files.path(index), partial(ledger.committed.__contains__, index))
             if index not in committed[-FRAMES_KEPT:]:

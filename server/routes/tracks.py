@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -60,7 +61,7 @@ async def tracks(
 ) -> Response:
     """Returns a few trajectories; the query is in the address."""
     request = TracksRequest(
-        ids=_ids(ids) if ids else None,
+        ids=ids_in(ids) if ids else None,
         pixels=_numbers(pixel, "pixel", 2) if pixel else None,
         camera=camera,
         points=_numbers(point, "point", 3) if point else None,
@@ -117,11 +118,7 @@ def query_of(scene: Scene, request: TracksRequest) -> TracksQuery:
             value="json",
             remedy=f"ask for npz, or for at most {MOST_JSON_POINTS} points times frames",
         )
-    if request.ids is not None and not all(0 <= id <= LARGEST_ID for id in request.ids):
-        below = next(id for id in request.ids if not 0 <= id <= LARGEST_ID)
-        raise Problem(
-            422, f"no Gaussian can have the id {below}", field="ids", value=below, remedy="take ids out of an answer"
-        )
+    check_ids(request.ids or ())
     if request.pixels is not None and request.camera is None:
         raise Problem(
             422,
@@ -210,7 +207,16 @@ def _camera(scene: Scene, camera: CameraModel | str) -> Camera:
     return camera.camera()
 
 
-def _ids(text: str) -> list[int]:
+def check_ids(ids: Iterable[int]) -> None:
+    """Refuses ids that no Gaussian can have."""
+    for id in ids:
+        if not 0 <= id <= LARGEST_ID:
+            remedy = "take ids out of an answer"
+            raise Problem(422, f"no Gaussian can have the id {id}", field="ids", value=id, remedy=remedy)
+
+
+def ids_in(text: str) -> list[int]:
+    """Returns the ids of a query parameter."""
     try:
         return [int(part) for part in text.split(",")]
     except ValueError:

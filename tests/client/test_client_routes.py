@@ -40,6 +40,7 @@ CALLS = [
     calls.tracks("s", ids=[0]),
     calls.tracks_arrays("s", ids=[0]),
     calls.parts("s"),
+    calls.gaussians("s", [0]),
     calls.budget("s"),
     calls.set_budget("s", iterations=50),
     calls.tradeoff("s"),

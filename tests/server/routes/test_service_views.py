@@ -82,7 +82,7 @@ def test_a_bad_render_is_refused_by_name(http, finished, request_, status, field
 
 
 def test_nothing_can_be_read_before_the_first_commit(http, quiet_scene):
-    for path in ("render", "tracks?ids=0", "parts"):
+    for path in ("render", "tracks?ids=0", "parts", "gaussians?ids=0"):
         assert problem(http.get(f"/v1/scenes/{quiet_scene}/{path}"), 409)["state"] == "awaiting_first_frame"
     problem(http.get(f"/v1/scenes/{quiet_scene}/frames/0/splat.ply"), 409)
     problem(http.get(f"/v1/scenes/{quiet_scene}/frames/0"), 404)
@@ -151,3 +151,19 @@ def test_parts_and_ply(sdk, finished):
     parts = sdk.parts(finished, 2)
     assert (parts.count, parts.ids, parts.labels) == (2, [0, 1], [0, 1])
     assert sdk.ply(finished, 1) == b"ply\n1"
+
+
+def test_lives_of_gaussians(sdk, finished):
+    found = sdk.gaussians(finished, [1, 0])
+    assert (found.frame, [one.id for one in found.gaussians]) == (2, [1, 0])
+    assert {(one.born, tuple(one.retired), tuple(one.revived)) for one in found.gaussians} == {(0, (), ())}
+
+
+@pytest.mark.parametrize(
+    ("ids", "status"), [("99", 404), ("0,99", 404), ("-1", 422), ("a", 422), ("", 422), ("1,", 422)]
+)
+def test_ids_that_no_gaussian_has_are_refused_by_name(http, finished, ids, status):
+    told = problem(http.get(f"/v1/scenes/{finished}/gaussians?ids={ids}"), status)
+    assert "ids" in told["field"]
+    assert told["remedy"]
+    assert status == 422 or ("99" in told["value"] and "[99]" in told["detail"])

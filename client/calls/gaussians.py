@@ -1,0 +1,19 @@
+"""Calls on Gaussians: the frames in which they came and went."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from client.calls.call import Call, path, reads
+from client.wire import GaussiansModel
+
+
+def gaussians(id: str, ids: Sequence[int]) -> Call[GaussiansModel]:
+    """Reads the lives of Gaussians by id: the frames in which each was born, retired and revived.
+
+    >>> found = client.gaussians(scene, [1, 0])
+    >>> [(one.id, one.born, one.retired) for one in found.gaussians]
+    [(1, 0, []), (0, 0, [])]
+    """
+    arguments = {"params": {"ids": ",".join(str(int(value)) for value in ids)}}
+    return Call("GET", path(id, "gaussians"), reads(GaussiansModel), arguments=arguments)

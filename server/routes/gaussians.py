@@ -1,0 +1,30 @@
+"""Route of Gaussians: the frames in which they came and went."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request, Response
+
+from client.wire import GaussiansModel
+from server.processes.messages import GaussiansQuery
+from server.routes.access import TheScene, ask
+from server.routes.tracks import check_ids, ids_in
+
+router = APIRouter(prefix="/v1/scenes", tags=["gaussians"])
+
+ANSWERS: dict[int | str, dict[str, Any]] = {200: {"model": GaussiansModel}}
+
+
+@router.get("/{id}/gaussians", response_class=Response, responses=ANSWERS)
+async def gaussians(
+    scene: TheScene,
+    request: Request,
+    ids: Annotated[str, Query(min_length=1, max_length=10_000, description="Separated by commas.")],
+) -> Response:
+    """Returns the frames in which Gaussians were born, retired and revived. An id is never used for another thing."""
+    scene.committed_frame(None, "id")
+    wanted = ids_in(ids)
+    check_ids(wanted)
+    answer = await ask(request, scene, GaussiansQuery(tuple(wanted)))
+    return Response(answer.body, media_type=answer.media_type)

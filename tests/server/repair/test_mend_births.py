@@ -1,0 +1,52 @@
+"""Files of Gaussians that were born are mended like the others that every frame needs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from histories import state
+
+from scas4d_core.storage.frame_files import born_file
+from scas4d_core.storage.history import History
+from server.processes.messages import Mend, MendOutcome
+from server.repair.repairs import mend, mend_at_start
+
+
+@pytest.fixture
+def history(tmp_path):
+    history = History(tmp_path)
+    history.append(0, 0.0, state(0))
+    history.append(1, 0.1, history.newest.joined(state(1, 2)))
+    history.append(2, 0.2, history.newest)
+    return history
+
+
+@pytest.mark.parametrize("copy", [False, True])
+def test_one_of_both_is_written_from_the_other(history, tmp_path, copy):
+    file = tmp_path / born_file(1, copy)
+    whole = file.read_bytes()
+    for spoilt in (b"", whole[:300]):
+        file.write_bytes(spoilt)
+        (mended,) = mend(History.open(tmp_path), None, Mend((file.name,)))
+        assert (mended.outcome, file.name in mended.reason) == (MendOutcome.WRITTEN, True)
+        assert np.array_equal(History.open(tmp_path).ids, history.ids)
+        (mended,) = mend(History.open(tmp_path), None, Mend((file.name,)))
+        assert mended.outcome is MendOutcome.WHOLE
+    file.unlink()
+    assert file.name in mend_at_start(History.open(tmp_path))[0]
+    assert file.exists()
+
+
+def test_both_are_written_from_memory(history, tmp_path):
+    names = born_file(1), born_file(1, copy=True)
+    for name in names:
+        (tmp_path / name).write_bytes(b"")
+    assert [mended.outcome for mended in mend(history, None, Mend(names))] == [MendOutcome.WRITTEN, MendOutcome.WHOLE]
+    assert len(History.open(tmp_path).newest) == 9
+
+
+def test_of_a_birth_that_was_taken_back_nothing_is_missed(history, tmp_path):
+    history.cut(0)
+    (tmp_path / born_file(1)).write_bytes(b"")
+    (mended,) = mend(history, None, Mend((born_file(1),)))
+    assert mended.outcome is MendOutcome.GONE
