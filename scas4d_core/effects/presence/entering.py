@@ -116,6 +116,8 @@ class Entering(Effect):
 
     def evidence(self, seen: Seen) -> Evidence | None:
         """What is new explains so much; once something was born, what that explained, for as long as it is there."""
+        if not seen.views:
+            return None
         left = seen.result.carried.get(NAME)
         if left is not None and seen.result.gaussians.present[left["rows"]].any():
             return _evidence(float(left["share"]), int(left["cameras"]))

@@ -28,8 +28,8 @@ SHARE, IDLE_SHARE = 0.02, 0.002
 FRAMES = 2
 """In a row that a Gaussian is in no picture before it is retired: at the border a thing comes and goes."""
 ABOUT = 0.1
-"""Of the moving extent: what has a Gaussian in some picture as near as this has not left: the half of a thing that is in
-view leads the other."""
+"""Of the moving extent: what has a Gaussian in some picture as near as this has not left: the half of a thing that
+is in view leads the other."""
 WIDTHS = 3.0
 """Standard deviations of a Gaussian that have to be outside as well."""
 
@@ -61,6 +61,8 @@ class Leaving(Effect):
 
     def evidence(self, seen: Seen) -> Evidence | None:
         """How much of what moves is in no picture, or was when the first was retired, as long as it stays away."""
+        if not seen.views:
+            return None
         state = seen.result.gaussians
         left = seen.result.carried.get(NAME)
         if left is not None and state.retired.any():

@@ -51,6 +51,8 @@ class UncoveredEffect(Effect):
 
     def evidence(self, seen: Seen) -> Evidence | None:
         """What is bare has so much of the error; once something was born, what had it then."""
+        if not seen.views:
+            return None
         left = seen.result.carried.get(NAME)
         if left is not None:
             return _evidence(float(left["share"]))
