@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from scas4d_core.gaussians import Gaussians
     from scas4d_core.update.result import UpdateResult
 
+Bool = NDArray[np.bool_]
+
 NAME = "entering"
 GLANCED = 2
 """Cameras of a glance that have to see something new before all are asked."""
@@ -31,8 +33,16 @@ SMALLEST = 0.003
 things that move is smaller."""
 SHARE = 0.05
 """Of the squared error of all pictures that a thing explains, from which it is one."""
-GONE = 0.01
-"""The same, below which the effect may be switched off."""
+WORTH = 0.01
+"""The same, from which Gaussians are born once the effect is on."""
+SURPLUS = 0.5
+"""Of the pixels of things that are new, which must not be made up for by stale ones: else they came from there."""
+BORDER, SUDDEN = 0.5, 0.2
+"""What enters comes over the border of the pictures: of the cameras that see a thing, the share in which it touches it;
+and the share of the error that a thing has to explain that appears in their middle. There, an update that has not
+followed a limb shows one beside it: 0.07 in `stage`."""
+TINY = 1e-12
+"""Of a sum of squared errors: none."""
 SETTLED = 4
 """Frames after its birth in which a Gaussian is still fitted beside the update."""
 NONE = np.zeros(0, np.int64)
@@ -73,21 +83,26 @@ def entered(seen: Seen) -> Found | None:
     everyone = said(seen, seen.views)
     hull = carve_new(everyone)
     total = sum(float(one.error.sum()) for one in everyone)
-    kept, share, cameras = np.zeros(len(hull.points), np.bool_), 0.0, 0
+    kept, share, cameras, pixels = np.zeros(len(hull.points), np.bool_), 0.0, 0, 0
     for thing in np.unique(hull.things):
         mine = hull.things == thing
-        prints = [footprint(one, hull.points[mine], hull.voxel) for one in everyone]
-        explains = sum(float(one.error[one.new & where].sum()) for one, where in zip(everyone, prints, strict=True))
-        see = sum(
-            int((one.new & where).sum()) >= SMALLEST * where.size for one, where in zip(everyone, prints, strict=True)
-        )
-        if total > 0 and explains / total >= GONE:
+        shown = [one.new & footprint(one, hull.points[mine], hull.voxel) for one in everyone]
+        explains = sum(float(one.error[where].sum()) for one, where in zip(everyone, shown, strict=True))
+        explains /= max(total, TINY)
+        see = [where for where in shown if where.sum() >= SMALLEST * where.size]
+        at_border = sum(_at_border(where) for where in see) >= BORDER * len(see)
+        if see and explains >= (WORTH if at_border else SUDDEN):
             kept |= mine
-            share += explains / total
-            cameras = max(cameras, see)
-    if not kept.any():
+            share += explains
+            cameras = max(cameras, len(see))
+            pixels += sum(int(where.sum()) for where in shown)
+    if not kept.any() or sum(one.surplus for one in everyone) < SURPLUS * pixels:
         return None
     return Found(everyone, hull.only(kept), share, cameras)
+
+
+def _at_border(pixels: Bool) -> bool:
+    return bool(pixels[[0, -1]].any() or pixels[:, [0, -1]].any())
 
 
 def _says(one: Novelty) -> bool:
@@ -166,5 +181,5 @@ EFFECT = Entering(
     cost="six pictures rendered a frame; where something enters, about an update more",
     auto=True,
     on_above=SHARE,
-    off_below=GONE,
+    off_below=WORTH,
 )
