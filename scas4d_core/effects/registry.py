@@ -30,5 +30,8 @@ EFFECTS = {
     "shadows": "scas4d_core.effects.appearance.shadows",
     "camera_gain": "scas4d_core.effects.appearance.camera_gain",
     "light": "scas4d_core.effects.appearance.light",
+    "uncovered": "scas4d_core.effects.presence.uncovered",
+    "entering": "scas4d_core.effects.presence.entering",
+    "leaving": "scas4d_core.effects.presence.leaving",
 }
 """The module of each effect, by its name; in the order in which they take part in an iteration."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +69,15 @@ def collect_views(
     return views
 
 
-def look_at_point(views: Sequence[PosedPicture]) -> Float:
+class Posed(Protocol):
+    """Whatever has a camera."""
+
+    @property
+    def camera(self) -> Camera:
+        """Calibrated."""
+
+
+def look_at_point(views: Sequence[Posed]) -> Float:
     """[3] point nearest to all optical axes (least squares): the middle of the stage of an inward-looking rig."""
     axes = np.array([view.camera.rotation[2] for view in views])
     centres = np.array([view.camera.centre for view in views])

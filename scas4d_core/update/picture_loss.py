@@ -20,7 +20,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import SMALLEST_SQUARE
 from scas4d_core.kernels import image_loss
 from scas4d_core.kernels.projection import TILE
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Drawing, Gradients
+from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Drawing, Gradients, Picture
 from scas4d_core.rasterize.limits import DEFAULT, Limits
 
 Array = NDArray[np.float32]
@@ -150,6 +150,14 @@ class ViewFactory:
         """The view with other planes [C, H, W] of the same size."""
         return self._view(view.name, view.camera, target, view.exposure)
 
+    def cropped(self, view: TrainingView, left: int, top: int, right: int, bottom: int) -> TrainingView:
+        """The part of a view in a rectangle of whole pixels, ``right`` and ``bottom`` excluded."""
+        lens = view.camera.lens.copy()
+        lens[2:] = lens[2] - left, lens[3] - top, right - left, bottom - top
+        camera = view.camera._replace(lens=lens, width=right - left, height=bottom - top)
+        target = np.ascontiguousarray(view.target[:, top:bottom, left:right])
+        return self._view(view.name, camera, target, view.exposure)
+
     def _view(self, name: str, camera: CameraArrays, target: Array, exposure: Array) -> TrainingView:
         return TrainingView(name, camera, target, exposure, self.scratch(*target.shape))
 
@@ -217,6 +225,12 @@ class PictureLoss:
     def begin(self, previous: Gaussians) -> None:
         """Takes the state that a frame starts from; here nothing hangs on it."""
 
+    def apart(self, factory: ViewFactory) -> PictureLoss:
+        """The image loss with the same background and limits, and buffers of its own: for views of other sizes."""
+        red, green, blue, _ = self._background.tolist()
+        limits = Limits(*self.rasterizer.limits.tolist())
+        return PictureLoss(factory, (red, green, blue), 1.0, 0.0, limits=limits)
+
     def evaluate(
         self,
         means: Array,
@@ -242,6 +256,11 @@ class PictureLoss:
         gradients = self.rasterizer.backward(g_image, g_alpha, self._detached)
         lap("render backward")
         return gradients
+
+    def render(self, state: Gaussians, features: Array, view: TrainingView, depth_channel: int = -1) -> Picture:
+        """The view without a comparison; see ``CpuRasterizer.forward``."""
+        given = (state.means, state.factors, state.opacities, features, view.camera, self._background)
+        return self.rasterizer.forward(*given, depth_channel)
 
     def measure(self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView) -> None:
         """Render the view and set ``image_part``, ``mask_part`` and ``psnr``, without gradients; see ``evaluate``."""

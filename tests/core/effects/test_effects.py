@@ -140,7 +140,7 @@ def seen(index: int) -> Seen:
 @pytest.mark.usefixtures("shy")
 def test_evidence_switches_with_hysteresis() -> None:
     settings = Settings()
-    switches = first_switches(settings, 0)
+    switches = {"shy": first_switches(settings, 0)["shy"]}
     assert not switches["shy"].on
     on = []
     for index in range(3 + IDLE):
@@ -153,7 +153,7 @@ def test_evidence_switches_with_hysteresis() -> None:
 @pytest.mark.usefixtures("shy")
 def test_a_pinned_switch_hears_no_evidence() -> None:
     settings = Settings(effects={"shy": "off"})
-    switches = decided(first_switches(settings, 0), settings, seen(1))
+    switches = decided({"shy": first_switches(settings, 0)["shy"]}, settings, seen(1))
     assert not switches["shy"].on
     assert switches["shy"].pinned
 

@@ -1,0 +1,166 @@
+"""The hull of what is new: voxels that several cameras see as new, and that no camera sees through.
+
+An octree, as for the visual hull of frame 0; beside its silhouettes a camera has pixels in which it has no say: those
+where the state shows a moving thing that may hide the new one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, distance_transform_edt, label
+
+from scas4d_core.first_frame.posed_pictures import front_depth, look_at_point, pixels_inside
+
+if TYPE_CHECKING:
+    from scas4d_core.effects.presence.novelty import Novelty
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+AGREE = 4
+"""Cameras that must see a voxel as new: three see the same ghost in a rig of twenty."""
+MISSES = 0.1
+"""Share of the cameras with a say that may see a voxel as free: outlines are off by a pixel."""
+COARSE = 32
+"""Voxels along an edge of the first grid."""
+VOXEL_PIXELS = 1.5
+"""Edge of the smallest voxel, at most, in pixels at the middle of the stage."""
+MOST_VOXELS = 1_000_000
+"""A level that would hold more is not entered."""
+SMALLEST = 27
+"""Voxels of a thing, at least: three along each edge."""
+SIDES = np.stack(np.meshgrid(*[np.arange(2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Hull:
+    """Voxels of what is new.
+
+    Attributes:
+        points: [V, 3] their centres, inside world. surface: [V] those with an empty neighbour. things: [V] number of
+            the connected thing that each belongs to. voxel: edge, metres.
+    """
+
+    points: Float
+    surface: Bool
+    things: NDArray[np.int64]
+    voxel: float
+
+    def only(self, kept: Bool) -> Hull:
+        """The hull without some of its things; ``kept`` [V]."""
+        return Hull(self.points[kept], self.surface[kept], self.things[kept], self.voxel)
+
+
+def carve_new(seen: Sequence[Novelty]) -> Hull:
+    """Carves what is new, out of the stage: a cube about its middle that holds all cameras.
+
+    Args:
+        seen: what the cameras say.
+    """
+    middle = look_at_point(seen)
+    reach = max(float(np.linalg.norm(one.camera.centre - middle)) for one in seen)
+    pixel = float(np.median([_depth_of(one, middle) / one.camera.fx for one in seen]))
+    voxel = 2 * reach / COARSE
+    origin = middle - reach + voxel / 2
+    cells = np.stack(np.meshgrid(*[np.arange(COARSE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    distances = [(_distance(one.new), _distance(one.new | one.covered)) for one in seen]
+    while True:
+        last = voxel <= VOXEL_PIXELS * pixel or 8 * len(cells) > MOST_VOXELS
+        cells = cells[_kept(seen, distances, origin + cells * voxel, voxel, last)]
+        if last or len(cells) == 0:
+            return _hull(cells, origin, voxel)
+        cells = (2 * cells[:, None, :] + SIDES).reshape(-1, 3)
+        origin = origin - voxel / 4
+        voxel /= 2
+
+
+def _depth_of(one: Novelty, point: Float) -> float:
+    return max(float(one.camera.project(point)[1]), 1e-3)
+
+
+def _distance(pixels: Bool) -> Float:
+    """[H, W] pixels to the nearest of some; infinity where there are none."""
+    if not pixels.any():
+        return np.full(pixels.shape, np.inf)
+    result: Float = distance_transform_edt(~pixels)
+    return result
+
+
+def _kept(
+    seen: Sequence[Novelty], distances: Sequence[tuple[Float, Float]], centres: Float, voxel: float, last: bool
+) -> Bool:
+    agree, against, asked = (np.zeros(len(centres), np.int64) for _ in range(3))
+    half = 0.5 * voxel if last else 0.5 * np.sqrt(3.0) * voxel
+    for one, (new, possible) in zip(seen, distances, strict=True):
+        camera = one.camera
+        uv, depth = camera.project(centres)
+        # Before the last level a voxel stays if any part of it may be new, and a part may be seen beyond the border.
+        slack = camera.fx * half / np.maximum(depth, 1e-9) + (0.71 if last else 1.5)
+        border = 0.0 if last else slack
+        with np.errstate(invalid="ignore"):
+            near = (depth > half) & (uv[:, 0] >= -border) & (uv[:, 0] < camera.width + border)
+            near &= (uv[:, 1] >= -border) & (uv[:, 1] < camera.height + border)
+            clipped = np.clip(np.where(near[:, None], uv, 0), 0, [camera.width - 1, camera.height - 1])
+        column, row = clipped.astype(np.int64).T
+        agree += near & (new[row, column] <= slack)
+        missed = near & (possible[row, column] > slack)
+        if not last:
+            missed &= (uv[:, 0] >= 0) & (uv[:, 0] < camera.width) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height)
+        against += missed
+        asked += missed | (near & (new[row, column] <= slack))
+    kept: Bool = (agree >= AGREE) & (against <= np.floor(MISSES * asked))
+    return kept
+
+
+def _hull(cells: NDArray[np.int64], origin: Float, voxel: float) -> Hull:
+    if len(cells) == 0:
+        return Hull(np.zeros((0, 3)), np.zeros(0, np.bool_), np.zeros(0, np.int64), voxel)
+    low = cells.min(axis=0) - 1
+    grid = np.zeros(cells.max(axis=0) + 2 - low, np.bool_)
+    at = tuple((cells - low).T)
+    grid[at] = True
+    numbers, _ = label(grid, np.ones((3, 3, 3)))
+    inner = grid.copy()
+    for axis in range(3):
+        for step in (1, -1):
+            inner &= np.roll(grid, step, axis)
+    things = numbers[at].astype(np.int64)
+    kept = np.bincount(things)[things] >= SMALLEST
+    return Hull((origin + cells * voxel)[kept], ~inner[at][kept], things[kept], voxel)
+
+
+def footprint(one: Novelty, points: Float, voxel: float) -> Bool:
+    """[H, W] the pixels of a camera that show voxels with centres [P, 3]."""
+    column, row, depth, inside = pixels_inside(one.camera, points)
+    shown = np.zeros(one.new.shape, np.bool_)
+    shown[row[inside], column[inside]] = True
+    if not inside.any():
+        return shown
+    wide = 1 + int(np.ceil(one.camera.fx * voxel / float(np.median(depth[inside]))))
+    found: Bool = binary_dilation(shown, np.ones((2 * (wide // 2) + 1,) * 2, np.bool_))
+    return found
+
+
+def colours_of(seen: Sequence[Novelty], points: Float, hull: Hull) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Median colour [P, 3] of points over the cameras that see them as new, and how many do [P]; NaN where none.
+
+    Args:
+        points: [P, 3] on the hull's surface. hull: what hides them.
+    """
+    samples = np.full((len(seen), len(points), 3), np.nan, np.float32)
+    front = hull.points[hull.surface]
+    for sample, one in zip(samples, seen, strict=True):
+        column, row, depth, inside = pixels_inside(one.camera, points)
+        free = depth <= front_depth(one.camera, front, hull.voxel, points) + 2 * hull.voxel
+        use = inside & free & one.new[row, column]
+        sample[use] = one.image[row[use], column[use]]
+    count = np.isfinite(samples[:, :, 0]).sum(axis=0)
+    colours = np.full((len(points), 3), np.nan, np.float32)
+    if (count > 0).any():
+        colours[count > 0] = np.nanmedian(samples[:, count > 0], axis=0)
+    return colours, count

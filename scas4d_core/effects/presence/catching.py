@@ -1,0 +1,84 @@
+"""Catches what was born in the frame before: its motion is not known yet, and it may fall further than its width.
+
+Its hull is carved out of the pictures of the frame once more, without it; the way from the one hull to the other is
+where its clusters start from.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.effects.parts import Part, PartsBuilder, Work
+from scas4d_core.effects.presence.carving import Hull, carve_new
+from scas4d_core.effects.presence.novelty import novelties
+
+if TYPE_CHECKING:
+    from scas4d_core.effects.parts import Arrays
+    from scas4d_core.update.picture_loss import PictureLoss
+
+Float = NDArray[np.float64]
+
+SAME = 2.5
+"""Times larger or smaller that a hull may be and still be that of the same thing: it comes gradually into view."""
+OWN = 0.5
+"""Share of a cluster's Gaussians that must belong to the thing for the cluster to start with its way."""
+
+
+class Catching(Part):
+    """Sets the shift of the coarsest clusters of what was born in the frame before.
+
+    Args:
+        name: of the effect, whose arrays name the rows ("young"), the thing of each ("thing"), and for each thing its
+            hull's centre ("centres", [T, 3] metres) and volume ("volumes", cubic metres).
+    """
+
+    def __init__(self, builder: PartsBuilder, name: str) -> None:
+        self._hierarchy, self._factory, self._scene, self._name = (
+            builder.hierarchy,
+            builder.factory,
+            builder.scene,
+            name,
+        )
+        self._picture: PictureLoss | None = None
+
+    def start(self, work: Work) -> None:
+        """Finds each young thing in the pictures of the frame."""
+        arrays = work.carried.get(self._name)
+        if arrays is None or not len(arrays["young"]) or not self._hierarchy.sizes:
+            return
+        rest = work.previous.retire(arrays["young"])
+        rig = self._factory.rig
+        hull = carve_new(novelties(rest, rest.colours, work.views, rig, self._renderer()))
+        thing = np.full(len(work.previous), -1)
+        thing[arrays["young"]] = arrays["thing"]
+        of_entries, labels = thing[self._hierarchy.rows], self._hierarchy.labels[0]
+        counts = np.bincount(labels)
+        for number, way in _ways(hull, arrays).items():
+            own = np.bincount(labels, weights=of_entries == number, minlength=len(counts)) > OWN * counts
+            work.deformation.clusters[0][own, 3:6] = way
+
+    def _renderer(self) -> PictureLoss:
+        if self._picture is None:
+            from scas4d_core.rasterize.limits import scene_limits
+            from scas4d_core.update.picture_loss import PictureLoss
+
+            limits = scene_limits(self._scene.near, self._factory.rig.radius)
+            self._picture = PictureLoss(self._factory, self._scene.background, 1.0, 0.0, limits=limits)
+        return self._picture
+
+
+def _ways(hull: Hull, arrays: Arrays) -> dict[int, Float]:
+    """By number of a young thing, [3] metres to the nearest hull of about its size."""
+    found: dict[int, Float] = {}
+    numbers = np.unique(hull.things)
+    centres = np.array([hull.points[hull.things == number].mean(axis=0) for number in numbers]).reshape(-1, 3)
+    volumes = np.array([(hull.things == number).sum() * hull.voxel**3 for number in numbers])
+    for thing, (centre, volume) in enumerate(zip(arrays["centres"], arrays["volumes"], strict=True)):
+        alike = (volumes < SAME * volume) & (volumes > volume / SAME)
+        if alike.any():
+            ways = (centres - centre)[alike]
+            found[thing] = ways[np.argmin(np.square(ways).sum(axis=1))]
+    return found

@@ -1,0 +1,185 @@
+"""Things that enter: where cameras agree that nothing the state has explains the pictures, Gaussians are born."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.evidence import Evidence
+from scas4d_core.effects.parts import Arrays
+from scas4d_core.effects.presence.carving import Hull, carve_new, footprint
+from scas4d_core.effects.presence.catching import Catching
+from scas4d_core.effects.presence.novelty import Novelty, glance, said
+
+if TYPE_CHECKING:
+    from scas4d_core.effects.evidence import Seen
+    from scas4d_core.effects.parts import PartsBuilder
+    from scas4d_core.gaussians import Gaussians
+    from scas4d_core.update.result import UpdateResult
+
+Bool = NDArray[np.bool_]
+
+NAME = "entering"
+GLANCED = 2
+"""Cameras of a glance that have to see something new before all are asked."""
+SMALLEST = 0.003
+"""Share of a camera's pixels that it must see as new to have a say: 200 of 256 x 256. What an update leaves behind of
+things that move is smaller."""
+SHARE = 0.05
+"""Of the squared error of all pictures that a thing explains, from which it is one."""
+WORTH = 0.01
+"""The same, from which Gaussians are born once the effect is on."""
+SURPLUS = 0.5
+"""Of the pixels of things that are new, which must not be made up for by stale ones: else they came from there."""
+BORDER, SUDDEN = 0.5, 0.2
+"""What enters comes over the border of the pictures: of the cameras that see a thing, the share in which it touches it;
+and the share of the error that a thing has to explain that appears in their middle. There, an update that has not
+followed a limb shows one beside it: 0.07 in `stage`."""
+TINY = 1e-12
+"""Of a sum of squared errors: none."""
+SETTLED = 4
+"""Frames after its birth in which a Gaussian is still fitted beside the update."""
+NONE = np.zeros(0, np.int64)
+NOBODY: Arrays = {
+    "rows": NONE,
+    "age": NONE,
+    "young": NONE,
+    "thing": NONE,
+    "centres": np.zeros((0, 3)),
+    "volumes": np.zeros(0),
+    "share": np.array(0.0),
+    "cameras": np.array(0),
+}
+"""What is left before anything was born."""
+BUDGET = 0.1
+"""Gaussians that are born in a frame at most, as a share of those that are there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What has entered.
+
+    Attributes:
+        seen: what the cameras say. hull: of the things that count. share: of the squared error that they explain.
+        cameras: that see them.
+    """
+
+    seen: Sequence[Novelty]
+    hull: Hull
+    share: float
+    cameras: int
+
+
+def entered(seen: Seen) -> Found | None:
+    """What a frame shows that the state does not have; None where there is nothing of the kind."""
+    if sum(_says(one) for one in glance(seen)) < GLANCED:
+        return None
+    everyone = said(seen, seen.views)
+    hull = carve_new(everyone)
+    total = sum(float(one.error.sum()) for one in everyone)
+    kept, share, cameras, pixels = np.zeros(len(hull.points), np.bool_), 0.0, 0, 0
+    for thing in np.unique(hull.things):
+        mine = hull.things == thing
+        shown = [one.new & footprint(one, hull.points[mine], hull.voxel) for one in everyone]
+        explains = sum(float(one.error[where].sum()) for one, where in zip(everyone, shown, strict=True))
+        explains /= max(total, TINY)
+        see = [where for where in shown if where.sum() >= SMALLEST * where.size]
+        at_border = sum(_at_border(where) for where in see) >= BORDER * len(see)
+        if see and explains >= (WORTH if at_border else SUDDEN):
+            kept |= mine
+            share += explains
+            cameras = max(cameras, len(see))
+            pixels += sum(int(where.sum()) for where in shown)
+    if not kept.any() or sum(one.surplus for one in everyone) < SURPLUS * pixels:
+        return None
+    return Found(everyone, hull.only(kept), share, cameras)
+
+
+def _at_border(pixels: Bool) -> bool:
+    return bool(pixels[[0, -1]].any() or pixels[:, [0, -1]].any())
+
+
+def _says(one: Novelty) -> bool:
+    return one.surplus >= SMALLEST * one.new.size
+
+
+def _remembered(found: Found, born: Gaussians, rows: NDArray[np.int64], left: Arrays) -> Arrays:
+    """The arrays that the births of a frame add to those that were left."""
+    things = np.unique(found.hull.things)
+    nearest = cKDTree(found.hull.points).query(born.means)[1]
+    return {
+        "rows": np.concatenate([left["rows"], rows]),
+        "age": np.concatenate([left["age"], np.zeros(len(rows), np.int64)]),
+        "young": rows,
+        "thing": np.searchsorted(things, found.hull.things[nearest]),
+        "centres": np.array([found.hull.points[found.hull.things == number].mean(axis=0) for number in things]),
+        "volumes": np.array([(found.hull.things == number).sum() * found.hull.voxel**3 for number in things]),
+        "share": np.maximum(found.share, left["share"]),
+        "cameras": np.maximum(found.cameras, left["cameras"]),
+    }
+
+
+@dataclass(frozen=True)
+class Entering(Effect):
+    """Births, in frames that show more than the state has."""
+
+    def evidence(self, seen: Seen) -> Evidence | None:
+        """What is new explains so much; once something was born, what that explained, for as long as it is there."""
+        if not seen.views:
+            return None
+        left = seen.result.carried.get(NAME)
+        if left is not None and seen.result.gaussians.present[left["rows"]].any():
+            return _evidence(float(left["share"]), int(left["cameras"]))
+        found = entered(seen)
+        return Evidence(0.0, "") if found is None else _evidence(found.share, found.cameras)
+
+    def populated(self, seen: Seen) -> UpdateResult:
+        """The result with the Gaussians that are born, and the young ones settled."""
+        from scas4d_core.effects.presence.growing import grown, seeds, settled
+
+        result, found = seen.result, entered(seen)
+        left = result.carried.get(NAME, NOBODY)
+        state, rng = result.gaussians, np.random.default_rng([seen.index, len(result.gaussians)])
+        young = left["age"] < SETTLED
+        settling = left["rows"][young & state.present[left["rows"]]]
+        if len(settling):
+            state = settled(state, settling, seen.views, seen.rig, seen.picture, rng)
+        arrays = {**left, "young": NONE, "thing": NONE, "age": left["age"] + 1}
+        joins = result.joins
+        if found is not None:
+            points, colours = seeds(found.seen, found.hull, int(BUDGET * len(state)), rng)
+            born = grown(state, points, colours, seen.views, seen.rig, seen.picture, rng, moves=True)
+            rows = np.arange(len(state), len(state) + len(born))
+            state = state.joined(born)
+            arrays |= _remembered(found, born, rows, arrays)
+            alone = np.full(len(born), -1, np.int64)
+            joins = alone if joins is None else np.concatenate([joins, alone])
+        if found is None and left is NOBODY:
+            return result
+        return replace(result, gaussians=state, joins=joins, carried={**result.carried, NAME: arrays})
+
+    def join(self, builder: PartsBuilder) -> None:
+        """Adds the search for what was born in the frame before."""
+        builder.parts.append(Catching(builder, NAME))
+
+
+def _evidence(share: float, cameras: int) -> Evidence:
+    return Evidence(share, f"a thing entered: {cameras} cameras agree, it explains {100 * share:.0f} % of the error")
+
+
+EFFECT = Entering(
+    name=NAME,
+    group=Group.PRESENCE,
+    says="Things enter the scene: where cameras agree that nothing explains the pictures, Gaussians are born.",
+    gauge="Only what no Gaussian covers is new, and only beyond what has moved away elsewhere.",
+    cost="six pictures rendered a frame; where something enters, about an update more",
+    auto=True,
+    on_above=SHARE,
+    off_below=WORTH,
+)

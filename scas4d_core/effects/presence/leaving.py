@@ -1,0 +1,108 @@
+"""Things that leave: Gaussians that move and are in no picture any more, they and what is about them, are retired.
+
+They keep their rows and ids: they are neither drawn nor moved, until something that they explain comes into view.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.evidence import Evidence
+from scas4d_core.gaussians import Gaussians, moving_extent
+
+if TYPE_CHECKING:
+    from scas4d_core.cameras import Rig
+    from scas4d_core.effects.evidence import Seen
+    from scas4d_core.effects.parts import Arrays, PartsBuilder
+    from scas4d_core.update.result import UpdateResult
+
+NAME = "leaving"
+SHARE, IDLE_SHARE = 0.02, 0.002
+"""Of the moving Gaussians that are in no picture, from which the effect is on, and below which it may go off."""
+FRAMES = 2
+"""In a row that a Gaussian is in no picture before it is retired: at the border a thing comes and goes."""
+ABOUT = 0.1
+"""Of the moving extent: what has a Gaussian in some picture as near as this has not left: the half of a thing that
+is in view leads the other."""
+WIDTHS = 3.0
+"""Standard deviations of a Gaussian that have to be outside as well."""
+
+
+def outside(state: Gaussians, rig: Rig) -> NDArray[np.bool_]:
+    """[N] the moving Gaussians that are in no picture.
+
+    Args:
+        state: Θ_t. rig: the cameras inside, those that are not believed included: they come back.
+    """
+    rows = np.flatnonzero(state.moving)
+    means = state.means[rows].astype(np.float64)
+    width = WIDTHS * np.sqrt(np.square(state.factors[rows]).sum(axis=1).max(axis=1))
+    shown = np.zeros(len(rows), np.bool_)
+    for camera in rig.cameras:
+        uv, depth = camera.project(means)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            border = camera.fx * width / depth
+            inside = (uv > -border[:, None]) & (uv < [camera.width, camera.height] + border[:, None])
+        shown |= (depth > 0) & inside.all(axis=1)
+    found = np.zeros(len(state), np.bool_)
+    found[rows] = ~shown
+    return found
+
+
+@dataclass(frozen=True)
+class Leaving(Effect):
+    """Retirements, in frames in which something has left all views."""
+
+    def evidence(self, seen: Seen) -> Evidence | None:
+        """How much of what moves is in no picture, or was when the first was retired, as long as it stays away."""
+        if not seen.views:
+            return None
+        state = seen.result.gaussians
+        left = seen.result.carried.get(NAME)
+        if left is not None and state.retired.any():
+            return _evidence(float(left["share"]))
+        moving = int(state.moving.sum())
+        return _evidence(float(outside(state, seen.rig).sum()) / max(1, moving))
+
+    def populated(self, seen: Seen) -> UpdateResult:
+        """The result with those retired that have been outside for long enough."""
+        state = seen.result.gaussians
+        out = outside(state, seen.rig)
+        left: Arrays = dict(seen.result.carried.get(NAME, {}))
+        before = left.get("frames", np.zeros(0, np.int64))
+        frames = np.where(out, 1 + np.pad(before, (0, len(out) - len(before))), 0)
+        gone = frames >= FRAMES
+        inside = state.moving & ~out
+        if gone.any() and inside.any():
+            near = ABOUT * moving_extent(state.replace(foreground=np.where(inside, state.foreground, np.float32(0))))
+            rows = np.flatnonzero(gone)
+            gone[rows] = cKDTree(state.means[inside]).query(state.means[rows])[0] > near
+        share = float(gone.sum()) / max(1, int(state.moving.sum()))
+        arrays = {"frames": frames, "share": np.maximum(left.get("share", np.array(0.0)), share)}
+        carried = {**seen.result.carried, NAME: arrays}
+        return replace(seen.result, gaussians=state.retire(gone) if gone.any() else state, carried=carried)
+
+    def join(self, builder: PartsBuilder) -> None:
+        """Adds nothing: retirements come after the update of a frame."""
+
+
+def _evidence(share: float) -> Evidence:
+    return Evidence(share, f"{100 * share:.0f} % of what moves has left all pictures" if share else "")
+
+
+EFFECT = Leaving(
+    name=NAME,
+    group=Group.PRESENCE,
+    says="Things leave the scene: what is in no picture any more is retired, and can come back as itself.",
+    gauge="None is needed: what is in no picture explains nothing.",
+    cost="one projection of what moves a frame; an update costs less by what has left",
+    auto=True,
+    on_above=SHARE,
+    off_below=IDLE_SHARE,
+)

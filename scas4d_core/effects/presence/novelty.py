@@ -1,0 +1,130 @@
+"""Pixels of a frame that show what the state does not have, and those where the state shows what is not there.
+
+With a mask a pixel is new where the mask has foreground and the rendered label has none. Without, it is new where the
+picture differs from the rendering of what stands. What merely moved and was not followed shows as both, new pixels and
+stale ones, of about the same number: only what is new beyond what is stale can have entered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_opening, binary_propagation, uniform_filter
+
+if TYPE_CHECKING:
+    from scas4d_core.cameras import Camera, Rig
+    from scas4d_core.effects.evidence import Seen
+    from scas4d_core.gaussians import Gaussians
+    from scas4d_core.update.picture_loss import PictureLoss, TrainingView
+
+Bool = NDArray[np.bool_]
+Array = NDArray[np.float32]
+
+THERE, ABSENT = 0.5, 0.3
+"""Rendered label from which a pixel shows a moving Gaussian, and below which it shows none."""
+RIM = 3
+"""Pixels: narrower regions are rims, where the outline of what is known is off by a pixel."""
+BARE = 0.5
+"""Transmittance that is left, from which the state has nothing in a pixel."""
+DIFFERENT, TIMES_USUAL = 0.1, 3.0
+"""Without masks: the mean difference of a channel, 0…1, in a square of ``RIM`` pixels, from which it is another thing;
+and times the median of such differences over the picture."""
+
+
+@dataclass(frozen=True, eq=False)
+class Novelty:
+    """What a camera says about a frame.
+
+    Attributes:
+        view: of the frame. camera: inside. image: [H, W, 3] of its picture, 0…1, as the scene's colours are.
+        new: [H, W] shows what the state does not have. stale: [H, W] the state shows what is not there.
+        covered: [H, W] the state shows a moving thing, which something new may lie behind.
+        bare: [H, W] the state shows nothing at all where the picture has something that stands. behind: [H, W] picture
+            and state show what stands, as far as can be told.
+        error: [H, W] squared difference of picture and rendering, mean over the channels.
+    """
+
+    view: TrainingView
+    camera: Camera
+    image: Array
+    new: Bool
+    stale: Bool
+    covered: Bool
+    bare: Bool
+    behind: Bool
+    error: Array
+
+    @property
+    def surplus(self) -> int:
+        """New pixels beyond the stale ones."""
+        return int(self.new.sum()) - int(self.stale.sum())
+
+
+GLANCE = 6
+"""Cameras that are looked at in each frame, others each time; all of them where these find something."""
+
+_said: WeakKeyDictionary[Gaussians, dict[str, Novelty]] = WeakKeyDictionary()
+"""What cameras say, by state: several effects ask for the same."""
+
+
+def glance(seen: Seen) -> list[Novelty]:
+    """What some cameras say of a frame."""
+    count = len(seen.views)
+    return said(seen, [seen.views[(seen.index + count * k // GLANCE) % count] for k in range(min(GLANCE, count))])
+
+
+def said(seen: Seen, views: Sequence[TrainingView]) -> list[Novelty]:
+    """What some views say, in the colours of the frame before: what is new may be painted on what stands by now."""
+    state = seen.result.gaussians
+    known = _said.setdefault(state, {})
+    missing = [view for view in views if view.name not in known]
+    colours = state.colours.copy()
+    colours[: len(seen.before)] = seen.before.colours
+    found = novelties(state, colours, missing, seen.rig, seen.picture)
+    known.update({view.name: one for view, one in zip(missing, found, strict=True)})
+    return [known[view.name] for view in views]
+
+
+def novelties(
+    state: Gaussians, colours: Array, views: Sequence[TrainingView], rig: Rig, picture: PictureLoss
+) -> list[Novelty]:
+    """What each view says against a state.
+
+    Args:
+        state: Θ_t, updated to the frame. colours: [N, 3] RGB to render: of the frame before, so that what is new has
+            not been painted on what stands. views: of the frame.
+    """
+    features = np.concatenate([colours, state.foreground[:, None]], axis=1).astype(np.float32)
+    return [_novelty(state, features, view, rig[view.name], picture) for view in views]
+
+
+def _novelty(state: Gaussians, features: Array, view: TrainingView, camera: Camera, picture: PictureLoss) -> Novelty:
+    planes, rest = picture.render(state, features, view)
+    gain, offset = view.exposure[:3, 0, None, None], view.exposure[:3, 1, None, None]
+    difference: Array = view.target[:3] - (gain * planes[:3] + offset)
+    label = planes[3]
+    blurred = uniform_filter(np.abs(difference).mean(axis=0), RIM)
+    if len(view.target) > 3:
+        shown = view.target[3] > 0.5
+        new, stale = shown & (label < ABSENT), ~shown & (label > THERE)
+        behind = ~shown & (label < ABSENT)
+    else:
+        off = blurred > max(DIFFERENT, TIMES_USUAL * float(np.median(blurred)))
+        new, stale = off & (label < THERE), off & (label >= THERE)
+        behind = label < ABSENT
+    bare = behind & (rest > BARE) & (blurred > DIFFERENT)
+    image = np.moveaxis((view.target[:3] - offset) / gain, 0, -1)
+    error = np.square(difference).mean(axis=0)
+    return Novelty(view, camera, image, _wide(new), _wide(stale), label >= ABSENT, _wide(bare), behind, error)
+
+
+def _wide(pixels: Bool) -> Bool:
+    """The regions that are somewhere as wide as ``RIM``."""
+    cores: Any = binary_opening(pixels, np.ones((RIM, RIM), np.bool_))
+    found: Bool = binary_propagation(cores, mask=pixels)
+    return found

@@ -1,0 +1,105 @@
+"""Things that move uncover what they hid: Gaussians that stand are born where the state has nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.evidence import Evidence
+from scas4d_core.effects.presence.carving import footprint
+from scas4d_core.effects.presence.novelty import glance, said
+from scas4d_core.effects.presence.uncovering import Uncovered, uncovered
+
+if TYPE_CHECKING:
+    from scas4d_core.effects.evidence import Seen
+    from scas4d_core.effects.parts import Arrays, PartsBuilder
+    from scas4d_core.update.result import UpdateResult
+
+NAME = "uncovered"
+GLANCED = 3
+"""Cameras of a glance that have to see something bare before all are asked."""
+SMALLEST = 0.0004
+"""Share of a camera's pixels that it must see as bare to have a say: 26 of 256 x 256, five by five."""
+SHARE = 0.03
+"""Of the squared error of all pictures that is in the bare regions, from which they are worth it."""
+WORTH = 0.005
+"""The same, from which Gaussians are born once the effect is on."""
+BUDGET = 0.05
+"""Gaussians that are born in a frame at most, as a share of those that are there."""
+
+
+def _found(seen: Seen) -> tuple[Uncovered, float] | None:
+    """What is uncovered, and the share of the squared error that it explains."""
+    if sum(one.bare.sum() >= SMALLEST * one.bare.size for one in glance(seen)) < GLANCED:
+        return None
+    everyone = said(seen, seen.views)
+    found = uncovered(everyone, seen.result.gaussians, seen.picture)
+    if not len(found.points):
+        return None
+    total = sum(float(one.error.sum()) for one in everyone)
+    prints = [one.bare & footprint(one, found.points, found.spacing) for one in everyone]
+    explains = sum(float(one.error[where].sum()) for one, where in zip(everyone, prints, strict=True))
+    return (found, explains / total) if total > 0 else None
+
+
+@dataclass(frozen=True)
+class UncoveredEffect(Effect):
+    """Births behind what moves away."""
+
+    def evidence(self, seen: Seen) -> Evidence | None:
+        """What is bare has so much of the error; once something was born, what had it then."""
+        if not seen.views:
+            return None
+        left = seen.result.carried.get(NAME)
+        if left is not None:
+            return _evidence(float(left["share"]))
+        found = _found(seen)
+        return Evidence(0.0, "") if found is None else _evidence(found[1])
+
+    def populated(self, seen: Seen) -> UpdateResult:
+        """The result with the Gaussians that are born."""
+        result, found = seen.result, _found(seen)
+        if found is None or found[1] < WORTH:
+            return result
+        from scas4d_core.effects.presence.growing import grown
+
+        points, share = found
+        state, rng = result.gaussians, np.random.default_rng([seen.index, len(result.gaussians)])
+        some = np.arange(len(points.points))
+        most = int(BUDGET * len(state))
+        if len(some) > most:
+            some = np.sort(rng.choice(some, most, replace=False))
+        born = grown(
+            state, points.points[some], points.colours[some], seen.views, seen.rig, seen.picture, rng, moves=False
+        )
+        joins = np.full(len(born), -1, np.int64)
+        left = result.carried.get(NAME)
+        arrays: Arrays = {"share": np.array(share if left is None else max(share, float(left["share"])))}
+        return replace(
+            result,
+            gaussians=state.joined(born),
+            joins=joins if result.joins is None else np.concatenate([result.joins, joins]),
+            carried={**result.carried, NAME: arrays},
+        )
+
+    def join(self, builder: PartsBuilder) -> None:
+        """Adds nothing: births come after the update of a frame."""
+
+
+def _evidence(share: float) -> Evidence:
+    return Evidence(share, f"what moves has uncovered regions that hold {100 * share:.0f} % of the error")
+
+
+EFFECT = UncoveredEffect(
+    name=NAME,
+    group=Group.PRESENCE,
+    says="What moves uncovers what it hid: Gaussians that stand are born where nothing was known.",
+    gauge="Only pixels in which the state has nothing are bare.",
+    cost="six pictures rendered a frame, shared with entering; where something is bare, about half an update more",
+    auto=True,
+    on_above=SHARE,
+    off_below=WORTH,
+)

@@ -1,0 +1,135 @@
+"""Points on what a moving thing has uncovered: the surface around a bare region goes on through it.
+
+In a picture the inverse depth of a plane is linear in the pixel's place: it is fitted to what stands about the region.
+The points that come of it count where cameras agree on their colour.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, label
+
+from scas4d_core.first_frame.posed_pictures import pixels_inside
+
+if TYPE_CHECKING:
+    from scas4d_core.effects.presence.novelty import Novelty
+    from scas4d_core.gaussians import Gaussians
+    from scas4d_core.update.picture_loss import PictureLoss
+
+Array = NDArray[np.float32]
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+AROUND = 6
+"""Pixels about a region to which its plane is fitted."""
+FEWEST = 24
+"""Of these that a fit needs."""
+OPAQUE = 0.1
+"""Transmittance up to which a pixel has a depth."""
+ROUNDS = 5
+"""Of reweighted least squares: pixels of another surface about the region are outliers."""
+NEAR = 0.02
+"""Relative difference of inverse depth that an inlier has, about."""
+CAMERAS, SPREAD = 3, 0.08
+"""Cameras that must see a point, and the mean absolute deviation of a channel, 0…1, up to which they agree."""
+APART = 1.3
+"""Pixels, in the camera that sees it best, between points."""
+
+
+@dataclass(frozen=True, eq=False)
+class Uncovered:
+    """Points on what was uncovered.
+
+    Attributes:
+        points: [P, 3] inside world. colours: [P, 3] in 0…1. spacing: metres between neighbours, about.
+    """
+
+    points: Float
+    colours: Array
+    spacing: float
+
+
+def uncovered(seen: Sequence[Novelty], state: Gaussians, picture: PictureLoss) -> Uncovered:
+    """Points in the bare regions of all cameras.
+
+    Args:
+        seen: what the cameras say. state: Θ_t. picture: renders.
+    """
+    standing = state.retire(state.moving)
+    found = [_points(one, standing, picture) for one in seen if one.bare.any()]
+    points = np.concatenate(found) if found else np.zeros((0, 3))
+    if not len(points):
+        return Uncovered(points, np.zeros((0, 3), np.float32), 0.0)
+    pixel = np.full(len(points), np.inf)
+    for one in seen:
+        _, _, depth, inside = pixels_inside(one.camera, points)
+        pixel = np.where(inside, np.minimum(pixel, depth / one.camera.fx), pixel)
+    cell = APART * float(np.median(pixel))
+    _, kept = np.unique(np.round(points / cell).astype(np.int64), axis=0, return_index=True)
+    points = points[np.sort(kept)]
+    colours, agreed = _agreed(seen, points)
+    return Uncovered(points[agreed], colours[agreed], cell)
+
+
+def _points(one: Novelty, standing: Gaussians, picture: PictureLoss) -> Float:
+    """[P, 3] points of a camera's bare pixels."""
+    features = np.zeros((len(standing), 4), np.float32)
+    planes, rest = picture.render(standing, features, one.view, depth_channel=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = (1 - rest) / planes[0]
+    known = (rest < OPAQUE) & one.behind & np.isfinite(inverse)
+    regions, count = label(one.bare, np.ones((3, 3)))
+    points = []
+    for number in range(1, count + 1):
+        region = regions == number
+        ring = binary_dilation(region, iterations=AROUND) & known
+        if ring.sum() >= FEWEST:
+            depth = 1 / _plane(np.argwhere(ring), inverse[ring], np.argwhere(region))
+            points.append(_lifted(one, np.argwhere(region), depth))
+    return np.concatenate(points) if points else np.zeros((0, 3))
+
+
+def _plane(at: NDArray[np.int64], values: Array, wanted: NDArray[np.int64]) -> Float:
+    """Values of a plane at rows and columns [Q, 2], fitted to those at others [P, 2]; no less than a small number."""
+    design = np.column_stack([at, np.ones(len(at))]).astype(np.float64)
+    weights = np.ones(len(at))
+    middle = max(float(np.median(values)), 1e-6)
+    for _ in range(ROUNDS):
+        root = np.sqrt(weights)[:, None]
+        solution = np.linalg.lstsq(root * design, root[:, 0] * values, rcond=None)[0]
+        weights = 1 / (1 + np.square((values - design @ solution) / (NEAR * middle)))
+    found: Float = np.maximum(np.column_stack([wanted, np.ones(len(wanted))]) @ solution, 0.1 * middle)
+    return found
+
+
+def _lifted(one: Novelty, pixels: NDArray[np.int64], depth: Float) -> Float:
+    """[P, 3] points in the world of pixels (row, column) at depths."""
+    camera = one.camera
+    x = (pixels[:, 1] + 0.5 - camera.cx) / camera.fx * depth
+    y = (pixels[:, 0] + 0.5 - camera.cy) / camera.fy * depth
+    points: Float = (np.column_stack([x, y, depth]) - camera.translation) @ camera.rotation
+    return points
+
+
+def _agreed(seen: Sequence[Novelty], points: Float) -> tuple[Array, Bool]:
+    """Median colour [P, 3] of points over the cameras that see what stands there, and whether these agree [P]."""
+    samples = np.full((len(seen), len(points), 3), np.nan, np.float32)
+    bare = np.zeros(len(points), np.int64)
+    for sample, one in zip(samples, seen, strict=True):
+        column, row, _, inside = pixels_inside(one.camera, points)
+        use = inside & one.behind[row, column]
+        sample[use] = one.image[row[use], column[use]]
+        bare += inside & one.bare[row, column]
+    count = np.isfinite(samples[:, :, 0]).sum(axis=0)
+    colours = np.zeros((len(points), 3), np.float32)
+    agreed = (count >= CAMERAS) & (bare >= CAMERAS)
+    if agreed.any():
+        colours[agreed] = np.nanmedian(samples[:, agreed], axis=0)
+        spread = np.nanmean(np.abs(samples[:, agreed] - colours[agreed]), axis=0).max(axis=1)
+        agreed[agreed] = spread < SPREAD
+    return colours, agreed

@@ -1,0 +1,111 @@
+"""Things that enter a small room: where they are found, what is born, and where nothing is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scas4d_core.effects.presence import entering
+from scas4d_core.effects.presence.carving import carve_new
+from scas4d_core.effects.presence.entering import EFFECT, SETTLED, entered
+from scas4d_core.effects.presence.novelty import novelties, said
+from tests.helpers.effect_cases.visited_room import BALL, CENTRE, known, psnr, scene, seen, visitor
+
+
+@pytest.fixture(autouse=True)
+def _small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scas4d_core.effects.presence.growing.ITERATIONS", 120)
+
+
+def test_a_thing_that_is_new_is_found_where_it_is() -> None:
+    found = entered(seen(scene(known()), scene(known(), visitor())))
+    assert found is not None
+    assert found.cameras >= 8
+    assert found.share > 0.5
+    assert np.abs(found.hull.points.mean(axis=0) - CENTRE).max() < 0.02
+    assert np.ptp(found.hull.points, axis=0) == pytest.approx([2 * BALL] * 3, rel=0.35)
+
+
+def test_what_is_born_shows_it() -> None:
+    before = scene(known())
+    frame = seen(before, scene(known(), visitor()))
+    result = EFFECT.populated(frame)
+    born = result.gaussians.rows(np.arange(len(before), len(result.gaussians)))
+    assert len(born) > 50
+    assert born.moving.all()
+    assert (born.ids == -1).all()
+    assert result.joins is not None
+    assert result.joins.tolist() == [-1] * len(born)
+    assert np.median(np.abs(np.linalg.norm(born.means - CENTRE, axis=1) - BALL)) < 0.02
+    assert psnr(result.gaussians, frame) > psnr(before, frame) + 8
+    for name in ("means", "colours", "factors", "ids"):  # the others stay as they are
+        assert np.array_equal(getattr(result.gaussians, name)[: len(before)], getattr(before, name))
+    again = entered(seen(result.gaussians, scene(known(), visitor())))
+    assert again is None  # nothing is left that would be born twice
+
+
+def test_the_same_frame_bears_the_same_bits() -> None:
+    first, second = (EFFECT.populated(seen(scene(known()), scene(known(), visitor()))) for _ in range(2))
+    for name, array in first.gaussians.arrays().items():
+        assert np.array_equal(array, second.gaussians.arrays()[name]), name
+
+
+def test_nothing_enters_where_the_state_shows_the_frame() -> None:
+    state = scene(known(), visitor())
+    frame = seen(state, state)
+    assert entered(frame) is None
+    assert EFFECT.populated(frame) is frame.result
+    assert EFFECT.evidence(frame) == entering.Evidence(0.0, "")
+
+
+def test_what_moved_without_being_followed_has_not_entered() -> None:
+    moved = visitor(CENTRE + np.array([0.0, 0.0, -0.35]))
+    frame = seen(scene(known(), visitor()), scene(known(), moved))
+    assert any(one.new.any() and one.stale.any() for one in said(frame, frame.views))
+    assert entered(frame) is None
+
+
+def test_without_masks_the_colours_tell() -> None:
+    state = scene(known())
+    found = entered(seen(state, scene(known(), visitor()), masks=False))
+    assert found is not None
+    assert np.abs(found.hull.points.mean(axis=0) - CENTRE).max() < 0.04
+
+
+def test_evidence_says_how_many_cameras_agree_and_outlives_the_birth() -> None:
+    frame = seen(scene(known()), scene(known(), visitor()))
+    found = EFFECT.evidence(frame)
+    assert found is not None
+    assert found.share >= EFFECT.on_above
+    assert "cameras agree" in found.text
+    result = EFFECT.populated(frame)
+    later = seen(result.gaussians, scene(known(), visitor()), 6, carried=dict(result.carried))
+    after = EFFECT.evidence(later)
+    assert after is not None
+    assert after.share == pytest.approx(found.share)
+
+
+def test_the_young_are_settled_and_then_left_alone() -> None:
+    true = scene(known(), visitor())
+    result = EFFECT.populated(seen(scene(known()), true))
+    count, state, carried = len(scene(known())), result.gaussians, dict(result.carried)
+    off = state.means.copy()
+    off[count:] += np.float32([0.01, 0.0, 0.0])
+    frame = seen(state.replace(means=off), true, 6, carried=carried)
+    settled = EFFECT.populated(frame)
+    assert psnr(settled.gaussians, frame) > psnr(frame.result.gaussians, frame) + 1
+    assert np.array_equal(settled.gaussians.opacities, state.opacities)
+    grown_up = {**carried, "entering": {**carried["entering"], "age": np.full(len(state) - count, SETTLED)}}
+    later = seen(state.replace(means=off), true, 7, carried=grown_up)
+    assert np.array_equal(EFFECT.populated(later).gaussians.means, off)
+
+
+def test_no_voxel_is_free_to_a_camera() -> None:
+    state = scene(known())
+    frame = seen(state, scene(known(), visitor()))
+    says = novelties(state, state.colours, frame.views, frame.rig, frame.picture)
+    hull = carve_new(says)
+    for one in says:
+        uv, _ = one.camera.project(hull.points)
+        column, row = np.clip(uv.astype(int), 0, 79).T
+        assert (one.new | one.covered)[row, column].mean() > 0.85

@@ -1,0 +1,55 @@
+"""What a moving thing uncovers: Gaussians that stand are born in the hole, on the surface that goes on through it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scas4d_core.effects.presence.novelty import said
+from scas4d_core.effects.presence.uncovered import EFFECT
+from scas4d_core.effects.presence.uncovering import uncovered
+from tests.helpers.effect_cases.visited_room import BOX, FLOOR, known, psnr, scene, seen
+
+HOLE = 0.15
+ASIDE = BOX + np.array([0.5, 0.0, 0.3])
+
+
+@pytest.fixture(autouse=True)
+def _small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scas4d_core.effects.presence.growing.ITERATIONS", 120)
+
+
+def test_points_lie_on_the_floor_in_the_hole() -> None:
+    frame = seen(scene(known(ASIDE), hole=HOLE), scene(known(ASIDE)))
+    found = uncovered(said(frame, frame.views), frame.result.gaussians, frame.picture)
+    assert len(found.points) > 20
+    assert np.abs(found.points[:, 1] - FLOOR).max() < 0.03
+    assert np.hypot(*(found.points - BOX)[:, [0, 2]].T).max() < HOLE + 0.03
+
+
+def test_what_is_born_stands_and_shows_the_floor() -> None:
+    before = scene(known(ASIDE), hole=HOLE)
+    frame = seen(before, scene(known(ASIDE)))
+    evidence = EFFECT.evidence(frame)
+    assert evidence is not None
+    assert evidence.share > EFFECT.on_above
+    result = EFFECT.populated(frame)
+    born = result.gaussians.rows(np.arange(len(before), len(result.gaussians)))
+    assert len(born) > 20
+    assert not born.moving.any()
+    assert psnr(result.gaussians, frame) > psnr(before, frame) + 5
+
+
+def test_nothing_is_born_where_nothing_is_bare() -> None:
+    state = scene(known(ASIDE))
+    frame = seen(state, state)
+    assert EFFECT.populated(frame) is frame.result
+    evidence = EFFECT.evidence(frame)
+    assert evidence is not None
+    assert evidence.share == 0
+
+
+def test_black_space_is_not_bare() -> None:
+    state = known(ASIDE)  # alone, before nothing: the pictures are black where the state has nothing
+    frame = seen(state, state)
+    assert not any(one.bare.any() for one in said(frame, frame.views))
