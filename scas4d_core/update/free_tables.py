@@ -40,7 +40,7 @@ class FreeTable:
     """The columns of one table of parameters whose rate is above 0, with their moments, which start at zero.
 
     Args:
-        table, gradients: [n, columns]; the table is stepped in place. columns: rate of each column.
+        table, gradients: [n, columns]; the table is stepped in place, and by nobody else. columns: rate of each column.
         plan: of the rates. start: share of the iterations after which it begins.
 
     Attributes:
@@ -63,7 +63,6 @@ class FreeTable:
         if self._values is self._table:
             self._adam.step(self._gradients, iteration, planned)
             return
-        np.take(self._table, self._free, axis=1, out=self._values)
         self._adam.step(np.take(self._gradients, self._free, axis=1), iteration, planned)
         self._table[:, self._free] = self._values
 

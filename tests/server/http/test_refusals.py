@@ -81,7 +81,7 @@ DEFINITIONS = {
     ),
     "no object": ({"settings": {"update": "fast"}}, "settings.update", "fast", "an object"),
     "null": ({"settings": {"scene": {"image_scale": None}}}, "settings.scene.image_scale", "null", "a number"),
-    "preset": ({"preset": "best"}, "preset", "best", "dynamic3dgs, scas4d"),
+    "preset": ({"preset": "best"}, "preset", "best", "rigid, scas4d"),
     "misspelt": ({"presett": "scas4d"}, "body.presett", "scas4d", "'preset'"),
     "missing": ({"rig": {"axes": "opencv"}}, "body.rig.cameras", "nothing", "add 'cameras'"),
     "choice": ({"ingest": {"when_full": "wait"}}, "body.ingest.when_full", "wait", "'refuse' or 'skip'"),
