@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from scas4d_core.update.result import UpdateResult
 
 NAME = "uncovered"
-GLANCED = 3
-"""Cameras of a glance that have to see something bare before all are asked."""
+GLANCED, GLANCED_ON = 3, 1
+"""Cameras of a glance that have to see something bare before all are asked; and where the effect is on. What moves on
+goes on uncovering, and a hole behind it is seen by few cameras at first."""
 SMALLEST = 0.0004
 """Share of a camera's pixels that it must see as bare to have a say: 26 of 256 x 256, five by five."""
 SHARE = 0.03
@@ -31,9 +32,9 @@ BUDGET = 0.05
 """Gaussians that are born in a frame at most, as a share of those that are there."""
 
 
-def _found(seen: Seen) -> tuple[Uncovered, float] | None:
+def _found(seen: Seen, glanced: int) -> tuple[Uncovered, float] | None:
     """What is uncovered, and the share of the squared error that it explains."""
-    if sum(one.bare.sum() >= SMALLEST * one.bare.size for one in glance(seen)) < GLANCED:
+    if sum(one.bare.sum() >= SMALLEST * one.bare.size for one in glance(seen)) < glanced:
         return None
     everyone = said(seen, seen.views)
     found = uncovered(everyone, seen.result.gaussians, seen.picture)
@@ -56,12 +57,12 @@ class UncoveredEffect(Effect):
         left = seen.result.carried.get(NAME)
         if left is not None:
             return _evidence(float(left["share"]))
-        found = _found(seen)
+        found = _found(seen, GLANCED)
         return Evidence(0.0, "") if found is None else _evidence(found[1])
 
     def populated(self, seen: Seen) -> UpdateResult:
         """The result with the Gaussians that are born."""
-        result, found = seen.result, _found(seen)
+        result, found = seen.result, _found(seen, GLANCED_ON)
         if found is None or found[1] < WORTH:
             return result
         from scas4d_core.effects.presence.growing import grown
