@@ -117,8 +117,9 @@ class Past:
         places = {name: place for name, (place, _, _) in rows}
         bright = {name: value for name, (_, value, _) in rows}
         outs = {name: int(out) for name, (_, _, out) in rows}
-        level, updates, held, fitted, behind, iterations = (scene := arrays["scene"].tolist())[:6]
-        light, lit, step = scene[6:] + [1.0, 0.0, 1.0][len(scene) - 6 :]  # older checkpoints know less of the light
+        scene: list[float] = arrays["scene"].tolist()
+        scene += [1.0, 0.0, 1.0][len(scene) - 6 :]  # older checkpoints know nothing of the light
+        level, updates, held, fitted, behind, iterations, light, lit, step = scene
         error = dict(zip(arrays["witnesses"].tolist(), arrays["error"].tolist(), strict=True))
         last = dict(zip(arrays["shown"].tolist(), arrays["last"].tolist(), strict=True)) if "last" in arrays else {}
         return cls(

@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 
 
 FASTER = 2.0
-"""Times the rate of what stands, where the light changes: 0.1 to 0.2 dB on a lamp that crosses a room, four times no
-more."""
+"""Times the rate of what stands, where the light changes: 0.1 to 0.2 dB on a lamp that crosses a room."""
 
 
 class Colours(Part):
