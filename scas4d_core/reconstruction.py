@@ -127,7 +127,7 @@ class Reconstruction(CommittedScene):
         self.static = result = replace(result, gaussians=with_reliable_labels(result.gaussians))
         fitted = perf_counter()
         self._fixed = FirstFrame(len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians))
-        switches = first_switches(settings, frame.index)
+        switches = first_switches(settings, frame.index, result.evidence or {})
         self._roots = result.gaussians
         self._updater, structure = self._preparation.updater(result.gaussians, switches)
         seen = () if self._fixed.masked else self._factory.views(self._factory.scaled(frame), {}, use_masks=False)

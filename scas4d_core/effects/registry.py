@@ -18,5 +18,6 @@ EFFECTS = {
     "floor": "scas4d_core.effects.coherence.floor",
     "moving_colour": "scas4d_core.effects.appearance.moving_colour",
     "standing_colour": "scas4d_core.effects.appearance.standing_colour",
+    "direction": "scas4d_core.effects.appearance.direction",
 }
 """The module of each effect, by its name; in the order in which they take part in an iteration."""
