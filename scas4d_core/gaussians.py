@@ -37,6 +37,9 @@ class Gaussians:
         ids: [N] int64, for ever; −1 until the frame of its birth is committed.
         retired: [N] bool; not given: none.
         own_opacities: [N] float32 in (0, 1), those of the retired too; follows from what is given as ``opacities``.
+        gloss: [M, 3] float32, of the first M: normal, in the world's axes, times strength of what mirrors; those born
+            later are dull. environment: float32, what is mirrored (``kernels.appearance.direction``). Both are None
+            where colours do not depend on direction; else ``colours`` are those without the gloss.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [0.5, 0, 2]], radius=0.1, colours=[1, 0, 0])
     >>> len(state), state.moving
@@ -59,6 +62,8 @@ class Gaussians:
     ids: NDArray[np.int64] = field(metadata=ONCE)
     retired: NDArray[np.bool_] = None  # type: ignore[assignment]
     own_opacities: Array = None  # type: ignore[assignment]
+    gloss: Array | None = field(default=None, metadata=WHOLE)
+    environment: Array | None = field(default=None, metadata=WHOLE)
 
     def __post_init__(self) -> None:
         retired = np.zeros(len(self.means), np.bool_) if self.retired is None else self.retired
@@ -125,7 +130,10 @@ class Gaussians:
             which: [N] bool, or rows in any order.
         """
         chosen = np.asarray(which)
-        return replace(self, **{name: array[chosen] for name, array in self._by_row().items()})
+        gloss = self.gloss
+        if gloss is not None:
+            gloss = np.concatenate([gloss, np.zeros((len(self) - len(gloss), 3), np.float32)])[chosen]
+        return replace(self, gloss=gloss, **{name: array[chosen] for name, array in self._by_row().items()})
 
     def joined(self, born: Gaussians) -> Gaussians:
         """The state with new Gaussians after its own, in new rows; they get their ids when the frame is committed."""

@@ -33,5 +33,6 @@ EFFECTS = {
     "uncovered": "scas4d_core.effects.presence.uncovered",
     "entering": "scas4d_core.effects.presence.entering",
     "leaving": "scas4d_core.effects.presence.leaving",
+    "direction": "scas4d_core.effects.appearance.direction",
 }
 """The module of each effect, by its name; in the order in which they take part in an iteration."""

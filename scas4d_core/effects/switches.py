@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from scas4d_core.effects.effect import effect
@@ -16,7 +17,7 @@ from scas4d_core.errors import InputError
 from scas4d_core.settings import Settings
 
 if TYPE_CHECKING:
-    from scas4d_core.effects.evidence import Seen
+    from scas4d_core.effects.evidence import Evidence, Seen
     from scas4d_core.effects.parts import Arrays, PartsBuilder
 
 IDLE = 8
@@ -42,6 +43,8 @@ class Switch:
 
 
 Switches = Mapping[str, Switch]
+NONE_FOUND: Mapping[str, Evidence] = MappingProxyType({})
+"""No evidence."""
 
 
 def contradictions(settings: Settings) -> Iterator[tuple[str, Mode, str, str]]:
@@ -53,11 +56,11 @@ def contradictions(settings: Settings) -> Iterator[tuple[str, Mode, str, str]]:
             yield name, mode, f"effects.{name} cannot be 'off': {refusal[0]}", refusal[1]
 
 
-def first_switches(settings: Settings, index: int) -> dict[str, Switch]:
-    """The switches before any evidence: what is pinned, and what is on in every scene whose settings allow it.
+def first_switches(settings: Settings, index: int, found: Mapping[str, Evidence] = NONE_FOUND) -> dict[str, Switch]:
+    """The switches before any update: what is pinned, on in every scene whose settings allow it, or found in frame 0.
 
     Args:
-        index: of the first frame.
+        index: of the first frame. found: evidence in the fit of frame 0, by effect.
 
     Raises:
         InputError: the settings contradict what is pinned.
@@ -69,12 +72,17 @@ def first_switches(settings: Settings, index: int) -> dict[str, Switch]:
     """
     for _, _, fault, remedy in contradictions(settings):
         raise InputError(fault, remedy)
-    found = {}
+    switches = {}
     for name in EFFECTS:
         mode, one = settings.effects.get(name, "auto"), effect(name)
-        on = mode == "on" or (mode == "auto" and not one.auto and one.refused(settings) is None)
-        found[name] = Switch(on, index, pinned=mode != "auto")
-    return found
+        allowed = mode == "auto" and one.refused(settings) is None
+        on = mode == "on" or (allowed and not one.auto)
+        evidence = found.get(name)
+        if evidence is not None and allowed and one.auto:
+            on = evidence.share >= one.on_above
+        share, text = (0.0, "") if evidence is None else (evidence.share, evidence.text)
+        switches[name] = Switch(on, index, mode != "auto", share, text)
+    return switches
 
 
 def switches_record(switches: Switches) -> dict[str, dict[str, Any]]:

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures.frame import Frame, InitialPoints
+from scas4d_core.first_frame.glossy import fit_by_direction
 from scas4d_core.first_frame.initial_points import initial_points
-from scas4d_core.first_frame.static_scene import StaticResult, fit_static_scene
+from scas4d_core.first_frame.static_scene import StaticResult, first_trainer
 from scas4d_core.frame_report import Progress
 from scas4d_core.robust.checks import axis_lengths
-from scas4d_core.settings import Settings
+from scas4d_core.settings import SceneSettings, Settings, StaticSettings
 from scas4d_core.storage.history import History
-from scas4d_core.update.picture_loss import ViewFactory
+from scas4d_core.update.picture_loss import TrainingView, ViewFactory
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +55,42 @@ class FirstFrame:
         return cls(masked, exposures, axis_lengths(history.gaussians(first)))
 
 
+def fit_static_scene(
+    factory: ViewFactory,
+    views: list[TrainingView],
+    positions: NDArray[np.float64],
+    colours: NDArray[np.float32],
+    foreground: NDArray[np.float32] | None,
+    scene: SceneSettings,
+    settings: StaticSettings,
+    progress: Callable[[int, float], None] | None = None,
+) -> StaticResult:
+    """Fits Θ_0 to the views of frame 0, from a cloud of points.
+
+    Args:
+        factory: of the scene's views. views: of frame 0; their exposures are learnt in place.
+        positions: [P, 3] metres in the inside world. colours: [P, 3] in 0…1. foreground: [P] in 0…1, or None.
+        scene, settings: of the scene, of frame 0.
+        progress: called with the iterations done and the last loss.
+
+    Raises:
+        ValueError: the cloud is empty.
+
+    >>> from scas4d_core.captures import open_capture
+    >>> capture = open_capture("samples/robot", image_scale=0.25)
+    >>> factory, cloud = ViewFactory(capture.rig), capture.points
+    >>> views = factory.views(capture.frame(0), {})
+    >>> few = StaticSettings(iterations=20, max_gaussians=1000)
+    >>> fitted = fit_static_scene(
+    ...     factory, views, cloud.positions, cloud.colours, cloud.foreground, SceneSettings(), few
+    ... )
+    >>> fitted.losses[-1] < fitted.losses[0], len(fitted.gaussians) <= 1000
+    (True, True)
+    """
+    trainer = first_trainer(factory, views, positions, colours, foreground, scene, settings)
+    return trainer.result(trainer.train(progress))
+
+
 def fit_first(
     frame: Frame,
     points: InitialPoints | None,
@@ -79,13 +116,10 @@ def fit_first(
         positions = points.positions
     else:
         positions = world.to_inside(points.positions)
-    return fit_static_scene(
-        factory,
-        factory.views(frame, {}),
-        positions,
-        points.colours,
-        points.foreground,
-        settings.scene,
-        static,
+    views = factory.views(frame, {})
+    cloud = positions, points.colours, points.foreground
+    return fit_by_direction(
+        lambda: first_trainer(factory, views, *cloud, settings.scene, static),
+        settings.effects.get("direction", "auto") if settings.device == "cpu" else "off",
         lambda done, loss: on_progress(Progress("fitting frame 0", done, static.iterations, {"loss": loss})),
     )

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.effects.evidence import Evidence
 from scas4d_core.first_frame.initial_gaussians import (
     COLOUR,
     LABEL,
@@ -22,6 +23,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels import activation
 from scas4d_core.kernels.adam import EVERY_ROW, adam
 from scas4d_core.rasterize.limits import scene_limits
+from scas4d_core.rasterize.shading import Shading, without_turn
 from scas4d_core.settings import SceneSettings, StaticSettings
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory, view_order
 from scas4d_core.update.result import CameraFit, camera_fit
@@ -68,6 +70,7 @@ class StaticResult:
         gaussians: Θ_0. exposures: [3, 2] gain and offset of each training camera; empty without exposure terms.
         losses: the training loss of every iteration. psnr: dB of the view that each iteration rendered.
         cameras: by name, the fit of each camera's picture in its last iteration.
+        evidence: that was found for effects, by name.
     """
 
     gaussians: Gaussians
@@ -75,6 +78,7 @@ class StaticResult:
     losses: list[float]
     psnr: list[float] = field(default_factory=list)
     cameras: dict[str, CameraFit] = field(default_factory=dict)
+    evidence: Mapping[str, Evidence] | None = None
 
 
 STOP_ROUNDS = 5
@@ -96,17 +100,25 @@ class StaticTrainer:
         self.views = views
         self.parameters = parameters
         self.budget = budget(views, scene, settings)
+        self.shading: Shading | None = None
         self.radius = factory.rig.radius
         limits = scene_limits(scene.near, self.radius)
-        self._loss = PictureLoss(factory, scene.background, 1.0, WEIGHT_MASK, False, limits)
+        self.loss = PictureLoss(factory, scene.background, 1.0, WEIGHT_MASK, False, limits)
         self._masked = any(len(view.target) > 3 for view in views)
-        self._rng = np.random.default_rng(settings.seed)
+        self.random = np.random.default_rng(settings.seed)
         self._reset_moments()
         self.exposing = settings.exposure is not False
         self.psnr: list[float] = []
         self._last = settings.iterations
         self.cameras: dict[str, CameraFit] = {}
         self._exposure_moments = {view.name: np.zeros((2, *view.exposure.shape), np.float32) for view in views}
+
+    def shapes(self) -> tuple[Array, Array, Array, Array]:
+        """Means, factors, opacities and features of the parameters as they are."""
+        count = len(self.parameters)
+        found = [np.empty(shape, np.float32) for shape in ((count, 3), (count, 3, 3), (count,), (count, 4))]
+        activation.activate(self.parameters, *found)
+        return found[0], found[1], found[2], found[3]
 
     def _reset_moments(self) -> None:
         count = len(self.parameters)
@@ -123,11 +135,17 @@ class StaticTrainer:
         self._features = np.empty((count, 4), np.float32)
         self._gradients = np.empty_like(self.parameters)
 
-    def train(self, progress: Callable[[int, float], None] | None = None) -> list[float]:
-        """Runs all iterations, or fewer by the stop rule; ``progress`` is called with the iteration and its loss."""
+    def train(
+        self, progress: Callable[[int, float], None] | None = None, enough: Callable[[int], bool] | None = None
+    ) -> list[float]:
+        """Runs all iterations, or fewer by the stop rule.
+
+        Args:
+            progress: called with the iteration and its loss. enough: called with the iterations done; True ends it.
+        """
         settings = self.settings
         losses: list[float] = []
-        order = view_order(len(self.views), settings.iterations, self._rng)
+        order = view_order(len(self.views), settings.iterations, self.random)
         self._allocate()
         start = len(self.parameters)
         until = int(DENSIFY_UNTIL * settings.iterations)
@@ -146,7 +164,7 @@ class StaticTrainer:
                 self._assess_exposure()
             if progress is not None:
                 progress(done, losses[-1])
-            if done == self._last:
+            if done == self._last or (enough is not None and enough(done)):
                 break
         return losses
 
@@ -161,16 +179,22 @@ class StaticTrainer:
     def step(self, view: TrainingView, iteration: int) -> float:
         """One iteration: renders the view, compares, carries the gradient back, steps Adam. Returns the loss."""
         activation.activate(self.parameters, self._means, self._factors, self._opacities, self._features)
-        gradients = self._loss.evaluate(self._means, self._factors, self._opacities, self._features, view)
-        self.psnr.append(self._loss.psnr)
+        if self.shading is not None:
+            turns, colours = without_turn(len(self._means)), self._features[:, :3].copy()
+            self.shading.show(self._means, turns, colours, view.camera, self._features)
+        gradients = self.loss.evaluate(self._means, self._factors, self._opacities, self._features, view)
+        if self.shading is not None:
+            self.shading.saw(self._means, turns, colours, view.camera, gradients.features)
+            self.shading.step(1 - 0.9 * iteration / self.settings.iterations)
+        self.psnr.append(self.loss.psnr)
         if iteration >= self._last - len(self.views):
-            self.cameras[view.name] = camera_fit(self._loss.psnr, self._loss.colour_shift(view))
+            self.cameras[view.name] = camera_fit(self.loss.psnr, self.loss.colour_shift(view))
         activation.activate_backward(
             self.parameters, self._factors, self._opacities, self._features, gradients.means, gradients.factors,
             gradients.opacities, gradients.features, self._gradients,
         )  # fmt: skip
         width = np.array([view.camera.width / 2, view.camera.height / 2], np.float32)
-        visible = self._loss.rasterizer.counts > 0
+        visible = self.loss.rasterizer.counts > 0
         self._screen += np.sqrt(np.square(gradients.screen * width).sum(axis=1))
         self._seen += visible
         adam(
@@ -179,7 +203,7 @@ class StaticTrainer:
         )  # fmt: skip
         if self.exposing:
             self._step_exposure(view, iteration)
-        return self._loss.image_part + self._loss.mask_part
+        return self.loss.image_part + self.loss.mask_part
 
     def _rates(self, iteration: int) -> Array:
         share = iteration / max(self.settings.iterations - 1, 1)
@@ -197,7 +221,7 @@ class StaticTrainer:
         """Adam on the camera's gain and offset; afterwards their mean over cameras is brought back to 1 and 0."""
         moments = self._exposure_moments[view.name]
         rates = np.full(2, RATE_EXPOSURE, np.float32)
-        gradient = self._loss.exposure_gradient[: len(view.exposure)].copy()
+        gradient = self.loss.exposure_gradient[: len(view.exposure)].copy()
         gradient[3:] = 0
         adam(view.exposure, gradient, moments[0], moments[1], rates, EVERY_ROW, BETA1, BETA2, iteration + 1)
         centre = np.mean([other.exposure[:3] for other in self.views], axis=0) - np.array([1, 0], np.float32)
@@ -230,7 +254,7 @@ class StaticTrainer:
         clone = chosen[largest[chosen] <= median]
         halves = [self._half(split), self._half(split)]
         keep[split] = False
-        self._take(np.flatnonzero(keep), [self.parameters[clone], *halves])
+        self._take(np.flatnonzero(keep), [self.parameters[clone], *halves], [clone, split, split])
 
     def remove_unseen(self) -> None:
         """Removes Gaussians that fewer than ``MIN_VIEWS`` cameras see.
@@ -241,14 +265,16 @@ class StaticTrainer:
         activation.activate(self.parameters, self._means, self._factors, self._opacities, self._features)
         counts = np.zeros(len(self.parameters), np.int64)
         for view in self.views:
-            seen = self._loss.coverage(self._means, self._factors, self._opacities, self._features, view)
+            seen = self.loss.coverage(self._means, self._factors, self._opacities, self._features, view)
             counts += seen > SEEN_PIXELS
         keep = counts >= min(MIN_VIEWS, len(self.views))
         if keep.any():
-            self._take(np.flatnonzero(keep), [])
+            self._take(np.flatnonzero(keep), [], [])
 
-    def _take(self, rows: NDArray[np.int64], added: list[Array]) -> None:
-        """Keeps some rows with their moments and appends others with none."""
+    def _take(self, rows: NDArray[np.int64], added: list[Array], parents: list[NDArray[np.int64]]) -> None:
+        """Keeps some rows with their moments and appends others with none; ``parents``: the rows these come from."""
+        if self.shading is not None:
+            self.shading = self.shading.taken(rows, np.concatenate([rows[:0], *parents]))
         fresh = np.zeros((sum(map(len, added)), activation.COLUMNS), np.float32)
         first = np.concatenate([self._first[rows], fresh])
         second = np.concatenate([self._second[rows], fresh])
@@ -260,13 +286,14 @@ class StaticTrainer:
     def _half(self, rows: NDArray[np.int64]) -> Array:
         """The rows with smaller scales, each displaced by a sample of its own Gaussian."""
         half = self.parameters[rows].copy()
-        offset = self._rng.standard_normal((len(rows), 3)).astype(np.float32)
+        offset = self.random.standard_normal((len(rows), 3)).astype(np.float32)
         half[:, MEAN] += np.einsum("nij,nj->ni", self._factors[rows], offset)
         half[:, SCALE] -= np.log(SPLIT_SHRINK)
         return half
 
     def gaussians(self) -> Gaussians:
         """The state Θ_0; without masks every Gaussian may move."""
+        shading = self.shading
         self._allocate()
         activation.activate(self.parameters, self._means, self._factors, self._opacities, self._features)
         count = len(self.parameters)
@@ -278,10 +305,17 @@ class StaticTrainer:
             colours=self._features[:, :3].copy(),
             foreground=self._features[:, 3].copy() if self._masked else np.ones(count, np.float32),
             ids=np.arange(count, dtype=np.int64),
+            gloss=None if shading is None else shading.gloss.copy(),
+            environment=None if shading is None else shading.environment.copy(),
         )
 
+    def result(self, losses: list[float]) -> StaticResult:
+        """Of the iterations so far."""
+        exposures = {view.name: view.exposure[:3].copy() for view in self.views} if self.exposing else {}
+        return StaticResult(self.gaussians(), exposures, losses, self.psnr, self.cameras)
 
-def fit_static_scene(
+
+def first_trainer(
     factory: ViewFactory,
     views: list[TrainingView],
     positions: NDArray[np.float64],
@@ -289,36 +323,11 @@ def fit_static_scene(
     foreground: Array | None,
     scene: SceneSettings,
     settings: StaticSettings,
-    progress: Callable[[int, float], None] | None = None,
-) -> StaticResult:
-    """Fits Θ_0 to the views of frame 0, from a cloud of points.
-
-    Args:
-        factory: of the scene's views. views: of frame 0; their exposures are learnt in place.
-        positions: [P, 3] metres in the inside world. colours: [P, 3] in 0…1. foreground: [P] in 0…1, or None.
-        scene, settings: of the scene, of frame 0.
-        progress: called with the iterations done and the last loss.
-
-    Raises:
-        ValueError: the cloud is empty.
-
-    >>> from scas4d_core.captures import open_capture
-    >>> capture = open_capture("samples/robot", image_scale=0.25)
-    >>> factory, cloud = ViewFactory(capture.rig), capture.points
-    >>> views = factory.views(capture.frame(0), {})
-    >>> few = StaticSettings(iterations=20, max_gaussians=1000)
-    >>> fitted = fit_static_scene(
-    ...     factory, views, cloud.positions, cloud.colours, cloud.foreground, SceneSettings(), few
-    ... )
-    >>> fitted.losses[-1] < fitted.losses[0], len(fitted.gaussians) <= 1000
-    (True, True)
-    """
+) -> StaticTrainer:
+    """The trainer of ``start.fit_static_scene``, before its first iteration; arguments and errors are the same."""
     if len(positions) == 0:
         raise ValueError("the first cloud holds no point; give points, masks, or more overlapping cameras")
     rng = np.random.default_rng(settings.seed)
     limit = max(1, int(INITIAL_SHARE * budget(views, scene, settings)))
     parameters = initial_parameters(positions, colours, foreground, limit, rng)
-    trainer = StaticTrainer(factory, views, parameters, scene, settings)
-    losses = trainer.train(progress)
-    exposures = {view.name: view.exposure[:3].copy() for view in views} if trainer.exposing else {}
-    return StaticResult(trainer.gaussians(), exposures, losses, trainer.psnr, trainer.cameras)
+    return StaticTrainer(factory, views, parameters, scene, settings)

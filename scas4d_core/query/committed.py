@@ -19,6 +19,7 @@ from scas4d_core.query import tracks as tracks_of_history
 from scas4d_core.query.tracks import ALPHA_OF_A_SURFACE, Tracks
 from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
 from scas4d_core.rasterize.limits import DEFAULT, Limits
+from scas4d_core.rasterize.shading import colours_seen
 from scas4d_core.storage.history import History
 
 Array = NDArray[np.float32]
@@ -91,7 +92,8 @@ class CommittedScene:
         """
         gaussians = self._state(index)
         inside = self.world.camera_to_inside(camera)
-        features = np.concatenate([gaussians.colours, np.zeros((len(gaussians.means), 1), np.float32)], axis=1)
+        colours = colours_seen(gaussians, CameraArrays.of(inside))
+        features = np.concatenate([colours, np.zeros((len(gaussians.means), 1), np.float32)], axis=1)
         picture = self._rasterizer.forward(
             gaussians.means, gaussians.factors, gaussians.opacities, features, CameraArrays.of(inside),
             np.array([*background, 0.0], np.float32), depth_channel=3,

@@ -1,7 +1,8 @@
 """Writes and reads a frame as a standard 3D Gaussian Splatting ``.ply`` (Kerbl et al. 2023), for any splat viewer.
 
 Binary little-endian, one float32 row a Gaussian: x y z, nx ny nz (zero), f_dc_0…2 (degree 0 of the spherical
-harmonics), opacity (logit), scale_0…2 (log), rot_0…3 (w, x, y, z). World and lengths are the user's.
+harmonics), opacity (logit), scale_0…2 (log), rot_0…3 (w, x, y, z). Where colours depend on direction, f_rest_0…44
+(degrees 1 to 3, channel by channel) follow. World and lengths are the user's.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.errors import InputError
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.query.harmonics import harmonics
 
 Float = NDArray[np.float64]
 
@@ -87,8 +89,15 @@ def write_ply(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None
     array([[0., 0., 4.]])
     """
     gaussians = gaussians.rows(gaussians.present) if gaussians.retired.any() else gaussians
-    data = np.zeros(len(gaussians), dtype=[(name, "<f4") for name in _FIELDS])
-    for name, column in _columns(splats(gaussians, world)).items():
+    columns = _columns(splats(gaussians, world))
+    if gaussians.gloss is not None:
+        sums = harmonics(gaussians)
+        columns |= {f"f_dc_{channel}": sums[:, 0, channel] for channel in range(3)}
+        rest = sums[:, 1:].transpose(0, 2, 1).reshape(len(gaussians), -1)
+        columns |= {f"f_rest_{k}": column for k, column in enumerate(rest.T)}
+    fields = (*_FIELDS, *(name for name in columns if name not in _FIELDS))
+    data = np.zeros(len(gaussians), dtype=[(name, "<f4") for name in fields])
+    for name, column in columns.items():
         data[name] = column
     target = Path(path)
     beside = target.with_name(f".{target.name}.{os.getpid()}.part")

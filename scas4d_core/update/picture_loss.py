@@ -274,17 +274,9 @@ class PictureLoss:
         rows = np.empty((channels, height, 2), np.float32)
         g_exposure = np.empty((channels, height, 2), np.float32)
         image_loss.image_loss(
-            self.rasterizer.planes,
-            view.exposure,
-            view.target,
-            *view.moments,
-            self._weights[:channels],
-            height * width,
-            self._factory.scratch(channels, height, width),
-            g_image,
-            rows,
-            g_exposure,
-        )
+            self.rasterizer.planes, view.exposure, view.target, *view.moments, self._weights[:channels],
+            height * width, self._factory.scratch(channels, height, width), g_image, rows, g_exposure,
+        )  # fmt: skip
         g_image[channels:] = 0
         sums = rows.sum(axis=1, dtype=np.float64)
         self.image_part, self.mask_part = float(sums[:3, 0].sum()), float(sums[3:, 0].sum())

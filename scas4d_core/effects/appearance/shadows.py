@@ -51,14 +51,16 @@ class ShadowsPart(Part):
         """Steps them, where the end of the update is what is kept."""
         if work.kept is not Candidate.END or not self._stands.any():
             return state
+        from scas4d_core.rasterize.shading import colours_seen  # it loads the kernels
+
         before: Arrays = work.carried.get(NAME, {})
         known = [view for view in work.views if view.name in before]
         compared = [(view, *_compared(before[view.name], view, state, work.picture)) for view in known]
         changed = [(view, one) for view, one, stands in compared if (one & stands).sum() > HARDLY * stands.sum()]
         for first in range(min(SUBSETS, len(changed))):
-            features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
-            sums, weights = np.zeros((len(features), 3)), np.full(len(features), FEW)
+            sums, weights = np.zeros((len(state), 3)), np.full(len(state), FEW)
             for view, squares in changed[first::SUBSETS]:
+                features = np.concatenate([colours_seen(state, view.camera), state.foreground[:, None]], axis=1)
                 more, seen = work.picture.residuals(
                     state.means, state.factors, state.opacities, features, view, self._stands,
                     np.repeat(np.repeat(squares, SIDE, 0), SIDE, 1),

@@ -11,12 +11,12 @@ from box_scene import held_out_camera, make_box, make_rig, photograph, take_fram
 from scas4d_core.captures.frame import Frame
 from scas4d_core.first_frame import static_scene
 from scas4d_core.first_frame.initial_gaussians import initial_parameters, logit
+from scas4d_core.first_frame.start import fit_static_scene
 from scas4d_core.first_frame.static_scene import (
     EXPOSURE_SPREAD,
     STOP_ROUNDS,
     StaticResult,
     StaticTrainer,
-    fit_static_scene,
 )
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.settings import SceneSettings, StaticSettings

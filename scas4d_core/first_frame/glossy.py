@@ -1,0 +1,166 @@
+"""Frame 0 of glossy things: whether there are any, and the fit with what they mirror.
+
+Left alone, a fit explains each camera's highlights by Gaussians that only this camera sees, behind or before the
+surface, and they stay in what follows. So where a trial, early in the fit, finds that colours depend on direction, the
+environment is learnt on the surface found so far, and the fit begins anew with both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from scas4d_core.effects.effect import effect
+from scas4d_core.effects.evidence import Evidence
+from scas4d_core.effects.registry import Mode
+from scas4d_core.first_frame.normals import surface_normals
+from scas4d_core.first_frame.static_scene import StaticResult, StaticTrainer
+from scas4d_core.kernels.adam import EVERY_ROW, adam
+from scas4d_core.rasterize.shading import GLOSS, Shading, without_turn
+
+Array = NDArray[np.float32]
+
+TRIAL = 0.15
+"""Share of the iterations after which the trial is made: there is a surface, and little has been made up behind it."""
+FEWEST_VIEWS = 12
+"""For the trial: of fewer cameras each has highlights that no other sees beside it, and anything explains them."""
+ROUNDS = 8
+"""Over all views, of the trial."""
+LEARNT = 0.5
+"""Share of the iterations up to which the environment is learnt on the first surface; then the fit begins anew."""
+NORMALS_EVERY = 0.1
+"""Share of the iterations between two estimates of the normals in that."""
+SETTLED = 0.6
+"""Share of the iterations after which normals are learnt; before, they are those of the first surface."""
+SMOOTH_EVERY = 10
+"""Iterations between two averages over neighbours."""
+
+
+def fit_by_direction(
+    make: Callable[[], StaticTrainer], mode: Mode, progress: Callable[[int, float], None] | None = None
+) -> StaticResult:
+    """Fits Θ_0 with colours that depend on direction, where that is called for.
+
+    Args:
+        make: the trainer of the fit, before its first iteration. mode: "auto": where a trial says so.
+        progress: called with the iterations done and the last loss.
+    """
+    trainer = make()
+    if mode == "off":
+        return trainer.result(trainer.train(progress))
+    trial = GlossTrial(trainer, mode)
+    losses = trainer.train(progress, trial.convinced)
+    if trial.on:
+        before, trainer = trial.learnt(len(losses)), make()
+        losses = GlossyFit(trainer, before).train(progress)
+    found = {} if trial.evidence is None else {"direction": trial.evidence}
+    return replace(trainer.result(losses), evidence=found)
+
+
+class GlossTrial:
+    """Finds whether colours depend on direction, on the surface of an unfinished fit.
+
+    Args:
+        trainer: of the fit. mode: "on" needs no evidence.
+
+    Attributes:
+        on: once asked. evidence: share of the residual that direction explains and colours alone do not; None: no
+            trial was made.
+    """
+
+    def __init__(self, trainer: StaticTrainer, mode: Mode) -> None:
+        self._trainer, self._mode = trainer, mode
+        self.on = False
+        self.evidence: Evidence | None = None
+
+    def convinced(self, done: int) -> bool:
+        """At the time of the trial, whether it speaks for direction; the fit is as it was."""
+        if done != round(TRIAL * self._trainer.settings.iterations):
+            return False
+        if self._mode != "on" and len(self._trainer.views) < FEWEST_VIEWS:
+            return False
+        means, factors, opacities, _ = self._trainer.shapes()
+        normals = surface_normals(means, factors, opacities, self._trainer.views, self._trainer.loss.rasterizer)
+        without, seen = self._left(None), self._left(Shading.fresh(GLOSS * normals, means))
+        share = max(0.0, 1 - seen / max(without, 1e-12))
+        self.evidence = Evidence(share, f"explains {100 * share:.0f} % of the residual of frame 0")
+        self.on = self._mode == "on" or share >= effect("direction").on_above
+        return self.on
+
+    def _left(self, shading: Shading | None) -> float:
+        """Mean squared error of the pictures after a few rounds of colours, and of a shading."""
+        trainer = self._trainer
+        means, factors, opacities, features = trainer.shapes()
+        colours, shown = np.ascontiguousarray(features[:, :3]), features.copy()
+        moments, turns = np.zeros((2, *colours.shape), np.float32), without_turn(len(means))
+        rates, beta1, beta2 = np.full(3, 2.5e-3, np.float32), np.float32(0.9), np.float32(0.999)
+        errors: list[float] = []
+        for number in range(ROUNDS * len(trainer.views)):
+            view = trainer.views[number % len(trainer.views)]
+            shown[:, :3] = colours
+            if shading is not None:
+                shading.show(means, turns, colours, view.camera, shown)
+            gradients = trainer.loss.evaluate(means, factors, opacities, shown, view)
+            errors.append(10 ** (-trainer.loss.psnr / 10))
+            if shading is not None:
+                shading.saw(means, turns, colours, view.camera, gradients.features)
+                shading.step()
+            pull = np.ascontiguousarray(gradients.features[:, :3])
+            adam(colours, pull, moments[0], moments[1], rates, EVERY_ROW, beta1, beta2, number + 1)
+        return float(np.mean(errors[-len(trainer.views) :]))
+
+    def learnt(self, done: int) -> StaticTrainer:
+        """The trainer once it has an environment, on the surface that it has."""
+        trainer, whole = self._trainer, self._trainer.settings.iterations
+        every = max(1, round(NORMALS_EVERY * whole))
+        environment = None
+        for iteration in range(done, max(done + 1, round(LEARNT * whole))):
+            if (iteration - done) % every == 0:
+                means, factors, opacities, _ = trainer.shapes()
+                normals = surface_normals(means, factors, opacities, trainer.views, trainer.loss.rasterizer)
+                trainer.shading = Shading.fresh(GLOSS * normals, means, environment)
+                environment = trainer.shading.environment
+            trainer.step(trainer.views[int(trainer.random.integers(len(trainer.views)))], iteration)
+        return trainer
+
+
+class GlossyFit:
+    """The fit of frame 0 with the surface and the environment of another.
+
+    Args:
+        trainer: that has not begun. before: the other.
+    """
+
+    def __init__(self, trainer: StaticTrainer, before: StaticTrainer) -> None:
+        assert before.shading is not None
+        self._trainer = trainer
+        means, factors, opacities, _ = before.shapes()
+        normals = surface_normals(means, factors, opacities, before.views, before.loss.rasterizer)
+        self._tree, self._normals = cKDTree(means), normals
+        trainer.shading = Shading.fresh(self._placed(None), means, before.shading.environment)
+
+    def _placed(self, gloss: Array | None) -> Array:
+        """[N, 3] gloss with the normals of the first surface; strengths as they are."""
+        normals = self._normals[self._tree.query(self._trainer.parameters[:, :3], 6)[1]].mean(axis=1)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+        strength = GLOSS if gloss is None else np.linalg.norm(gloss, axis=1, keepdims=True)
+        placed: Array = (strength * normals).astype(np.float32)
+        return placed
+
+    def train(self, progress: Callable[[int, float], None] | None) -> list[float]:
+        """Runs all iterations, see ``StaticTrainer.train``."""
+        return self._trainer.train(progress, self._after)
+
+    def _after(self, done: int) -> bool:
+        shading, share = self._trainer.shading, done / self._trainer.settings.iterations
+        assert shading is not None
+        if share <= SETTLED and done % 100 == 0:
+            shading.gloss[:] = self._placed(shading.gloss)
+            shading.changed_from[:] = shading.gloss
+        elif share > SETTLED and done % SMOOTH_EVERY == 0:
+            shading.smooth(self._trainer.parameters[:, :3])
+        return False

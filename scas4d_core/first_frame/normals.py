@@ -1,0 +1,92 @@
+"""Normals of the surfaces of a state, from its rendered depth: the direction to mirror in (``rasterize.shading``)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion, gaussian_filter
+from scipy.spatial import cKDTree
+
+from scas4d_core.rasterize.cpu import CpuRasterizer
+from scas4d_core.rasterize.shading import camera_centre
+from scas4d_core.update.picture_loss import TrainingView
+
+Array = NDArray[np.float32]
+
+BLUR = 1.5
+"""Pixels, over which depth is averaged before its slope is taken."""
+STEEPEST = 0.2
+"""Cosine to the viewing ray below which a pixel says nothing about its normal."""
+REACH, NEAR = 0.02, 32
+"""Of the extent, and in number: neighbours over which normals are averaged."""
+SOLID = 0.5
+"""Alpha from which a pixel shows a surface."""
+TINY = 1e-9
+
+
+def surface_normals(
+    means: Array, factors: Array, opacities: Array, views: Sequence[TrainingView], rasterizer: CpuRasterizer
+) -> Array:
+    """[N, 3] unit normals that point outwards, to the cameras.
+
+    Each pixel's normal, from the slope of the depth about it, goes to the Gaussians by their share in the pixel; then
+    it is averaged over neighbours.
+
+    Args:
+        means, factors, opacities: of the state. views: of it, whose cameras are looked through.
+    """
+    count, black = len(means), np.zeros(4, np.float32)
+    features = np.zeros((count, 4), np.float32)
+    reach = REACH * float(np.max(np.percentile(means, 99, axis=0) - np.percentile(means, 1, axis=0)))
+    total, outwards = np.zeros((count, 4)), np.zeros((count, 3))
+    for view in views:
+        camera = view.camera
+        picture = rasterizer.forward(means, factors, opacities, features, camera, black, depth_channel=3)
+        alpha = 1 - picture.rest
+        solid = alpha > SOLID
+        depth = np.where(solid, picture.features[3] / np.maximum(alpha, SOLID), 0).astype(np.float64)
+        normals, weights = _pixel_normals(depth, solid, camera.lens, reach)
+        rasterizer.forward(means, factors, opacities, features, camera, black)
+        g_image, g_alpha = rasterizer.gradient_buffers()
+        g_image[:], g_alpha[:] = 0, 0
+        height, width = weights.shape
+        g_image[:3, :height, :width] = np.moveaxis(normals @ camera.pose[:, :3] * weights[:, :, None], -1, 0)
+        g_image[3, :height, :width] = weights
+        seen = rasterizer.backward(g_image, g_alpha, 3).features
+        g_image[:] = 0
+        total += seen
+        outwards += seen[:, 3:] * _unit(camera_centre(camera) - means)
+    found = np.where(total[:, 3:] > 1e-3, total[:, :3], outwards)
+    found = _unit(np.where(np.linalg.norm(found, axis=1, keepdims=True) > TINY, found, _unit(means - means.mean(0))))
+    weight = np.minimum(total[:, 3], 5) + 1e-3
+    near = cKDTree(means).query(means, min(NEAR, count))
+    distance, index = (np.asarray(array).reshape(count, -1) for array in near)
+    share = np.exp(-0.5 * np.square(distance / reach)) * weight[index]
+    share = share * (np.einsum("nkc,nc->nk", found[index], found) > 0)
+    return _unit(np.einsum("nkc,nk->nc", found[index], share)).astype(np.float32)
+
+
+def _pixel_normals(
+    depth: NDArray[Any], solid: NDArray[np.bool_], lens: Array, reach: float
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """[H, W, 3] normals in the camera's axes, and their weights [H, W]."""
+    height, width = depth.shape
+    smooth = gaussian_filter(depth, BLUR) / np.maximum(gaussian_filter(solid.astype(np.float64), BLUR), 1e-3)
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    points = np.stack([(u - lens[2]) / lens[0] * smooth, (v - lens[3]) / lens[1] * smooth, smooth], axis=-1)
+    across, down = np.zeros_like(points), np.zeros_like(points)
+    across[:, 1:-1] = points[:, 2:] - points[:, :-2]
+    down[1:-1] = points[2:] - points[:-2]
+    normals = _unit(np.cross(down, across))
+    towards = -np.einsum("hwc,hwc->hw", normals, _unit(points))
+    normals *= np.where(towards < 0, -1, 1)[:, :, None]
+    inside = binary_erosion(solid, iterations=2) & (np.abs(smooth - depth) < reach)
+    return normals, np.where(inside & (np.abs(towards) > STEEPEST), np.abs(towards), 0)
+
+
+def _unit(vectors: NDArray[Any]) -> NDArray[Any]:
+    found: NDArray[Any] = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), TINY)
+    return found

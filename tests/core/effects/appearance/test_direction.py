@@ -1,0 +1,233 @@
+"""Colour by direction: found where things are glossy and only there, kept with the state, seen in views; off is off."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from box_scene import look_at, photograph
+from effect_cases import BEFORE, UPDATE, same, updated
+from plyfile import PlyData
+from scipy.spatial.transform import Rotation
+
+from scas4d_core.cameras import Camera, Rig, WorldFrame
+from scas4d_core.captures.frame import Frame
+from scas4d_core.effects.appearance.direction import EFFECT
+from scas4d_core.effects.evidence import Evidence, Seen
+from scas4d_core.effects.parts import PartsBuilder
+from scas4d_core.effects.switches import first_switches, joined, names_on
+from scas4d_core.first_frame.glossy import fit_by_direction
+from scas4d_core.first_frame.normals import surface_normals
+from scas4d_core.first_frame.static_scene import StaticResult, first_trainer
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.kernels.appearance.direction import CELLS, MIDDLE, NEARNESS, ROWS, SHEEN, SIDE
+from scas4d_core.preparation import SMALLEST_CLUSTER
+from scas4d_core.query.committed import CommittedScene
+from scas4d_core.query.harmonics import basis_of
+from scas4d_core.query.ply import write_ply
+from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
+from scas4d_core.rasterize.shading import Shading, colours_seen, neighbourhood_turns, neighbourhoods, without_turn
+from scas4d_core.settings import SceneSettings, Settings, StaticSettings
+from scas4d_core.storage.history import History
+from scas4d_core.structure.hierarchy import build_hierarchy
+from scas4d_core.update.frame_update import FrameUpdate
+from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
+
+RADIUS, COUNT, SIZE = 0.3, 1500, 96
+
+
+def rig() -> Rig:
+    """Twelve cameras all round, at three heights."""
+    angles = [(2 * np.pi * k / 12, (-0.7, 0.1, 0.8)[k % 3]) for k in range(12)]
+    return Rig(tuple(look_at(f"c{k}", [np.sin(a), h, np.cos(a)], 140, SIZE) for k, (a, h) in enumerate(angles)))
+
+
+def sphere(glossy: bool = True) -> Gaussians:
+    """A ball with patches of colour, and lamps that it mirrors."""
+    k = np.arange(COUNT) + 0.5
+    z, turn = 1 - 2 * k / COUNT, np.pi * (1 + 5**0.5) * k
+    normals = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
+    axes = [Rotation.align_vectors([n], [[0, 0, 1]])[0].as_matrix() for n in normals]
+    factors = np.stack(axes) * [0.013, 0.013, 0.003]
+    colours = 0.15 + 0.4 * (np.sin(9 * normals) > 0)
+    state = Gaussians.of_points(RADIUS * normals, 0.01, colours).replace(factors=factors.astype(np.float32))
+    if not glossy:
+        return state
+    environment = np.zeros((ROWS, 3), np.float32)
+    for cell in (5 * SIDE + 6, 10 * SIDE + 10, 12 * SIDE + 3):
+        environment[[cell, cell + 1, cell + SIDE]] = 1.5
+    environment[:CELLS] -= 0.05
+    environment[SHEEN] = 0.4
+    return state.replace(gloss=(0.5 * normals).astype(np.float32), environment=environment)
+
+
+def picture(state: Gaussians, camera: Camera) -> np.ndarray:
+    """[H, W, 3] 8 bit, as a camera sees it."""
+    return photograph(state.replace(colours=colours_seen(state, CameraArrays.of(camera))), camera)[0]
+
+
+def frame(state: Gaussians, index: int = 0) -> Frame:
+    return Frame(index, float(index), {camera.name: picture(state, camera) for camera in rig().cameras}, {})
+
+
+def fitted(state: Gaussians, mode: str, iterations: int = 1200) -> StaticResult:
+    static = StaticSettings(iterations=iterations, max_gaussians=COUNT, exposure=False)
+    factory, rng = ViewFactory(rig()), np.random.default_rng(0)
+    views = factory.views(frame(state), {})
+    points = state.means + rng.normal(0, 0.003, state.means.shape)
+    return fit_by_direction(
+        lambda: first_trainer(factory, views, points, state.colours, None, SceneSettings(), static),
+        mode,  # type: ignore[arg-type]
+    )
+
+
+def after(before: Gaussians, truth: Gaussians, effects: list[str]) -> tuple[Gaussians, Evidence | None]:
+    """The state after an update to another, and the evidence for direction in it."""
+    factory = ViewFactory(rig())
+    views = factory.views(frame(truth, 1), {}, use_masks=False)
+    hierarchy = build_hierarchy(before.means, before.moving, (2, 12), SMALLEST_CLUSTER)
+    settings = UPDATE.model_copy(update={"iterations": 24})
+    parts = joined(PartsBuilder(SceneSettings(), settings, factory, hierarchy, before), effects)
+    updater = FrameUpdate(factory, SceneSettings(), settings, hierarchy, None, before, parts)
+    result = updater.run(before, views, None, 1.0, seed=1)
+    picture_loss = PictureLoss(factory, (0, 0, 0), 1.0, 0.0)
+    return result.gaussians, EFFECT.evidence(Seen(1, before, result, rig(), views, picture_loss))
+
+
+def test_a_glossy_ball_is_found_in_frame_0_and_a_dull_one_is_fitted_as_if_nobody_had_looked() -> None:
+    glossy, dull = fitted(sphere(), "auto"), fitted(sphere(False), "auto")
+    shares = [result.evidence["direction"].share for result in (glossy, dull) if result.evidence]
+    assert shares[0] > EFFECT.on_above + 0.03
+    assert shares[1] < EFFECT.on_above - 0.03
+    assert glossy.gaussians.environment is not None
+    assert same(dull.gaussians.arrays(), fitted(sphere(False), "off").gaussians.arrays())
+    assert "gloss" not in dull.gaussians.arrays()
+    for result, on in ((glossy, True), (dull, False)):
+        switch = first_switches(Settings(), 0, result.evidence or {})["direction"]
+        assert (switch.on, switch.since) == (on, 0)
+        assert switch.text.startswith("explains ")
+    without = fitted(sphere(), "off")
+    assert np.mean(glossy.psnr[-24:]) > np.mean(without.psnr[-24:]) + 0.5
+
+
+def test_a_pin_needs_no_evidence_and_off_is_never_tried() -> None:
+    assert fitted(sphere(False), "on", 40).gaussians.gloss is not None
+    assert fitted(sphere(), "off", 40).evidence is None
+    off = Settings.model_validate({"effects": {"direction": "off"}})
+    assert not first_switches(off, 0, {"direction": Evidence(1, "")})["direction"].on
+    assert "direction" not in names_on(first_switches(Settings(), 0))
+
+
+def test_a_gpu_is_refused() -> None:
+    assert EFFECT.refused(Settings()) is None
+    assert EFFECT.refused(Settings.model_validate({"device": "cuda"})) == ("device is 'cuda'", "set device to 'cpu'")
+
+
+def test_normals_are_those_of_the_ball() -> None:
+    state = sphere()
+    views = ViewFactory(rig()).views(frame(state), {})
+    found = surface_normals(state.means, state.factors, state.opacities, views, CpuRasterizer())
+    cosines = np.clip(np.einsum("nc,nc->n", found, state.means / RADIUS), -1, 1)
+    assert np.degrees(np.arccos(cosines)).max() < 25
+    assert np.degrees(np.arccos(np.median(cosines))) < 6
+
+
+def test_what_is_seen_from_everywhere_is_colour_and_not_environment() -> None:
+    state, rng = sphere(), np.random.default_rng(0)
+    assert state.gloss is not None
+    shading, camera = Shading.fresh(state.gloss.copy(), state.means), CameraArrays.of(rig().cameras[0])
+    for _ in range(5):
+        pull = rng.normal(1, 1, (COUNT, 4)).astype(np.float32)
+        shading.saw(state.means, without_turn(COUNT), state.colours, camera, pull)
+        shading.step()
+    cells = shading.environment[:CELLS]
+    assert np.abs(cells).max() > 0.01
+    directions = rng.normal(size=(200_000, 3))
+    x, y, z = (directions / np.abs(directions).sum(axis=1, keepdims=True)).T
+    u = np.where(z < 0, (1 - np.abs(y)) * np.sign(x), x)
+    v = np.where(z < 0, (1 - np.abs(x)) * np.sign(y), y)
+    nearest = np.rint((v + 1) / 2 * (SIDE - 1)).astype(int) * SIDE + np.rint((u + 1) / 2 * (SIDE - 1)).astype(int)
+    assert np.abs(cells[nearest].mean(axis=0)).max() < 0.03 * np.abs(cells).max()
+    assert shading.environment[NEARNESS, 0] >= 0
+    assert (shading.environment[MIDDLE] == np.median(state.means, axis=0)).all()
+
+
+def test_highlights_stay_with_the_world_while_the_ball_turns() -> None:
+    state = sphere().replace(colours=np.full((COUNT, 3), 0.3, np.float32))
+    turn = Rotation.from_rotvec([0.1, 0.5, 0.2])
+    means = turn.apply(state.means).astype(np.float32)
+    turns = neighbourhood_turns(state.means, means, neighbourhoods(state.means))
+    np.testing.assert_allclose(turns, np.broadcast_to(turn.as_matrix(), turns.shape), atol=1e-4)
+    there = state.replace(means=means, gloss=np.einsum("nij,nj->ni", turns, state.gloss).astype(np.float32))
+    camera = CameraArrays.of(rig().cameras[3])
+    turned, still = (colours_seen(one, camera) for one in (there, state))
+    near = np.linalg.norm(there.means[:, None] - state.means[None], axis=-1).argmin(axis=1)
+    assert np.abs(turned - still).mean() > 2 * np.abs(turned - still[near]).mean()
+
+
+def test_an_update_learns_it_and_says_so() -> None:
+    truth = sphere()
+    assert truth.environment is not None
+    before = truth.replace(environment=0 * truth.environment)
+    effects = ["moving_colour", "direction"]
+    state, evidence = after(before, truth, effects)
+    assert evidence is not None
+    assert evidence.share > 0.05
+    assert evidence.text == f"explains {100 * evidence.share:.0f} % of the residual"
+    assert state.gloss is not None
+    assert before.gloss is not None
+    assert not np.array_equal(state.gloss, before.gloss)
+    assert after(before.replace(gloss=None, environment=None), truth, effects)[1] is None
+
+
+def test_without_gloss_nothing_changes_a_bit() -> None:
+    effects = ["rigidity", "moving_colour"]
+    assert same(updated(effects), updated([*effects, "direction"]))
+    assert colours_seen(BEFORE, CameraArrays.of(rig().cameras[0])) is BEFORE.colours
+
+
+def test_states_on_disk_have_it_and_views_show_it(tmp_path: Path) -> None:
+    state, camera, world = sphere(), rig().cameras[2], WorldFrame(np.zeros(3))
+    for name, kept in (("glossy", state), ("dull", state.replace(gloss=None, environment=None))):
+        History(tmp_path / name).append(0, 0.0, kept)
+    found, dull = (History.load(tmp_path / name) for name in ("glossy", "dull"))
+    assert found.gaussians(0).gloss is not None
+    assert same(state.arrays(), found.gaussians(0).arrays())
+    shown = CommittedScene(found, world).render(camera).colour
+    np.testing.assert_allclose(np.clip(shown, 0, 1), picture(state, camera) / 255.0, atol=1 / 255)
+    assert np.abs(CommittedScene(dull, world).render(camera).colour - shown).max() > 0.1
+    with np.load(next((tmp_path / "dull").glob("frame_*.npz"))) as file:
+        assert not {"gloss", "environment"} & set(file.files)
+
+
+def test_splat_files_have_harmonics_of_it(tmp_path: Path) -> None:
+    state, world = sphere(), WorldFrame(np.zeros(3))
+    write_ply(tmp_path / "a.ply", state, world)
+    table = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+    rest = np.stack([table[f"f_rest_{k}"] for k in range(45)], axis=1).reshape(COUNT, 3, 15)
+    first = np.stack([table[f"f_dc_{k}"] for k in range(3)], axis=1)[:, :, None]
+    coefficients = np.concatenate([first, rest], axis=2)
+    camera = look_at("far", [600, -200, 900])
+    away = -np.asarray(camera.centre) / np.linalg.norm(camera.centre)
+    shown = 0.5 + coefficients @ basis_of(away[None])[0]
+    truth = colours_seen(state, CameraArrays.of(camera))
+    assert np.square(shown - truth).mean() < 0.5 * np.square(truth - truth.mean(axis=0)).mean()
+    glints = (truth - state.colours).min(axis=1) > 0.1
+    assert glints.any()
+    assert (shown - state.colours)[glints].mean() > 0.3 * (truth - state.colours)[glints].mean()
+    write_ply(tmp_path / "b.ply", sphere(False), world)
+    assert "f_rest_0" not in PlyData.read(str(tmp_path / "b.ply"))["vertex"].data.dtype.names
+
+
+def test_those_born_later_are_dull() -> None:
+    state = sphere()
+    grown = state.joined(Gaussians.of_points(np.zeros((3, 3)), 0.02))
+    assert grown.gloss is not None
+    assert len(grown.gloss) == COUNT
+    seen = colours_seen(grown, CameraArrays.of(rig().cameras[0]))
+    assert (seen[COUNT:] == 0.5).all()
+    assert not (seen[:COUNT] == state.colours).all()
+    some = grown.rows([COUNT + 1, 7])
+    assert some.gloss is not None
+    assert not some.gloss[0].any()
+    assert (some.gloss[1] == state.gloss[7]).all()  # type: ignore[index]
