@@ -32,8 +32,6 @@ MARGIN = 2
 """Blocks by which what is drawn reaches further than what moves at the start: it will move on."""
 REACH = 2 * image_loss.REACH
 """Pixels around what is drawn that its gradient depends on: a window of SSIM has windows of pixels."""
-ROOMY = 2.0
-"""Drawn blocks for each that is reached, above which a region of the frame before is made anew."""
 MOST = 0.6
 """Share of moving Gaussians above which whole pictures are cheaper: little of them stands."""
 
@@ -142,23 +140,14 @@ class ChangedPixels(PictureLoss):
         key = (view.name, view.camera.width, view.camera.height)
         region = self._regions.get(key)
         if region is None or region.view is not view:
-            region = self._regions[key] = self._region(state, view, region)
+            # Made anew in each frame: a replay has no frames before, and figures hang on the box by their rounding.
+            region = self._regions[key] = self._made(self._marks(state, view.camera), view)
         while True:
             part = taken(state, region.rows)
             self.rasterizer.forward(*part, view.camera, self._background, drawing=Drawing(region.blocks, region.learnt))
             if not self.rasterizer.escaped:
                 return region
             region = self._regions[key] = self._made(self._marks(state, view.camera) | region.blocks, view)
-
-    def _region(self, state: State, view: TrainingView, before: Region | None) -> Region:
-        """The region of a view at the start of its frame: that of the frame before where it serves."""
-        marks = self._marks(state, view.camera)
-        if before is not None and not (marks & ~before.blocks).any():
-            reached = np.bitwise_count(_widened(marks, view.camera)).sum()
-            if np.bitwise_count(before.blocks).sum() <= ROOMY * reached:
-                self._follow(before, view)
-                return before
-        return self._made(marks, view)
 
     def _marks(self, state: State, camera: CameraArrays) -> NDArray[np.uint64]:
         return reached(self.rasterizer, state, self._moving, camera)

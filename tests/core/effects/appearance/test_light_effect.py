@@ -64,7 +64,7 @@ def test_it_frees_no_colours_that_are_held() -> None:
     usual = [name for name in names_on(first_switches(Settings(), 0)) if "colour" not in name]
     assert same(updated(usual), updated([*usual, "light"]))
     settings = Settings.model_validate({"update": {"rate_colour": 0}, "effects": {"light": "on"}})
-    assert [name for name, _, _ in contradictions(settings)] == ["light"]
+    assert [name for name, *_ in contradictions(settings)] == ["light"]
 
 
 def followed(mode: str, lamp: float) -> tuple[float, Reconstruction]:
