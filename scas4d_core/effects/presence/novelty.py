@@ -7,7 +7,7 @@ stale ones, of about the same number: only what is new beyond what is stale can 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
@@ -91,7 +91,11 @@ def said(seen: Seen, views: Sequence[TrainingView]) -> list[Novelty]:
 
 
 def novelties(
-    state: Gaussians, colours: Array, views: Sequence[TrainingView], rig: Rig, picture: PictureLoss
+    state: Gaussians,
+    colours: Array,
+    views: Sequence[TrainingView],
+    rig: Rig | Mapping[str, Camera],
+    picture: PictureLoss,
 ) -> list[Novelty]:
     """What each view says against a state.
 
