@@ -17,6 +17,7 @@ from scas4d_core.effects.presence.carving import Hull, carve_new, footprint
 from scas4d_core.effects.presence.catching import Catching
 from scas4d_core.effects.presence.novelty import Novelty, glance, said
 from scas4d_core.effects.presence.returning import returned, revived
+from scas4d_core.first_frame.posed_pictures import pixels_inside
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Seen
@@ -46,6 +47,9 @@ TINY = 1e-12
 """Of a sum of squared errors: none."""
 SETTLED = 4
 """Frames after its birth in which a Gaussian is still fitted beside the update."""
+DENIED = 0.5
+"""Share of the cameras that have what was born in view and see something else there, above which it is retired once it
+is settled: it was an error."""
 NONE = np.zeros(0, np.int64)
 NOBODY: Arrays = {
     "rows": NONE,
@@ -112,6 +116,17 @@ def _says(one: Novelty) -> bool:
     return one.surplus >= SMALLEST * one.new.size
 
 
+def _denied(seen: Sequence[Novelty], means: NDArray[np.float64]) -> Bool:
+    """[P] the means in whose pixels most cameras see that nothing of the kind is there."""
+    against, asked = np.zeros(len(means), np.int64), np.zeros(len(means), np.int64)
+    for one in seen:
+        column, row, _, inside = pixels_inside(one.camera, means)
+        asked += inside
+        against += inside & one.stale[row, column]
+    denied: Bool = against > DENIED * np.maximum(asked, 1)
+    return denied
+
+
 def _remembered(found: Found, state: Gaussians, rows: NDArray[np.int64], left: Arrays) -> Arrays:
     """The arrays that the births and returns of a frame add to those that were left; ``rows`` are theirs."""
     things = np.unique(found.hull.things)
@@ -161,6 +176,10 @@ class Entering(Effect):
             state = settled(state, settling, seen.views, seen.rig, seen.picture, rng)
         arrays = {**left, **{name: NOBODY[name] for name in OF_THE_YOUNG}, "age": left["age"] + 1}
         joins = result.joins
+        grown_up = left["rows"][(left["age"] == SETTLED) & state.present[left["rows"]]]
+        if len(grown_up):
+            denied = _denied(said(seen, seen.views), state.means[grown_up].astype(np.float64))
+            state = state.retire(grown_up[denied]) if denied.any() else state
         if found is not None and state.retired.any():
             back = returned(found.seen, found.hull, state, seen.picture)
             if back:

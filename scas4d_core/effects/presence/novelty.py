@@ -82,7 +82,7 @@ def said(seen: Seen, views: Sequence[TrainingView]) -> list[Novelty]:
     """What some views say, in the colours of the frame before: what is new may be painted on what stands by now."""
     state = seen.result.gaussians
     known = _said.setdefault(state, {})
-    missing = [view for view in views if view.name not in known]
+    missing = [view for view in views if view.name not in known or known[view.name].view is not view]
     colours = state.colours.copy()
     colours[: len(seen.before)] = seen.before.colours
     found = novelties(state, colours, missing, seen.rig, seen.picture)

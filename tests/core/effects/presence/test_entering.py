@@ -7,7 +7,7 @@ import pytest
 
 from scas4d_core.effects.presence import entering
 from scas4d_core.effects.presence.carving import carve_new
-from scas4d_core.effects.presence.entering import EFFECT, SETTLED, entered
+from scas4d_core.effects.presence.entering import EFFECT, NOBODY, SETTLED, entered
 from scas4d_core.effects.presence.novelty import novelties, said
 from tests.helpers.effect_cases.visited_room import BALL, CENTRE, known, psnr, scene, seen, sphere, visitor
 
@@ -129,3 +129,12 @@ def test_another_thing_is_not_taken_for_what_has_left() -> None:
     result = EFFECT.populated(frame)
     assert len(result.gaussians) > len(gone)
     assert result.gaussians.retired.sum() == 300
+
+
+def test_what_no_camera_confirms_is_retired() -> None:
+    count, state = len(scene(known())), scene(known(), visitor())
+    carried = {"entering": NOBODY | {"rows": np.arange(count, len(state)), "age": np.full(300, SETTLED)}}
+    gone = EFFECT.populated(seen(state, scene(known()), 9, carried=carried)).gaussians
+    assert gone.retired[count:].mean() > 0.8
+    assert not gone.retired[:count].any()
+    assert not EFFECT.populated(seen(state, state, 9, carried=carried)).gaussians.retired.any()
