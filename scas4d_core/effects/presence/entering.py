@@ -16,6 +16,8 @@ from scas4d_core.effects.parts import Arrays
 from scas4d_core.effects.presence.carving import Hull, carve_new, footprint
 from scas4d_core.effects.presence.catching import Catching
 from scas4d_core.effects.presence.novelty import Novelty, glance, said
+from scas4d_core.effects.presence.returning import returned, revived
+from scas4d_core.first_frame.posed_pictures import pixels_inside
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Seen
@@ -45,6 +47,9 @@ TINY = 1e-12
 """Of a sum of squared errors: none."""
 SETTLED = 4
 """Frames after its birth in which a Gaussian is still fitted beside the update."""
+DENIED = 0.5
+"""Share of the cameras that have what was born in view and see something else there, above which it is retired once it
+is settled: it was an error."""
 NONE = np.zeros(0, np.int64)
 NOBODY: Arrays = {
     "rows": NONE,
@@ -57,6 +62,8 @@ NOBODY: Arrays = {
     "cameras": np.array(0),
 }
 """What is left before anything was born."""
+OF_THE_YOUNG = ("young", "thing", "centres", "volumes")
+"""Arrays that are of the last frame alone, see ``Catching``."""
 BUDGET = 0.1
 """Gaussians that are born in a frame at most, as a share of those that are there."""
 
@@ -109,17 +116,34 @@ def _says(one: Novelty) -> bool:
     return one.surplus >= SMALLEST * one.new.size
 
 
-def _remembered(found: Found, born: Gaussians, rows: NDArray[np.int64], left: Arrays) -> Arrays:
-    """The arrays that the births of a frame add to those that were left."""
+def _denied(seen: Sequence[Novelty], means: NDArray[np.float64]) -> Bool:
+    """[P] the means in whose pixels most cameras see that nothing of the kind is there."""
+    against, asked = np.zeros(len(means), np.int64), np.zeros(len(means), np.int64)
+    for one in seen:
+        column, row, _, inside = pixels_inside(one.camera, means)
+        asked += inside
+        against += inside & one.stale[row, column]
+    denied: Bool = against > DENIED * np.maximum(asked, 1)
+    return denied
+
+
+def _remembered(found: Found, state: Gaussians, rows: NDArray[np.int64], left: Arrays) -> Arrays:
+    """The arrays that the births and returns of a frame add to those that were left; ``rows`` are theirs."""
     things = np.unique(found.hull.things)
-    nearest = cKDTree(found.hull.points).query(born.means)[1]
+    nearest = cKDTree(found.hull.points).query(state.means[rows])[1]
     return {
         "rows": np.concatenate([left["rows"], rows]),
         "age": np.concatenate([left["age"], np.zeros(len(rows), np.int64)]),
-        "young": rows,
-        "thing": np.searchsorted(things, found.hull.things[nearest]),
-        "centres": np.array([found.hull.points[found.hull.things == number].mean(axis=0) for number in things]),
-        "volumes": np.array([(found.hull.things == number).sum() * found.hull.voxel**3 for number in things]),
+        "young": np.concatenate([left["young"], rows]),
+        "thing": np.concatenate(
+            [left["thing"], len(left["centres"]) + np.searchsorted(things, found.hull.things[nearest])]
+        ),
+        "centres": np.concatenate(
+            [left["centres"], [found.hull.points[found.hull.things == n].mean(axis=0) for n in things]]
+        ),
+        "volumes": np.concatenate(
+            [left["volumes"], [(found.hull.things == n).sum() * found.hull.voxel**3 for n in things]]
+        ),
         "share": np.maximum(found.share, left["share"]),
         "cameras": np.maximum(found.cameras, left["cameras"]),
     }
@@ -150,17 +174,28 @@ class Entering(Effect):
         settling = left["rows"][young & state.present[left["rows"]]]
         if len(settling):
             state = settled(state, settling, seen.views, seen.rig, seen.picture, rng)
-        arrays = {**left, "young": NONE, "thing": NONE, "age": left["age"] + 1}
+        arrays = {**left, **{name: NOBODY[name] for name in OF_THE_YOUNG}, "age": left["age"] + 1}
         joins = result.joins
+        grown_up = left["rows"][(left["age"] == SETTLED) & state.present[left["rows"]]]
+        if len(grown_up):
+            denied = _denied(said(seen, seen.views), state.means[grown_up].astype(np.float64))
+            state = state.retire(grown_up[denied]) if denied.any() else state
+        if found is not None and state.retired.any():
+            back = returned(found.seen, found.hull, state, seen.picture)
+            if back:
+                state = revived(state, back)
+                arrays |= _remembered(found, state, np.concatenate([one.rows for one in back]), arrays)
+                rest = ~np.isin(found.hull.things, [one.thing for one in back])
+                found = replace(found, hull=found.hull.only(rest)) if rest.any() else None
         if found is not None:
             points, colours = seeds(found.seen, found.hull, int(BUDGET * len(state)), rng)
             born = grown(state, points, colours, seen.views, seen.rig, seen.picture, rng, moves=True)
             rows = np.arange(len(state), len(state) + len(born))
             state = state.joined(born)
-            arrays |= _remembered(found, born, rows, arrays)
+            arrays |= _remembered(found, state, rows, arrays)
             alone = np.full(len(born), -1, np.int64)
             joins = alone if joins is None else np.concatenate([joins, alone])
-        if found is None and left is NOBODY:
+        if state is result.gaussians and left is NOBODY:
             return result
         return replace(result, gaussians=state, joins=joins, carried={**result.carried, NAME: arrays})
 

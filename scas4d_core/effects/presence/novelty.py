@@ -7,7 +7,7 @@ stale ones, of about the same number: only what is new beyond what is stale can 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
@@ -82,7 +82,7 @@ def said(seen: Seen, views: Sequence[TrainingView]) -> list[Novelty]:
     """What some views say, in the colours of the frame before: what is new may be painted on what stands by now."""
     state = seen.result.gaussians
     known = _said.setdefault(state, {})
-    missing = [view for view in views if view.name not in known]
+    missing = [view for view in views if view.name not in known or known[view.name].view is not view]
     colours = state.colours.copy()
     colours[: len(seen.before)] = seen.before.colours
     found = novelties(state, colours, missing, seen.rig, seen.picture)
@@ -91,7 +91,11 @@ def said(seen: Seen, views: Sequence[TrainingView]) -> list[Novelty]:
 
 
 def novelties(
-    state: Gaussians, colours: Array, views: Sequence[TrainingView], rig: Rig, picture: PictureLoss
+    state: Gaussians,
+    colours: Array,
+    views: Sequence[TrainingView],
+    rig: Rig | Mapping[str, Camera],
+    picture: PictureLoss,
 ) -> list[Novelty]:
     """What each view says against a state.
 

@@ -7,9 +7,9 @@ import pytest
 
 from scas4d_core.effects.presence import entering
 from scas4d_core.effects.presence.carving import carve_new
-from scas4d_core.effects.presence.entering import EFFECT, SETTLED, entered
+from scas4d_core.effects.presence.entering import EFFECT, NOBODY, SETTLED, entered
 from scas4d_core.effects.presence.novelty import novelties, said
-from tests.helpers.effect_cases.visited_room import BALL, CENTRE, known, psnr, scene, seen, visitor
+from tests.helpers.effect_cases.visited_room import BALL, CENTRE, known, psnr, scene, seen, sphere, visitor
 
 
 @pytest.fixture(autouse=True)
@@ -109,3 +109,32 @@ def test_no_voxel_is_free_to_a_camera() -> None:
         uv, _ = one.camera.project(hull.points)
         column, row = np.clip(uv.astype(int), 0, 79).T
         assert (one.new | one.covered)[row, column].mean() > 0.85
+
+
+def test_what_comes_back_is_revived_as_itself() -> None:
+    gone = scene(known(), visitor([0.1, -3.0, 0.0]))
+    rows = np.arange(len(gone) - 300, len(gone))
+    frame = seen(gone.retire(rows), scene(known(), visitor()))
+    result = EFFECT.populated(frame)
+    assert len(result.gaussians) == len(gone)  # none is born
+    assert not result.gaussians.retired.any()
+    assert np.array_equal(result.gaussians.ids, gone.ids)
+    assert np.abs(result.gaussians.means[rows].mean(axis=0) - CENTRE).max() < 0.03
+    assert result.carried["entering"]["young"].tolist() == rows.tolist()  # it is looked for in the next frame
+
+
+def test_another_thing_is_not_taken_for_what_has_left() -> None:
+    gone = scene(known(), sphere(np.array([0.1, -3.0, 0.0]), BALL, phase=0.0))
+    frame = seen(gone.retire(np.arange(len(gone) - 300, len(gone))), scene(known(), visitor()))
+    result = EFFECT.populated(frame)
+    assert len(result.gaussians) > len(gone)
+    assert result.gaussians.retired.sum() == 300
+
+
+def test_what_no_camera_confirms_is_retired() -> None:
+    count, state = len(scene(known())), scene(known(), visitor())
+    carried = {"entering": NOBODY | {"rows": np.arange(count, len(state)), "age": np.full(300, SETTLED)}}
+    gone = EFFECT.populated(seen(state, scene(known()), 9, carried=carried)).gaussians
+    assert gone.retired[count:].mean() > 0.8
+    assert not gone.retired[:count].any()
+    assert not EFFECT.populated(seen(state, state, 9, carried=carried)).gaussians.retired.any()
