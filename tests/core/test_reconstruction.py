@@ -258,7 +258,8 @@ def test_what_seems_to_move_in_a_frame_that_is_held_is_not_learnt() -> None:
 def test_what_another_light_changes_has_not_moved(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scas4d_core.robust.checks.ENOUGH", 1)
     frames = [replace(frame, masks={}) for frame in FRAMES]
-    scene = start(frame=frames[0])
+    # The box is not followed well at so few pixels, and looks as if it had entered beside itself.
+    scene = start(SETTINGS.model_copy(update={"effects": {"entering": "off"}}), frame=frames[0])
     usual = scene.step(frames[1])
     dim = {name: (0.75 * picture).astype(np.uint8) for name, picture in frames[1].images.items()}
     report = scene.step(replace(frames[1], index=13, time=frames[1].time + 0.01, images=dim))

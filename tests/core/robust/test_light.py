@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from scas4d_core.captures.frame import Frame
+from scas4d_core.effects.registry import Mode
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.frame_report import FrameReport
@@ -35,7 +36,11 @@ NOISE = 1.0
 """Levels of 255: with more of it, what seems to move without masks differs from light to light."""
 
 GIVEN: Settings = SyntheticFootage().settings
-SETTINGS = GIVEN.model_copy(update={"update": GIVEN.update.model_copy(update={"patience": PATIENCE})})
+PINNED: dict[str, Mode] = {"standing_colour": "on", "shadows": "off"}
+"""The state was not fitted to pictures: what stands has to learn its colours, whether they change or not."""
+SETTINGS = GIVEN.model_copy(
+    update={"update": GIVEN.update.model_copy(update={"patience": PATIENCE}), "effects": PINNED}
+)
 FOOTAGE = SyntheticFootage(SETTINGS)
 
 
