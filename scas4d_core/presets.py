@@ -17,6 +17,10 @@ TIES = ("rigidity", "isometry", "rotation")
 """Effects that tie neighbours together."""
 
 
+OURS = ("shadows", "camera_gain", "light", "direction", "uncovered", "entering", "leaving")
+"""Effects that Dynamic3DGaussians does not have."""
+
+
 def _pinned(on: Iterable[str] = (), off: Iterable[str] = ()) -> dict[str, Mode]:
     """Effects as ``Settings.effects`` has them."""
     return {**dict.fromkeys(on, "on"), **dict.fromkeys(off, "off")}
@@ -60,15 +64,16 @@ PRESETS: dict[str, Settings] = {
             judge=False,
             still=-1.0,
             weights=Weights(mask=3.0, mask_alone=3.0, isometry=2.0, scale=0.0),
-        )
+        ),
+        effects=_pinned(on=("standing_colour",), off=OURS),
     ),
     # By kind of scene: effects that are pinned, all others "auto"; no weight, no rate (figures: docs/effects.md).
     # A new effect that a kind of scene always or never calls for is pinned here.
     "rigid": Settings(effects=_pinned(on=TIES, off=("cluster_scaling", "own_rotation", "own_scale"))),
     "articulated": Settings(effects=_pinned(on=("cluster_rotation", "own_position", *TIES))),
     "cloth": Settings(effects=_pinned(on=("cluster_scaling", "isometry", "own_position"), off=("rotation",))),
-    "people": Settings(effects=_pinned(on=("motion_labels", "standing_colour", "own_position", *TIES))),
-    "lights": Settings(effects=_pinned(on=("motion_labels", "moving_colour", "standing_colour"))),
+    "people": Settings(effects=_pinned(on=("motion_labels", "shadows", "own_position", *TIES), off=("direction",))),
+    "lights": Settings(effects=_pinned(on=("motion_labels", "moving_colour", "shadows", "light"))),
 }
 
 
