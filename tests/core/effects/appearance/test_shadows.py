@@ -1,0 +1,91 @@
+"""Shadows: what stands follows the pictures once a frame, where it looks other than in frame 0."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from box_scene import make_box, make_rig, take_frame
+
+from scas4d_core.effects.appearance.shadows import NAME
+from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.frame_outcome import Candidate
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.settings import Settings
+
+RIG = make_rig()
+BOX = make_box()
+MOVES = np.argsort(np.linalg.norm(BOX.means - BOX.means.min(axis=0), axis=1))[:40]
+STATE = BOX.replace(foreground=np.isin(np.arange(len(BOX)), MOVES).astype(np.float32))
+SHADED = ~STATE.moving & (BOX.means[:, 0] > np.quantile(BOX.means[:, 0], 0.6))
+
+
+def shaded(by: float) -> Gaussians:
+    colours = STATE.colours.copy()
+    colours[SHADED] *= 1 - by
+    return STATE.replace(colours=colours)
+
+
+def settings(mode: str, **more: str) -> Settings:
+    update = {"clusters": (2, 12), "iterations": 10, "judge": False, "still": -1}
+    return Settings.model_validate({"update": update, "effects": {NAME: mode, "uncovered": "off", **more}})
+
+
+def followed(mode: str, truth: Gaussians, frames: int = 4, **more: str) -> Reconstruction:
+    """A scene after frames that show the truth, the first one apart."""
+    first = take_frame(0, 0, STATE, RIG)
+    scene = Reconstruction.start(RIG, first, settings(mode, **more), static=StaticResult(STATE, {}, []))
+    for index in range(1, frames + 1):
+        scene.step(take_frame(index, index / 30, truth, RIG))
+    return scene
+
+
+def error(scene: Reconstruction, truth: Gaussians) -> float:
+    return float(np.abs(scene.history.newest.colours - truth.colours)[SHADED].mean())
+
+
+def test_a_shadow_over_what_stands_is_followed() -> None:
+    truth = shaded(0.3)
+    off, on = followed("off", truth), followed("auto", truth)
+    assert error(on, truth) < 0.4 * error(off, truth)
+    switch = on._carried.switches[NAME]
+    assert switch.on
+    assert switch.text.endswith("of what stands looks other than in frame 0")
+
+
+def test_nothing_changes_where_nothing_does() -> None:
+    off, on = followed("off", STATE), followed("auto", STATE)
+    for name, array in off.history.newest.arrays().items():
+        np.testing.assert_array_equal(on.history.newest.arrays()[name], array, err_msg=name)
+
+
+def test_it_goes_off_where_nothing_changes_and_on_again() -> None:
+    scene = followed("auto", STATE, frames=8)
+    assert not scene._carried.switches[NAME].on
+    scene.step(take_frame(9, 9 / 30, shaded(0.3), RIG))
+    assert scene._carried.switches[NAME].on
+
+
+def test_what_moves_keeps_its_own_colours() -> None:
+    truth = shaded(0.3)
+    on, off = followed("on", truth, moving_colour="off"), followed("off", truth, moving_colour="off")
+    for scene in (on, off):
+        np.testing.assert_array_equal(scene.history.newest.colours[MOVES], STATE.colours[MOVES])
+    assert (on.history.newest.colours[SHADED] != off.history.newest.colours[SHADED]).any()
+
+
+def test_a_scene_in_which_all_moves_has_none() -> None:
+    whole = BOX.replace(foreground=np.ones(len(BOX), np.float32))
+    scene = Reconstruction.start(
+        RIG, take_frame(0, 0, whole, RIG), settings("auto"), static=StaticResult(whole, {}, [])
+    )
+    assert NAME not in scene._carried.effects
+    assert not scene._carried.switches[NAME].on
+
+
+def test_an_update_that_is_not_kept_teaches_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    truth = shaded(0.3)
+    monkeypatch.setattr(
+        "scas4d_core.update.best_state.BestState.end", lambda self, colours, iterations, left_out: Candidate.STILL
+    )
+    np.testing.assert_array_equal(followed("on", truth, frames=1).history.newest.colours, STATE.colours)
