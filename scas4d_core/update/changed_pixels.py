@@ -86,6 +86,7 @@ class ChangedPixels(PictureLoss):
         self._standing = np.flatnonzero(~self._moves)
         self._stood: State | None = None
         self._bases: dict[tuple[str, int, int], Array] = {}
+        self._base_means: dict[tuple[str, int, int], NDArray[np.float64]] = {}
         self._regions: dict[tuple[str, int, int], Region] = {}
         self._gradients: Gradients | None = None
         self._scratch = np.empty(0, np.float32)
@@ -173,6 +174,7 @@ class ChangedPixels(PictureLoss):
         region.view, region.target = view, np.ascontiguousarray(view.target[where])
         region.moments = (np.ascontiguousarray(view.moments[0][where]), np.ascontiguousarray(view.moments[1][where]))
         whole = self._losses(base, view, view.target, view.moments, np.empty_like(base))
+        view.__dict__.pop("moments", None)  # those of the box are kept, and nobody needs both
         part = np.ascontiguousarray(base[where])
         region.rest = whole - self._losses(part, view, region.target, region.moments, np.empty_like(part))
 
@@ -183,6 +185,7 @@ class ChangedPixels(PictureLoss):
             assert self._stood is not None
             picture = self.rasterizer.forward(*self._stood, view.camera, self._background)
             self._bases[key] = picture.features.copy()
+            self._base_means[key] = means(self._bases[key][:3])
         return self._bases[key]
 
     def _compare_box(self, region: Region, view: TrainingView) -> None:
@@ -197,7 +200,8 @@ class ChangedPixels(PictureLoss):
         self.image_part, self.mask_part = float(sums[0]), float(sums[1])
         pixels = view.camera.height * view.camera.width
         self.psnr = 10 * log10(3 * pixels / max(float(sums[2]), SMALLEST_SQUARE))
-        self._shown_mean = means(self._base(view)[:3]) + (part[:3] - base[:3]).sum(axis=(1, 2)) / pixels
+        key = (view.name, view.camera.width, view.camera.height)
+        self._shown_mean = self._base_means[key] + (part[:3] - base[:3]).sum(axis=(1, 2), dtype=np.float64) / pixels
 
     def _losses(
         self, planes: Array, view: TrainingView, target: Array, moments: tuple[Array, Array], gradient: Array

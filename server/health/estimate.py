@@ -15,9 +15,9 @@ PROCESS = 280e6
 """Interpreter, libraries and compiled kernels of a process that reconstructs or reads."""
 PIXEL = 8
 """Bytes for each pixel as it is sent: decoded with its mask, of the frame at work and the one before."""
-SCALED_PIXEL = 80
-"""Bytes for each pixel after scaling: 3 or 4 channels of float32 in the target and SSIM's two moments; where there are
-no masks, of two frames."""
+SCALED_PIXEL = 112
+"""Bytes for each pixel after scaling: 3 or 4 channels of float32 in the target, the same and SSIM's two moments in the
+box around what moves, what stands alone; where there are no masks, targets and moments of two frames."""
 GAUSSIAN = 1800
 """Bytes for each Gaussian in the worker: state, layers, Adam, neighbours, and what a render needs."""
 READ_GAUSSIAN = 500
