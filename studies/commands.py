@@ -7,7 +7,7 @@ import typer
 from studies.effort.commands import effort
 from studies.frontier.commands import frontier
 from studies.hard_cases.commands import stability
-from studies.kernels.commands import device, kernels
+from studies.kernels.commands import device, kernels, moving
 from studies.paper.commands import paper
 from studies.quality.commands import processors, quality, refit, table, targets
 from studies.service.commands import crossing, faults, ingest, memory, views
@@ -15,7 +15,7 @@ from studies.service.commands import crossing, faults, ingest, memory, views
 STUDIES = {
     "Quality": (quality, refit, targets, table, processors),
     "Accuracy against time": (frontier, effort, paper),
-    "Speed of the code": (kernels, device),
+    "Speed of the code": (kernels, device, moving),
     "Hard cases": (stability,),
     "The running service": (faults, ingest, views, memory, crossing),
 }

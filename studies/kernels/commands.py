@@ -1,4 +1,4 @@
-"""`scripts/bench kernels` and `device`."""
+"""`scripts/bench kernels`, `device` and `moving`."""
 
 from __future__ import annotations
 
@@ -46,3 +46,20 @@ def device(
     write_page(out, text)
     if not agree:
         raise typer.Exit(1)
+
+
+def moving(
+    share: Annotated[
+        list[float] | None, typer.Option(min=0.01, max=1, help="Of the pixels; 0.05, 0.2 and 1 when left out.")
+    ] = None,
+    frames: Annotated[int, typer.Option(min=2, help="Updates of each; the first one does not count.")] = 8,
+    out: Page = None,
+) -> None:
+    """Measures the time of an update against the share of the pixels that move, on made-up footage, in turns."""
+    from scas4d_core.warm_up import warm_up_elsewhere
+    from studies.kernels import moving as study
+
+    warm_up_elsewhere()
+    text = study.table(study.measure(share or (0.05, 0.2, 1.0), frames))
+    typer.echo(text)
+    write_page(out, text)
