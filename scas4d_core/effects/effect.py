@@ -53,6 +53,10 @@ class Effect:
     on_above: float = 0.0
     off_below: float = 0.0
 
+    def always(self, settings: Settings) -> bool:
+        """Whether it is on in every scene with these settings, and waits for no evidence."""
+        return not self.auto
+
     def refused(self, settings: Settings) -> tuple[str, str] | None:
         """Fault and remedy where it cannot be on under these settings; None: it can."""
         return None

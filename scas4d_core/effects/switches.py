@@ -76,9 +76,9 @@ def first_switches(settings: Settings, index: int, found: Mapping[str, Evidence]
     for name in EFFECTS:
         mode, one = settings.effects.get(name, "auto"), effect(name)
         allowed = mode == "auto" and one.refused(settings) is None
-        on = mode == "on" or (allowed and not one.auto)
+        on = mode == "on" or (allowed and one.always(settings))
         evidence = found.get(name)
-        if evidence is not None and allowed and one.auto:
+        if evidence is not None and allowed and not one.always(settings):
             on = evidence.share >= one.on_above
         share, text = (0.0, "") if evidence is None else (evidence.share, evidence.text)
         switches[name] = Switch(on, index, mode != "auto", share, text)
@@ -110,7 +110,7 @@ def decided(switches: Switches, settings: Settings, seen: Seen) -> dict[str, Swi
 
 def _decided(name: str, switch: Switch, settings: Settings, seen: Seen) -> Switch:
     one = effect(name)
-    if switch.pinned or not one.auto or one.refused(settings) is not None:
+    if switch.pinned or one.always(settings) or one.refused(settings) is not None:
         return switch
     found = one.evidence(seen)
     if found is None:

@@ -23,6 +23,7 @@ from scas4d_core.gaussians import Gaussians
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Seen
+    from scas4d_core.settings import Settings
     from scas4d_core.update.picture_loss import PictureLoss, TrainingView
 
 NAME = "shadows"
@@ -75,6 +76,10 @@ class ShadowsPart(Part):
 @dataclass(frozen=True)
 class Shadows(Effect):
     """A closed-form step of the colours of what stands."""
+
+    def refused(self, settings: Settings) -> tuple[str, str] | None:
+        """Refused on a GPU, whose update does not know it: there colours follow in every iteration."""
+        return None if settings.device == "cpu" else (f"device is {settings.device!r}", "set device to 'cpu'")
 
     def began(self, seen: Seen) -> Arrays | None:
         """[h, w, 4] float16 of each view: mean colours of squares, and 1 where what moves reaches."""

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
 class StandingColour(Effect):
     """RGB of the Gaussians that stand, at the rate ``rate_colour_standing``."""
 
+    def always(self, settings: Settings) -> bool:
+        """On a GPU, whose update knows no shadows; elsewhere only where it is pinned."""
+        return settings.device != "cpu"
+
     def refused(self, settings: Settings) -> tuple[str, str] | None:
         """Refused with a rate of 0."""
         if settings.update.rate_colour_standing > 0:

@@ -7,6 +7,7 @@ import pytest
 from box_scene import make_box, make_rig, take_frame
 
 from scas4d_core.effects.appearance.shadows import NAME
+from scas4d_core.effects.switches import contradictions, first_switches
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
@@ -81,6 +82,13 @@ def test_a_scene_in_which_all_moves_has_none() -> None:
     )
     assert NAME not in scene._carried.effects
     assert not scene._carried.switches[NAME].on
+
+
+def test_on_a_gpu_colours_follow_in_every_iteration_instead() -> None:
+    switches = first_switches(Settings(device="cuda"), 0)
+    assert (switches[NAME].on, switches["standing_colour"].on) == (False, True)
+    assert not first_switches(Settings(), 0)["standing_colour"].on
+    assert [name for name, *_ in contradictions(Settings(device="cuda", effects={NAME: "on"}))] == [NAME]
 
 
 def test_an_update_that_is_not_kept_teaches_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
