@@ -70,6 +70,9 @@ class Preparation:
     def __init__(self, factory: ViewFactory, settings: Settings, world: WorldFrame, picture: PictureLoss) -> None:
         self._factory, self._settings, self._picture = factory, settings, picture
         self._scene = settings.scene
+        self._made_of: tuple[NDArray[np.float32], NDArray[np.bool_]] | None = None
+        self._hierarchy: Hierarchy
+        self._neighbours: Neighbours | None = None
         if self._scene.floor is not None:
             self._scene = self._scene.model_copy(update={"floor": floor_inside(self._scene.floor, world)})
 
@@ -97,13 +100,15 @@ class Preparation:
             first: the roots, with the labels to go by. switches: of the effects.
         """
         update = self._settings.update
-        hierarchy = build_hierarchy(first.means, first.moving, update.clusters, SMALLEST_CLUSTER, update.seed)
+        hierarchy = self._clusters(first)
         parts = joined(PartsBuilder(self._scene, update, self._factory, hierarchy, first), names_on(switches))
         self.parts = parts
         if not parts.freedom.clusters:  # no cascade either
             hierarchy = hierarchy.without_layers
         tied = parts.find(NeighbourTerms) is not None
-        neighbours = build_neighbours(first.means[hierarchy.rows], NEIGHBOURS, NEIGHBOUR_FALLOFF) if tied else None
+        if tied and self._neighbours is None:
+            self._neighbours = build_neighbours(first.means[hierarchy.rows], NEIGHBOURS, NEIGHBOUR_FALLOFF)
+        neighbours = self._neighbours if tied else None
         given = (self._factory, self._scene, update, hierarchy, neighbours, first, parts)
         structure = digest(hierarchy, neighbours)
         if self._settings.device == "cpu":
@@ -111,6 +116,15 @@ class Preparation:
         from scas4d_core.torch_backend.device_update import DeviceUpdate  # torch is loaded only where it is used
 
         return DeviceUpdate(*given, device=self._settings.device), structure
+
+    def _clusters(self, first: Gaussians) -> Hierarchy:
+        """The hierarchy of what moves; that of the updater before where the same Gaussians do, with its neighbours."""
+        made = self._made_of
+        if made is None or not all(map(np.array_equal, made, (first.means, first.moving))):
+            update = self._settings.update
+            self._made_of, self._neighbours = (first.means, first.moving), None
+            self._hierarchy = build_hierarchy(*self._made_of, update.clusters, SMALLEST_CLUSTER, update.seed)
+        return self._hierarchy
 
     def again(self, first: Gaussians, carried: CarryOver) -> tuple[Updater, CarryOver]:
         """The updater for a carry-over; a motion that belongs to other clusters is dropped from that.

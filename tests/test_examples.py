@@ -30,14 +30,13 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "scas4d_core.metrics.tracks": (
         "error_by_confidence", "median_trajectory_error", "oracle_tracks", "track_error_3d", "visibility_accuracy",
     ),
+    "scas4d_core.query.carriers": ("carriers", "geometric_median"),
     "scas4d_core.query.committed": ("CommittedScene", "View"),
     "scas4d_core.query.parts": ("match_labels", "parts"),
     "scas4d_core.query.ply": ("read_ply", "split_factors", "write_ply"),
     "scas4d_core.query.ray_depth": ("ray_depths",),
     "scas4d_core.query.tapvid3d": ("tapvid3d",),
-    "scas4d_core.query.tracks": (
-        "carriers", "geometric_median", "tracks_of_ids", "tracks_of_pixels", "tracks_of_points",
-    ),
+    "scas4d_core.query.tracks": ("tracks_of_ids", "tracks_of_pixels", "tracks_of_points"),
     "scas4d_core.rasterize.cpu": ("CpuRasterizer",),
     "scas4d_core.rasterize.limits": ("scene_limits",),
     "scas4d_core.rasterize.twin": ("render",),

@@ -18,7 +18,7 @@ PIXEL = 8
 SCALED_PIXEL = 112
 """Bytes for each pixel after scaling: 3 or 4 channels of float32 in the target, the same and SSIM's two moments in the
 box around what moves, what stands alone; where there are no masks, targets and moments of two frames."""
-GAUSSIAN = 1800
+GAUSSIAN = 2200
 """Bytes for each Gaussian in the worker: state, layers, Adam, neighbours, and what a render needs."""
 READ_GAUSSIAN = 500
 """Bytes for each Gaussian in a reader."""

@@ -19,7 +19,7 @@ from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.settings import Settings
 
-VERSION = 2
+VERSION = 3
 """Raise this when frame 0 comes out different from the same pictures and settings: what is kept is then fitted anew."""
 
 CLOUD_VERSION = 3
@@ -57,7 +57,7 @@ def load_first_frame(path: Path) -> tuple[StaticResult, float] | None:
     if not path.exists():
         return None
     with np.load(path, allow_pickle=False) as file:
-        gaussians = Gaussians(**{name: file[name] for name in ARRAYS})
+        gaussians = Gaussians(**{name: file[name] for name in ARRAYS if name in file})
         names, exposures = file["exposure_names"].tolist(), file["exposures"]
         result = StaticResult(gaussians, dict(zip(names, exposures, strict=True)), file["losses"].tolist())
         return result, float(file["seconds"])

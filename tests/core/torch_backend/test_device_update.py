@@ -11,6 +11,7 @@ import pytest
 import torch
 import torch.utils.cpp_extension
 from box_scene import MOVING, make_box, make_rig, moved, take_frame, to_user
+from effect_cases import of_whole_pictures
 
 from scas4d_core import reconstruction
 from scas4d_core.first_frame.static_scene import StaticResult
@@ -62,8 +63,10 @@ def sample() -> Iterator[None]:
 def updater(kind: type, settings: UpdateSettings = SETTINGS, **options: object) -> FrameUpdate | DeviceUpdate:
     hierarchy = build_hierarchy(BEFORE.means, BEFORE.moving, settings.clusters, SMALLEST_CLUSTER)
     neighbours = build_neighbours(BEFORE.means[hierarchy.rows], 6, 200.0)
+    factory = ViewFactory(RIG)
+    parts = of_whole_pictures(factory, settings, hierarchy, BEFORE)
     made: FrameUpdate | DeviceUpdate = kind(
-        ViewFactory(RIG), SceneSettings(), settings, hierarchy, neighbours, BEFORE, **options
+        factory, SceneSettings(), settings, hierarchy, neighbours, BEFORE, parts, **options
     )
     return made
 
