@@ -299,16 +299,14 @@ class PictureLoss:
         features: Array,
         view: TrainingView,
         learnt: NDArray[np.uint8],
-        pixels: NDArray[np.bool_],
     ) -> tuple[Array, Array]:
         """Sums over the pixels of what the view's picture has more than is rendered, and of 1, by blending weight.
 
         Args:
             learnt: [N] 1 for the Gaussians that the sums are wanted of.
-            pixels: [h, w] that count with what they have more; up to H, W.
 
         Returns:
-            [N, 3] RGB in pixels' worth, without the camera's exposure, and [N] pixels' worth of all pixels.
+            [N, 3] RGB in pixels' worth, without the camera's exposure, and [N] pixels' worth.
         """
         height, width = view.camera.height, view.camera.width
         blocks = np.full(-(-width // TILE) * -(-height // TILE), 2**64 - 1, np.uint64)
@@ -316,10 +314,8 @@ class PictureLoss:
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background, drawing=drawing)
         g_image, g_alpha = self.rasterizer.gradient_buffers()
         gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
-        here = (slice(None, 3), slice(min(height, len(pixels))), slice(min(width, pixels.shape[1])))
-        g_image[:3] = 0
-        g_image[here] = (view.target[here] - offset) / gain - self.rasterizer.planes[here]
-        g_image[here] *= pixels[here[1:]]
+        here = (slice(None, 3), slice(height), slice(width))
+        g_image[here] = (view.target[:3] - offset) / gain - self.rasterizer.planes[here]
         g_image[LABEL, :height, :width] = 1
         found = self.rasterizer.backward(g_image, g_alpha, LABEL).features
         return found[:, :3].copy(), found[:, LABEL].copy()

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from scas4d_core.captures import Capture
+from scas4d_core.effects.evidence import Evidence
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.settings import Settings
@@ -59,19 +60,25 @@ def load_first_frame(path: Path) -> tuple[StaticResult, float] | None:
     with np.load(path, allow_pickle=False) as file:
         gaussians = Gaussians(**{name: file[name] for name in ARRAYS if name in file})
         names, exposures = file["exposure_names"].tolist(), file["exposures"]
-        result = StaticResult(gaussians, dict(zip(names, exposures, strict=True)), file["losses"].tolist())
+        told = zip(*(file[f"evidence_{name}"].tolist() for name in ("names", "shares", "texts")), strict=True)
+        evidence = {name: Evidence(share, text) for name, share, text in told}
+        losses = file["losses"].tolist()
+        result = StaticResult(gaussians, dict(zip(names, exposures, strict=True)), losses, evidence=evidence)
         return result, float(file["seconds"])
 
 
 def save_first_frame(path: Path, result: StaticResult, seconds: float) -> None:
     """Keeps a frame 0; the file is whole or not there."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    names = sorted(result.exposures)
+    names, found = sorted(result.exposures), result.evidence or {}
     beside = path.with_suffix(f".{os.getpid()}.part")
     arrays: dict[str, Any] = {
         "exposure_names": np.array(names, dtype=np.str_),
         "exposures": np.array([result.exposures[name] for name in names], np.float32).reshape(-1, 3, 2),
         "losses": np.array(result.losses),
+        "evidence_names": np.array(list(found), dtype=np.str_),
+        "evidence_shares": np.array([one.share for one in found.values()]),
+        "evidence_texts": np.array([one.text for one in found.values()], dtype=np.str_),
         "seconds": np.float64(seconds),
         **result.gaussians.arrays(),
     }

@@ -3,7 +3,8 @@
 At the end of an update each standing Gaussian's colour takes steps to the mean, over the pixels of some views, of what
 the pictures have more than the render, weighted by the Gaussian's share of each pixel: SIRT with ordered subsets
 (Gilbert 1972; Hudson and Larkin 1994), whose steps of 1 do not overshoot, because the shares of a pixel add up to at
-most 1. Only pixels count that look other than in frame 0: what frame 0 could not fit is none of the shadows' business.
+most 1. That is done in frames in which what stands looks other than in frame 0: elsewhere it would fit noise, and what
+cameras do not agree upon.
 The kernels are those of the rasterizer.
 """
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from scas4d_core.update.picture_loss import PictureLoss, TrainingView
 
 NAME = "shadows"
-SUBSETS = 4
+SUBSETS = 6
 """Steps a frame, each from as many of the views as the others."""
 FEW = 1.0
 """Pixels' worth of blending weight that is added to each Gaussian's: what is hardly seen stays as it is."""
@@ -36,7 +37,7 @@ SIDE = 8
 CHANGED = 0.02
 """Difference of a mean colour, RGB in 0…1, from which a square looks other than in frame 0."""
 HARDLY = 0.005
-"""Share of the squares of what stands up to which nothing is learnt from a picture."""
+"""Share of the squares of what stands up to which nothing is learnt from a frame."""
 STANDS = 0.05
 """Share of Gaussians that stand, below which there is nothing for shadows to wander over."""
 
@@ -56,16 +57,16 @@ class ShadowsPart(Part):
 
         before: Arrays = work.carried.get(NAME, {})
         known = [view for view in work.views if view.name in before]
-        compared = [(view, *_compared(before[view.name], view, state, work.picture)) for view in known]
-        changed = [(view, one) for view, one, stands in compared if (one & stands).sum() > HARDLY * stands.sum()]
-        for first in range(min(SUBSETS, len(changed))):
+        compared = [_compared(before[view.name], view, state, work.picture) for view in known]
+        if sum((squares & stands).sum() for squares, stands in compared) <= HARDLY * sum(s.sum() for _, s in compared):
+            return state
+        for first in range(min(SUBSETS, len(known))):
             sums, weights = np.zeros((len(state), 3)), np.full(len(state), FEW)
-            for view, squares in changed[first::SUBSETS]:
+            for view in known[first::SUBSETS]:
                 features = np.concatenate([colours_seen(state, view.camera), state.foreground[:, None]], axis=1)
                 more, seen = work.picture.residuals(
-                    state.means, state.factors, state.opacities, features, view, self._stands,
-                    np.repeat(np.repeat(squares, SIDE, 0), SIDE, 1),
-                )  # fmt: skip
+                    state.means, state.factors, state.opacities, features, view, self._stands
+                )
                 sums += more
                 weights += seen
             step: Array = (sums / weights[:, None]).astype(np.float32)

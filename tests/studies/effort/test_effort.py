@@ -49,7 +49,8 @@ def test_repeats_are_said() -> None:
 def test_two_settings_take_turns(tmp_path: Path) -> None:
     """Every frame of every seed is counted, and its repeats apart."""
     capture = open_capture(SAMPLE)
-    rough = {"static": {"iterations": 20}, "update": {"still": 0.02, "judge": False}}
+    effects = dict.fromkeys(("entering", "uncovered", "direction"), "off")  # what is so rough seems to call for them
+    rough = {"static": {"iterations": 20}, "update": {"still": 0.02, "judge": False}, "effects": effects}
     many, few = (
         Settings.model_validate({**rough, "update": {**rough["update"], "iterations": count}}) for count in (8, 2)
     )
