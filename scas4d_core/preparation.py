@@ -54,6 +54,9 @@ NEIGHBOURS = 20
 NEIGHBOUR_FALLOFF = 2000.0
 """1/m²: the weight of a neighbour at a distance d is exp(−falloff d²) (Dynamic3DGaussians)."""
 
+MOST_BORN = 0.5
+"""Of the Gaussians of frame 0, that may be born in a scene: memory is bounded."""
+
 
 class Preparation:
     """Makes the updaters of a scene.
@@ -87,7 +90,7 @@ class Preparation:
         found = UpdateResult(result.gaussians, None, UpdateTrace())
         seen = Seen(frame.index, result.gaussians, found, self._factory.rig, views, self._picture)
         arrays = began(switches, self._settings, seen)
-        return switched_by(arrays, switches), arrays
+        return switched_by(arrays, switches, seen), arrays
 
     def exposures(self, fixed: dict[str, NDArray[np.float32]], carried: CarryOver) -> dict[str, NDArray[np.float32]]:
         """[3, 2] gain and offset of each camera: those that frame 0 found, or as they are known by now."""
@@ -187,7 +190,7 @@ class Preparation:
         return result, *self.regrown(updater, carried, seen, result, first)
 
     def populated(self, names: Sequence[str], seen: Seen) -> UpdateResult:
-        """The result of a frame with all that is born, retired or revived in it.
+        """The result of a frame with all that is born, retired or revived in it; what is not finite is left out.
 
         Args:
             names: of the effects that took part in its update. seen: the frame.
@@ -200,7 +203,10 @@ class Preparation:
             if type(one).populated is not Effect.populated:
                 result = one.populated(seen)
                 _check_rows(name, seen.result, result)
-                seen = replace(seen, result=result)
+                arrays = result.gaussians.arrays().values()
+                if all(np.isfinite(array).all() for array in arrays if array.dtype.kind == "f"):
+                    born = len(result.gaussians) - len(seen.result.gaussians)
+                    seen = replace(seen, result=result, room=max(0, seen.room - born))
         return seen.result
 
     def regrown(
@@ -258,6 +264,18 @@ def _lengthened(array: NDArray[Any], count: int, joins: NDArray[np.int64] | None
     rows = array[np.maximum(joins, 0)]
     rows[joins == FOUNDERLESS] = 0
     return np.concatenate([array, rows])
+
+
+def room_for_births(first: int, now: int) -> int:
+    """How many Gaussians may still be born.
+
+    Args:
+        first: that frame 0 had. now: that there are, retired ones too.
+
+    >>> room_for_births(1000, 1400), room_for_births(1000, 1600)
+    (100, 0)
+    """
+    return max(0, int((1 + MOST_BORN) * first) - now)
 
 
 def digest(hierarchy: Hierarchy, neighbours: Neighbours | None) -> int:

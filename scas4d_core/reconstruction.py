@@ -23,7 +23,7 @@ from scas4d_core.first_frame.start import FirstFrame, fit_first
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.frame_report import FrameReport, Progress, report_of_first, report_of_update
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.preparation import Preparation
+from scas4d_core.preparation import Preparation, room_for_births
 from scas4d_core.query.committed import CommittedScene, View
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness, fingerprints, goes_on, lit, noted
@@ -249,9 +249,8 @@ class Reconstruction(CommittedScene):
         steady = unusable is None and exposure == 1.0  # else nothing can be told from differences of the pictures
         updater, carried = self._updater, self._carried
         if steady and carried.seen and self._learns_labels:
-            updater, carried = self._preparation.relabelled(
-                updater, carried, self.history.newest, self._roots, believed
-            )
+            newest = self.history.newest
+            updater, carried = self._preparation.relabelled(updater, carried, newest, self._roots, believed)
         given = UpdateInput(
             state=self.history.newest if carried.labels is None else labelled(self.history.newest, carried.labels),
             motion=carried.motion,
@@ -274,10 +273,13 @@ class Reconstruction(CommittedScene):
         how = {"cold": given.motion is None, "relabelled": updater is not self._updater, **(notes or {})}
         carried = carried.after(result, past, frame.time, believed if self._learns_labels else None, shown)
         roots = self._roots
-        if result.outcome.learnt:
+        if result.outcome.learnt and result.exposure == 1.0:  # in a light that is taken out again much looks new
             learnt = [view for view in believed if view.name not in result.trace.left_out]
-            seen = Seen(frame.index, given.state, result, self.rig, learnt, self._picture)
-            result, updater, carried, roots = self._preparation.followed(updater, carried, seen, roots, self.populates)
+            room = room_for_births(len(self.history.first), len(result.gaussians))
+            seen = Seen(frame.index, given.state, result, self.rig, learnt, self._picture, room)
+            populates, follow = self.populates and exposure == 1.0, self._preparation.followed
+            result, updater, carried, roots = follow(updater, carried, seen, roots, populates)
+            watch.lap("presence")
         report = report_of_update(frame, result, self.history.newest, left_out, self.rig.names, watch, dropped)
         birth = {} if roots is self._roots else {"roots": roots, "joins": result.joins}
         self._commit(report, result.gaussians, carried, how, **birth)

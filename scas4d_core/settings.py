@@ -286,8 +286,7 @@ class UpdateSettings(SettingsModel):
     rate_colour: NotNegative = Field(0.0025, description="RGB of the Gaussians that move.")
     rate_colour_standing: NotNegative = Field(
         0.01,
-        description="RGB of the Gaussians that stand: light and shadows wander over them, and cannot be taken for a "
-        "motion.",
+        description="RGB of the Gaussians that stand, where standing_colour is on; with 0 they keep their colours.",
     )
     rate_end: float = Field(
         0.05, gt=0, le=1, description="All rates decay to this fraction over the frame (cosine); 1: constant."

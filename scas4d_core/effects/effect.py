@@ -39,7 +39,6 @@ class Effect:
         says: a sentence for users. gauge: that which fixes it against the effects that could explain the same pixels.
         cost: of an update with it, against one without.
         auto: whether it waits for evidence; else it is on wherever it is not refused.
-        at_first: one that waits is on from frame 0 until it is idle, where it keeps arrays of frame 0.
         on_above, off_below: share of ``Evidence`` from which it is switched on, and below which it is switched off.
     """
 
@@ -49,7 +48,6 @@ class Effect:
     gauge: str
     cost: str
     auto: bool = False
-    at_first: bool = False
     on_above: float = 0.0
     off_below: float = 0.0
 
@@ -68,6 +66,10 @@ class Effect:
     def needed(self, settings: Settings) -> tuple[str, str] | None:
         """Fault and remedy where these settings pin it off and nothing else does its work; None: it can be off."""
         return None
+
+    def on_at_first(self, seen: Seen) -> bool:
+        """Whether it is on after the first frame until it is idle, where it keeps arrays of that."""
+        return False
 
     def evidence(self, seen: Seen) -> Evidence | None:
         """The evidence of a frame that calls for it; None: the frame says nothing, and the switch stays."""

@@ -32,7 +32,8 @@ class Seen:
 
     Attributes:
         index: of the frame. before: Θ_{t−1}. result: Θ_t, the trace of its update, arrays of the effects.
-        rig: the cameras inside. views: that were learnt from. picture: renders them.
+        rig: the cameras inside. views: that were learnt from. picture: renders
+            them. room: Gaussians that may still be born in the scene.
     """
 
     index: int
@@ -41,3 +42,4 @@ class Seen:
     rig: Rig
     views: Sequence[TrainingView]
     picture: PictureLoss
+    room: int = 1_000_000

@@ -27,12 +27,12 @@ EFFECTS = {
     "motion_labels": "scas4d_core.effects.presence.motion_labels",
     "moving_colour": "scas4d_core.effects.appearance.moving_colour",
     "standing_colour": "scas4d_core.effects.appearance.standing_colour",
+    "direction": "scas4d_core.effects.appearance.direction",
     "shadows": "scas4d_core.effects.appearance.shadows",
     "camera_gain": "scas4d_core.effects.appearance.camera_gain",
     "light": "scas4d_core.effects.appearance.light",
     "uncovered": "scas4d_core.effects.presence.uncovered",
     "entering": "scas4d_core.effects.presence.entering",
     "leaving": "scas4d_core.effects.presence.leaving",
-    "direction": "scas4d_core.effects.appearance.direction",
 }
 """The module of each effect, by its name; in the order in which they take part in an iteration."""

@@ -134,14 +134,14 @@ def began(switches: Switches, settings: Settings, seen: Seen) -> dict[str, Array
     return found
 
 
-def switched_by(found: Mapping[str, Arrays], switches: Switches) -> dict[str, Switch]:
+def switched_by(found: Mapping[str, Arrays], switches: Switches, seen: Seen) -> dict[str, Switch]:
     """The switches after the first frame.
 
     Args:
-        found: from ``began``.
+        found: from ``began``. seen: the first frame.
     """
     return {
-        name: replace(switch, on=True) if name in found and effect(name).at_first else switch
+        name: replace(switch, on=True) if name in found and effect(name).on_at_first(seen) else switch
         for name, switch in switches.items()
     }
 

@@ -79,7 +79,7 @@ class GlossTrial:
 
     def convinced(self, done: int) -> bool:
         """At the time of the trial, whether it speaks for direction; the fit is as it was."""
-        if done != round(TRIAL * self._trainer.settings.iterations):
+        if done != max(1, round(TRIAL * self._trainer.settings.iterations)):
             return False
         if self._mode != "on" and len(self._trainer.views) < FEWEST_VIEWS:
             return False

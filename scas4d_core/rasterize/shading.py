@@ -167,7 +167,9 @@ def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) ->
     there, now = before[near].astype(np.float64), after[near].astype(np.float64)
     there -= there.mean(axis=1, keepdims=True)
     now -= now.mean(axis=1, keepdims=True)
-    left, _, right = np.linalg.svd(np.einsum("nki,nkj->nij", now, there))
+    spread = np.einsum("nki,nkj->nij", now, there)
+    spread[~np.isfinite(spread).all(axis=(1, 2))] = np.eye(3)  # such a place is held back; its neighbours keep theirs
+    left, _, right = np.linalg.svd(spread)
     left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
     turns: NDArray[np.float64] = left @ right
     return turns

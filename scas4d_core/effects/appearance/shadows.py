@@ -51,7 +51,7 @@ class ShadowsPart(Part):
 
     def end(self, work: Work, state: Gaussians) -> Gaussians:
         """Steps them, where the end of the update is what is kept."""
-        if work.kept is not Candidate.END or not self._stands.any():
+        if work.kept is not Candidate.END or not self._stands.any() or work.rates.colour_standing == 0:
             return state
         from scas4d_core.rasterize.shading import colours_seen  # it loads the kernels
 
@@ -79,19 +79,28 @@ class Shadows(Effect):
     """A closed-form step of the colours of what stands."""
 
     def refused(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused on a GPU, whose update does not know it: there colours follow in every iteration."""
+        """Refused with a rate of 0, and on a GPU, whose update does not know it: there colours follow in iterations."""
+        if not settings.update.rate_colour_standing > 0:
+            return "update.rate_colour_standing is 0", "give it a rate above 0"
         return None if settings.device == "cpu" else (f"device is {settings.device!r}", "set device to 'cpu'")
 
     def began(self, seen: Seen) -> Arrays | None:
         """[h, w, 4] float16 of each view: mean colours of squares, and 1 where what moves reaches."""
         state = seen.result.gaussians
-        if not (~state.moving).mean() >= STANDS:
+        stands = float((~state.moving).mean())
+        if 0 < stands < STANDS:
             return None
         found = {}
         for view in seen.views:
-            hidden = _hidden(view, state, seen.picture)[..., None]
-            found[view.name] = np.concatenate([_means(view), hidden], axis=-1).astype(np.float16)
+            means = _means(view)
+            # Where all seems to move, as without masks, it is not known yet what stands.
+            hidden = _hidden(view, state, seen.picture) if stands else np.zeros(means.shape[:2])
+            found[view.name] = np.concatenate([means, hidden[..., None]], axis=-1).astype(np.float16)
         return found
+
+    def on_at_first(self, seen: Seen) -> bool:
+        """Where something stands, until nothing has changed for a while."""
+        return bool((~seen.result.gaussians.moving).mean() >= STANDS)
 
     def evidence(self, seen: Seen) -> Evidence | None:
         """Share of what stands, seen in frame 0 and now, that looks other than then."""
@@ -102,6 +111,8 @@ class Shadows(Effect):
                 squares, stands = _compared(before[view.name], view, seen.result.gaussians, seen.picture)
                 changed += int((squares & stands).sum())
                 compared += int(stands.sum())
+        if not before and not seen.result.gaussians.moving.all():
+            return Evidence(0.0, "")  # what frame 0 left is lost
         if compared == 0:
             return None
         share = changed / compared
@@ -146,7 +157,6 @@ EFFECT = Shadows(
     gauge="It is of what stands, where that looks other than in frame 0; gains of cameras are taken out before.",
     cost="one render of each view and its backward, a frame",
     auto=True,
-    at_first=True,
     on_above=0.02,
     off_below=0.005,
 )

@@ -36,7 +36,7 @@ class StandingColour(Effect):
 EFFECT = StandingColour(
     name="standing_colour",
     group=Group.APPEARANCE,
-    says="The colours of what stands follow the pictures in every iteration; only where it is pinned on.",
+    says="The colours of what stands follow the pictures in every iteration: on a GPU, and where it is pinned on.",
     gauge="The mean absolute change of all colours is a term: what moves or a gain explains is not put into colours.",
     cost="whole pictures are rendered, and one step of Adam over RGB an iteration",
     auto=True,

@@ -30,6 +30,8 @@ COARSE = 32
 """Voxels along an edge of the first grid."""
 VOXEL_PIXELS = 1.5
 """Edge of the smallest voxel, at most, in pixels at the middle of the stage."""
+MOST_CELLS = 1 << 25
+"""Of the grid in which things are told apart; what is strewn wider is no thing."""
 MOST_VOXELS = 1_000_000
 """A level that would hold more is not entered."""
 SMALLEST = 27
@@ -120,9 +122,13 @@ def _kept(
 def _hull(cells: NDArray[np.int64], origin: Float, voxel: float) -> Hull:
     if len(cells) == 0:
         return Hull(np.zeros((0, 3)), np.zeros(0, np.bool_), np.zeros(0, np.int64), voxel)
-    low = cells.min(axis=0) - 1
-    grid = np.zeros(cells.max(axis=0) + 2 - low, np.bool_)
-    at = tuple((cells - low).T)
+    # Things far apart are moved together, with an empty layer between them: the grid is as large as they are.
+    close = np.stack([_without_gaps(column) for column in cells.T], axis=1)
+    shape = close.max(axis=0) + 2
+    if np.prod(shape) > MOST_CELLS:
+        return _hull(cells[:0], origin, voxel)
+    grid = np.zeros(shape, np.bool_)
+    at = tuple(close.T)
     grid[at] = True
     numbers, _ = label(grid, np.ones((3, 3, 3)))
     inner = grid.copy()
@@ -132,6 +138,18 @@ def _hull(cells: NDArray[np.int64], origin: Float, voxel: float) -> Hull:
     things = numbers[at].astype(np.int64)
     kept = np.bincount(things)[things] >= SMALLEST
     return Hull((origin + cells * voxel)[kept], ~inner[at][kept], things[kept], voxel)
+
+
+def _without_gaps(places: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Places along an axis, from 1 on, with one empty place for each gap.
+
+    >>> _without_gaps(np.array([7, -900, 8, 30]))
+    array([3, 1, 4, 6])
+    """
+    known, which = np.unique(places, return_inverse=True)
+    steps = np.minimum(np.diff(known, prepend=known[0] - 1), 2)
+    moved: NDArray[np.int64] = np.cumsum(steps)[which]
+    return moved
 
 
 def footprint(one: Novelty, points: Float, voxel: float) -> Bool:

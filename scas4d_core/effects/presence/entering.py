@@ -123,7 +123,7 @@ def _denied(seen: Sequence[Novelty], means: NDArray[np.float64]) -> Bool:
         column, row, _, inside = pixels_inside(one.camera, means)
         asked += inside
         against += inside & one.stale[row, column]
-    denied: Bool = against > DENIED * np.maximum(asked, 1)
+    denied: Bool = (asked >= GLANCED) & (against > DENIED * asked)
     return denied
 
 
@@ -188,7 +188,9 @@ class Entering(Effect):
                 rest = ~np.isin(found.hull.things, [one.thing for one in back])
                 found = replace(found, hull=found.hull.only(rest)) if rest.any() else None
         if found is not None:
-            points, colours = seeds(found.seen, found.hull, int(BUDGET * len(state)), rng)
+            points, colours = seeds(found.seen, found.hull, min(int(BUDGET * len(state)), seen.room), rng)
+            found = found if len(points) else None
+        if found is not None:
             born = grown(state, points, colours, seen.views, seen.rig, seen.picture, rng, moves=True)
             rows = np.arange(len(state), len(state) + len(born))
             state = state.joined(born)

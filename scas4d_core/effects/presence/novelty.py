@@ -75,7 +75,8 @@ _said: WeakKeyDictionary[Gaussians, dict[str, Novelty]] = WeakKeyDictionary()
 def glance(seen: Seen) -> list[Novelty]:
     """What some cameras say of a frame."""
     count = len(seen.views)
-    return said(seen, [seen.views[(seen.index + count * k // GLANCE) % count] for k in range(min(GLANCE, count))])
+    looked_at = min(GLANCE, count)
+    return said(seen, [seen.views[(seen.index + count * k // looked_at) % count] for k in range(looked_at)])
 
 
 def said(seen: Seen, views: Sequence[TrainingView]) -> list[Novelty]:
@@ -117,6 +118,7 @@ def _novelty(state: Gaussians, features: Array, view: TrainingView, camera: Came
         shown = view.target[3] > 0.5
         new, stale = shown & (label < ABSENT), ~shown & (label > THERE)
         behind = ~shown & (label < ABSENT)
+        new = binary_propagation(new & (blurred > DIFFERENT), mask=new)  # a mask alone may be wrong
     else:
         off = blurred > max(DIFFERENT, TIMES_USUAL * float(np.median(blurred)))
         new, stale = off & (label < THERE), off & (label >= THERE)

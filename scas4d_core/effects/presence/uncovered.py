@@ -70,7 +70,9 @@ class UncoveredEffect(Effect):
         points, share = found
         state, rng = result.gaussians, np.random.default_rng([seen.index, len(result.gaussians)])
         some = np.arange(len(points.points))
-        most = int(BUDGET * len(state))
+        most = min(int(BUDGET * len(state)), seen.room)
+        if most <= 0:
+            return result
         if len(some) > most:
             some = np.sort(rng.choice(some, most, replace=False))
         born = grown(
