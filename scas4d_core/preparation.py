@@ -267,7 +267,7 @@ def _lengthened(array: NDArray[Any], count: int, joins: NDArray[np.int64] | None
 
 
 def room_for_births(first: int, now: int) -> int:
-    """How many Gaussians may still be born.
+    """The number of Gaussians that may still be born.
 
     Args:
         first: that frame 0 had. now: that there are, retired ones too.

@@ -52,7 +52,7 @@ class Effect:
     off_below: float = 0.0
 
     def always(self, settings: Settings) -> bool:
-        """Whether it is on in every scene with these settings, and waits for no evidence."""
+        """True where it is on in every scene with these settings, and waits for no evidence."""
         return not self.auto
 
     def refused(self, settings: Settings) -> tuple[str, str] | None:
@@ -68,7 +68,7 @@ class Effect:
         return None
 
     def on_at_first(self, seen: Seen) -> bool:
-        """Whether it is on after the first frame until it is idle, where it keeps arrays of that."""
+        """True where it is on after the first frame until it is idle; it keeps arrays of that frame."""
         return False
 
     def evidence(self, seen: Seen) -> Evidence | None:

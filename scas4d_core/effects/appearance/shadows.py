@@ -99,7 +99,7 @@ class Shadows(Effect):
         return found
 
     def on_at_first(self, seen: Seen) -> bool:
-        """Where something stands, until nothing has changed for a while."""
+        """True where something stands."""
         return bool((~seen.result.gaussians.moving).mean() >= STANDS)
 
     def evidence(self, seen: Seen) -> Evidence | None:

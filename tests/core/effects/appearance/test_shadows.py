@@ -80,7 +80,8 @@ def test_a_scene_in_which_all_moves_has_none() -> None:
     scene = Reconstruction.start(
         RIG, take_frame(0, 0, whole, RIG), settings("auto"), static=StaticResult(whole, {}, [])
     )
-    assert NAME not in scene._carried.effects
+    assert not scene._carried.switches[NAME].on
+    scene.step(take_frame(1, 1 / 30, whole, RIG))
     assert not scene._carried.switches[NAME].on
 
 
@@ -97,3 +98,13 @@ def test_an_update_that_is_not_kept_teaches_nothing(monkeypatch: pytest.MonkeyPa
         "scas4d_core.update.best_state.BestState.end", lambda self, colours, iterations, left_out: Candidate.STILL
     )
     np.testing.assert_array_equal(followed("on", truth, frames=1).history.newest.colours, STATE.colours)
+
+
+def test_without_masks_it_waits_until_it_is_known_what_stands() -> None:
+    bare = STATE.replace(foreground=np.ones(len(BOX), np.float32))
+    first = take_frame(0, 0, STATE, RIG, masks=False)
+    scene = Reconstruction.start(RIG, first, settings("auto"), static=StaticResult(bare, {}, []))
+    assert not scene._carried.switches[NAME].on
+    assert scene._carried.effects[NAME]["c0"][..., 3].max() == 0  # nothing is known to hide anything
+    known = Reconstruction.start(RIG, first, settings("auto"), static=StaticResult(STATE, {}, []))
+    assert known._carried.switches[NAME].on
