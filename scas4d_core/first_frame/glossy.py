@@ -26,6 +26,8 @@ Array = NDArray[np.float32]
 
 TRIAL = 0.15
 """Share of the iterations after which the trial is made: there is a surface, and little has been made up behind it."""
+FEWEST_ITERATIONS = 100
+"""Of a fit, from which a part of it can tell what colours alone will not explain."""
 FEWEST_VIEWS = 12
 """For the trial: of fewer cameras each has highlights that no other sees beside it, and anything explains them."""
 ROUNDS = 8
@@ -81,7 +83,8 @@ class GlossTrial:
         """At the time of the trial, whether it speaks for direction; the fit is as it was."""
         if done != max(1, round(TRIAL * self._trainer.settings.iterations)):
             return False
-        if self._mode != "on" and len(self._trainer.views) < FEWEST_VIEWS:
+        few = len(self._trainer.views) < FEWEST_VIEWS or self._trainer.settings.iterations < FEWEST_ITERATIONS
+        if few and self._mode != "on":
             return False
         means, factors, opacities, _ = self._trainer.shapes()
         normals = surface_normals(means, factors, opacities, self._trainer.views, self._trainer.loss.rasterizer)
