@@ -20,7 +20,7 @@ from scas4d_core.captures import Capture, open_capture
 from studies.service.process import Service
 
 PACKAGES = ("scas4d_core", "server", "client")
-MOST_OF_A_FRAME, MOST_OF_A_RENDER = 53, 21
+MOST_OF_A_FRAME, MOST_OF_A_RENDER = 55, 22
 LATER = 3
 """The frame that is followed: frame 0 and the first updates have work of their own."""
 SETTINGS = {

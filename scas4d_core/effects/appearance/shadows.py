@@ -38,6 +38,8 @@ CHANGED = 0.02
 """Difference of a mean colour, RGB in 0…1, from which a square looks other than in frame 0."""
 HARDLY = 0.005
 """Share of the squares of what stands up to which nothing is learnt from a frame."""
+ENOUGH = 0.5
+"""Share of the cameras of frame 0 from which a frame teaches: what a few of them see is their own noise as well."""
 STANDS = 0.05
 """Share of Gaussians that stand, below which there is nothing for shadows to wander over."""
 
@@ -57,6 +59,8 @@ class ShadowsPart(Part):
 
         before: Arrays = work.carried.get(NAME, {})
         known = [view for view in work.views if view.name in before]
+        if len(known) < ENOUGH * len(before):
+            return state
         compared = [_compared(before[view.name], view, state, work.picture) for view in known]
         if sum((squares & stands).sum() for squares, stands in compared) <= HARDLY * sum(s.sum() for _, s in compared):
             return state
