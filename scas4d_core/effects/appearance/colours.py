@@ -18,6 +18,10 @@ FASTER = 2.0
 """Times the rate of what stands, where the light changes: 0.1 to 0.2 dB on a lamp that crosses a room."""
 
 
+MOST = 0.6
+"""Share of moving Gaussians above which all have a place in the table: picking rows costs more than it saves."""
+
+
 class Colours(Part):
     """RGB of the Gaussians as parameters of an update, with a term that keeps them as they were.
 
@@ -30,6 +34,7 @@ class Colours(Part):
 
     def __init__(self, builder: PartsBuilder) -> None:
         self._rows, self._count = builder.hierarchy.rows, len(builder.first)
+        self._whole = len(self._rows) > MOST * self._count
         self._optimizer: Adam
 
     def freed(self, rates: Rates) -> tuple[float, float]:
@@ -46,7 +51,8 @@ class Colours(Part):
 
         self._soft = np.float32(schedule.SOFT_COLOUR_WEIGHT / max(work.colours.size, 1))
         moving, standing = self.freed(work.rates)
-        if self.standing:
+        self._whole = self._whole or self.standing
+        if self._whole:
             self._table, by_row = work.colours, np.full(self._count, standing, np.float32)
             by_row[self._rows] = moving
         else:
@@ -57,16 +63,16 @@ class Colours(Part):
 
     def loss(self, work: Work) -> float:
         """The mean absolute change."""
-        before = work.previous.colours if self.standing else work.previous.colours[self._rows]
+        before = work.previous.colours if self._whole else work.previous.colours[self._rows]
         self._change: Array = self._table - before
         return float(self._soft * np.abs(self._change).sum(dtype=np.float64)) if work.tells else 0.0
 
     def step(self, work: Work, iteration: int, planned: int) -> None:
         """Steps the colours."""
         pull: Array = self._soft * np.sign(self._change)
-        found = work.gradients.features if self.standing else work.gradients.features[self._rows]
+        found = work.gradients.features if self._whole else work.gradients.features[self._rows]
         self._optimizer.step(found[:, :3] + pull, iteration, planned)
-        if not self.standing:
+        if not self._whole:
             work.colours[self._rows] = self._table
 
     def end(self, work: Work, state: Gaussians) -> Gaussians:

@@ -109,13 +109,15 @@ class Shadows(Effect):
     def evidence(self, seen: Seen) -> Evidence | None:
         """Share of what stands, seen in frame 0 and now, that looks other than then."""
         before: Arrays = seen.result.carried.get(NAME, {})
+        if seen.result.gaussians.moving.all():
+            return None
         changed = compared = 0
         for view in seen.views:
             if view.name in before:
                 squares, stands = _compared(before[view.name], view, seen.result.gaussians, seen.picture)
                 changed += int((squares & stands).sum())
                 compared += int(stands.sum())
-        if not before and not seen.result.gaussians.moving.all():
+        if not before:
             return Evidence(0.0, "")  # what frame 0 left is lost
         if compared == 0:
             return None
