@@ -101,6 +101,10 @@ class Gaussians:
     def __len__(self) -> int:
         return len(self.means)
 
+    def features(self, colours: Array) -> Array:
+        """[N, 4] features as they are rendered: colours [N, 3], its own or as a camera sees them, and the label."""
+        return np.concatenate([colours, self.foreground[:, None]], axis=1)
+
     def replace(self, **changes: Any) -> Gaussians:
         """A copy with some of the arrays exchanged; the others are shared. ``opacities`` are taken as its own.
 

@@ -68,7 +68,7 @@ class Work:
         self.previous, self.deformation, self.rates, self.views = previous, deformation, rates, views
         self.picture, self.carried = picture, carried
         self.colours = previous.colours.copy()
-        self.features = np.concatenate([previous.colours, previous.foreground[:, None]], axis=1)
+        self.features = previous.features(previous.colours)
 
 
 class Part:

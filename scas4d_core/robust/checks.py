@@ -168,7 +168,7 @@ def relit(state: Gaussians, gain: float) -> Gaussians:
 
 def _shown(picture: PictureLoss, state: Gaussians, view: TrainingView) -> Array:
     """[3, H, W] the state as the view's camera would show it."""
-    features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
+    features = state.features(state.colours)
     picture.measure(state.means, state.factors, state.opacities, features, view)
     planes = picture.rasterizer.planes[:LABEL, : view.camera.height, : view.camera.width]
     shown: Array = view.exposure[:LABEL, 0, None, None] * planes + view.exposure[:LABEL, 1, None, None]

@@ -38,7 +38,7 @@ def find_jump(gaussians: Gaussians, views: Sequence[TrainingView], picture: Pict
     if not rows.any():
         return None
     alone = np.where(rows, np.float32(0), gaussians.opacities)
-    features = np.concatenate([gaussians.colours, gaussians.foreground[:, None]], axis=1)
+    features = gaussians.features(gaussians.colours)
     rays_before: list[tuple[Float, Float]] = []
     rays_now: list[tuple[Float, Float]] = []
     for view in views:

@@ -300,7 +300,7 @@ class FrameSolver:
 
     def _measured(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
         """DB of cameras as a state shows them; those that are left out come back so, once they fit."""
-        features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
+        features = state.features(state.colours)
         found = {}
         for view in views:
             self._picture.measure(state.means, state.factors, state.opacities, features, view)

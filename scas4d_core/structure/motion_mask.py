@@ -75,7 +75,7 @@ def moving_between(
         gaussians: Θ_{t−1}. before, now: the views of both frames; cameras of only one are left out.
         picture: renders.
     """
-    features = np.concatenate([gaussians.colours, gaussians.foreground[:, None]], axis=1)
+    features = gaussians.features(gaussians.colours)
     earlier = {view.name: view for view in before}
     says = np.zeros(len(gaussians), np.int64)
     asked = np.zeros(len(gaussians), np.int64)

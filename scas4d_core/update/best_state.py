@@ -146,7 +146,7 @@ class BestState:
 
     def error_of(self, state: Gaussians) -> float:
         """Mean error on the probe views of a state."""
-        features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
+        features = state.features(state.colours)
         found = self._probes.errors(state.means, state.factors, state.opacities, features)
         return mean_error(found, list(found))
 
@@ -177,7 +177,7 @@ class BestState:
             self.errors[candidate] = errors
 
     def _errors(self, means: Array, factors: Array, colours: Array) -> dict[str, float]:
-        features = np.concatenate([colours, self._previous.foreground[:, None]], axis=1)
+        features = self._previous.features(colours)
         return self._probes.errors(means, factors, self._previous.opacities, features)
 
     def _mean(self, candidate: Candidate, otherwise: float = np.inf) -> float:

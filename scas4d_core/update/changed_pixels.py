@@ -94,7 +94,7 @@ class ChangedPixels(PictureLoss):
 
     def begin(self, previous: Gaussians) -> None:
         """Takes the state that a frame starts from; what stood otherwise before is rendered anew."""
-        features = np.concatenate([previous.colours, previous.foreground[:, None]], axis=1)
+        features = previous.features(previous.colours)
         state = taken((previous.means, previous.factors, previous.opacities, features), self._standing)
         if self._stood is None or not all(map(np.array_equal, state, self._stood)):
             self._bases.clear()
@@ -138,7 +138,7 @@ class ChangedPixels(PictureLoss):
 
     def _drawn(self, state: State, view: TrainingView) -> Region:
         """Renders the region of a view; widens it until it holds all that moves."""
-        key = (view.name, view.camera.width, view.camera.height)
+        key = _key(view)
         region = self._regions.get(key)
         if region is None or region.view is not view:
             # Made anew in each frame: a replay has no frames before, and figures hang on the box by their rounding.
@@ -180,7 +180,7 @@ class ChangedPixels(PictureLoss):
 
     def _base(self, view: TrainingView) -> Array:
         """[4, H, W] of what stands alone."""
-        key = (view.name, view.camera.width, view.camera.height)
+        key = _key(view)
         if key not in self._bases:
             assert self._stood is not None
             picture = self.rasterizer.forward(*self._stood, view.camera, self._background)
@@ -200,7 +200,7 @@ class ChangedPixels(PictureLoss):
         self.image_part, self.mask_part = float(sums[0]), float(sums[1])
         pixels = view.camera.height * view.camera.width
         self.psnr = 10 * log10(3 * pixels / max(float(sums[2]), SMALLEST_SQUARE))
-        key = (view.name, view.camera.width, view.camera.height)
+        key = _key(view)
         self._shown_mean = self._base_means[key] + (part[:3] - base[:3]).sum(axis=(1, 2), dtype=np.float64) / pixels
 
     def _losses(
@@ -244,6 +244,11 @@ def reached(
     marks = np.zeros(tiles_x * tiles_y, np.uint64)
     tiles.mark_blocks(splats, rects, tiles_x, marks)
     return marks
+
+
+def _key(view: TrainingView) -> tuple[str, int, int]:
+    """The camera and the size of its pictures: probe views are of the same cameras, and smaller."""
+    return view.name, view.camera.width, view.camera.height
 
 
 def _tiles(camera: CameraArrays) -> tuple[int, int]:

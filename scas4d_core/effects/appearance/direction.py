@@ -114,7 +114,7 @@ class Direction(Effect):
             if view.name not in chosen:
                 continue
             for which, colours in enumerate((state.colours, colours_seen(state, view.camera))):
-                features = np.concatenate([colours, state.foreground[:, None]], axis=1)
+                features = state.features(colours)
                 seen.picture.measure(state.means, state.factors, state.opacities, features, view)
                 left[which] += 10 ** (-seen.picture.psnr / 10)
         share = float(max(0, 1 - left[1] / max(left[0], 1e-12)))

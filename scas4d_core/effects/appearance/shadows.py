@@ -67,7 +67,7 @@ class ShadowsPart(Part):
         for first in range(min(SUBSETS, len(known))):
             sums, weights = np.zeros((len(state), 3)), np.full(len(state), FEW)
             for view in known[first::SUBSETS]:
-                features = np.concatenate([colours_seen(state, view.camera), state.foreground[:, None]], axis=1)
+                features = state.features(colours_seen(state, view.camera))
                 more, seen = work.picture.residuals(
                     state.means, state.factors, state.opacities, features, view, self._stands
                 )

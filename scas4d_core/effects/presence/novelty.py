@@ -104,7 +104,7 @@ def novelties(
         state: Θ_t, updated to the frame. colours: [N, 3] RGB to render: of the frame before, so that what is new has
             not been painted on what stands. views: of the frame.
     """
-    features = np.concatenate([colours, state.foreground[:, None]], axis=1).astype(np.float32)
+    features = state.features(colours)
     return [_novelty(state, features, view, rig[view.name], picture) for view in views]
 
 
