@@ -119,16 +119,14 @@ class Reconstruction(CommittedScene):
         """
         if not isfinite(frame.time):
             raise ValueError(f"frame {frame.index}: time {frame.time} s must be finite")
-        settings = with_background(settings, frame.images)
-        self = cls(rig, settings, History() if history is None else history)
+        self = cls(rig, with_background(settings, frame.images), History() if history is None else history)
         began, scaled = perf_counter(), self._factory.scaled(frame)
-        result = static or fit_first(
-            scaled, points, self._factory, self.settings, self.world, progress or (lambda _: None)
-        )
+        told = progress or (lambda _: None)
+        result = static or fit_first(scaled, points, self._factory, self.settings, self.world, told)
         self.static = result = replace(result, gaussians=with_reliable_labels(result.gaussians))
         fitted = perf_counter()
         lengths = axis_lengths(result.gaussians)
-        self._fixed = FirstFrame(len(frame.masks) > 0, result.exposures, lengths, settings.scene.behind)
+        self._fixed = FirstFrame(len(frame.masks) > 0, result.exposures, lengths, self.settings.scene.behind)
         self._roots = result.gaussians
         switches, effects = self._preparation.begun(scaled, result)
         self._updater, structure = self._preparation.updater(result.gaussians, switches)

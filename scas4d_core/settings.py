@@ -86,9 +86,7 @@ class SceneSettings(SettingsModel):
     )
     image_scale: float = Field(1.0, gt=0, le=1, description="Pictures are resized by this before anything else.")
     background: tuple[float, float, float] | Literal["auto"] = Field(
-        "auto",
-        description="RGB in 0…1 behind everything. 'auto': the colour of a plain backdrop, as the black of the field's "
-        "captures; in a room the mean colour of the pictures of frame 0, the best guess where no camera has looked.",
+        "auto", description="RGB in 0…1 behind all. 'auto': of a plain backdrop, else the mean of frame 0's pictures."
     )
     near: Positive | Literal["auto"] = Field(
         default="auto",
@@ -96,9 +94,7 @@ class SceneSettings(SettingsModel):
         "pictures tells how it looks right before a camera that is not there, and one stray Gaussian hides all.",
     )
     floor: tuple[float, float, float, float] | None = Field(
-        None,
-        description="Plane (a, b, c, d) of the floor in the user's world; a·x + b·y + c·z + d > 0 lies below it, and "
-        "what moves is kept above. None: the scene has no floor term.",
+        None, description="Plane (a, b, c, d), user's world: a·x + b·y + c·z + d > 0 lies below. None: no floor term."
     )
 
     @property
