@@ -19,7 +19,7 @@ from scas4d_core.cameras import Rig, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.effects.evidence import Seen
 from scas4d_core.effects.switches import switches_of, switches_record
-from scas4d_core.first_frame.start import FirstFrame, fit_first
+from scas4d_core.first_frame.start import FirstFrame, as_begun, fit_first, with_background
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.frame_report import FrameReport, Progress, report_of_first, report_of_update
 from scas4d_core.gaussians import Gaussians
@@ -75,7 +75,7 @@ class Reconstruction(CommittedScene):
         super().__init__(history, world, limits := scene_limits(settings.scene.near, self.rig.radius))
         self.settings, self._update = settings, settings.update
         self._factory = ViewFactory(self.rig, None if scale == 1.0 else rig)
-        self._picture = PictureLoss(self._factory, settings.scene.background, 1.0, 0.0, limits=limits)
+        self._picture = PictureLoss(self._factory, settings.scene.behind, 1.0, 0.0, limits=limits)
         self._preparation = Preparation(self._factory, self.settings, self.world, self._picture)
         self.populates = True
         self.static: StaticResult | None = None
@@ -119,18 +119,18 @@ class Reconstruction(CommittedScene):
         """
         if not isfinite(frame.time):
             raise ValueError(f"frame {frame.index}: time {frame.time} s must be finite")
-        self = cls(rig, settings, History() if history is None else history)
-        began = perf_counter()
-        result = static or fit_first(
-            self._factory.scaled(frame), points, self._factory, settings, self.world, progress or (lambda _: None)
-        )
+        self = cls(rig, with_background(settings, frame.images), History() if history is None else history)
+        began, scaled = perf_counter(), self._factory.scaled(frame)
+        told = progress or (lambda _: None)
+        result = static or fit_first(scaled, points, self._factory, self.settings, self.world, told)
         self.static = result = replace(result, gaussians=with_reliable_labels(result.gaussians))
         fitted = perf_counter()
-        self._fixed = FirstFrame(len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians))
+        lengths = axis_lengths(result.gaussians)
+        self._fixed = FirstFrame(len(frame.masks) > 0, result.exposures, lengths, self.settings.scene.behind)
         self._roots = result.gaussians
-        switches, effects = self._preparation.begun(self._factory.scaled(frame), result)
+        switches, effects = self._preparation.begun(scaled, result)
         self._updater, structure = self._preparation.updater(result.gaussians, switches)
-        seen = self._factory.views(self._factory.scaled(frame), {}, False) if self._learns_labels else ()
+        seen = self._factory.views(scaled, {}, False) if self._learns_labels else ()
         load = {} if started is None else {"load": began - started}
         seconds = {**load, "fit": fitted - began, "prepare": perf_counter() - fitted}
         report = report_of_first(frame, result, self.rig.names, len(self._updater.hierarchy.rows), seconds, dropped)
@@ -160,7 +160,7 @@ class Reconstruction(CommittedScene):
         """
         if history.directory is None or not history.indices:
             raise ResumeError("the history holds no committed frame; start the scene with its first frame")
-        self = cls(rig, settings, history)
+        self = cls(rig, as_begun(settings, history), history)
         assert self._checkpoints is not None
         try:
             self._fixed = FirstFrame.of(history)
@@ -195,7 +195,7 @@ class Reconstruction(CommittedScene):
             HistoryError: the frame or the first one cannot be read.
         """
         copy = history.copied((history.indices[0], index))
-        self = cls(rig, settings, copy)
+        self = cls(rig, as_begun(settings, copy), copy)
         self._fixed = FirstFrame.of(copy)
         self._go_on(index, self._cold(index))
         return self

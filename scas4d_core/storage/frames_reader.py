@@ -39,6 +39,7 @@ class FramesReader:
         self._files = None if directory is None else FrameFiles(directory)
         self.damaged: dict[int, str] = {}
         self._fixed: Arrays = {}
+        self._background: tuple[float, float, float] | None = None
         self._times: dict[int, float] = {}
         self._reports: dict[int, dict[str, Any]] = {}
         self._stamps: dict[int, Stamp] = {}
@@ -163,6 +164,18 @@ class FramesReader:
         if index in self._frames:
             self._texts[index] = text
         return report
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """RGB in 0…1 behind everything, which frame 0 has found; black where its report has none.
+
+        Raises:
+            HistoryError: its file is damaged, and the copy as well.
+        """
+        if self._background is None and self._times:
+            red, green, blue = self.report(next(iter(self._times))).get("background", (0.0, 0.0, 0.0))
+            self._background = (red, green, blue)
+        return self._background or (0.0, 0.0, 0.0)
 
     def _events(self) -> Int:
         """[E, 4] the log of the newest frame that can be read."""

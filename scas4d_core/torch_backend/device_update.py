@@ -79,7 +79,7 @@ class DeviceUpdate:
         self._factory = factory
         limits = scene_limits(scene.near, factory.rig.radius)
         parts = parts or joined(PartsBuilder(scene, settings, factory, hierarchy, first))
-        self._picture = PictureLoss(factory, scene.background, schedule.IMAGE_WEIGHT, parts.mask, limits=limits)
+        self._picture = PictureLoss(factory, scene.behind, schedule.IMAGE_WEIGHT, parts.mask, limits=limits)
         self._freedom = parts.freedom
         bounds = length_bounds(hierarchy, first)
         self._deformation = CpuDeformation(hierarchy, neighbours, bounds, settings.cluster_map, settings.covariance)
@@ -92,7 +92,7 @@ class DeviceUpdate:
             weights=_weights(parts, neighbours is not None),
             terms=tuple(part.twin for part in parts.parts),
             max_scale=deformation.MAX_SCALE,
-            background=scene.background,
+            background=scene.behind,
             cluster_map=settings.cluster_map,
             covariance=settings.covariance,
             near=limits.near,

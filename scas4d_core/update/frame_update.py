@@ -84,7 +84,7 @@ class FrameUpdate:
         self._hooks, self._length, self._freedom = Hooks(parts.parts), parts.length, parts.freedom
         self._rates = freed(Rates.of(settings, len(hierarchy.sizes), factory.rig.radius), parts.freedom)
         limits = scene_limits(scene.near, factory.rig.radius)
-        given = (factory, scene.background, schedule.IMAGE_WEIGHT, parts.mask)
+        given = (factory, scene.behind, schedule.IMAGE_WEIGHT, parts.mask)
         self._picture = PictureLoss(*given, limits=limits)
         if not parts.whole and len(hierarchy.rows) <= MOST * len(first):
             self._picture = ChangedPixels(*given, hierarchy.rows, len(first), limits)

@@ -66,7 +66,7 @@ class Catching(Part):
             from scas4d_core.update.picture_loss import PictureLoss
 
             limits = scene_limits(self._scene.near, self._factory.rig.radius)
-            self._picture = PictureLoss(self._factory, self._scene.background, 1.0, 0.0, limits=limits)
+            self._picture = PictureLoss(self._factory, self._scene.behind, 1.0, 0.0, limits=limits)
         return self._picture
 
 
