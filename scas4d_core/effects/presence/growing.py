@@ -97,10 +97,15 @@ def settled(
     """The state with means, factors and colours of some rows fitted to the views; opacities stay for ever.
 
     Args:
-        rows: of young Gaussians: their hull was rough, and their first update as well.
+        rows: of young Gaussians: their hull was rough, and their first update as well. What is glossy, and came back as
+            itself, is left as it is: more is seen of it than its colours, which alone are fitted.
     """
     from scas4d_core.first_frame import initial_gaussians as made
 
+    if state.gloss is not None:  # those born later have none
+        rows = rows[rows >= len(state.gloss)]
+    if not len(rows):
+        return state
     mine, others = state.rows(rows), state.retire(rows)
     sides, lengths, axes = np.linalg.svd(mine.factors.astype(np.float64))
     handed = np.sign(np.linalg.det(sides))
@@ -157,6 +162,8 @@ class _Fit:
                 self._crops.append(self._crop(state, rows, factory.cropped(view, *box)))
 
     def _crop(self, state: Gaussians, rows: Int, view: TrainingView) -> _Crop:
+        from scas4d_core.rasterize.shading import features_seen  # it loads the kernels
+
         n = len(rows)
         count = n + len(self._parameters)
         made = _Crop(
@@ -165,7 +172,7 @@ class _Fit:
         )  # fmt: skip
         made.means[:n], made.factors[:n] = state.means[rows], state.factors[rows]
         made.opacities[:n] = state.opacities[rows]
-        made.features[:n, :3], made.features[:n, 3] = state.colours[rows], state.foreground[rows]
+        made.features[:n] = features_seen(state.rows(rows), view.camera)
         return made
 
     def run(self, iterations: int, rng: np.random.Generator, opacities: bool = True) -> None:
