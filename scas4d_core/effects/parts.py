@@ -43,7 +43,8 @@ class Work:
     Attributes:
         previous: Θ_{t−1}. deformation: has taken it. rates: of this attempt. views: that it learns from.
         picture: renders them.
-        colours: [N, 3] RGB now. features: [N, 4] as they are rendered, RGB and label.
+        colours: [N, 3] RGB now. gloss, environment: now, where a part learns them; else those of Θ_{t−1}.
+        features: [N, 4] as they are rendered, RGB and label.
         sample: entries of the hierarchy's order whose neighbours this iteration looks at.
         gradients: of the pictures of the iteration; parts add to them. carried: arrays that the part left at the frame
             before, by effect; replaced by those for the frame after.
@@ -68,7 +69,13 @@ class Work:
         self.previous, self.deformation, self.rates, self.views = previous, deformation, rates, views
         self.picture, self.carried = picture, carried
         self.colours = previous.colours.copy()
+        self.gloss, self.environment = previous.gloss, previous.environment
         self.features = previous.features(previous.colours)
+
+    @property
+    def look(self) -> Gaussians:
+        """Θ_{t−1}, unmoved, with what has been learnt of its looks so far."""
+        return self.previous.replace(colours=self.colours, gloss=self.gloss, environment=self.environment)
 
 
 class Part:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scas4d_core.effects.parts import Arrays
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.rasterize.shading import features_seen
 from scas4d_core.robust import outliers
 from scas4d_core.robust.checks import EXPOSURE, evened, gain_of, relit, validated
 from scas4d_core.robust.outliers import Past
@@ -300,9 +301,9 @@ class FrameSolver:
 
     def _measured(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
         """DB of cameras as a state shows them; those that are left out come back so, once they fit."""
-        features = state.features(state.colours)
         found = {}
         for view in views:
+            features = features_seen(state, view.camera)
             self._picture.measure(state.means, state.factors, state.opacities, features, view)
             found[view.name] = self._picture.psnr
         return found

@@ -153,7 +153,7 @@ class DeviceUpdate:
         trace.cameras = {view.name: camera_fit(psnr) for view, psnr in zip(chain(*pictures), found.psnr, strict=False)}
         _take(deformation, Tables.of(hierarchy, found))
         trace.errors = best.errors
-        trace.kept = best.end(found.gaussians.colours, trace.iterations, {})
+        trace.kept = best.end(found.gaussians, trace.iterations, {})
         watch.lap("end")
         state = found.gaussians if trace.kept is Candidate.END else previous
         if trace.kept is Candidate.WARM:

@@ -151,11 +151,11 @@ class FrameUpdate:
                 work.views = [view for view in views if view.name not in trace.left_out]
                 watch.lap("judge")
             if stopping.looks(trace.iterations):
-                stopping.saw(trace.iterations, best.error(work.colours))
+                stopping.saw(trace.iterations, best.error(work.look))
                 watch.lap("looks")
         deformation.forward()
         trace.planned, trace.errors = stopping.planned_so_far, best.errors
-        trace.kept = work.kept = best.end(work.colours, trace.iterations, trace.left_out)
+        trace.kept = work.kept = best.end(work.look, trace.iterations, trace.left_out)
         watch.lap("end")
         state = previous if work.kept is Candidate.STILL else self._commit(previous)
         for end in self._hooks.end:

@@ -55,7 +55,7 @@ class ShadowsPart(Part):
         """Steps them, where the end of the update is what is kept."""
         if work.kept is not Candidate.END or not self._stands.any() or work.rates.colour_standing == 0:
             return state
-        from scas4d_core.rasterize.shading import colours_seen  # it loads the kernels
+        from scas4d_core.rasterize.shading import features_seen  # it loads the kernels
 
         before: Arrays = work.carried.get(NAME, {})
         known = [view for view in work.views if view.name in before]
@@ -67,7 +67,7 @@ class ShadowsPart(Part):
         for first in range(min(SUBSETS, len(known))):
             sums, weights = np.zeros((len(state), 3)), np.full(len(state), FEW)
             for view in known[first::SUBSETS]:
-                features = state.features(colours_seen(state, view.camera))
+                features = features_seen(state, view.camera)
                 more, seen = work.picture.residuals(
                     state.means, state.factors, state.opacities, features, view, self._stands
                 )

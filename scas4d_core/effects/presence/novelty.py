@@ -104,8 +104,10 @@ def novelties(
         state: Θ_t, updated to the frame. colours: [N, 3] RGB to render: of the frame before, so that what is new has
             not been painted on what stands. views: of the frame.
     """
-    features = state.features(colours)
-    return [_novelty(state, features, view, rig[view.name], picture) for view in views]
+    from scas4d_core.rasterize.shading import features_seen  # it loads the kernels
+
+    shown = state.replace(colours=colours)
+    return [_novelty(state, features_seen(shown, view.camera), view, rig[view.name], picture) for view in views]
 
 
 def _novelty(state: Gaussians, features: Array, view: TrainingView, camera: Camera, picture: PictureLoss) -> Novelty:
