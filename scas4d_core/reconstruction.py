@@ -18,7 +18,7 @@ from numba import get_num_threads
 from scas4d_core.cameras import Rig, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.effects.evidence import Seen
-from scas4d_core.effects.switches import switches_of, switches_record
+from scas4d_core.effects.switches import kept_of, switches_record
 from scas4d_core.first_frame.start import FirstFrame, fit_first
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.frame_report import FrameReport, Progress, report_of_first, report_of_update
@@ -30,7 +30,7 @@ from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import FrameSolver, UpdateInput
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.storage.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, find_commit
+from scas4d_core.storage.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, cold_start, find_commit
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.structure.motion_mask import labelled, with_reliable_labels
 from scas4d_core.torch_backend.device import require_device
@@ -167,7 +167,7 @@ class Reconstruction(CommittedScene):
         except (HistoryError, KeyError) as error:
             raise ResumeError(f"the first frame, which every update needs, cannot be read ({error})") from error
         index, left, faults = find_commit(history, self._checkpoints, self._factory, held)
-        same = self._go_on(index, self._cold(index) if left is None else left)
+        same = self._go_on(index, cold_start(history, index, self._fixed.masked) if left is None else left)
         if left is not None and not same:
             faults.append("clusters came out otherwise than before: the next update starts without a motion")
         self.resumed = ResumePoint(index, history.cut(index), faults, cold=left is None or not same)
@@ -197,7 +197,7 @@ class Reconstruction(CommittedScene):
         copy = history.copied((history.indices[0], index))
         self = cls(rig, settings, copy)
         self._fixed = FirstFrame.of(copy)
-        self._go_on(index, self._cold(index))
+        self._go_on(index, cold_start(copy, index, self._fixed.masked))
         return self
 
     def _go_on(self, index: int, carried: CarryOver) -> bool:
@@ -208,12 +208,6 @@ class Reconstruction(CommittedScene):
 
     def _take_roots(self, roots: Gaussians) -> None:
         self._roots, self._fixed = roots, replace(self._fixed, lengths=axis_lengths(roots))
-
-    def _cold(self, index: int) -> CarryOver:
-        """The carry-over of a committed frame as far as its state and report have it: labels learnt, switches."""
-        moving = self.history.gaussians(index).foreground > 0.5
-        labels = None if self._fixed.masked or moving.all() else moving
-        return CarryOver(labels=labels, switches=switches_of(self.history.report(index).get("effects", {})))
 
     def step(
         self,
@@ -342,7 +336,8 @@ class Reconstruction(CommittedScene):
         seconds = report.seconds  # a record cannot tell its own writing: it has that of the one before
         seconds[REPORT] = seconds.get(REPORT, 0.0) + self.history.record_seconds + perf_counter() - began
         record["seconds"] = dict(seconds)
-        self.history.append(report.index, report.time, gaussians, record, **birth)
+        kept = kept_of(carried.effects) if self.history.indices else carried.effects
+        self.history.append(report.index, report.time, gaussians, record, effects=kept, **birth)
         if birth:
             self._take_roots(self.history.roots())
         self._carried, self.report = carried, report

@@ -40,6 +40,8 @@ class Effect:
         cost: of an update with it, against one without.
         auto: whether it waits for evidence; else it is on wherever it is not refused.
         on_above, off_below: share of ``Evidence`` from which it is switched on, and below which it is switched off.
+        kept: names of its arrays in ``work.carried`` that are committed with each frame: a cold start, without a
+            checkpoint, has these, and those of ``began``. They are small.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Effect:
     auto: bool = False
     on_above: float = 0.0
     off_below: float = 0.0
+    kept: tuple[str, ...] = ()
 
     def always(self, settings: Settings) -> bool:
         """True where it is on in every scene with these settings, and waits for no evidence."""

@@ -134,6 +134,13 @@ def began(switches: Switches, settings: Settings, seen: Seen) -> dict[str, Array
     return found
 
 
+def kept_of(carried: Mapping[str, Arrays]) -> dict[str, Arrays]:
+    """The arrays that are committed with a frame after the first, of those that the effects leave, by effect."""
+    known = {name: own for name, own in carried.items() if name in EFFECTS}
+    kept = {name: {key: own[key] for key in effect(name).kept if key in own} for name, own in known.items()}
+    return {name: own for name, own in kept.items() if own}
+
+
 def switched_by(found: Mapping[str, Arrays], switches: Switches, seen: Seen) -> dict[str, Switch]:
     """The switches after the first frame.
 

@@ -194,4 +194,5 @@ EFFECT = CameraGain(
     auto=True,
     on_above=0.04,
     off_below=0.02,
+    kept=("gains",),
 )

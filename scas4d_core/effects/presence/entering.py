@@ -219,4 +219,5 @@ EFFECT = Entering(
     auto=True,
     on_above=SHARE,
     off_below=WORTH,
+    kept=tuple(NOBODY),
 )

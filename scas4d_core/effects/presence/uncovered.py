@@ -105,4 +105,5 @@ EFFECT = UncoveredEffect(
     auto=True,
     on_above=SHARE,
     off_below=WORTH,
+    kept=("share",),
 )
