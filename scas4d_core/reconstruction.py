@@ -17,7 +17,7 @@ from numba import get_num_threads
 
 from scas4d_core.cameras import Rig, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
-from scas4d_core.effects.evidence import Seen
+from scas4d_core.effects.evidence import FitTime, Seen
 from scas4d_core.effects.switches import kept_of, switches_record
 from scas4d_core.first_frame.start import FirstFrame, fit_first
 from scas4d_core.first_frame.static_scene import StaticResult
@@ -266,19 +266,23 @@ class Reconstruction(CommittedScene):
             result = replace(result, gaussians=self.history.newest, motion=carried.motion, carried=carried.effects)
         how = {"cold": given.motion is None, "relabelled": updater is not self._updater, **(notes or {})}
         carried = carried.after(result, past, frame.time, believed if self._learns_labels else None, shown)
-        roots = self._roots
+        roots, fits = self._roots, FitTime(self._budget.end_of_births(watch.began))
         if result.outcome.learnt and result.exposure == 1.0:  # in a light that is taken out again much looks new
             learnt = [view for view in believed if view.name not in result.trace.left_out]
             room = room_for_births(len(self.history.first), len(result.gaussians))
-            seen = Seen(frame.index, given.state, result, self.rig, learnt, self._picture, room)
+            seen = Seen(frame.index, given.state, result, self.rig, learnt, self._picture, room, fits)
             populates, follow = self.populates and exposure == 1.0, self._preparation.followed
             result, updater, carried, roots = follow(updater, carried, seen, roots, populates)
+            self._budget.births = bool(fits.spent or fits.put_off)
             watch.lap("presence")
-        report = report_of_update(frame, result, self.history.newest, left_out, self.rig.names, watch, dropped)
+        report = report_of_update(
+            frame, result, self.history.newest, left_out, self.rig.names, watch, dropped, fits.put_off
+        )
         birth = {} if roots is self._roots else {"roots": roots, "joins": result.joins}
         self._commit(report, result.gaussians, carried, how, **birth)
         self._updater = updater
-        commit = solver.judging + perf_counter() - watch.began - watch.total
+        commit = solver.judging + watch.seconds.get("presence", 0.0) - fits.spent
+        commit += perf_counter() - watch.began - watch.total
         self._budget.learn(result.trace.moments, result.trace.seconds, commit)
         return report
 

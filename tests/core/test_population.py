@@ -15,12 +15,16 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.effects import effect as effect_module
+from scas4d_core.effects.evidence import Seen
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.remake import remake
+from scas4d_core.robust.solve_frame import FrameSolver, Solved, UpdateInput
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings
 from scas4d_core.storage.births import Life
 from scas4d_core.storage.history import History
+from scas4d_core.update.result import UpdateResult
+from scas4d_core.update.schedule import FOR_BIRTHS
 from scas4d_core.update.warm_start import Motion, motion_between, warm_start
 
 BOX = make_box()
@@ -178,6 +182,34 @@ def test_an_effect_that_breaks_the_rules_is_named(
     )
     with pytest.raises(ValueError, match="rows were lost or moved"):
         scene.step(FRAMES[True][1])
+    effect_module.effect.cache_clear()
+
+
+def test_births_have_their_time_in_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    ends, asked = [], FrameSolver.run
+
+    def run(self: FrameSolver, given: UpdateInput, repeated: bool = False) -> Solved:
+        assert given.end is not None
+        ends.append(given.end)
+        return asked(self, given, repeated)
+
+    def populated(seen: Seen) -> UpdateResult:
+        assert seen.time.end is not None
+        ends.append(seen.time.end)
+        if seen.index == 2:
+            seen.time.put_off.append("a ball was not born")
+        return seen.result
+
+    monkeypatch.setattr(FrameSolver, "run", run)
+    install(monkeypatch, populated)
+    scene = start(History(), masks=True, settings=SETTINGS)
+    scene.set_budget(budget_ms=1000.0)
+    reports = [scene.step(frame) for frame in FRAMES[True][1:5]]
+    assert [report.put_off for report in reports] == [[], ["a ball was not born"], [], []]
+    assert scene.history.report(2)["put_off"] == ["a ball was not born"]
+    assert all("presence" in report.seconds for report in reports)
+    left = [births - iterations for iterations, births in zip(ends[::2], ends[1::2], strict=True)]
+    assert left == pytest.approx([0, 0, FOR_BIRTHS, 0], abs=1e-6)
     effect_module.effect.cache_clear()
 
 

@@ -173,7 +173,7 @@ class Entering(Effect):
         young = left["age"] < SETTLED
         settling = left["rows"][young & state.present[left["rows"]]]
         if len(settling):
-            state = settled(state, settling, seen.views, seen.rig, seen.picture, rng)
+            state = settled(state, settling, seen.views, seen.rig, seen.picture, rng, seen.time)
         arrays = {**left, **{name: NOBODY[name] for name in OF_THE_YOUNG}, "age": left["age"] + 1}
         joins = result.joins
         grown_up = left["rows"][(left["age"] == SETTLED) & state.present[left["rows"]]]
@@ -190,8 +190,11 @@ class Entering(Effect):
         if found is not None:
             points, colours = seeds(found.seen, found.hull, min(int(BUDGET * len(state)), seen.room), rng)
             found = found if len(points) else None
+        born = None
         if found is not None:
-            born = grown(state, points, colours, seen.views, seen.rig, seen.picture, rng, moves=True)
+            given = seen.views, seen.rig, seen.picture, rng
+            born = grown(state, points, colours, *given, moves=True, time=seen.time)
+        if found is not None and born is not None:
             rows = np.arange(len(state), len(state) + len(born))
             state = state.joined(born)
             arrays |= _remembered(found, state, rows, arrays)

@@ -75,9 +75,10 @@ class UncoveredEffect(Effect):
             return result
         if len(some) > most:
             some = np.sort(rng.choice(some, most, replace=False))
-        born = grown(
-            state, points.points[some], points.colours[some], seen.views, seen.rig, seen.picture, rng, moves=False
-        )
+        given = seen.views, seen.rig, seen.picture, rng
+        born = grown(state, points.points[some], points.colours[some], *given, moves=False, time=seen.time)
+        if born is None:
+            return result
         joins = np.full(len(born), -1, np.int64)
         left = result.carried.get(NAME)
         arrays: Arrays = {"share": np.array(share if left is None else max(share, float(left["share"])))}

@@ -7,6 +7,7 @@ import pytest
 from effect_cases.glossy_ball import COUNT, frame, rig, sphere
 from scipy.spatial import cKDTree
 
+from scas4d_core.effects.evidence import FitTime
 from scas4d_core.effects.parts import PartsBuilder
 from scas4d_core.effects.presence.growing import _Fit, settled
 from scas4d_core.effects.presence.novelty import novelties
@@ -122,7 +123,7 @@ def test_what_is_glossy_and_came_back_is_not_settled() -> None:
     grown = BALL.joined(Gaussians.of_points(BALL.means[:5] + np.float32(0.02), 0.01))
     rng = np.random.default_rng(0)
     rows = np.array([3, 4, COUNT + 1])
-    after = settled(grown, rows, views(), rig(), PICTURE, rng)
+    after = settled(grown, rows, views(), rig(), PICTURE, rng, FitTime())
     assert np.array_equal(after.means[:COUNT], grown.means[:COUNT])
     assert not np.array_equal(after.means[COUNT + 1], grown.means[COUNT + 1])
-    assert settled(grown, rows[:2], views(), rig(), PICTURE, rng) is grown
+    assert settled(grown, rows[:2], views(), rig(), PICTURE, rng, FitTime()) is grown
