@@ -93,7 +93,7 @@ class Part:
         """Called before the first iteration of an attempt."""
 
     def show(self, work: Work, view: TrainingView) -> None:
-        """Called before a view is rendered: may change ``work.features`` and the view's exposure."""
+        """Called before a view is rendered: may change ``work.features``, and the view's exposure (``exposes``)."""
 
     def saw(self, work: Work, view: TrainingView, picture: PictureLoss, gradients: Gradients) -> None:
         """Called with the gradients of a view: reads its own, and turns those of features into those of colours."""
@@ -121,7 +121,7 @@ class PartsBuilder:
     Attributes:
         scene, update: the settings, the floor inside. factory: of the scene's views. hierarchy: of the moving.
         first: the roots, Θ_0 with all born since (``preparation``). whole: whether a part needs whole pictures: it
-            changes what stands, or how a camera sees it.
+            changes what stands, or how a camera sees it. exposes: whether a part changes the exposures of views.
         length: weight of the limit of the axes' lengths, which the cascade's kernel has in itself.
         mask: weight of the term of masks, which the comparison of pictures has in itself. learns_labels: whether what
             moves is learnt from motion where no masks are given.
@@ -135,6 +135,7 @@ class PartsBuilder:
     hierarchy: Hierarchy
     first: Gaussians
     whole: bool = False
+    exposes: bool = False
     length: float = 0.0
     mask: float = 0.0
     learns_labels: bool = False

@@ -162,7 +162,7 @@ class DeviceUpdate:
         motion_found = Motion.of(deformation, best.seconds)
         watch.lap("commit")
         trace.seconds = watch.seconds
-        return UpdateResult(state, motion_found, trace, carried=dict(carried))
+        return UpdateResult(state, motion_found, trace, carried=dict(carried), views=views)
 
     def _on_device(self, view: TrainingView) -> TorchView:
         """The view as ``TorchUpdate`` takes it."""

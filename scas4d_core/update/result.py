@@ -164,7 +164,7 @@ class UpdateResult:
         attempts: each attempt at the frame, with what came of it.
         exposure: times that the frame is brighter than usual.
         offsets: dB by camera above (+) or below its usual place among the cameras; empty where nothing was rendered.
-        carried: arrays for the next update, by effect.
+        carried: arrays for the next update, by effect. views: that were learnt from, with the exposures of the end.
         joins: [B] int64 of the Gaussians born in this frame, which are the last rows: the row of the founder that each
             joins in the hierarchy and the graph, or −1 where it starts a structure of its own. None: none is born.
     """
@@ -180,4 +180,5 @@ class UpdateResult:
     exposure: float = 1.0
     offsets: Mapping[str, float] = field(default_factory=dict)
     carried: Mapping[str, Arrays] = field(default_factory=dict)
+    views: Sequence[TrainingView] = ()
     joins: NDArray[np.int64] | None = None

@@ -181,7 +181,7 @@ class CameraGain(Effect):
 
     def join(self, builder: PartsBuilder) -> None:
         """Adds the gains; they are read off whole pictures."""
-        builder.whole = True
+        builder.whole = builder.exposes = True
         builder.parts.append(CameraGains(builder))
 
 
