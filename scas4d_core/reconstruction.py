@@ -268,7 +268,7 @@ class Reconstruction(CommittedScene):
         carried = carried.after(result, past, frame.time, believed if self._learns_labels else None, shown)
         roots, fits = self._roots, FitTime(self._budget.end_of_births(watch.began))
         if result.outcome.learnt and result.exposure == 1.0:  # in a light that is taken out again much looks new
-            learnt = [view for view in believed if view.name not in result.trace.left_out]
+            learnt = [view for view in result.views or believed if view.name not in result.trace.left_out]
             room = room_for_births(len(self.history.first), len(result.gaussians))
             seen = Seen(frame.index, given.state, result, self.rig, learnt, self._picture, room, fits)
             populates, follow = self.populates and exposure == 1.0, self._preparation.followed

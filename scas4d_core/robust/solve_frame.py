@@ -291,7 +291,7 @@ class FrameSolver:
         with self._timed():
             # Short updates render a camera long before their end: one that does not fit is looked at once more.
             off = outliers.misfits(given.past, psnr, outliers.LAST_DB)
-            again = [view for view in given.views if view.name in off]
+            again = [view for view in result.views or given.views if view.name in off]
             psnr |= self._measured([*again, *given.suspects], result.gaussians)
         past = outliers.settle(given.past, psnr, given.brightness, result.exposure, len(trace.losses))
         if trace.errors.get(Candidate.END):

@@ -6,6 +6,7 @@ The loop is ``FrameUpdate.run``: deform, render and compare, tie neighbours, car
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -62,7 +63,7 @@ class FrameUpdate:
     """The ``Updater`` of the CPU; buffers are kept from frame to frame.
 
     Attributes:
-        tells: whether figures that the report alone needs are worked out; the state is the same without.
+        tells: whether figures that the report alone needs are worked out; state and evidence are the same without.
     """
 
     tells = True
@@ -82,6 +83,7 @@ class FrameUpdate:
         self._factory = factory
         parts = parts or joined(PartsBuilder(scene, settings, factory, hierarchy, first))
         self._hooks, self._length, self._freedom = Hooks(parts.parts), parts.length, parts.freedom
+        self._exposes = parts.exposes
         self._rates = freed(Rates.of(settings, len(hierarchy.sizes), factory.rig.radius), parts.freedom)
         limits = scene_limits(scene.near, factory.rig.radius)
         given = (factory, scene.behind, schedule.IMAGE_WEIGHT, parts.mask)
@@ -104,6 +106,8 @@ class FrameUpdate:
         """Find D_t and apply it, see ``Updater.run``."""
         settings, deformation = self.settings, self._deformation
         motion = predicted(motion, self._freedom)
+        if self._exposes:  # another attempt at the frame starts from the exposures that it came with
+            views = [replace(view, exposure=view.exposure.copy()) for view in views]
         stopping = options.stopping or Stopping(settings.iterations)
         rng = np.random.default_rng([settings.seed, seed])
         watch, trace = Stopwatch(), UpdateTrace()
@@ -166,7 +170,7 @@ class FrameUpdate:
         trace.guards = {name: count for name, count in acted.items() if count}
         watch.lap("commit")
         trace.seconds = watch.seconds
-        return UpdateResult(state, found, trace, carried=work.carried)
+        return UpdateResult(state, found, trace, carried=work.carried, views=views)
 
     def _attempted(self, options: AttemptOptions, cold: bool) -> Rates:
         """The rates of an attempt; without a motion to start from there is further to go."""
@@ -186,7 +190,7 @@ class FrameUpdate:
             for saw in self._hooks.saw:
                 saw(work, view, picture, found)
             loss += picture.image_part + picture.mask_part
-            trace.see(view, picture, self.tells)
+            trace.see(view, picture)
             watch.lap(REPORT)
             if len(views) == 1:
                 work.gradients = found
