@@ -33,14 +33,14 @@ SAMPLE = 4000
 PATCH = 40
 """Gaussians of a patch beside its middle: positions of fewer are too noisy to tell a turn."""
 PATCHES = 400
-"""At most: the evidence is a median over them."""
+"""Or up to twice as many: the evidence is a median over them."""
 AROUND = 19
 """Patches that a patch is compared with, the nearest: with it a twentieth of what moves."""
 REST = 1e-3
 """Of the size of what moves: where nine tenths of it move less in a frame, the frame says nothing."""
 
 # Thresholds, in radians: from 0.030 while `cloth` swings and the effect is off, backwards and with half of the cameras
-# too, from 0.05 while it is on; in all other captures 0.002 at most while it is off, 0.014 with rotation pinned off.
+# too, from 0.037 while it is on; in all other captures 0.004 at most while it is off, 0.014 with rotation pinned off.
 
 Double = NDArray[np.float64]
 
@@ -83,7 +83,7 @@ def bend(before: Gaussians, after: Gaussians) -> float | None:
         return None
     patches = cKDTree(old).query(middles, k=PATCH + 1)[1]
     turns, rest = turns_of(old[patches], new[patches])
-    around = cKDTree(middles).query(middles, k=AROUND + 1)[1][:, 1:]
+    around = np.asarray(cKDTree(middles).query(middles, k=AROUND + 1)[1])[:, 1:]
     cosines = (np.einsum("pkij,pij->pk", turns[around], turns) - 1) / 2
     angles = np.median(np.arccos(np.clip(cosines, -1, 1)), axis=1)
     return float(np.median(angles - rest))
