@@ -170,15 +170,15 @@ class UpdateTrace:
         """DB by camera, when last rendered."""
         return {name: fit["psnr"] for name, fit in self.cameras.items()}
 
-    def see(self, view: TrainingView, picture: PictureLoss, shifts: bool, left: int) -> None:
-        """Note a view that was rendered and compared.
+    def see(self, view: TrainingView, picture: PictureLoss, left: int) -> None:
+        """Note a view that was rendered and compared; its colour shift is evidence for gains of cameras, too.
 
         Args:
-            shifts: with the colour shift, for the report alone. left: iterations that are planned after this one.
+            left: iterations that are planned after this one.
         """
         self.psnr.append(picture.psnr)
         self.first.setdefault(view.name, picture.psnr)
-        self.cameras[view.name] = camera_fit(picture.psnr, picture.colour_shift(view) if shifts else None)
+        self.cameras[view.name] = camera_fit(picture.psnr, picture.colour_shift(view))
         if left < SHOWN:
             self.shown.pop(view.name, None)
             self.shown[view.name] = _thinned(*picture.shown(view))
@@ -199,7 +199,7 @@ class UpdateResult:
         attempts: each attempt at the frame, with what came of it.
         exposure: times that the frame is brighter than usual.
         offsets: dB by camera above (+) or below its usual place among the cameras; empty where nothing was rendered.
-        carried: arrays for the next update, by effect.
+        carried: arrays for the next update, by effect. views: that were learnt from, with the exposures of the end.
         joins: [B] int64 of the Gaussians born in this frame, which are the last rows: the row of the founder that each
             joins in the hierarchy and the graph, or −1 where it starts a structure of its own. None: none is born.
     """
@@ -215,4 +215,5 @@ class UpdateResult:
     exposure: float = 1.0
     offsets: Mapping[str, float] = field(default_factory=dict)
     carried: Mapping[str, Arrays] = field(default_factory=dict)
+    views: Sequence[TrainingView] = ()
     joins: NDArray[np.int64] | None = None

@@ -1,4 +1,4 @@
-"""`scripts/bench quality`, `refit`, `effects`, `targets`, `table` and `processors`."""
+"""`scripts/bench quality`, `refit`, `effects`, `switches`, `targets`, `table` and `processors`."""
 
 from __future__ import annotations
 
@@ -129,6 +129,23 @@ def effects(
         changes=changes or (),
         again=again,
     )
+
+
+def switches(
+    captures: Captures,
+    out: Study = QUALITY,
+    updates: Annotated[int, typer.Option(min=1, help="Of each capture, played forwards and backwards.")] = 50,
+    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed, default 0. May be repeated.")] = None,
+    again: Again = False,
+    changes: Changes = None,
+) -> None:
+    """Updates captures for a while, and says which effects are switched on and off, and when.
+
+    Leaves switches.md in the study's folder; a capture that was played is not played again.
+    """
+    from studies.quality.switches import run
+
+    run(captures, out, updates=updates, seeds=seed or (0,), changes=changes or (), again=again)
 
 
 def targets(

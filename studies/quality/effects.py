@@ -26,7 +26,7 @@ from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from scas4d_core.warm_up import warm_up_elsewhere
 from studies.machine import core_version, machine
-from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
+from studies.quality.first_frame import first_of
 from studies.quality.settings import settings_of
 
 Pins = Mapping[str, str]
@@ -169,7 +169,7 @@ def _compared(capture: Capture, folder: Path, out: Path, settings: Settings, pin
     wall, cpu = np.zeros((2, count - 1)), np.zeros((2, count - 1))
     taken: tuple[Pins, Pins] = ({}, pins)
     for one, removed in zip(given, taken, strict=True):
-        first: dict[str, Any] = {"points": capture.points, "static": _first(capture, out, one)}
+        first: dict[str, Any] = {"points": capture.points, "static": first_of(capture, out, one)}
         with without(removed):
             scenes.append(Reconstruction.start(capture.rig, capture.frame(0), one, **first))
     truth, same = open_capture(folder, image_scale=settings.scene.image_scale), True
@@ -202,21 +202,6 @@ def _compared(capture: Capture, folder: Path, out: Path, settings: Settings, pin
         "same_bits": "yes" if same else "no",
         "gaussians": 0 if report is None else report.gaussians,
     }
-
-
-def _first(capture: Capture, out: Path, settings: Settings) -> Any:
-    """Frame 0, fitted once for all variants; gloss is a part of it, so that is pinned for frame 0 as well."""
-    key = first_frame_key(capture, settings)
-    gloss = settings.effects.get("direction", "auto")
-    path = out / "first" / f"{key}{'' if gloss == 'auto' else f'-direction-{gloss}'}.npz"
-    found = load_first_frame(path)
-    if found is not None:
-        return found[0]
-    began = perf_counter()
-    scene = Reconstruction.start(capture.rig, capture.frame(0), settings, points=capture.points)
-    assert scene.static is not None
-    save_first_frame(path, scene.static, perf_counter() - began)
-    return load_first_frame(path)[0]  # type: ignore[index]
 
 
 def _words(scene: Reconstruction, pins: Pins) -> str:

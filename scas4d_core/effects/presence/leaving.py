@@ -105,4 +105,5 @@ EFFECT = Leaving(
     auto=True,
     on_above=SHARE,
     off_below=IDLE_SHARE,
+    kept=("share",),
 )

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Seen
     from scas4d_core.gaussians import Gaussians
     from scas4d_core.update.picture_loss import PictureLoss, TrainingView
-    from scas4d_core.update.result import Thinned
+    from scas4d_core.update.result import Thinned, UpdateTrace
 
 Bool = NDArray[np.bool_]
 Array = NDArray[np.float32]
@@ -89,8 +89,8 @@ rims that are none, 0.2 to 0.6."""
 
 _said: WeakKeyDictionary[Gaussians, dict[str, Novelty]] = WeakKeyDictionary()
 """What cameras say, by state: several effects ask for the same."""
-_glimpsed: WeakKeyDictionary[Gaussians, list[Glimpse]] = WeakKeyDictionary()
-"""The same of glimpses."""
+_glimpsed: WeakKeyDictionary[UpdateTrace, list[Glimpse]] = WeakKeyDictionary()
+"""Those of an update."""
 
 
 def glance(seen: Seen, least: int, new: float = 0.0, bare: float = 0.0) -> list[Novelty]:
@@ -109,10 +109,10 @@ def glance(seen: Seen, least: int, new: float = 0.0, bare: float = 0.0) -> list[
 
 def _glimpses(seen: Seen) -> list[Glimpse]:
     """Those of the cameras that the update rendered last."""
-    state, shown = seen.result.gaussians, seen.result.trace.shown
-    if state not in _glimpsed:
-        _glimpsed[state] = [_glimpse(view, shown[view.name]) for view in seen.views if view.name in shown]
-    return _glimpsed[state]
+    trace = seen.result.trace
+    if trace not in _glimpsed:
+        _glimpsed[trace] = [_glimpse(view, trace.shown[view.name]) for view in seen.views if view.name in trace.shown]
+    return _glimpsed[trace]
 
 
 def _glimpse(view: TrainingView, thinned: Thinned) -> Glimpse:
@@ -168,8 +168,10 @@ def novelties(
         state: Θ_t, updated to the frame. colours: [N, 3] RGB to render: of the frame before, so that what is new has
             not been painted on what stands. views: of the frame.
     """
-    features = state.features(colours)
-    return [_novelty(state, features, view, rig[view.name], picture) for view in views]
+    from scas4d_core.rasterize.shading import features_seen  # it loads the kernels
+
+    shown = state.replace(colours=colours)
+    return [_novelty(state, features_seen(shown, view.camera), view, rig[view.name], picture) for view in views]
 
 
 def _novelty(state: Gaussians, features: Array, view: TrainingView, camera: Camera, picture: PictureLoss) -> Novelty:
