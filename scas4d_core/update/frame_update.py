@@ -134,7 +134,7 @@ class FrameUpdate:
             work.features[:, :3] = work.colours
             watch.lap("cascade")
             met = len(trace.first)
-            loss = self._pictures(plan.take(), work, trace, watch)
+            loss = self._pictures(plan.take(), work, trace, watch, planned - iteration - 1)
             work.sample = samples[iteration % len(samples)]
             for term in self._hooks.loss:
                 loss += term(work)
@@ -177,8 +177,14 @@ class FrameUpdate:
         rates = self._rates.tried(options.rates, options.rigid, options.hold_colours)
         return rates.hurried(self.settings.cold_start if cold else 1.0)
 
-    def _pictures(self, views: list[TrainingView], work: Work, trace: UpdateTrace, watch: Stopwatch) -> float:
-        """Image and mask loss, the mean over the views; ``work`` gets the gradients, of a single view the buffers."""
+    def _pictures(
+        self, views: list[TrainingView], work: Work, trace: UpdateTrace, watch: Stopwatch, left: int
+    ) -> float:
+        """Image and mask loss, the mean over the views; ``work`` gets the gradients, of a single view the buffers.
+
+        Args:
+            left: iterations that are planned after this one.
+        """
         deformation, picture = self._deformation, self._picture
         loss, total = 0.0, None
         for view in views:
@@ -190,7 +196,7 @@ class FrameUpdate:
             for saw in self._hooks.saw:
                 saw(work, view, picture, found)
             loss += picture.image_part + picture.mask_part
-            trace.see(view, picture)
+            trace.see(view, picture, left)
             watch.lap(REPORT)
             if len(views) == 1:
                 work.gradients = found

@@ -86,7 +86,7 @@ class Found:
 
 def entered(seen: Seen) -> Found | None:
     """What a frame shows that the state does not have; None where there is nothing of the kind."""
-    if sum(_says(one) for one in glance(seen)) < GLANCED:
+    if sum(_says(one) for one in glance(seen, GLANCED, new=SMALLEST)) < GLANCED:
         return None
     everyone = said(seen, seen.views)
     hull = carve_new(everyone)
@@ -221,7 +221,7 @@ EFFECT = Entering(
     group=Group.PRESENCE,
     says="Things enter the scene: where cameras agree that nothing explains the pictures, Gaussians are born.",
     gauge="Only what no Gaussian covers is new, and only beyond what has moved away elsewhere.",
-    cost="six pictures rendered a frame; where something enters, about an update more",
+    cost="a look at the pictures that an update rendered last; where something enters, about an update more",
     auto=True,
     on_above=SHARE,
     off_below=WORTH,

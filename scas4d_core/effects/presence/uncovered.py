@@ -48,7 +48,7 @@ def _found(seen: Seen, glanced: int) -> Found | None:
 
 
 def _looked_for(seen: Seen, glanced: int) -> Found | None:
-    if sum(one.bare.sum() >= SMALLEST * one.bare.size for one in glance(seen)) < glanced:
+    if sum(one.bare.sum() >= SMALLEST * one.bare.size for one in glance(seen, glanced, bare=SMALLEST)) < glanced:
         return None
     everyone = said(seen, seen.views)
     found = uncovered(everyone, seen.result.gaussians, seen.picture)
@@ -113,7 +113,7 @@ EFFECT = UncoveredEffect(
     group=Group.PRESENCE,
     says="What moves uncovers what it hid: Gaussians that stand are born where nothing was known.",
     gauge="Only pixels in which the state has nothing are bare.",
-    cost="six pictures rendered a frame, shared with entering; where something is bare, about half an update more",
+    cost="a look at the pictures that an update rendered last; where something is bare, about half an update more",
     auto=True,
     on_above=SHARE,
     off_below=WORTH,
