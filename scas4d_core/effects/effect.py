@@ -40,6 +40,7 @@ class Effect:
         cost: of an update with it, against one without.
         auto: whether it waits for evidence; else it is on wherever it is not refused.
         on_above, off_below: share of ``Evidence`` from which it is switched on, and below which it is switched off.
+        without_masks: whether it is anything in a scene whose first frame has no masks.
         kept: names of its arrays in ``work.carried`` that are committed with each frame: a cold start, without a
             checkpoint, has these, and those of ``began``. They are small.
     """
@@ -52,6 +53,7 @@ class Effect:
     auto: bool = False
     on_above: float = 0.0
     off_below: float = 0.0
+    without_masks: bool = True
     kept: tuple[str, ...] = ()
 
     def always(self, settings: Settings) -> bool:

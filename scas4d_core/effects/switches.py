@@ -56,11 +56,13 @@ def contradictions(settings: Settings) -> Iterator[tuple[str, Mode, str, str]]:
             yield name, mode, f"effects.{name} cannot be 'off': {refusal[0]}", refusal[1]
 
 
-def first_switches(settings: Settings, index: int, found: Mapping[str, Evidence] = NONE_FOUND) -> dict[str, Switch]:
+def first_switches(
+    settings: Settings, index: int, found: Mapping[str, Evidence] = NONE_FOUND, masked: bool = True
+) -> dict[str, Switch]:
     """The switches before any update: what is pinned, on in every scene whose settings allow it, or found in frame 0.
 
     Args:
-        index: of the first frame. found: evidence in the fit of frame 0, by effect.
+        index: of the first frame. found: evidence in the fit of frame 0, by effect. masked: whether that has masks.
 
     Raises:
         InputError: the settings contradict what is pinned.
@@ -81,6 +83,8 @@ def first_switches(settings: Settings, index: int, found: Mapping[str, Evidence]
         if evidence is not None and allowed and not one.always(settings):
             on = evidence.share >= one.on_above
         share, text = (0.0, "") if evidence is None else (evidence.share, evidence.text)
+        if allowed and not masked and not one.without_masks:
+            on, text = False, "the first frame has no masks"
         switches[name] = Switch(on, index, mode != "auto", share, text)
     return switches
 

@@ -63,7 +63,7 @@ class FrameUpdate:
     """The ``Updater`` of the CPU; buffers are kept from frame to frame.
 
     Attributes:
-        tells: whether figures that the report alone needs are worked out; the state is the same without.
+        tells: whether figures that the report alone needs are worked out; state and evidence are the same without.
     """
 
     tells = True
@@ -190,7 +190,7 @@ class FrameUpdate:
             for saw in self._hooks.saw:
                 saw(work, view, picture, found)
             loss += picture.image_part + picture.mask_part
-            trace.see(view, picture, self.tells)
+            trace.see(view, picture)
             watch.lap(REPORT)
             if len(views) == 1:
                 work.gradients = found

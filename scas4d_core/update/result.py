@@ -144,11 +144,11 @@ class UpdateTrace:
         """DB by camera, when last rendered."""
         return {name: fit["psnr"] for name, fit in self.cameras.items()}
 
-    def see(self, view: TrainingView, picture: PictureLoss, shifts: bool) -> None:
-        """Note a view that was rendered and compared; ``shifts``: with the colour shift, for the report alone."""
+    def see(self, view: TrainingView, picture: PictureLoss) -> None:
+        """Note a view that was rendered and compared; its colour shift is evidence for gains of cameras, too."""
         self.psnr.append(picture.psnr)
         self.first.setdefault(view.name, picture.psnr)
-        self.cameras[view.name] = camera_fit(picture.psnr, picture.colour_shift(view) if shifts else None)
+        self.cameras[view.name] = camera_fit(picture.psnr, picture.colour_shift(view))
 
 
 @dataclass(frozen=True, eq=False)
