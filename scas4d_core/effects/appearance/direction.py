@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, Group, refused_on_gpu
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.effects.parts import Array, Part, PartsBuilder, Work
 from scas4d_core.frame_outcome import Candidate
@@ -99,7 +99,7 @@ class Direction(Effect):
 
     def refused(self, settings: Settings) -> tuple[str, str] | None:
         """Refused on a GPU, whose update does not know it."""
-        return None if settings.device == "cpu" else (f"device is {settings.device!r}", "set device to 'cpu'")
+        return refused_on_gpu(settings)
 
     def evidence(self, seen: Seen) -> Evidence | None:
         """The share of the squared error of a few pictures that the gloss takes away."""

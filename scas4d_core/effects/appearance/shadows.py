@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, Group, refused_at_zero, refused_on_gpu
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.effects.parts import Array, Arrays, Part, PartsBuilder, Work
 from scas4d_core.frame_outcome import Candidate
@@ -84,9 +84,7 @@ class Shadows(Effect):
 
     def refused(self, settings: Settings) -> tuple[str, str] | None:
         """Refused with a rate of 0, and on a GPU, whose update does not know it: there colours follow in iterations."""
-        if not settings.update.rate_colour_standing > 0:
-            return "update.rate_colour_standing is 0", "give it a rate above 0"
-        return None if settings.device == "cpu" else (f"device is {settings.device!r}", "set device to 'cpu'")
+        return refused_at_zero(settings, "rate_colour_standing") or refused_on_gpu(settings)
 
     def began(self, seen: Seen) -> Arrays | None:
         """[h, w, 4] float16 of each view: mean colours of squares, and 1 where what moves reaches."""
