@@ -85,9 +85,12 @@ class Part:
 
     Attributes:
         guards: how often each guard acted in the attempt; None: it has none.
+        known_to_devices: whether the update of a torch device does its work in another way. Of other parts it calls
+            ``start``, ``end`` and ``twin`` alone: effects that need more are refused there (``switches.refusal``).
     """
 
     guards: GuardCounts | None = None
+    known_to_devices = False
 
     def start(self, work: Work) -> None:
         """Called before the first iteration of an attempt."""
@@ -112,6 +115,21 @@ class Part:
     def twin(self, means: Tensor) -> Tensor | None:
         """The term of ``loss`` in torch, from the moving Gaussians' means [M, 3]; None: it has none."""
         return None
+
+
+def not_on_devices(kind: type[Part]) -> list[str]:
+    """The hooks of a part that the update of a torch device would have to call, and does not.
+
+    >>> class Glow(Part):
+    ...     def loss(self, work):
+    ...         return 0.5
+    >>> not_on_devices(Glow)
+    ['loss']
+    """
+    if kind.known_to_devices:
+        return []
+    asked = ("show", "saw", "step") if kind.twin is not Part.twin else ("show", "saw", "loss", "step")
+    return [hook for hook in asked if getattr(kind, hook) is not getattr(Part, hook)]
 
 
 @dataclass(eq=False)
