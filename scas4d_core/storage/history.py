@@ -336,11 +336,3 @@ class History(HistoryReader):
         self._stamps[index] = self._files.write(index, as_written(frame, time, text, log, packed(effects)))
         self.damaged.pop(index, None)
         self._times = dict(sorted([*self._times.items(), (index, float(time))]))
-
-    def completed(self, index: int, state: Gaussians) -> Gaussians:
-        """A state that was made again for a frame, with the Gaussians that were born in it, as they were then."""
-        for birth in births_in(self._log_at(index)):
-            born = self._born(birth)
-            if self.rows_of(birth[1:2])[0] >= len(state):
-                state = state.joined(Gaussians(**{name: born[name] for name in (*FIXED, *PER_FRAME)}))
-        return state

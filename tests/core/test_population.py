@@ -157,6 +157,35 @@ def test_a_state_made_again_has_the_born_of_its_frame(populated: None, tmp_path:
     assert history.lives(history.ids) == whole.history.lives(whole.history.ids)
 
 
+def test_a_state_made_again_has_what_came_back_where_it_was_then(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    rows, far = np.array([3, 4, 5, 40]), np.float32([0.4, -0.3, 0.0])
+
+    def populated(seen: Seen) -> UpdateResult:
+        state = seen.result.gaussians
+        if seen.index == 2:
+            state = state.retire(rows)
+        if seen.index == 4:
+            means = state.means.copy()
+            means[rows] += far
+            state = state.replace(means=means).revive(rows)
+        return replace(seen.result, gaussians=state)
+
+    install(monkeypatch, populated)
+    whole = go_on(start(History(tmp_path), masks=True), FRAMES[True])
+    then = whole.history.gaussians(4)
+    (tmp_path / "frame_000004.npz").write_bytes(b"")
+    history = History.open(tmp_path)
+    remake(RIG, SETTINGS, history, 3, FRAMES[True][4], {})
+    made = History.load(tmp_path).gaussians(4)
+    assert not made.retired.any()
+    off = np.linalg.norm(made.means - then.means, axis=1)
+    assert off[rows].max() < 0.2 * np.linalg.norm(far)
+    assert off.max() < 0.2 * np.linalg.norm(far)  # all others, too
+    effect_module.effect.cache_clear()
+
+
 def test_a_copy_aside_goes_on_with_the_born(populated: None) -> None:
     scene = go_on(start(History(), masks=True), FRAMES[True][:4])
     aside = Reconstruction.aside(RIG, SETTINGS, scene.history, 3)
