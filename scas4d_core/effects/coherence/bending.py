@@ -118,7 +118,7 @@ class Bending(Effect):
         return "update.weights.rotation is 0", "give it a weight above 0"
 
     def evidence(self, seen: Seen) -> Evidence | None:
-        """How much neighbourhoods turn unlike each other from a frame to the next."""
+        """The turn of neighbourhoods against those around them, from a frame to the next."""
         angle = bend(seen.before, seen.result.gaussians)
         if angle is None:
             return None

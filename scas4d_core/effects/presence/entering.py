@@ -71,7 +71,7 @@ BUDGET = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What has entered.
+    """The hull of what has entered.
 
     Attributes:
         seen: what the cameras say. hull: of the things that count. share: of the squared error that they explain.

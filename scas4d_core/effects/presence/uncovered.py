@@ -40,7 +40,7 @@ _found_in: WeakKeyDictionary[Gaussians, dict[int, Found | None]] = WeakKeyDictio
 
 
 def _found(seen: Seen, glanced: int) -> Found | None:
-    """What is uncovered, and the share of the squared error that it explains."""
+    """Points on what is uncovered, and the share of the squared error that they explain."""
     known = _found_in.setdefault(seen.result.gaussians, {})
     if glanced not in known:
         known[glanced] = _looked_for(seen, glanced)
