@@ -65,6 +65,7 @@ class FrameReport:
         loss: each iteration's weighted sum; of frame 0 at most ``REPORTED_LOSSES`` means.
         psnr: dB, over the training views of the last iterations, each as it was rendered then; NaN where not measured.
         moving, gaussians: how many Gaussians move, and are there. born, retired, revived: how many were, in this frame.
+        put_off: what the budget left no time for, in words; the next frame has some for it.
         cameras: by name, how well each camera's picture was met when it was last rendered: a bumped camera shows.
         used: cameras whose pictures were learnt from; none of a frame that was held or stood. dropped: cameras left
             out, with the reason.
@@ -103,6 +104,7 @@ class FrameReport:
     born: int = 0
     retired: int = 0
     revived: int = 0
+    put_off: list[str] = field(default_factory=list)
 
     def record(self) -> dict[str, Any]:
         """The report as JSON: numbers that are not finite are None."""
@@ -158,14 +160,15 @@ def report_of_update(
     names: Sequence[str],
     watch: Stopwatch,
     dropped: Mapping[str, str] | None,
+    put_off: Sequence[str] = (),
 ) -> FrameReport:
     """The report of an update.
 
     Args:
         result: that is committed. before: the state committed before.
         left_out: cameras whose pictures were not believed at first sight, with the reason.
-        names: of the rig's cameras. watch: with the stages "decode", "judge" and "update".
-        dropped: cameras that the caller has left out, with the reason.
+        names: of the rig's cameras. watch: with the stages "decode", "judge" and "update", and "presence" if it was.
+        dropped: cameras that the caller has left out, with the reason. put_off: see ``FrameReport``.
     """
     trace, gaussians = result.trace, result.gaussians
     began = perf_counter()
@@ -174,6 +177,8 @@ def report_of_update(
     stages = {"decode": watch.seconds["decode"], **trace.seconds}
     stages["judge"] = watch.seconds["judge"] + trace.seconds.get("judge", 0.0)
     stages["other"] = max(0.0, watch.seconds["update"] - sum(trace.seconds.values()))
+    if "presence" in watch.seconds:
+        stages["presence"] = watch.seconds["presence"]
     report = FrameReport(
         index=frame.index,
         time=frame.time,
@@ -202,6 +207,7 @@ def report_of_update(
         born=len(gaussians) - len(before),
         retired=int((gaussians.retired[: len(before)] & before.present).sum()),
         revived=int((gaussians.present[: len(before)] & before.retired).sum()),
+        put_off=list(put_off),
     )
     stages[REPORT] = watch.seconds[REPORT] + trace.seconds.get(REPORT, 0.0) + perf_counter() - began
     return report

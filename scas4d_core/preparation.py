@@ -85,7 +85,7 @@ class Preparation:
         Args:
             frame: the first, at the size of the rig. result: its fit.
         """
-        switches = first_switches(self._settings, frame.index, result.evidence or {})
+        switches = first_switches(self._settings, frame.index, result.evidence or {}, len(frame.masks) > 0)
         views = self._factory.views(frame, result.exposures, use_masks=False)
         found = UpdateResult(result.gaussians, None, UpdateTrace())
         seen = Seen(frame.index, result.gaussians, found, self._factory.rig, views, self._picture)

@@ -17,7 +17,7 @@ TIES = ("rigidity", "isometry", "rotation")
 """Effects that tie neighbours together."""
 
 
-OURS = ("shadows", "camera_gain", "light", "direction", "uncovered", "entering", "leaving")
+OURS = ("bending", "shadows", "camera_gain", "light", "direction", "uncovered", "entering", "leaving")
 """Effects that Dynamic3DGaussians does not have."""
 
 
@@ -71,7 +71,7 @@ PRESETS: dict[str, Settings] = {
     # A new effect that a kind of scene always or never calls for is pinned here.
     "rigid": Settings(effects=_pinned(on=TIES, off=("cluster_scaling", "own_rotation", "own_scale"))),
     "articulated": Settings(effects=_pinned(on=("cluster_rotation", "own_position", *TIES))),
-    "cloth": Settings(effects=_pinned(on=("cluster_scaling", "isometry", "own_position"), off=("rotation",))),
+    "cloth": Settings(effects=_pinned(on=("bending", "cluster_scaling", "isometry", "own_position"))),
     "people": Settings(effects=_pinned(on=("motion_labels", "shadows", "own_position", *TIES), off=("direction",))),
     "lights": Settings(effects=_pinned(on=("motion_labels", "moving_colour", "shadows", "light"))),
 }

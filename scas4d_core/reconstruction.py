@@ -17,9 +17,9 @@ from numba import get_num_threads
 
 from scas4d_core.cameras import Rig, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
-from scas4d_core.effects.evidence import Seen
-from scas4d_core.effects.switches import switches_of, switches_record
-from scas4d_core.first_frame.start import FirstFrame, fit_first
+from scas4d_core.effects.evidence import FitTime, Seen
+from scas4d_core.effects.switches import kept_of, switches_record
+from scas4d_core.first_frame.start import FirstFrame, as_begun, fit_first, with_background
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.frame_report import FrameReport, Progress, report_of_first, report_of_update
 from scas4d_core.gaussians import Gaussians
@@ -30,7 +30,7 @@ from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import FrameSolver, UpdateInput
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.storage.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, find_commit
+from scas4d_core.storage.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, cold_start, find_commit
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.structure.motion_mask import labelled, with_reliable_labels
 from scas4d_core.torch_backend.device import require_device
@@ -75,7 +75,7 @@ class Reconstruction(CommittedScene):
         super().__init__(history, world, limits := scene_limits(settings.scene.near, self.rig.radius))
         self.settings, self._update = settings, settings.update
         self._factory = ViewFactory(self.rig, None if scale == 1.0 else rig)
-        self._picture = PictureLoss(self._factory, settings.scene.background, 1.0, 0.0, limits=limits)
+        self._picture = PictureLoss(self._factory, settings.scene.behind, 1.0, 0.0, limits=limits)
         self._preparation = Preparation(self._factory, self.settings, self.world, self._picture)
         self.populates = True
         self.static: StaticResult | None = None
@@ -119,18 +119,18 @@ class Reconstruction(CommittedScene):
         """
         if not isfinite(frame.time):
             raise ValueError(f"frame {frame.index}: time {frame.time} s must be finite")
-        self = cls(rig, settings, History() if history is None else history)
-        began = perf_counter()
-        result = static or fit_first(
-            self._factory.scaled(frame), points, self._factory, settings, self.world, progress or (lambda _: None)
-        )
+        self = cls(rig, with_background(settings, frame.images), History() if history is None else history)
+        began, scaled = perf_counter(), self._factory.scaled(frame)
+        told = progress or (lambda _: None)
+        result = static or fit_first(scaled, points, self._factory, self.settings, self.world, told)
         self.static = result = replace(result, gaussians=with_reliable_labels(result.gaussians))
         fitted = perf_counter()
-        self._fixed = FirstFrame(len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians))
+        lengths = axis_lengths(result.gaussians)
+        self._fixed = FirstFrame(len(frame.masks) > 0, result.exposures, lengths, self.settings.scene.behind)
         self._roots = result.gaussians
-        switches, effects = self._preparation.begun(self._factory.scaled(frame), result)
+        switches, effects = self._preparation.begun(scaled, result)
         self._updater, structure = self._preparation.updater(result.gaussians, switches)
-        seen = self._factory.views(self._factory.scaled(frame), {}, False) if self._learns_labels else ()
+        seen = self._factory.views(scaled, {}, False) if self._learns_labels else ()
         load = {} if started is None else {"load": began - started}
         seconds = {**load, "fit": fitted - began, "prepare": perf_counter() - fitted}
         report = report_of_first(frame, result, self.rig.names, len(self._updater.hierarchy.rows), seconds, dropped)
@@ -160,14 +160,14 @@ class Reconstruction(CommittedScene):
         """
         if history.directory is None or not history.indices:
             raise ResumeError("the history holds no committed frame; start the scene with its first frame")
-        self = cls(rig, settings, history)
+        self = cls(rig, as_begun(settings, history), history)
         assert self._checkpoints is not None
         try:
             self._fixed = FirstFrame.of(history)
         except (HistoryError, KeyError) as error:
             raise ResumeError(f"the first frame, which every update needs, cannot be read ({error})") from error
         index, left, faults = find_commit(history, self._checkpoints, self._factory, held)
-        same = self._go_on(index, self._cold(index) if left is None else left)
+        same = self._go_on(index, cold_start(history, index, self._fixed.masked) if left is None else left)
         if left is not None and not same:
             faults.append("clusters came out otherwise than before: the next update starts without a motion")
         self.resumed = ResumePoint(index, history.cut(index), faults, cold=left is None or not same)
@@ -195,9 +195,9 @@ class Reconstruction(CommittedScene):
             HistoryError: the frame or the first one cannot be read.
         """
         copy = history.copied((history.indices[0], index))
-        self = cls(rig, settings, copy)
+        self = cls(rig, as_begun(settings, copy), copy)
         self._fixed = FirstFrame.of(copy)
-        self._go_on(index, self._cold(index))
+        self._go_on(index, cold_start(copy, index, self._fixed.masked))
         return self
 
     def _go_on(self, index: int, carried: CarryOver) -> bool:
@@ -208,12 +208,6 @@ class Reconstruction(CommittedScene):
 
     def _take_roots(self, roots: Gaussians) -> None:
         self._roots, self._fixed = roots, replace(self._fixed, lengths=axis_lengths(roots))
-
-    def _cold(self, index: int) -> CarryOver:
-        """The carry-over of a committed frame as far as its state and report have it: labels learnt, switches."""
-        moving = self.history.gaussians(index).foreground > 0.5
-        labels = None if self._fixed.masked or moving.all() else moving
-        return CarryOver(labels=labels, switches=switches_of(self.history.report(index).get("effects", {})))
 
     def step(
         self,
@@ -272,19 +266,23 @@ class Reconstruction(CommittedScene):
             result = replace(result, gaussians=self.history.newest, motion=carried.motion, carried=carried.effects)
         how = {"cold": given.motion is None, "relabelled": updater is not self._updater, **(notes or {})}
         carried = carried.after(result, past, frame.time, believed if self._learns_labels else None, shown)
-        roots = self._roots
+        roots, fits = self._roots, FitTime(self._budget.end_of_births(watch.began))
         if result.outcome.learnt and result.exposure == 1.0:  # in a light that is taken out again much looks new
-            learnt = [view for view in believed if view.name not in result.trace.left_out]
+            learnt = [view for view in result.views or believed if view.name not in result.trace.left_out]
             room = room_for_births(len(self.history.first), len(result.gaussians))
-            seen = Seen(frame.index, given.state, result, self.rig, learnt, self._picture, room)
+            seen = Seen(frame.index, given.state, result, self.rig, learnt, self._picture, room, fits)
             populates, follow = self.populates and exposure == 1.0, self._preparation.followed
             result, updater, carried, roots = follow(updater, carried, seen, roots, populates)
+            self._budget.births = bool(fits.spent or fits.put_off)
             watch.lap("presence")
-        report = report_of_update(frame, result, self.history.newest, left_out, self.rig.names, watch, dropped)
+        report = report_of_update(
+            frame, result, self.history.newest, left_out, self.rig.names, watch, dropped, fits.put_off
+        )
         birth = {} if roots is self._roots else {"roots": roots, "joins": result.joins}
         self._commit(report, result.gaussians, carried, how, **birth)
         self._updater = updater
-        commit = solver.judging + perf_counter() - watch.began - watch.total
+        commit = solver.judging + watch.seconds.get("presence", 0.0) - fits.spent
+        commit += perf_counter() - watch.began - watch.total
         self._budget.learn(result.trace.moments, result.trace.seconds, commit)
         return report
 
@@ -342,7 +340,8 @@ class Reconstruction(CommittedScene):
         seconds = report.seconds  # a record cannot tell its own writing: it has that of the one before
         seconds[REPORT] = seconds.get(REPORT, 0.0) + self.history.record_seconds + perf_counter() - began
         record["seconds"] = dict(seconds)
-        self.history.append(report.index, report.time, gaussians, record, **birth)
+        kept = kept_of(carried.effects) if self.history.indices else carried.effects
+        self.history.append(report.index, report.time, gaussians, record, effects=kept, **birth)
         if birth:
             self._take_roots(self.history.roots())
         self._carried, self.report = carried, report

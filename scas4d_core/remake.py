@@ -58,5 +58,5 @@ def remake(
         raise StepError(f"frame {frame.index} does not fit the frame before it: {report['degraded']}")
     arrays = history.completed(frame.index, aside.history.gaussians(frame.index)).arrays()
     kept = {name: arrays[name] for name in (*PER_FRAME, *WHOLES) if name in arrays}
-    history.replace(frame.index, frame.time, kept, report)
+    history.replace(frame.index, frame.time, kept, report, aside.history.effects(frame.index))
     return report

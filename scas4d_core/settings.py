@@ -85,8 +85,8 @@ class SceneSettings(SettingsModel):
         "camera tells no size: give a number such that what it sees is about 3 m away.",
     )
     image_scale: float = Field(1.0, gt=0, le=1, description="Pictures are resized by this before anything else.")
-    background: tuple[float, float, float] = Field(
-        (0.0, 0.0, 0.0), description="RGB in 0…1 behind everything; black, as in the captures of the field."
+    background: tuple[float, float, float] | Literal["auto"] = Field(
+        "auto", description="RGB in 0…1 behind all. 'auto': of a plain backdrop, else the mean of frame 0's pictures."
     )
     near: Positive | Literal["auto"] = Field(
         default="auto",
@@ -94,10 +94,13 @@ class SceneSettings(SettingsModel):
         "pictures tells how it looks right before a camera that is not there, and one stray Gaussian hides all.",
     )
     floor: tuple[float, float, float, float] | None = Field(
-        None,
-        description="Plane (a, b, c, d) of the floor in the user's world; a·x + b·y + c·z + d > 0 lies below it, and "
-        "what moves is kept above. None: the scene has no floor term.",
+        None, description="Plane (a, b, c, d), user's world: a·x + b·y + c·z + d > 0 lies below. None: no floor term."
     )
+
+    @property
+    def behind(self) -> tuple[float, float, float]:
+        """The background as RGB; black while 'auto' is not resolved (``first_frame.start.with_background``)."""
+        return (0.0, 0.0, 0.0) if self.background == "auto" else self.background
 
     @field_validator("floor")
     @classmethod

@@ -158,3 +158,6 @@ class FrameReportModel(Model):
     born: int = Field(default=0, description="Gaussians that were born in this frame.")
     retired: int = Field(default=0, description="Gaussians that left the scene in this frame; their ids stay theirs.")
     revived: int = Field(default=0, description="Retired Gaussians that came back in this frame, as themselves.")
+    put_off: list[str] = Field(
+        default_factory=list, description="Births for which the budget left no time; the next frame has some for them."
+    )

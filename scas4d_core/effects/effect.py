@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
 from importlib import import_module
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 from scas4d_core.effects.registry import EFFECTS
@@ -40,6 +41,9 @@ class Effect:
         cost: of an update with it, against one without.
         auto: whether it waits for evidence; else it is on wherever it is not refused.
         on_above, off_below: share of ``Evidence`` from which it is switched on, and below which it is switched off.
+        without_masks: whether it is anything in a scene whose first frame has no masks.
+        kept: names of its arrays in ``work.carried`` that are committed with each frame: a cold start, without a
+            checkpoint, has these, and those of ``began``. They are small.
     """
 
     name: str
@@ -50,6 +54,8 @@ class Effect:
     auto: bool = False
     on_above: float = 0.0
     off_below: float = 0.0
+    without_masks: bool = True
+    kept: tuple[str, ...] = ()
 
     def always(self, settings: Settings) -> bool:
         """True where it is on in every scene with these settings, and waits for no evidence."""
@@ -89,6 +95,26 @@ class Effect:
     def join(self, builder: PartsBuilder) -> None:
         """Puts its part into the updates of a scene; called only where it is on."""
         raise NotImplementedError
+
+
+Refusal = tuple[str, str]
+"""Fault and remedy."""
+
+
+def refused_at_zero(settings: Settings, key: str) -> Refusal | None:
+    """Fault and remedy where a rate or weight of the update is 0.
+
+    Args:
+        key: in the settings of the update, as "rate_colour" and "weights.floor".
+    """
+    if attrgetter(key)(settings.update) > 0:
+        return None
+    return f"update.{key} is 0", f"give it a {'weight' if key.startswith('weights.') else 'rate'} above 0"
+
+
+def refused_on_gpu(settings: Settings) -> Refusal | None:
+    """Fault and remedy where another device than the CPU renders."""
+    return None if settings.device == "cpu" else (f"device is {settings.device!r}", "set device to 'cpu'")
 
 
 @cache

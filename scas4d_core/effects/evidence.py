@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -26,6 +26,21 @@ class Evidence:
     text: str
 
 
+@dataclass(eq=False)
+class FitTime:
+    """The time for fitting what is born in a frame, beside its update.
+
+    Attributes:
+        end: ``perf_counter`` by which fits have to be over; None: there is no limit.
+        spent: seconds that they took. put_off: what there was no time for, in words; it is found again in the next
+            frame.
+    """
+
+    end: float | None = None
+    spent: float = 0.0
+    put_off: list[str] = field(default_factory=list)
+
+
 @dataclass(frozen=True, eq=False)
 class Seen:
     """A frame as the evidence for effects is taken from it, once its state is committed.
@@ -33,7 +48,7 @@ class Seen:
     Attributes:
         index: of the frame. before: Θ_{t−1}. result: Θ_t, the trace of its update, arrays of the effects.
         rig: the cameras inside. views: that were learnt from. picture: renders
-            them. room: Gaussians that may still be born in the scene.
+            them. room: Gaussians that may still be born in the scene. time: for fitting them.
     """
 
     index: int
@@ -43,3 +58,4 @@ class Seen:
     views: Sequence[TrainingView]
     picture: PictureLoss
     room: int = 1_000_000
+    time: FitTime = field(default_factory=FitTime)

@@ -43,7 +43,8 @@ class Work:
     Attributes:
         previous: Θ_{t−1}. deformation: has taken it. rates: of this attempt. views: that it learns from.
         picture: renders them.
-        colours: [N, 3] RGB now. features: [N, 4] as they are rendered, RGB and label.
+        colours: [N, 3] RGB now. gloss, environment: now, where a part learns them; else those of Θ_{t−1}.
+        features: [N, 4] as they are rendered, RGB and label.
         sample: entries of the hierarchy's order whose neighbours this iteration looks at.
         gradients: of the pictures of the iteration; parts add to them. carried: arrays that the part left at the frame
             before, by effect; replaced by those for the frame after.
@@ -68,7 +69,13 @@ class Work:
         self.previous, self.deformation, self.rates, self.views = previous, deformation, rates, views
         self.picture, self.carried = picture, carried
         self.colours = previous.colours.copy()
+        self.gloss, self.environment = previous.gloss, previous.environment
         self.features = previous.features(previous.colours)
+
+    @property
+    def look(self) -> Gaussians:
+        """Θ_{t−1}, unmoved, with what has been learnt of its looks so far."""
+        return self.previous.replace(colours=self.colours, gloss=self.gloss, environment=self.environment)
 
 
 class Part:
@@ -78,15 +85,18 @@ class Part:
 
     Attributes:
         guards: how often each guard acted in the attempt; None: it has none.
+        known_to_devices: whether the update of a torch device does its work in another way. Of other parts it calls
+            ``start``, ``end`` and ``twin`` alone: effects that need more are refused there (``switches.refusal``).
     """
 
     guards: GuardCounts | None = None
+    known_to_devices = False
 
     def start(self, work: Work) -> None:
         """Called before the first iteration of an attempt."""
 
     def show(self, work: Work, view: TrainingView) -> None:
-        """Called before a view is rendered: may change ``work.features`` and the view's exposure."""
+        """Called before a view is rendered: may change ``work.features``, and the view's exposure (``exposes``)."""
 
     def saw(self, work: Work, view: TrainingView, picture: PictureLoss, gradients: Gradients) -> None:
         """Called with the gradients of a view: reads its own, and turns those of features into those of colours."""
@@ -107,6 +117,21 @@ class Part:
         return None
 
 
+def not_on_devices(kind: type[Part]) -> list[str]:
+    """The hooks of a part that the update of a torch device would have to call, and does not.
+
+    >>> class Glow(Part):
+    ...     def loss(self, work):
+    ...         return 0.5
+    >>> not_on_devices(Glow)
+    ['loss']
+    """
+    if kind.known_to_devices:
+        return []
+    asked = ("show", "saw", "step") if kind.twin is not Part.twin else ("show", "saw", "loss", "step")
+    return [hook for hook in asked if getattr(kind, hook) is not getattr(Part, hook)]
+
+
 @dataclass(eq=False)
 class PartsBuilder:
     """Collects the parts of the effects that are on, for the updates of one scene.
@@ -114,7 +139,7 @@ class PartsBuilder:
     Attributes:
         scene, update: the settings, the floor inside. factory: of the scene's views. hierarchy: of the moving.
         first: the roots, Θ_0 with all born since (``preparation``). whole: whether a part needs whole pictures: it
-            changes what stands, or how a camera sees it.
+            changes what stands, or how a camera sees it. exposes: whether a part changes the exposures of views.
         length: weight of the limit of the axes' lengths, which the cascade's kernel has in itself.
         mask: weight of the term of masks, which the comparison of pictures has in itself. learns_labels: whether what
             moves is learnt from motion where no masks are given.
@@ -128,6 +153,7 @@ class PartsBuilder:
     hierarchy: Hierarchy
     first: Gaussians
     whole: bool = False
+    exposes: bool = False
     length: float = 0.0
     mask: float = 0.0
     learns_labels: bool = False

@@ -21,6 +21,7 @@ EFFECTS = {
     "rigidity": "scas4d_core.effects.coherence.rigidity",
     "isometry": "scas4d_core.effects.coherence.isometry",
     "rotation": "scas4d_core.effects.coherence.rotation",
+    "bending": "scas4d_core.effects.coherence.bending",
     "axis_length": "scas4d_core.effects.coherence.axis_length",
     "floor": "scas4d_core.effects.coherence.floor",
     "mask_term": "scas4d_core.effects.presence.mask_term",

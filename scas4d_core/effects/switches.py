@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from importlib import import_module
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from scas4d_core.effects.effect import effect
+from scas4d_core.effects.parts import Part, not_on_devices
 from scas4d_core.effects.registry import EFFECTS, Mode
 from scas4d_core.errors import InputError
 from scas4d_core.settings import Settings
@@ -47,20 +49,34 @@ NONE_FOUND: Mapping[str, Evidence] = MappingProxyType({})
 """No evidence."""
 
 
+def refusal(name: str, settings: Settings) -> tuple[str, str] | None:
+    """Fault and remedy where an effect cannot be on under these settings, or on their device; None: it can."""
+    own = effect(name).refused(settings)
+    if own is not None or settings.device == "cpu":
+        return own
+    for kind in vars(import_module(EFFECTS[name])).values():  # its parts, shared ones too, are named in its module
+        if isinstance(kind, type) and issubclass(kind, Part) and (hooks := not_on_devices(kind)):
+            missing = f"no update there calls {' and '.join(hooks)} of {kind.__name__}"
+            return f"device is {settings.device!r}, and {missing}", "set device to 'cpu'"
+    return None
+
+
 def contradictions(settings: Settings) -> Iterator[tuple[str, Mode, str, str]]:
     """Name, mode, fault and remedy of each effect whose pin the settings contradict."""
     for name, mode in settings.effects.items():
-        if mode == "on" and (refusal := effect(name).refused(settings)) is not None:
-            yield name, mode, f"effects.{name} cannot be 'on': {refusal[0]}", f"{refusal[1]}, or leave it 'auto'"
-        if mode == "off" and (refusal := effect(name).needed(settings)) is not None:
-            yield name, mode, f"effects.{name} cannot be 'off': {refusal[0]}", refusal[1]
+        if mode == "on" and (found := refusal(name, settings)) is not None:
+            yield name, mode, f"effects.{name} cannot be 'on': {found[0]}", f"{found[1]}, or leave it 'auto'"
+        if mode == "off" and (found := effect(name).needed(settings)) is not None:
+            yield name, mode, f"effects.{name} cannot be 'off': {found[0]}", found[1]
 
 
-def first_switches(settings: Settings, index: int, found: Mapping[str, Evidence] = NONE_FOUND) -> dict[str, Switch]:
+def first_switches(
+    settings: Settings, index: int, found: Mapping[str, Evidence] = NONE_FOUND, masked: bool = True
+) -> dict[str, Switch]:
     """The switches before any update: what is pinned, on in every scene whose settings allow it, or found in frame 0.
 
     Args:
-        index: of the first frame. found: evidence in the fit of frame 0, by effect.
+        index: of the first frame. found: evidence in the fit of frame 0, by effect. masked: whether that has masks.
 
     Raises:
         InputError: the settings contradict what is pinned.
@@ -72,15 +88,20 @@ def first_switches(settings: Settings, index: int, found: Mapping[str, Evidence]
     """
     for _, _, fault, remedy in contradictions(settings):
         raise InputError(fault, remedy)
-    switches = {}
+    switches, on_cpu = {}, settings.model_copy(update={"device": "cpu"})
     for name in EFFECTS:
         mode, one = settings.effects.get(name, "auto"), effect(name)
-        allowed = mode == "auto" and one.refused(settings) is None
+        refused = refusal(name, settings)
+        allowed = mode == "auto" and refused is None
         on = mode == "on" or (allowed and one.always(settings))
         evidence = found.get(name)
         if evidence is not None and allowed and not one.always(settings):
             on = evidence.share >= one.on_above
         share, text = (0.0, "") if evidence is None else (evidence.share, evidence.text)
+        if mode == "auto" and refused is not None and refusal(name, on_cpu) is None:
+            text = refused[0]  # it is the device
+        if allowed and not masked and not one.without_masks:
+            on, text = False, "the first frame has no masks"
         switches[name] = Switch(on, index, mode != "auto", share, text)
     return switches
 
@@ -110,7 +131,7 @@ def decided(switches: Switches, settings: Settings, seen: Seen) -> dict[str, Swi
 
 def _decided(name: str, switch: Switch, settings: Settings, seen: Seen) -> Switch:
     one = effect(name)
-    if switch.pinned or one.always(settings) or one.refused(settings) is not None:
+    if switch.pinned or one.always(settings) or refusal(name, settings) is not None:
         return switch
     found = one.evidence(seen)
     if found is None:
@@ -127,11 +148,18 @@ def began(switches: Switches, settings: Settings, seen: Seen) -> dict[str, Array
     found = {}
     for name, switch in switches.items():
         one = effect(name)
-        if (switch.on or not switch.pinned) and one.refused(settings) is None:
+        if (switch.on or not switch.pinned) and refusal(name, settings) is None:
             arrays = one.began(seen)
             if arrays is not None:
                 found[name] = arrays
     return found
+
+
+def kept_of(carried: Mapping[str, Arrays]) -> dict[str, Arrays]:
+    """The arrays that are committed with a frame after the first, of those that the effects leave, by effect."""
+    known = {name: own for name, own in carried.items() if name in EFFECTS}
+    kept = {name: {key: own[key] for key in effect(name).kept if key in own} for name, own in known.items()}
+    return {name: own for name, own in kept.items() if own}
 
 
 def switched_by(found: Mapping[str, Arrays], switches: Switches, seen: Seen) -> dict[str, Switch]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,8 +18,54 @@ from scas4d_core.first_frame.static_scene import StaticResult, first_trainer
 from scas4d_core.frame_report import Progress
 from scas4d_core.robust.checks import axis_lengths
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings
-from scas4d_core.storage.history import History
+from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.update.picture_loss import TrainingView, ViewFactory
+
+Colour = tuple[float, float, float]
+
+PLAIN = 0.2
+"""Share of all pixels that have one colour, from which it is that of a plain backdrop; most cameras have half of it."""
+ALIKE = 8
+"""Levels of 255 by which the pixels of one colour may differ: noise, and the traces of JPEG."""
+EVERY = 4
+"""Pixels, between those that are looked at."""
+
+
+def with_background(settings: Settings, images: Mapping[str, NDArray[np.uint8]]) -> Settings:
+    """The settings with the background that 'auto' stands for.
+
+    It is the colour of a plain backdrop, else the mean colour. A background that the pictures do not have, as black in
+    a bright room, teaches the fit dark seams, and shows as a black hole where no camera has looked.
+
+    Args:
+        images: of frame 0.
+
+    >>> from scas4d_core.settings import Settings
+    >>> green = np.full((64, 64, 3), (20, 200, 30), np.uint8)
+    >>> with_background(Settings(), {"front": green}).scene.background
+    (0.0784, 0.7843, 0.1176)
+    """
+    if settings.scene.background != "auto":
+        return settings
+    pixels = [image[EVERY // 2 :: EVERY, EVERY // 2 :: EVERY].reshape(-1, 3) for image in images.values()]
+    everyone = np.concatenate(pixels)
+    cells = np.ravel_multi_index(tuple(everyone.T // ALIKE), (256 // ALIKE,) * 3)
+    common = np.median(everyone[cells == np.bincount(cells).argmax()], axis=0)
+    of_it = [(np.abs(some - common) <= ALIKE).all(axis=1) for some in pixels]
+    plain = np.concatenate(of_it).mean() >= PLAIN and np.median([some.mean() for some in of_it]) >= PLAIN / 2
+    red, green, blue = np.round((common if plain else everyone.mean(axis=0)) / 255, 4).tolist()
+    scene = settings.scene.model_copy(update={"background": (red, green, blue)})
+    return settings.model_copy(update={"scene": scene})
+
+
+def as_begun(settings: Settings, history: History) -> Settings:
+    """The settings with the background with which a scene began; as they are where its first frame cannot be read."""
+    if settings.scene.background != "auto":
+        return settings
+    with suppress(HistoryError, KeyError):
+        scene = settings.scene.model_copy(update={"background": history.background})
+        return settings.model_copy(update={"scene": scene})
+    return settings
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,18 +74,20 @@ class FirstFrame:
 
     Attributes:
         masked: true where it had masks. exposures: [3, 2] gain and offset of each channel, by camera name.
-        lengths: [N, 3] metres, of the axes of the Gaussians.
+        lengths: [N, 3] metres, of the axes of the Gaussians. background: RGB in 0…1 behind everything.
     """
 
     masked: bool
     exposures: dict[str, NDArray[np.float32]]
     lengths: NDArray[np.float32]
+    background: Colour
 
     def record(self) -> dict[str, Any]:
         """The facts that the state of frame 0 does not hold, as JSON values; they are committed with its report."""
         return {
             "masked": self.masked,
             "exposures": {name: exposure.tolist() for name, exposure in self.exposures.items()},
+            "background": list(self.background),
         }
 
     @classmethod
@@ -52,7 +101,7 @@ class FirstFrame:
         report = history.report(first)
         masked = bool(report["masked"])
         exposures = {name: np.array(exposure, np.float32) for name, exposure in report["exposures"].items()}
-        return cls(masked, exposures, axis_lengths(history.gaussians(first)))
+        return cls(masked, exposures, axis_lengths(history.gaussians(first)), history.background)
 
 
 def fit_static_scene(

@@ -103,7 +103,7 @@ class StaticTrainer:
         self.shading: Shading | None = None
         self.radius = factory.rig.radius
         limits = scene_limits(scene.near, self.radius)
-        self.loss = PictureLoss(factory, scene.background, 1.0, WEIGHT_MASK, False, limits)
+        self.loss = PictureLoss(factory, scene.behind, 1.0, WEIGHT_MASK, False, limits)
         self._masked = any(len(view.target) > 3 for view in views)
         self.random = np.random.default_rng(settings.seed)
         self._reset_moments()

@@ -76,14 +76,14 @@ class CommittedScene:
         camera: Camera,
         index: int | None = None,
         *,
-        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        background: tuple[float, float, float] | None = None,
         labels: NDArray[Any] | None = None,
     ) -> View:
         """Renders a novel view.
 
         Args:
             camera: user's world. index: a committed frame.
-            background: RGB in 0…1 behind everything.
+            background: RGB in 0…1 behind everything; the scene's where None.
             labels: [N] part of each Gaussian, −1 for none; given where ``View.parts`` is wanted. Those of the newest
                 frame are for any: of Gaussians born later nothing is shown.
 
@@ -96,7 +96,8 @@ class CommittedScene:
         features = np.concatenate([colours, np.zeros((len(gaussians.means), 1), np.float32)], axis=1)
         picture = self._rasterizer.forward(
             gaussians.means, gaussians.factors, gaussians.opacities, features, CameraArrays.of(inside),
-            np.array([*background, 0.0], np.float32), depth_channel=3,
+            np.array([*(self.history.background if background is None else background), 0.0], np.float32),
+            depth_channel=3,
         )  # fmt: skip
         colour = np.moveaxis(picture.features[:3], 0, -1).copy()
         alpha = 1 - picture.rest

@@ -241,7 +241,7 @@ class CpuRasterizer:
             means, factors, features, camera, depth_channel, splats, counts, firsts, starts, items, slots, covers,
             drawing.learnt, tile_order, image, rest, most,
         )  # fmt: skip
-        return Picture(image[:, :height, :width], rest[:height, :width])
+        return self.picture
 
     def _whole(self, tile_count: int, count: int) -> Drawing:
         """A drawing of every block, from which every Gaussian learns."""
@@ -318,6 +318,12 @@ class CpuRasterizer:
     def planes(self) -> Array:
         """[C, rows, stride] of the last forward pass, padded to whole tiles."""
         return self._last.image
+
+    @property
+    def picture(self) -> Picture:
+        """The result of the last forward pass, valid until the next one."""
+        height, width = self._last.camera.height, self._last.camera.width
+        return Picture(self._last.image[:, :height, :width], self._last.rest[:height, :width])
 
     @property
     def splats(self) -> Array:

@@ -45,16 +45,25 @@ def without_turn(count: int) -> Array:
     return turns
 
 
-def colours_seen(gaussians: Gaussians, camera: CameraArrays) -> Array:
-    """[N, 3] the colours of a state as a camera sees them; the state's own array where they depend on no direction."""
+def features_seen(gaussians: Gaussians, camera: CameraArrays, turns: Array | None = None) -> Array:
+    """[N, 4] the features of a state as a camera sees them: RGB and label. See ``colours_seen``."""
+    return gaussians.features(colours_seen(gaussians, camera, turns))
+
+
+def colours_seen(gaussians: Gaussians, camera: CameraArrays, turns: Array | None = None) -> Array:
+    """[N, 3] the colours of a state as a camera sees them; the state's own array where they depend on no direction.
+
+    Args:
+        turns: [N, 4] unit quaternions by which the Gaussians have turned since their gloss was known; None: not at all.
+    """
     if gaussians.gloss is None or gaussians.environment is None:
         return gaussians.colours
     from scas4d_core.kernels.appearance.direction import shade
 
     shown = np.empty((len(gaussians), 4), np.float32)
     shade(
-        gaussians.means, gaussians.gloss, without_turn(len(gaussians)), gaussians.colours, gaussians.environment,
-        camera_centre(camera), shown,
+        gaussians.means, gaussians.gloss, without_turn(len(gaussians)) if turns is None else turns, gaussians.colours,
+        gaussians.environment, camera_centre(camera), shown,
     )  # fmt: skip
     return np.ascontiguousarray(shown[:, :3])
 

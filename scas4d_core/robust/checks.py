@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.rasterize.shading import features_seen
 from scas4d_core.robust.outliers import Past, few
 from scas4d_core.update.picture_loss import LABEL, PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import UpdateResult
@@ -168,7 +169,7 @@ def relit(state: Gaussians, gain: float) -> Gaussians:
 
 def _shown(picture: PictureLoss, state: Gaussians, view: TrainingView) -> Array:
     """[3, H, W] the state as the view's camera would show it."""
-    features = state.features(state.colours)
+    features = features_seen(state, view.camera)
     picture.measure(state.means, state.factors, state.opacities, features, view)
     planes = picture.rasterizer.planes[:LABEL, : view.camera.height, : view.camera.width]
     shown: Array = view.exposure[:LABEL, 0, None, None] * planes + view.exposure[:LABEL, 1, None, None]

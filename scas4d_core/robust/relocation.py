@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.rasterize.shading import features_seen
 from scas4d_core.update.picture_loss import LABEL, PictureLoss, TrainingView
 
 Float = NDArray[np.float64]
@@ -38,11 +39,11 @@ def find_jump(gaussians: Gaussians, views: Sequence[TrainingView], picture: Pict
     if not rows.any():
         return None
     alone = np.where(rows, np.float32(0), gaussians.opacities)
-    features = gaussians.features(gaussians.colours)
     rays_before: list[tuple[Float, Float]] = []
     rays_now: list[tuple[Float, Float]] = []
     for view in views:
         height, width = view.camera.height, view.camera.width
+        features = features_seen(gaussians, view.camera)
         picture.measure(gaussians.means, gaussians.factors, gaussians.opacities, features, view)
         before = picture.rasterizer.planes[LABEL, :height, :width] > 0.5
         picture.measure(gaussians.means, gaussians.factors, alone, features, view)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scas4d_core.effects.parts import Arrays
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.rasterize.shading import features_seen
 from scas4d_core.robust import outliers
 from scas4d_core.robust.checks import EXPOSURE, evened, gain_of, relit, validated
 from scas4d_core.robust.outliers import Past
@@ -290,7 +291,7 @@ class FrameSolver:
         with self._timed():
             # Short updates render a camera long before their end: one that does not fit is looked at once more.
             off = outliers.misfits(given.past, psnr, outliers.LAST_DB)
-            again = [view for view in given.views if view.name in off]
+            again = [view for view in result.views or given.views if view.name in off]
             psnr |= self._measured([*again, *given.suspects], result.gaussians)
         past = outliers.settle(given.past, psnr, given.brightness, result.exposure, len(trace.losses))
         if trace.errors.get(Candidate.END):
@@ -300,9 +301,9 @@ class FrameSolver:
 
     def _measured(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
         """DB of cameras as a state shows them; those that are left out come back so, once they fit."""
-        features = state.features(state.colours)
         found = {}
         for view in views:
+            features = features_seen(state, view.camera)
             self._picture.measure(state.means, state.factors, state.opacities, features, view)
             found[view.name] = self._picture.psnr
         return found

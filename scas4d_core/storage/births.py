@@ -89,6 +89,20 @@ def retired_after(events: Int, ids: Int) -> NDArray[np.bool_]:
     return retired
 
 
+def revived_in(events: Int, index: int, ids: Int) -> Int:
+    """Rows of the Gaussians that came back in a frame.
+
+    Args:
+        ids: [N] of all Gaussians, by row.
+
+    >>> revived_in(np.array([[5, 1, 3, 4], [6, 2, 4, 4]]), 6, np.array([2, 3, 4]))
+    array([2])
+    """
+    own = events[(events[:, 0] == index) & (events[:, 1] == Event.REVIVED)].tolist()
+    wanted = [np.arange(first, last + 1) for _, _, first, last in own]
+    return rows_among(ids, np.concatenate(wanted)) if wanted else np.zeros(0, np.int64)
+
+
 def rows_among(ids: Int, wanted: Int) -> Int:
     """[Q] rows of ids; −1 for one that is not among them.
 

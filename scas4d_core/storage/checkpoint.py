@@ -219,6 +219,25 @@ def _unpacked(arrays: dict[str, NDArray[Any]]) -> Motion:
     return Motion(**values)
 
 
+def cold_start(history: History, index: int, masked: bool) -> CarryOver:
+    """The carry-over of a committed frame as far as the history has it: labels learnt, switches, arrays of effects.
+
+    Args:
+        masked: whether the scene has masks.
+
+    Raises:
+        HistoryError: the frame cannot be read.
+    """
+    moving = history.gaussians(index).foreground > 0.5
+    first, newest = history.effects(history.indices[0]), history.effects(index)
+    effects = {name: {**first.get(name, {}), **newest.get(name, {})} for name in (*first, *newest)}
+    return CarryOver(
+        labels=None if masked or moving.all() else moving,
+        switches=switches_of(history.report(index).get("effects", {})),
+        effects=effects,
+    )
+
+
 class ResumeError(ValueError):
     """A history from which no scene can be resumed; the message names the damage."""
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Self
 
@@ -24,6 +26,10 @@ from scas4d_core.storage.frame_files import (
 
 EVENTS = "events"
 """Array of a frame's file: the log of births, retirements and revivals up to it; only where there are any."""
+EFFECTS = "effects"
+"""Array of a frame's file: what effects left of it for a cold start, the bytes of an npz; only where there is any."""
+EffectArrays = Mapping[str, Mapping[str, NDArray[Any]]]
+"""Arrays of effects, by effect and name."""
 FRAMES_KEPT = 4
 """Frames of a history on disk that stay in memory: the newest, and the last ones read."""
 
@@ -39,11 +45,14 @@ class FramesReader:
         self._files = None if directory is None else FrameFiles(directory)
         self.damaged: dict[int, str] = {}
         self._fixed: Arrays = {}
+        self._background: tuple[float, float, float] | None = None
         self._times: dict[int, float] = {}
         self._reports: dict[int, dict[str, Any]] = {}
         self._stamps: dict[int, Stamp] = {}
         self._texts: dict[int, bytes] = {}
         """Reports on disk of the frames that are in memory."""
+        self._packed: dict[int, NDArray[np.uint8]] = {}
+        """What effects left of the frames that were written here and are in memory, packed."""
         self._frames: OrderedDict[int, Arrays] = OrderedDict()
         self._births: dict[int, Arrays] = {}
         """What is known of the born, by frame; those of frames that were taken back stay."""
@@ -164,6 +173,31 @@ class FramesReader:
             self._texts[index] = text
         return report
 
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """RGB in 0…1 behind everything, which frame 0 has found; black where its report has none.
+
+        Raises:
+            HistoryError: its file is damaged, and the copy as well.
+        """
+        if self._background is None and self._times:
+            red, green, blue = self.report(next(iter(self._times))).get("background", (0.0, 0.0, 0.0))
+            self._background = (red, green, blue)
+        return self._background or (0.0, 0.0, 0.0)
+
+    def effects(self, index: int) -> dict[str, Arrays]:
+        """What effects left of a committed frame for a cold start, by effect; nothing where it cannot be read."""
+        return unpacked(self._left(index))
+
+    def _left(self, index: int) -> NDArray[np.uint8] | None:
+        """The same, packed; None: nothing."""
+        self._require(index)
+        found = self._packed.get(index)
+        if found is None and self._files is not None:
+            with suppress(FileNotFoundError, UnreadableFrameError):  # the state may be whole all the same
+                found = self._files.read(index, (), (EFFECTS,)).get(EFFECTS)
+        return found
+
     def _events(self) -> Int:
         """[E, 4] the log of the newest frame that can be read."""
         while (newest := self._newest()) >= 0:
@@ -243,6 +277,7 @@ class FramesReader:
         self._reports.pop(index, None)
         self._stamps.pop(index, None)
         self._texts.pop(index, None)
+        self._packed.pop(index, None)
         self._frames.pop(index, None)
         if self._files is not None and self._log[0] == index:
             self._log = (-1, NO_EVENTS)
@@ -254,3 +289,42 @@ class FramesReader:
             for old in [i for i in self._frames if i != newest][: max(0, len(self._frames) - FRAMES_KEPT)]:
                 del self._frames[old]
                 self._texts.pop(old, None)
+                self._packed.pop(old, None)
+
+
+def packed(effects: EffectArrays) -> NDArray[np.uint8] | None:
+    """Arrays of effects as one array of bytes; None of none.
+
+    >>> unpacked(packed({"shadows": {"c.0": np.arange(3)}}))
+    {'shadows': {'c.0': array([0, 1, 2])}}
+    """
+    arrays: dict[str, Any] = {f"{name}.{key}": array for name, own in effects.items() for key, array in own.items()}
+    if not arrays:
+        return None
+    file = BytesIO()
+    np.savez(file, **arrays)
+    return np.frombuffer(file.getvalue(), np.uint8)
+
+
+def unpacked(given: NDArray[np.uint8] | None) -> dict[str, Arrays]:
+    """The arrays of effects, by effect and name, that were ``packed``."""
+    found: dict[str, Arrays] = {}
+    if given is not None:
+        with np.load(BytesIO(given.tobytes()), allow_pickle=False) as file:
+            for name in file.files:
+                effect, _, key = name.partition(".")
+                found.setdefault(effect, {})[key] = file[name]
+    return found
+
+
+def as_written(frame: Arrays, time: float, report: bytes, log: Int, left: NDArray[np.uint8] | None) -> dict[str, Any]:
+    """The arrays of a frame's file.
+
+    Args:
+        log: up to it. left: what effects left of it, packed.
+    """
+    if len(log):
+        frame = {**frame, EVENTS: log}
+    if left is not None:
+        frame = {**frame, EFFECTS: left}
+    return {**frame, "time": np.float64(time), "report": np.frombuffer(report, np.uint8)}

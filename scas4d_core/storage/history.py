@@ -13,14 +13,16 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from time import perf_counter
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scas4d_core.gaussians import FIXED, PER_FRAME, UNBORN, WHOLES, Gaussians
 from scas4d_core.storage.births import FOUNDERLESS, Event, Int, births_in, events_of, retired_after
 from scas4d_core.storage.frame_files import Arrays, DamagedFrameError, FrameFiles, HistoryError, UnreadableFrameError
-from scas4d_core.storage.frames_reader import EVENTS, FRAMES_KEPT
+from scas4d_core.storage.frames_reader import FRAMES_KEPT, EffectArrays, as_written, packed
 from scas4d_core.storage.history_reader import ROOT, ROOTS, HistoryReader
 from scas4d_core.storage.npz import clear_parts
 
@@ -94,7 +96,8 @@ class History(HistoryReader):
             arrays, log = self.gaussians(index).arrays(), self._log_at(index)
             frame = {name: np.array(arrays[name]) for name in (*PER_FRAME, *WHOLES) if name in arrays}
             births = {birth[0]: self._born(birth) for birth in births_in(log)}
-            copy._write(index, self._times[index], frame, json.dumps(self.report(index)), log, births, self._fixed)
+            text, left = json.dumps(self.report(index)), self._left(index)
+            copy._write(index, self._times[index], frame, text, log, births, self._fixed, left)
         return copy
 
     def append(
@@ -106,6 +109,7 @@ class History(HistoryReader):
         *,
         joins: Int | None = None,
         roots: Gaussians | None = None,
+        effects: EffectArrays = MappingProxyType({}),
     ) -> None:
         """Commits the state of one frame with its report; when this returns both are on disk (if there is a directory).
 
@@ -117,6 +121,7 @@ class History(HistoryReader):
             report: made of JSON values (finite numbers, strings, lists, mappings).
             joins: [B] rows of the founders of the born; None: none has one.
             roots: of all Gaussians (``births.grown_roots``); None: the born have theirs where they are.
+            effects: arrays that a cold start needs, by effect.
 
         Raises:
             HistoryError: index not above the last, fewer Gaussians, other ids or opacities, or a report that is no
@@ -161,7 +166,8 @@ class History(HistoryReader):
                 events_of(index, Event.REVIVED, np.flatnonzero(retired & ~gaussians.retired), ids),
             ]
         )
-        self._write(index, time, frame, text, log if len(log) > len(before) else before, births, self._fixed or fixed)
+        log = log if len(log) > len(before) else before
+        self._write(index, time, frame, text, log, births, self._fixed or fixed, packed(effects))
 
     def _birth(self, index: int, born: Gaussians, joins: Int | None, roots: Gaussians | None) -> Arrays:
         """All that is kept of a birth.
@@ -188,16 +194,18 @@ class History(HistoryReader):
         return arrays | {"ids": spent["ids"] if same and spent else np.arange(first, first + count, dtype=np.int64)}
 
     def _write(
-        self, index: int, time: float, frame: Arrays, text: str, log: Int, births: Mapping[int, Arrays], fixed: Arrays
-    ) -> None:
+        self, index: int, time: float, frame: Arrays, text: str, log: Int, births: Mapping[int, Arrays], fixed: Arrays,
+        left: NDArray[np.uint8] | None,
+    ) -> None:  # fmt: skip
         """Commits a frame that fits those before.
 
         Args:
             log: up to it. births: those that may not have been written yet, by frame. fixed: of the first frame.
+            left: by effects, packed.
         """
         if self._files is not None:
             encoded = text.encode()
-            written = _as_written(frame, time, encoded, log)
+            written = as_written(frame, time, encoded, log, left)
             if not self._fixed:
                 self._files.write_fixed(fixed, index, written)
             for born_in, arrays in births.items():
@@ -211,6 +219,8 @@ class History(HistoryReader):
             self._stamps[index] = (sum(array.nbytes for array in frame.values()), 0)
             self._reports[index] = json.loads(text)
         self._births.update(births)
+        if left is not None:
+            self._packed[index] = left
         self._fixed = fixed
         self._times[index] = float(time)
         self._log = (index, log)
@@ -299,16 +309,19 @@ class History(HistoryReader):
         if self._files is None or frame is None or text is None or index not in self._times:
             return False
         self._stamps[index] = self._files.write(
-            index, _as_written(frame, self._times[index], text, self._log_at(index))
+            index, as_written(frame, self._times[index], text, self._log_at(index), self._packed.get(index))
         )
         return True
 
-    def replace(self, index: int, time: float, arrays: Mapping[str, Any], report: Mapping[str, Any]) -> None:
+    def replace(
+        self, index: int, time: float, arrays: Mapping[str, Any], report: Mapping[str, Any],
+        effects: EffectArrays = MappingProxyType({}),
+    ) -> None:  # fmt: skip
         """Writes the state of a frame anew whose file is damaged or gone.
 
         Args:
             index: of a frame before the newest. time: seconds. arrays: ``PER_FRAME``, and ``WHOLES`` if there are any.
-            report: as for ``append``.
+            report, effects: as for ``append``.
 
         Raises:
             HistoryError: the frame is not before the newest, or has another number of Gaussians.
@@ -320,21 +333,6 @@ class History(HistoryReader):
         frame = {name: np.asarray(arrays[name]) for name in (*PER_FRAME, *WHOLES) if name in arrays}
         text = json.dumps(dict(report), allow_nan=False).encode()
         self._forget(index)
-        self._stamps[index] = self._files.write(index, _as_written(frame, time, text, log))
+        self._stamps[index] = self._files.write(index, as_written(frame, time, text, log, packed(effects)))
         self.damaged.pop(index, None)
         self._times = dict(sorted([*self._times.items(), (index, float(time))]))
-
-    def completed(self, index: int, state: Gaussians) -> Gaussians:
-        """A state that was made again for a frame, with the Gaussians that were born in it, as they were then."""
-        for birth in births_in(self._log_at(index)):
-            born = self._born(birth)
-            if self.rows_of(birth[1:2])[0] >= len(state):
-                state = state.joined(Gaussians(**{name: born[name] for name in (*FIXED, *PER_FRAME)}))
-        return state
-
-
-def _as_written(frame: Arrays, time: float, report: bytes, log: Int) -> dict[str, Any]:
-    """The arrays of a frame's file."""
-    if len(log):
-        frame = {**frame, EVENTS: log}
-    return {**frame, "time": np.float64(time), "report": np.frombuffer(report, np.uint8)}

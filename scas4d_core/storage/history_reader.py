@@ -11,7 +11,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from scas4d_core.errors import InputError
 from scas4d_core.gaussians import FIXED, PER_FRAME, WHOLES, Gaussians
-from scas4d_core.storage.births import FOUNDERLESS, Int, Life, births_in, lives_of, retired_after, rows_among
+from scas4d_core.storage.births import (
+    FOUNDERLESS,
+    Int,
+    Life,
+    births_in,
+    lives_of,
+    retired_after,
+    revived_in,
+    rows_among,
+)
 from scas4d_core.storage.frame_files import DamagedFrameError, HistoryError, UnreadableFrameError
 from scas4d_core.storage.frames_reader import FramesReader
 
@@ -78,6 +87,29 @@ class HistoryReader(FramesReader):
             roots = roots.joined(Gaussians(**given | {name: born[ROOT + name] for name in ROOTS}))
         fixed = self._fixed_after(births)
         return roots.replace(ids=fixed["ids"], retired=retired_after(log, fixed["ids"]))
+
+    def completed(self, index: int, state: Gaussians) -> Gaussians:
+        """A state that was made again for a frame, with what was born in it, as it was then, and what came back in it.
+
+        Where that came back is not kept apart: it is shown as in the next frame that can be read.
+        """
+        log = self._log_at(index)
+        for birth in births_in(log):
+            born = self._born(birth)
+            if self.rows_of(birth[1:2])[0] >= len(state):
+                state = state.joined(Gaussians(**{name: born[name] for name in (*FIXED, *PER_FRAME)}))
+        later = next((one for one in self._times if one > index), None)
+        back = revived_in(log, index, state.ids)
+        if later is None or not len(back):
+            return state
+        with suppress(HistoryError):
+            there = self.gaussians(later)
+            back = back[there.present[back]]
+            arrays = {name: np.array(getattr(state, name)) for name in PER_FRAME}
+            for name, array in arrays.items():
+                array[back] = getattr(there, name)[back]
+            state = state.replace(**arrays)
+        return state
 
     @property
     def ids(self) -> Int:

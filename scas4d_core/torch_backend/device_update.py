@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.effects.appearance.colours import Colours
 from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
-from scas4d_core.effects.parts import NOTHING, Arrays, PartsBuilder
+from scas4d_core.effects.parts import NOTHING, Arrays, Hooks, PartsBuilder, Work, not_on_devices
 from scas4d_core.effects.switches import joined
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
@@ -79,8 +79,13 @@ class DeviceUpdate:
         self._factory = factory
         limits = scene_limits(scene.near, factory.rig.radius)
         parts = parts or joined(PartsBuilder(scene, settings, factory, hierarchy, first))
-        self._picture = PictureLoss(factory, scene.background, schedule.IMAGE_WEIGHT, parts.mask, limits=limits)
+        self._picture = PictureLoss(factory, scene.behind, schedule.IMAGE_WEIGHT, parts.mask, limits=limits)
         self._freedom = parts.freedom
+        own = [part for part in parts.parts if not part.known_to_devices]
+        for part in own:
+            if hooks := not_on_devices(type(part)):
+                raise ValueError(f"{type(part).__name__}: an update on a device calls no {', '.join(hooks)}")
+        self._hooks = Hooks(own)
         bounds = length_bounds(hierarchy, first)
         self._deformation = CpuDeformation(hierarchy, neighbours, bounds, settings.cluster_map, settings.covariance)
         self._update = TorchUpdate(
@@ -92,7 +97,7 @@ class DeviceUpdate:
             weights=_weights(parts, neighbours is not None),
             terms=tuple(part.twin for part in parts.parts),
             max_scale=deformation.MAX_SCALE,
-            background=scene.background,
+            background=scene.behind,
             cluster_map=settings.cluster_map,
             covariance=settings.covariance,
             near=limits.near,
@@ -123,14 +128,18 @@ class DeviceUpdate:
         probes = ProbeViews(self._factory, self._picture, views if options.compare else [])
         best = BestState(probes, deformation, previous, motion, seconds, settings.momentum)
         best.start(options.step)
+        rates = self._update.rates.tried(options.rates, options.rigid, options.hold_colours)
+        rates = rates.hurried(settings.cold_start) if motion is None else rates
+        work = Work(previous, deformation, rates, views, self._picture, dict(carried))
+        for begin in self._hooks.start:
+            begin(work)
         stands = best.stands(options.enough)
         if stands:
             stopping = Stopping(0)
         plan = ViewPlan(views, settings.views, most, rng)
         pictures = [plan.take() for _ in range(0 if stands else most)]
         samples = plan_samples(len(hierarchy.rows), rng)
-        rates = self._update.rates.tried(options.rates, options.rigid, options.hold_colours)
-        update = replace(self._update, rates=rates.hurried(settings.cold_start) if motion is None else rates)
+        update = replace(self._update, rates=rates)
         start, deltas = Tables(hierarchy, deformation.clusters, deformation.deltas).split()
         distinct = {id(view): view for seen in pictures for view in seen}
         place = {key: index for index, key in enumerate(distinct)}
@@ -153,16 +162,19 @@ class DeviceUpdate:
         trace.cameras = {view.name: camera_fit(psnr) for view, psnr in zip(chain(*pictures), found.psnr, strict=False)}
         _take(deformation, Tables.of(hierarchy, found))
         trace.errors = best.errors
-        trace.kept = best.end(found.gaussians.colours, trace.iterations, {})
+        trace.kept = best.end(found.gaussians, trace.iterations, {})
         watch.lap("end")
         state = found.gaussians if trace.kept is Candidate.END else previous
         if trace.kept is Candidate.WARM:
             start, deltas = Tables(hierarchy, deformation.clusters, deformation.deltas).split()
             state = update.run(previous, [], [], start=start, deltas=deltas).gaussians
+        work.colours, work.kept = found.gaussians.colours, trace.kept
+        for end in self._hooks.end:
+            state = end(work, state)
         motion_found = Motion.of(deformation, best.seconds)
         watch.lap("commit")
         trace.seconds = watch.seconds
-        return UpdateResult(state, motion_found, trace, carried=dict(carried))
+        return UpdateResult(state, motion_found, trace, carried=work.carried, views=views)
 
     def _on_device(self, view: TrainingView) -> TorchView:
         """The view as ``TorchUpdate`` takes it."""

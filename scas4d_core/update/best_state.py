@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import Rig
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.rasterize.shading import features_seen, without_turn
 from scas4d_core.update.deformation import CpuDeformation
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.warm_start import Motion, warm_start
@@ -59,15 +60,16 @@ class ProbeViews:
         self._views = [factory.coarser(view, SCALE) for view in views if view.name in chosen]
         self._picture = picture
 
-    def errors(self, means: Array, factors: Array, opacities: Array, features: Array) -> dict[str, float]:
+    def errors(self, state: Gaussians, turns: Array | None = None) -> dict[str, float]:
         """The image loss (``losses.image_loss``) of a state in each view, by the camera's name.
 
         Args:
-            means, factors, opacities, features: [N, 3], [N, 3, 3], [N], [N, 4] float32.
+            turns: since its gloss was known, see ``shading.colours_seen``.
         """
         found = {}
         for view in self._views:
-            self._picture.measure(means, factors, opacities, features, view)
+            features = features_seen(state, view.camera, turns)
+            self._picture.measure(state.means, state.factors, state.opacities, features, view)
             found[view.name] = self._picture.image_part
         return found
 
@@ -105,11 +107,11 @@ class BestState:
                 as long as since the motion was found.
         """
         previous, motion = self._previous, self._motion
-        self._measure(Candidate.STILL, previous.means, previous.factors, previous.colours)
+        self._note(Candidate.STILL, self._probes.errors(previous))
         self._set(motion)
         if motion is not None and self.errors:
             self._deformation.forward()
-            self._measure(Candidate.WARM, self._deformation.means, self._deformation.factors, previous.colours)
+            self._note(Candidate.WARM, self._moved(previous))
             if step is not None:
                 self._try_after_rest(motion, step)
             if self._mean(Candidate.STILL) < self._mean(Candidate.WARM):
@@ -121,7 +123,7 @@ class BestState:
         self.seconds = step
         self._set(motion)
         self._deformation.forward()
-        self._measure(Candidate.WARM, self._deformation.means, self._deformation.factors, self._previous.colours)
+        self._note(Candidate.WARM, self._moved(self._previous))
         if mean_error(errors, list(errors)) <= self._mean(Candidate.WARM):
             self.seconds, self.errors[Candidate.WARM] = whole, errors
             self._set(motion)
@@ -138,28 +140,32 @@ class BestState:
         names = sorted(still.keys() & enough.keys())
         return bool(names) and mean_error(still, names) <= mean_error(enough, names)
 
-    def error(self, colours: Array) -> float:
-        """Mean error on the probe views of the deformation as it is set, with its cascade brought up to date."""
+    def error(self, look: Gaussians) -> float:
+        """Mean error on the probe views of the deformation as it is set, with its cascade brought up to date.
+
+        Args:
+            look: Θ_{t−1} with the colours, gloss and environment as the update has them now.
+        """
         self._deformation.forward()
-        found = self._errors(self._deformation.means, self._deformation.factors, colours)
+        found = self._moved(look)
         return mean_error(found, list(found))
 
     def error_of(self, state: Gaussians) -> float:
         """Mean error on the probe views of a state."""
-        features = state.features(state.colours)
-        found = self._probes.errors(state.means, state.factors, state.opacities, features)
+        found = self._probes.errors(state)
         return mean_error(found, list(found))
 
-    def end(self, colours: Array, iterations: int, left_out: Mapping[str, str]) -> Candidate:
+    def end(self, look: Gaussians, iterations: int, left_out: Mapping[str, str]) -> Candidate:
         """The best candidate; the deformation is set to it.
 
         Args:
-            colours: as the update leaves them. iterations: that it had. left_out: cameras that have no say.
+            look: a state with the colours, gloss and environment that the update leaves.
+            iterations: that it had. left_out: cameras that have no say.
         """
         if not self.errors:
             return Candidate.END
         if iterations:
-            self._measure(Candidate.END, self._deformation.means, self._deformation.factors, colours)
+            self._note(Candidate.END, self._moved(look))
         names = [name for name in self.errors[Candidate.STILL] if name not in left_out]
         found = [candidate for candidate in Candidate if candidate in self.errors]  # of equal ones the first
         best = min(found, key=lambda candidate: _or_last(mean_error(self.errors[candidate], names)))
@@ -171,14 +177,21 @@ class BestState:
     def _set(self, motion: Motion | None) -> None:
         warm_start(self._deformation, motion, self.seconds, self._momentum)
 
-    def _measure(self, candidate: Candidate, means: Array, factors: Array, colours: Array) -> None:
-        errors = self._errors(means, factors, colours)
+    def _note(self, candidate: Candidate, errors: dict[str, float]) -> None:
         if errors:
             self.errors[candidate] = errors
 
-    def _errors(self, means: Array, factors: Array, colours: Array) -> dict[str, float]:
-        features = self._previous.features(colours)
-        return self._probes.errors(means, factors, self._previous.opacities, features)
+    def _moved(self, look: Gaussians) -> dict[str, float]:
+        """Errors of Θ_{t−1} under the deformation, with the looks of a state."""
+        found, turns = self._deformation, None
+        if look.gloss is not None:
+            turns = without_turn(len(look))
+            turns[found.hierarchy.rows] = found.turns
+        state = self._previous.replace(
+            means=found.means, factors=found.factors,
+            colours=look.colours, gloss=look.gloss, environment=look.environment,
+        )  # fmt: skip
+        return self._probes.errors(state, turns)
 
     def _mean(self, candidate: Candidate, otherwise: float = np.inf) -> float:
         errors = self.errors.get(candidate)

@@ -19,7 +19,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import SMALLEST_SQUARE
 from scas4d_core.kernels import image_loss, tiles
 from scas4d_core.kernels.projection import TILE
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Drawing, Gradients
+from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Drawing, Gradients, Picture
 from scas4d_core.rasterize.limits import DEFAULT, Limits
 from scas4d_core.update.picture_loss import LABEL, PictureLoss, TrainingView, ViewFactory, means, no_lap
 
@@ -86,6 +86,7 @@ class ChangedPixels(PictureLoss):
         self._standing = np.flatnonzero(~self._moves)
         self._stood: State | None = None
         self._bases: dict[tuple[str, int, int], Array] = {}
+        self._base_rests: dict[tuple[str, int, int], Array] = {}
         self._base_means: dict[tuple[str, int, int], NDArray[np.float64]] = {}
         self._regions: dict[tuple[str, int, int], Region] = {}
         self._gradients: Gradients | None = None
@@ -129,6 +130,14 @@ class ChangedPixels(PictureLoss):
         """As ``evaluate``, without gradients."""
         region = self._drawn((means, factors, opacities, features), view)
         self._compare_box(region, view)
+
+    def shown(self, view: TrainingView) -> Picture:
+        """See ``PictureLoss``."""
+        region, drawn = self._regions[_key(view)], self.rasterizer.picture
+        whole = Picture(self._base(view).copy(), self._base_rests[_key(view)].copy())
+        for plane, new in zip((*whole.features, whole.rest), (*drawn.features, drawn.rest), strict=True):
+            np.copyto(plane[region.box], new[region.box], where=region.shown)
+        return whole
 
     def colour_shift(self, view: TrainingView) -> tuple[float, float, float]:
         """See ``PictureLoss``."""
@@ -184,7 +193,7 @@ class ChangedPixels(PictureLoss):
         if key not in self._bases:
             assert self._stood is not None
             picture = self.rasterizer.forward(*self._stood, view.camera, self._background)
-            self._bases[key] = picture.features.copy()
+            self._bases[key], self._base_rests[key] = picture.features.copy(), picture.rest.copy()
             self._base_means[key] = means(self._bases[key][:3])
         return self._bases[key]
 

@@ -6,6 +6,7 @@ The loop is ``FrameUpdate.run``: deform, render and compare, tie neighbours, car
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -62,7 +63,7 @@ class FrameUpdate:
     """The ``Updater`` of the CPU; buffers are kept from frame to frame.
 
     Attributes:
-        tells: whether figures that the report alone needs are worked out; the state is the same without.
+        tells: whether figures that the report alone needs are worked out; state and evidence are the same without.
     """
 
     tells = True
@@ -82,9 +83,10 @@ class FrameUpdate:
         self._factory = factory
         parts = parts or joined(PartsBuilder(scene, settings, factory, hierarchy, first))
         self._hooks, self._length, self._freedom = Hooks(parts.parts), parts.length, parts.freedom
+        self._exposes = parts.exposes
         self._rates = freed(Rates.of(settings, len(hierarchy.sizes), factory.rig.radius), parts.freedom)
         limits = scene_limits(scene.near, factory.rig.radius)
-        given = (factory, scene.background, schedule.IMAGE_WEIGHT, parts.mask)
+        given = (factory, scene.behind, schedule.IMAGE_WEIGHT, parts.mask)
         self._picture = PictureLoss(*given, limits=limits)
         if not parts.whole and len(hierarchy.rows) <= MOST * len(first):
             self._picture = ChangedPixels(*given, hierarchy.rows, len(first), limits)
@@ -104,6 +106,8 @@ class FrameUpdate:
         """Find D_t and apply it, see ``Updater.run``."""
         settings, deformation = self.settings, self._deformation
         motion = predicted(motion, self._freedom)
+        if self._exposes:  # another attempt at the frame starts from the exposures that it came with
+            views = [replace(view, exposure=view.exposure.copy()) for view in views]
         stopping = options.stopping or Stopping(settings.iterations)
         rng = np.random.default_rng([settings.seed, seed])
         watch, trace = Stopwatch(), UpdateTrace()
@@ -130,7 +134,7 @@ class FrameUpdate:
             work.features[:, :3] = work.colours
             watch.lap("cascade")
             met = len(trace.first)
-            loss = self._pictures(plan.take(), work, trace, watch)
+            loss = self._pictures(plan.take(), work, trace, watch, planned - iteration - 1)
             work.sample = samples[iteration % len(samples)]
             for term in self._hooks.loss:
                 loss += term(work)
@@ -151,11 +155,11 @@ class FrameUpdate:
                 work.views = [view for view in views if view.name not in trace.left_out]
                 watch.lap("judge")
             if stopping.looks(trace.iterations):
-                stopping.saw(trace.iterations, best.error(work.colours))
+                stopping.saw(trace.iterations, best.error(work.look))
                 watch.lap("looks")
         deformation.forward()
         trace.planned, trace.errors = stopping.planned_so_far, best.errors
-        trace.kept = work.kept = best.end(work.colours, trace.iterations, trace.left_out)
+        trace.kept = work.kept = best.end(work.look, trace.iterations, trace.left_out)
         watch.lap("end")
         state = previous if work.kept is Candidate.STILL else self._commit(previous)
         for end in self._hooks.end:
@@ -166,15 +170,21 @@ class FrameUpdate:
         trace.guards = {name: count for name, count in acted.items() if count}
         watch.lap("commit")
         trace.seconds = watch.seconds
-        return UpdateResult(state, found, trace, carried=work.carried)
+        return UpdateResult(state, found, trace, carried=work.carried, views=views)
 
     def _attempted(self, options: AttemptOptions, cold: bool) -> Rates:
         """The rates of an attempt; without a motion to start from there is further to go."""
         rates = self._rates.tried(options.rates, options.rigid, options.hold_colours)
         return rates.hurried(self.settings.cold_start if cold else 1.0)
 
-    def _pictures(self, views: list[TrainingView], work: Work, trace: UpdateTrace, watch: Stopwatch) -> float:
-        """Image and mask loss, the mean over the views; ``work`` gets the gradients, of a single view the buffers."""
+    def _pictures(
+        self, views: list[TrainingView], work: Work, trace: UpdateTrace, watch: Stopwatch, left: int
+    ) -> float:
+        """Image and mask loss, the mean over the views; ``work`` gets the gradients, of a single view the buffers.
+
+        Args:
+            left: iterations that are planned after this one.
+        """
         deformation, picture = self._deformation, self._picture
         loss, total = 0.0, None
         for view in views:
@@ -186,7 +196,7 @@ class FrameUpdate:
             for saw in self._hooks.saw:
                 saw(work, view, picture, found)
             loss += picture.image_part + picture.mask_part
-            trace.see(view, picture, self.tells)
+            trace.see(view, picture, left)
             watch.lap(REPORT)
             if len(views) == 1:
                 work.gradients = found

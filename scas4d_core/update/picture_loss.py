@@ -262,6 +262,10 @@ class PictureLoss:
         given = (state.means, state.factors, state.opacities, features, view.camera, self._background)
         return self.rasterizer.forward(*given, depth_channel)
 
+    def shown(self, view: TrainingView) -> Picture:
+        """The view's whole picture as ``evaluate`` rendered it last; valid until anything else is rendered."""
+        return self.rasterizer.picture
+
     def measure(self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView) -> None:
         """Render the view and set ``image_part``, ``mask_part`` and ``psnr``, without gradients; see ``evaluate``."""
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import TypedDict
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.effects.parts import Arrays
+from scas4d_core.effects.parts import Array, Arrays
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView
@@ -52,6 +52,29 @@ class Stopwatch:
         """Book a part of a stage to another."""
         self.seconds[stage] -= seconds
         self.seconds[other] = self.seconds.get(other, 0.0) + seconds
+
+
+SHOWN = 8
+"""Views of the last iterations whose renderings the trace keeps: what is new in a frame is seen by many cameras."""
+ROWS = 128
+"""Of such a rendering, about: of larger pictures every so many rows and columns are kept."""
+
+
+class Thinned(NamedTuple):
+    """A rendering, thinned out.
+
+    Attributes:
+        every: so many rows and columns. planes: [5, h, w] float32, RGB before the camera's exposure, label,
+            transmittance left.
+    """
+
+    every: int
+    planes: Array
+
+
+def _thinned(features: Array, rest: Array) -> Thinned:
+    every = max(1, min(rest.shape) // ROWS)
+    return Thinned(every, np.concatenate([features[:, ::every, ::every], rest[None, ::every, ::every]]))
 
 
 @dataclass(frozen=True)
@@ -119,6 +142,8 @@ class UpdateTrace:
         planned: (iteration, iterations in all) whenever the stopping rule planned otherwise.
         errors: image loss by candidate, then by probe view; empty where nothing was compared. kept: the candidate that
             became Θ_t.
+        shown: by camera, the renderings of the last ``SHOWN`` iterations: evidence is taken from them without another
+            rendering. Empty on other devices, and where an update ended sooner than planned.
         guards: those that acted, how often.
     """
 
@@ -132,6 +157,7 @@ class UpdateTrace:
     planned: list[tuple[int, int]] = field(default_factory=list)
     errors: dict[Candidate, dict[str, float]] = field(default_factory=dict)
     kept: Candidate = Candidate.END
+    shown: dict[str, Thinned] = field(default_factory=dict)
     guards: dict[str, int] = field(default_factory=dict)
 
     @property
@@ -144,11 +170,20 @@ class UpdateTrace:
         """DB by camera, when last rendered."""
         return {name: fit["psnr"] for name, fit in self.cameras.items()}
 
-    def see(self, view: TrainingView, picture: PictureLoss, shifts: bool) -> None:
-        """Note a view that was rendered and compared; ``shifts``: with the colour shift, for the report alone."""
+    def see(self, view: TrainingView, picture: PictureLoss, left: int) -> None:
+        """Note a view that was rendered and compared; its colour shift is evidence for gains of cameras, too.
+
+        Args:
+            left: iterations that are planned after this one.
+        """
         self.psnr.append(picture.psnr)
         self.first.setdefault(view.name, picture.psnr)
-        self.cameras[view.name] = camera_fit(picture.psnr, picture.colour_shift(view) if shifts else None)
+        self.cameras[view.name] = camera_fit(picture.psnr, picture.colour_shift(view))
+        if left < SHOWN:
+            self.shown.pop(view.name, None)
+            self.shown[view.name] = _thinned(*picture.shown(view))
+            for name in list(self.shown)[:-SHOWN]:  # what was planned for the last iterations has become longer
+                del self.shown[name]
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +199,7 @@ class UpdateResult:
         attempts: each attempt at the frame, with what came of it.
         exposure: times that the frame is brighter than usual.
         offsets: dB by camera above (+) or below its usual place among the cameras; empty where nothing was rendered.
-        carried: arrays for the next update, by effect.
+        carried: arrays for the next update, by effect. views: that were learnt from, with the exposures of the end.
         joins: [B] int64 of the Gaussians born in this frame, which are the last rows: the row of the founder that each
             joins in the hierarchy and the graph, or −1 where it starts a structure of its own. None: none is born.
     """
@@ -180,4 +215,5 @@ class UpdateResult:
     exposure: float = 1.0
     offsets: Mapping[str, float] = field(default_factory=dict)
     carried: Mapping[str, Arrays] = field(default_factory=dict)
+    views: Sequence[TrainingView] = ()
     joins: NDArray[np.int64] | None = None

@@ -223,6 +223,8 @@ UNTIMED = 100
 
 RATE = 0.3
 """How fast what a budget foresees follows what was."""
+FOR_BIRTHS = 0.4
+"""Of a budget, that fits of what is born may have: about an update's worth where something entered."""
 AFTER_S = 0.05
 """Seconds after the last iteration that are foreseen before any frame was measured."""
 
@@ -309,16 +311,23 @@ class TimeBudget:
 
     Attributes:
         milliseconds: a frame may take, None: as many as it needs. each: seconds of an iteration, None: not known yet.
-        after: seconds from the last iteration to the end of the commit.
+        after: seconds from the last iteration to the end of the commit, without fits of what is born.
+        births: whether the next frame has time for such fits, taken from its iterations: the one before had some.
     """
 
     def __init__(self, milliseconds: float | None) -> None:
         self.milliseconds = milliseconds
         self.each: float | None = None
         self.after = AFTER_S
+        self.births = False
 
     def end(self, began: float) -> float | None:
         """The moment by which the last iteration has to be over, of a frame begun at ``began``; None: no limit."""
+        kept = FOR_BIRTHS * self.births * (self.milliseconds or 0.0) / 1000
+        return None if (end := self.end_of_births(began)) is None else end - kept
+
+    def end_of_births(self, began: float) -> float | None:
+        """The moment by which fits of what is born have to be over; None: no limit."""
         return None if self.milliseconds is None else began + self.milliseconds / 1000 - self.after
 
     def learn(self, moments: Sequence[float], seconds: Mapping[str, float], commit: float) -> None:

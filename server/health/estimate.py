@@ -18,6 +18,10 @@ PIXEL = 8
 SCALED_PIXEL = 112
 """Bytes for each pixel after scaling: 3 or 4 channels of float32 in the target, the same and SSIM's two moments in the
 box around what moves, what stands alone; where there are no masks, targets and moments of two frames."""
+NOVEL_PIXEL = 38
+"""Bytes for each pixel after scaling where Gaussians may be born: what each camera says is new there (a picture, an
+error, five masks: 21), and the distances to it in carving, or the parts of pictures that the born are fitted to (17).
+The voxels of a thing are few beside that."""
 GAUSSIAN = 2200
 """Bytes for each Gaussian in the worker: state, layers, Adam, neighbours, and what a render needs."""
 READ_GAUSSIAN = 500
@@ -28,6 +32,8 @@ HISTORY = 28
 """Bytes for each Gaussian and frame of a query: position and material rotation."""
 LARGEST_BUDGET, MOST_PER_PIXEL = 100_000, 0.61
 """Limits of `scas4d_core.first_frame.static_scene.budget`, for a picture without background."""
+BEARING = ("entering", "uncovered")
+"""Effects by which Gaussians are born, and which ask the cameras what is new."""
 SCALES = (0.75, 0.5, 0.35, 0.25, 0.125)
 
 CGROUP = Path("/sys/fs/cgroup/memory.max")
@@ -50,7 +56,8 @@ def estimate(rig: RigModel, settings: Settings, server: ServerSettings, scale: f
     scaled = round(pixels * scale * scale)
     most = max(1, round(MOST_PER_PIXEL * scaled / len(sizes)))
     gaussians = settings.static.max_gaussians or min(LARGEST_BUDGET, most)
-    pictures = pixels * PIXEL + scaled * SCALED_PIXEL
+    bears = any(settings.effects.get(name) != "off" for name in BEARING)
+    pictures = pixels * PIXEL + scaled * (SCALED_PIXEL + NOVEL_PIXEL * bears)
     worker = PROCESS + pictures + gaussians * GAUSSIAN
     readers = 2 * (PROCESS + gaussians * READ_GAUSSIAN)
     limit = machine_mb() if server.max_scene_memory_mb is None else server.max_scene_memory_mb

@@ -224,7 +224,8 @@ class ReplayEnded:
 class RenderQuery:
     """A view of a committed frame.
 
-    `parts` is the number of parts where they are asked for and it is given; `labels` [N] are then the parts themselves.
+    `background` None is the one that frame 0 has found. `parts` is their number where they are asked for and it is
+    given; `labels` [N] are then the parts themselves.
     """
 
     kind: ClassVar[str] = "render"
@@ -232,7 +233,7 @@ class RenderQuery:
     frame: int
     kinds: tuple[str, ...]
     format: Literal["png", "jpeg", "webp", "npz", "float32"]
-    background: tuple[float, float, float]
+    background: tuple[float, float, float] | None
     parts: int | None = None
     quality: int | None = None
     labels: NDArray[np.int16] | None = None

@@ -100,7 +100,7 @@ def _written_in_part(history: History, files: FrameFiles, index: int, message: M
         return MendOutcome.DAMAGED
     if report is None:
         report = _report_of(files, index)
-    history.replace(index, time, arrays, report or {})
+    history.replace(index, time, arrays, report or {}, history.effects(index) if index in history else {})
     return MendOutcome.REPORT_LOST if report is None else MendOutcome.WRITTEN
 
 

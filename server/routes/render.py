@@ -101,12 +101,13 @@ def query_of(scene: Scene, request: RenderRequest) -> RenderQuery:
             value=request.format.value,
             remedy="ask for png, npz or float32",
         )
+    own = scene.spec.settings.scene.background
     return RenderQuery(
         camera,
         scene.committed_frame(request.frame),
         kinds,
         request.format.value,
-        request.background or scene.spec.settings.scene.background,
+        request.background or (None if own == "auto" else own),
         parts=request.parts,
         quality=request.quality,
     )

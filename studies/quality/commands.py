@@ -1,4 +1,4 @@
-"""`scripts/bench quality`, `refit`, `targets`, `table` and `processors`."""
+"""`scripts/bench quality`, `refit`, `effects`, `switches`, `targets`, `table` and `processors`."""
 
 from __future__ import annotations
 
@@ -90,6 +90,62 @@ def refit(
         changes=changes or (),
         again=again,
     )
+
+
+def effects(
+    captures: Captures,
+    out: Annotated[Path, typer.Option(help="Folder of the study. Run again to go on.")] = Path("out/effects"),
+    name: Annotated[
+        list[str] | None, typer.Option(help="Only this effect, by name; all when left out. May be repeated.")
+    ] = None,
+    pin: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=MODE,NAME=MODE", help="Effects pinned together. May be repeated."),
+    ] = None,
+    preset: Annotated[str, typer.Option(help="Named settings.")] = "scas4d",
+    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed, default 0. May be repeated.")] = None,
+    frames: Annotated[int | None, typer.Option(min=2, help="Only so many frames; all when left out.")] = None,
+    again: Again = False,
+    changes: Changes = None,
+) -> None:
+    """Compares each effect pinned off, pinned on or removed from the registry with auto: dB, time and bits.
+
+    Both are updated in turns from the same frame 0, a file a finished run. Effects that are on in every scene are
+    tried off alone; "removed" shows what one costs that is off. Leaves effects.md in the study's folder.
+
+    Example: scripts/bench effects captures/robot --name entering --name leaving --frames 8
+    """
+    from studies.quality.effects import run
+
+    pins = [dict(one.split("=", 1) for one in given.split(",")) for given in pin or ()]
+    run(
+        captures,
+        out,
+        names=name or (),
+        pins=pins,
+        preset=preset,
+        seeds=seed or (0,),
+        frames=frames,
+        changes=changes or (),
+        again=again,
+    )
+
+
+def switches(
+    captures: Captures,
+    out: Study = QUALITY,
+    updates: Annotated[int, typer.Option(min=1, help="Of each capture, played forwards and backwards.")] = 50,
+    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed, default 0. May be repeated.")] = None,
+    again: Again = False,
+    changes: Changes = None,
+) -> None:
+    """Updates captures for a while, and says which effects are switched on and off, and when.
+
+    Leaves switches.md in the study's folder; a capture that was played is not played again.
+    """
+    from studies.quality.switches import run
+
+    run(captures, out, updates=updates, seeds=seed or (0,), changes=changes or (), again=again)
 
 
 def targets(

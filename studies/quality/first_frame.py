@@ -10,6 +10,7 @@ import json
 import os
 from dataclasses import fields
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from scas4d_core.captures import Capture
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 
 VERSION = 3
@@ -85,3 +87,19 @@ def save_first_frame(path: Path, result: StaticResult, seconds: float) -> None:
     with beside.open("wb") as file:
         np.savez(file, **arrays)
     beside.replace(path)
+
+
+def first_of(capture: Capture, out: Path, settings: Settings) -> StaticResult:
+    """Frame 0, from the folder of a study, where it is fitted once; gloss is a part of it, so its pin counts too."""
+    key = first_frame_key(capture, settings)
+    gloss = settings.effects.get("direction", "auto")
+    path = out / "first" / f"{key}{'' if gloss == 'auto' else f'-direction-{gloss}'}.npz"
+    found = load_first_frame(path)
+    if found is None:
+        began = perf_counter()
+        scene = Reconstruction.start(capture.rig, capture.frame(0), settings, points=capture.points)
+        assert scene.static is not None
+        save_first_frame(path, scene.static, perf_counter() - began)
+        found = load_first_frame(path)
+        assert found is not None
+    return found[0]

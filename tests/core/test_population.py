@@ -15,12 +15,16 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.effects import effect as effect_module
+from scas4d_core.effects.evidence import Seen
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.remake import remake
+from scas4d_core.robust.solve_frame import FrameSolver, Solved, UpdateInput
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings
 from scas4d_core.storage.births import Life
 from scas4d_core.storage.history import History
+from scas4d_core.update.result import UpdateResult
+from scas4d_core.update.schedule import FOR_BIRTHS
 from scas4d_core.update.warm_start import Motion, motion_between, warm_start
 
 BOX = make_box()
@@ -153,6 +157,35 @@ def test_a_state_made_again_has_the_born_of_its_frame(populated: None, tmp_path:
     assert history.lives(history.ids) == whole.history.lives(whole.history.ids)
 
 
+def test_a_state_made_again_has_what_came_back_where_it_was_then(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    rows, far = np.array([3, 4, 5, 40]), np.float32([0.4, -0.3, 0.0])
+
+    def populated(seen: Seen) -> UpdateResult:
+        state = seen.result.gaussians
+        if seen.index == 2:
+            state = state.retire(rows)
+        if seen.index == 4:
+            means = state.means.copy()
+            means[rows] += far
+            state = state.replace(means=means).revive(rows)
+        return replace(seen.result, gaussians=state)
+
+    install(monkeypatch, populated)
+    whole = go_on(start(History(tmp_path), masks=True), FRAMES[True])
+    then = whole.history.gaussians(4)
+    (tmp_path / "frame_000004.npz").write_bytes(b"")
+    history = History.open(tmp_path)
+    remake(RIG, SETTINGS, history, 3, FRAMES[True][4], {})
+    made = History.load(tmp_path).gaussians(4)
+    assert not made.retired.any()
+    off = np.linalg.norm(made.means - then.means, axis=1)
+    assert off[rows].max() < 0.2 * np.linalg.norm(far)
+    assert off.max() < 0.2 * np.linalg.norm(far)  # all others, too
+    effect_module.effect.cache_clear()
+
+
 def test_a_copy_aside_goes_on_with_the_born(populated: None) -> None:
     scene = go_on(start(History(), masks=True), FRAMES[True][:4])
     aside = Reconstruction.aside(RIG, SETTINGS, scene.history, 3)
@@ -178,6 +211,34 @@ def test_an_effect_that_breaks_the_rules_is_named(
     )
     with pytest.raises(ValueError, match="rows were lost or moved"):
         scene.step(FRAMES[True][1])
+    effect_module.effect.cache_clear()
+
+
+def test_births_have_their_time_in_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    ends, asked = [], FrameSolver.run
+
+    def run(self: FrameSolver, given: UpdateInput, repeated: bool = False) -> Solved:
+        assert given.end is not None
+        ends.append(given.end)
+        return asked(self, given, repeated)
+
+    def populated(seen: Seen) -> UpdateResult:
+        assert seen.time.end is not None
+        ends.append(seen.time.end)
+        if seen.index == 2:
+            seen.time.put_off.append("a ball was not born")
+        return seen.result
+
+    monkeypatch.setattr(FrameSolver, "run", run)
+    install(monkeypatch, populated)
+    scene = start(History(), masks=True, settings=SETTINGS)
+    scene.set_budget(budget_ms=1000.0)
+    reports = [scene.step(frame) for frame in FRAMES[True][1:5]]
+    assert [report.put_off for report in reports] == [[], ["a ball was not born"], [], []]
+    assert scene.history.report(2)["put_off"] == ["a ball was not born"]
+    assert all("presence" in report.seconds for report in reports)
+    left = [births - iterations for iterations, births in zip(ends[::2], ends[1::2], strict=True)]
+    assert left == pytest.approx([0, 0, FOR_BIRTHS, 0], abs=1e-6)
     effect_module.effect.cache_clear()
 
 

@@ -176,7 +176,7 @@ def test_a_history_that_cannot_be_written_leaves_no_trace(monkeypatch: pytest.Mo
     scene, other = start(shortened()), start(shortened())
     with monkeypatch.context() as patch:
 
-        def full(*_: object) -> None:
+        def full(*_: object, **__: object) -> None:
             raise OSError("disk full")
 
         patch.setattr(History, "append", full)

@@ -67,7 +67,7 @@ class DrawnCommitted(fakes.FakeCommitted):
                 disc = np.hypot(columns - uv[number, 0], rows - uv[number, 1]) < 0.09 * inside.fx / z[number]
                 depth[disc], nearest[disc] = z[number], number
         met = nearest >= 0
-        colour = np.broadcast_to(np.array(background, np.float32), (*shape, 3)).copy()
+        colour = np.broadcast_to(np.array(background or (0, 0, 0), np.float32), (*shape, 3)).copy()
         colour[met] = colours()[nearest[met]]
         parts = None
         if labels is not None:

@@ -169,7 +169,7 @@ class FakeCommitted:
 
     def render(self, camera, index, *, background, labels=None):
         self.history.gaussians(index)
-        colour = np.broadcast_to(np.array(background, np.float32), (camera.height, camera.width, 3)).copy()
+        colour = np.broadcast_to(np.array(background or (0, 0, 0), np.float32), (camera.height, camera.width, 3)).copy()
         colour[0, 0] = min(1, index / 10)  # which frame this is
         depth = np.full(colour.shape[:2], 2.0)
         depth[0, 0], depth[0, 1:2] = np.nan, 4.0
@@ -237,6 +237,9 @@ def replay(rig, settings, history, base, frames, iterations, over):
 def warm_up():
     if "FAKE_FAULT" in os.environ:
         raise FloatingPointError("the fake was told to raise")
+    until = os.environ.get("FAKE_WARM_UP_UNTIL")  # the name of a file that somebody makes
+    while until is not None and not os.path.exists(until):
+        time.sleep(0.01)
 
 
 def install(**others):

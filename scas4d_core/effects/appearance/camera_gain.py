@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, Group, refused_on_gpu
 from scas4d_core.effects.evidence import Evidence, Seen
 from scas4d_core.effects.parts import Array, Arrays, Part, PartsBuilder, Work
 from scas4d_core.gaussians import Gaussians
@@ -168,7 +168,7 @@ class CameraGain(Effect):
 
     def refused(self, settings: Settings) -> tuple[str, str] | None:
         """Refused where another device renders: the gains are read off the CPU's renderings."""
-        return None if settings.device == "cpu" else (f"device is {settings.device!r}", "take the device 'cpu'")
+        return refused_on_gpu(settings)
 
     def evidence(self, seen: Seen) -> Evidence | None:
         """How much the cameras' gains differ: those that are known, times what their pictures still lack."""
@@ -181,7 +181,7 @@ class CameraGain(Effect):
 
     def join(self, builder: PartsBuilder) -> None:
         """Adds the gains; they are read off whole pictures."""
-        builder.whole = True
+        builder.whole = builder.exposes = True
         builder.parts.append(CameraGains(builder))
 
 
@@ -194,4 +194,5 @@ EFFECT = CameraGain(
     auto=True,
     on_above=0.04,
     off_below=0.02,
+    kept=("gains",),
 )

@@ -31,6 +31,7 @@ class Colours(Part):
     """
 
     moving = standing = lit = False
+    known_to_devices = True
 
     def __init__(self, builder: PartsBuilder) -> None:
         self._rows, self._count = builder.hierarchy.rows, len(builder.first)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, Group, refused_on_gpu
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.effects.parts import Array, Part, PartsBuilder, Work
 from scas4d_core.frame_outcome import Candidate
@@ -54,6 +54,7 @@ class DirectionPart(Part):
             return
         rates = (RATE_GLOSS, RATE_ENVIRONMENT, RATE_NEARNESS)
         self._shading = Shading(state.gloss.copy(), state.environment.copy(), rates)
+        work.gloss, work.environment = self._shading.gloss, self._shading.environment
         if self._near is None:
             self._near = neighbourhoods(self._roots[: len(state.gloss)])
         self._turns = without_turn(len(state))
@@ -98,11 +99,11 @@ class Direction(Effect):
 
     def refused(self, settings: Settings) -> tuple[str, str] | None:
         """Refused on a GPU, whose update does not know it."""
-        return None if settings.device == "cpu" else (f"device is {settings.device!r}", "set device to 'cpu'")
+        return refused_on_gpu(settings)
 
     def evidence(self, seen: Seen) -> Evidence | None:
         """The share of the squared error of a few pictures that the gloss takes away."""
-        from scas4d_core.rasterize.shading import colours_seen
+        from scas4d_core.rasterize.shading import features_seen
         from scas4d_core.update.best_state import spread
 
         if seen.before.gloss is None:
@@ -113,8 +114,7 @@ class Direction(Effect):
         for view in seen.views:
             if view.name not in chosen:
                 continue
-            for which, colours in enumerate((state.colours, colours_seen(state, view.camera))):
-                features = state.features(colours)
+            for which, features in enumerate((state.features(state.colours), features_seen(state, view.camera))):
                 seen.picture.measure(state.means, state.factors, state.opacities, features, view)
                 left[which] += 10 ** (-seen.picture.psnr / 10)
         share = float(max(0, 1 - left[1] / max(left[0], 1e-12)))

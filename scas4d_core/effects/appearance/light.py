@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.effects.appearance.colours import Colours
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, Group, refused_at_zero
 from scas4d_core.effects.evidence import Evidence, Seen
 from scas4d_core.effects.parts import PartsBuilder
 
@@ -76,9 +76,7 @@ class Light(Effect):
 
     def refused(self, settings: Settings) -> tuple[str, str] | None:
         """Refused where no colours of what moves are learnt."""
-        if settings.update.rate_colour > 0:
-            return None
-        return "update.rate_colour is 0", "give it a rate above 0"
+        return refused_at_zero(settings, "rate_colour")
 
     def evidence(self, seen: Seen) -> Evidence | None:
         """How much the colours change together from a frame to the next."""

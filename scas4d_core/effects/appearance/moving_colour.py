@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from scas4d_core.effects.appearance.colours import Colours
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, Group, refused_at_zero
 from scas4d_core.effects.parts import PartsBuilder
 
 if TYPE_CHECKING:
@@ -19,9 +19,7 @@ class MovingColour(Effect):
 
     def refused(self, settings: Settings) -> tuple[str, str] | None:
         """Refused with a rate of 0."""
-        if settings.update.rate_colour > 0:
-            return None
-        return "update.rate_colour is 0", "give it a rate above 0"
+        return refused_at_zero(settings, "rate_colour")
 
     def join(self, builder: PartsBuilder) -> None:
         """Frees their colours."""

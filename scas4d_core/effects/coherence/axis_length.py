@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, Group, refused_at_zero
 from scas4d_core.effects.parts import PartsBuilder
 
 if TYPE_CHECKING:
@@ -18,9 +18,7 @@ class AxisLength(Effect):
 
     def refused(self, settings: Settings) -> tuple[str, str] | None:
         """Refused with a weight of 0."""
-        if settings.update.weights.scale > 0:
-            return None
-        return "update.weights.scale is 0", "give it a weight above 0"
+        return refused_at_zero(settings, "weights.scale")
 
     def join(self, builder: PartsBuilder) -> None:
         """The cascade's backward has the term in itself: it gets the weight."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.cameras import WorldFrame
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, Group, refused_at_zero
 from scas4d_core.effects.parts import Part, PartsBuilder, Work
 
 if TYPE_CHECKING:
@@ -83,9 +83,7 @@ class Floor(Effect):
         """Refused without a plane, and with a weight of 0."""
         if settings.scene.floor is None:
             return "the scene names no floor", "give scene.floor, a plane (a, b, c, d)"
-        if settings.update.weights.floor > 0:
-            return None
-        return "update.weights.floor is 0", "give it a weight above 0"
+        return refused_at_zero(settings, "weights.floor")
 
     def join(self, builder: PartsBuilder) -> None:
         """Adds the term."""

@@ -14,6 +14,8 @@ class NeighbourTerms(Part):
         strengths: weights of rigidity, isometry and rotation.
     """
 
+    known_to_devices = True
+
     def __init__(self, builder: PartsBuilder) -> None:
         self.strengths = [0.0, 0.0, 0.0]
 

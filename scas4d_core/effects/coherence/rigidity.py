@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, Group, refused_at_zero
 from scas4d_core.effects.parts import PartsBuilder
 
 if TYPE_CHECKING:
@@ -19,9 +19,7 @@ class Rigidity(Effect):
 
     def refused(self, settings: Settings) -> tuple[str, str] | None:
         """Refused with a weight of 0."""
-        if settings.update.weights.rigidity > 0:
-            return None
-        return "update.weights.rigidity is 0", "give it a weight above 0"
+        return refused_at_zero(settings, "weights.rigidity")
 
     def join(self, builder: PartsBuilder) -> None:
         """Adds its strength to the terms between neighbours."""

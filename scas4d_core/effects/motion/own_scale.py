@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from scas4d_core.effects.effect import Group
+from scas4d_core.effects.effect import Group, refused_at_zero
 from scas4d_core.effects.motion.free_columns import FreeColumns
 
 if TYPE_CHECKING:
@@ -18,9 +18,7 @@ class OwnScale(FreeColumns):
 
     def refused(self, settings: Settings) -> tuple[str, str] | None:
         """Refused with a rate of 0."""
-        if settings.update.rate_scale > 0:
-            return None
-        return "update.rate_scale is 0", "give it a rate above 0"
+        return refused_at_zero(settings, "rate_scale")
 
 
 EFFECT = OwnScale(

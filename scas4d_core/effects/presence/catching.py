@@ -17,6 +17,7 @@ from scas4d_core.effects.presence.novelty import novelties
 
 if TYPE_CHECKING:
     from scas4d_core.effects.parts import Arrays
+    from scas4d_core.gaussians import Gaussians
     from scas4d_core.update.picture_loss import PictureLoss
 
 Float = NDArray[np.float64]
@@ -32,7 +33,8 @@ class Catching(Part):
 
     Args:
         name: of the effect, whose arrays name the rows ("young"), the thing of each ("thing"), and for each thing its
-            hull's centre ("centres", [T, 3] metres) and volume ("volumes", cubic metres).
+            hull's centre ("centres", [T, 3] metres) and volume ("volumes", cubic metres), and the mean of its Gaussians
+            ("places", [T, 3] metres).
     """
 
     def __init__(self, builder: PartsBuilder, name: str) -> None:
@@ -57,6 +59,7 @@ class Catching(Part):
         of_entries, labels = thing[self._hierarchy.rows], self._hierarchy.labels[0]
         counts = np.bincount(labels)
         for number, way in _ways(hull, arrays).items():
+            way = way - _gone(work.previous, arrays, number)
             own = np.bincount(labels, weights=of_entries == number, minlength=len(counts)) > OWN * counts
             work.deformation.clusters[0][own, 3:6] = way
 
@@ -66,8 +69,17 @@ class Catching(Part):
             from scas4d_core.update.picture_loss import PictureLoss
 
             limits = scene_limits(self._scene.near, self._factory.rig.radius)
-            self._picture = PictureLoss(self._factory, self._scene.background, 1.0, 0.0, limits=limits)
+            self._picture = PictureLoss(self._factory, self._scene.behind, 1.0, 0.0, limits=limits)
         return self._picture
+
+
+def _gone(state: Gaussians, arrays: Arrays, number: int) -> Float:
+    """[3] metres that a young thing has gone since its frame: an attempt may start from where another ended."""
+    rows = arrays["young"][arrays["thing"] == number]
+    if not len(rows) or "places" not in arrays:  # as an earlier version left them
+        return np.zeros(3)
+    gone: Float = state.means[rows].mean(axis=0) - arrays["places"][number]
+    return gone
 
 
 def _ways(hull: Hull, arrays: Arrays) -> dict[int, Float]:

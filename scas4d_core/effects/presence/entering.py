@@ -58,11 +58,12 @@ NOBODY: Arrays = {
     "thing": NONE,
     "centres": np.zeros((0, 3)),
     "volumes": np.zeros(0),
+    "places": np.zeros((0, 3), np.float32),
     "share": np.array(0.0),
     "cameras": np.array(0),
 }
 """What is left before anything was born."""
-OF_THE_YOUNG = ("young", "thing", "centres", "volumes")
+OF_THE_YOUNG = ("young", "thing", "centres", "volumes", "places")
 """Arrays that are of the last frame alone, see ``Catching``."""
 BUDGET = 0.1
 """Gaussians that are born in a frame at most, as a share of those that are there."""
@@ -70,7 +71,7 @@ BUDGET = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What has entered.
+    """The hull of what has entered.
 
     Attributes:
         seen: what the cameras say. hull: of the things that count. share: of the squared error that they explain.
@@ -85,7 +86,7 @@ class Found:
 
 def entered(seen: Seen) -> Found | None:
     """What a frame shows that the state does not have; None where there is nothing of the kind."""
-    if sum(_says(one) for one in glance(seen)) < GLANCED:
+    if sum(_says(one) for one in glance(seen, GLANCED, new=SMALLEST)) < GLANCED:
         return None
     everyone = said(seen, seen.views)
     hull = carve_new(everyone)
@@ -130,19 +131,21 @@ def _denied(seen: Sequence[Novelty], means: NDArray[np.float64]) -> Bool:
 def _remembered(found: Found, state: Gaussians, rows: NDArray[np.int64], left: Arrays) -> Arrays:
     """The arrays that the births and returns of a frame add to those that were left; ``rows`` are theirs."""
     things = np.unique(found.hull.things)
-    nearest = cKDTree(found.hull.points).query(state.means[rows])[1]
+    thing = found.hull.things[cKDTree(found.hull.points).query(state.means[rows])[1]]
+    own = [state.means[rows[thing == n]] for n in things]
     return {
         "rows": np.concatenate([left["rows"], rows]),
         "age": np.concatenate([left["age"], np.zeros(len(rows), np.int64)]),
         "young": np.concatenate([left["young"], rows]),
-        "thing": np.concatenate(
-            [left["thing"], len(left["centres"]) + np.searchsorted(things, found.hull.things[nearest])]
-        ),
+        "thing": np.concatenate([left["thing"], len(left["centres"]) + np.searchsorted(things, thing)]),
         "centres": np.concatenate(
             [left["centres"], [found.hull.points[found.hull.things == n].mean(axis=0) for n in things]]
         ),
         "volumes": np.concatenate(
             [left["volumes"], [(found.hull.things == n).sum() * found.hull.voxel**3 for n in things]]
+        ),
+        "places": np.concatenate(
+            [left["places"], [one.mean(axis=0) if len(one) else np.zeros(3, np.float32) for one in own]]
         ),
         "share": np.maximum(found.share, left["share"]),
         "cameras": np.maximum(found.cameras, left["cameras"]),
@@ -173,7 +176,7 @@ class Entering(Effect):
         young = left["age"] < SETTLED
         settling = left["rows"][young & state.present[left["rows"]]]
         if len(settling):
-            state = settled(state, settling, seen.views, seen.rig, seen.picture, rng)
+            state = settled(state, settling, seen.views, seen.rig, seen.picture, rng, seen.time)
         arrays = {**left, **{name: NOBODY[name] for name in OF_THE_YOUNG}, "age": left["age"] + 1}
         joins = result.joins
         grown_up = left["rows"][(left["age"] == SETTLED) & state.present[left["rows"]]]
@@ -190,8 +193,11 @@ class Entering(Effect):
         if found is not None:
             points, colours = seeds(found.seen, found.hull, min(int(BUDGET * len(state)), seen.room), rng)
             found = found if len(points) else None
+        born = None
         if found is not None:
-            born = grown(state, points, colours, seen.views, seen.rig, seen.picture, rng, moves=True)
+            given = seen.views, seen.rig, seen.picture, rng
+            born = grown(state, points, colours, *given, moves=True, time=seen.time)
+        if found is not None and born is not None:
             rows = np.arange(len(state), len(state) + len(born))
             state = state.joined(born)
             arrays |= _remembered(found, state, rows, arrays)
@@ -215,8 +221,9 @@ EFFECT = Entering(
     group=Group.PRESENCE,
     says="Things enter the scene: where cameras agree that nothing explains the pictures, Gaussians are born.",
     gauge="Only what no Gaussian covers is new, and only beyond what has moved away elsewhere.",
-    cost="six pictures rendered a frame; where something enters, about an update more",
+    cost="a look at the pictures that an update rendered last; where something enters, about an update more",
     auto=True,
     on_above=SHARE,
     off_below=WORTH,
+    kept=tuple(NOBODY),
 )

@@ -7,6 +7,7 @@ a small share of one of the update.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from time import perf_counter
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from scas4d_core.effects.presence.carving import Hull, colours_of
 
 if TYPE_CHECKING:
     from scas4d_core.cameras import Camera, Rig
+    from scas4d_core.effects.evidence import FitTime
     from scas4d_core.effects.presence.novelty import Novelty
     from scas4d_core.gaussians import Gaussians
     from scas4d_core.update.picture_loss import PictureLoss, TrainingView
@@ -29,6 +31,9 @@ ITERATIONS = 400
 """Of a fit: on the part of the pictures that shows the thing they take less time than an update of 100."""
 SETTLING = 150
 """Of the fit of what was born some frames ago, after each update."""
+FEWEST = 0.25
+"""Share of the iterations of a fit, of which there must be time for more: what is half fitted is in every frame after,
+and the next frame finds it as well."""
 SHORTEST = 1e-6
 """Metres, of an axis."""
 OPACITY = 0.6
@@ -68,13 +73,14 @@ def grown(
     rng: np.random.Generator,
     *,
     moves: bool,
-) -> Gaussians:
-    """Gaussians on points, fitted to the views beside those of the state.
+    time: FitTime,
+) -> Gaussians | None:
+    """Gaussians on points, fitted to the views beside those of the state; None where there is no time for it.
 
     Args:
         state: Θ_t, all of whose Gaussians stay as they are. points: [P, 3] inside. colours: [P, 3].
         views: of the frame. rig: the cameras inside. picture: has background and limits of the scene.
-        rng: of the order of views. moves: whether they do, or stand.
+        rng: of the order of views. moves: whether they do, or stand. time: for the fit.
     """
     from scas4d_core.first_frame import initial_gaussians as made
 
@@ -82,7 +88,9 @@ def grown(
     parameters[:, made.OPACITY] = made.logit(np.array(OPACITY))
     parameters[:, made.LABEL] = made.logit(np.array(float(moves)))
     fit = _Fit(state, parameters, views, rig, picture)
-    fit.run(ITERATIONS, rng)
+    if not fit.run(ITERATIONS, rng, time):
+        time.put_off.append(f"{len(points)} Gaussians that {'move' if moves else 'stand'} were not born")
+        return None
     return fit.gaussians()
 
 
@@ -93,14 +101,21 @@ def settled(
     rig: Rig,
     picture: PictureLoss,
     rng: np.random.Generator,
+    time: FitTime,
 ) -> Gaussians:
     """The state with means, factors and colours of some rows fitted to the views; opacities stay for ever.
 
     Args:
-        rows: of young Gaussians: their hull was rough, and their first update as well.
+        rows: of young Gaussians: their hull was rough, and their first update as well. What is glossy, and came back as
+            itself, is left as it is: more is seen of it than its colours, which alone are fitted.
+        time: for the fit; without enough of it they stay as they are.
     """
     from scas4d_core.first_frame import initial_gaussians as made
 
+    if state.gloss is not None:  # those born later have none
+        rows = rows[rows >= len(state.gloss)]
+    if not len(rows):
+        return state
     mine, others = state.rows(rows), state.retire(rows)
     sides, lengths, axes = np.linalg.svd(mine.factors.astype(np.float64))
     handed = np.sign(np.linalg.det(sides))
@@ -114,7 +129,9 @@ def settled(
     parameters[:, made.COLOUR] = mine.colours
     parameters[:, made.LABEL] = made.logit(mine.foreground[:, None])
     fit = _Fit(others, parameters, views, rig, picture)
-    fit.run(SETTLING, rng, opacities=False)
+    if not fit.run(SETTLING, rng, time, opacities=False):
+        time.put_off.append(f"{len(rows)} young Gaussians were not settled")
+        return state
     found = fit.gaussians()
     means, factors, colours = state.means.copy(), state.factors.copy(), state.colours.copy()
     means[rows], colours[rows] = found.means, found.colours
@@ -157,6 +174,8 @@ class _Fit:
                 self._crops.append(self._crop(state, rows, factory.cropped(view, *box)))
 
     def _crop(self, state: Gaussians, rows: Int, view: TrainingView) -> _Crop:
+        from scas4d_core.rasterize.shading import features_seen  # it loads the kernels
+
         n = len(rows)
         count = n + len(self._parameters)
         made = _Crop(
@@ -165,24 +184,46 @@ class _Fit:
         )  # fmt: skip
         made.means[:n], made.factors[:n] = state.means[rows], state.factors[rows]
         made.opacities[:n] = state.opacities[rows]
-        made.features[:n, :3], made.features[:n, 3] = state.colours[rows], state.foreground[rows]
+        made.features[:n] = features_seen(state.rows(rows), view.camera)
         return made
 
-    def run(self, iterations: int, rng: np.random.Generator, opacities: bool = True) -> None:
-        """Steps the parameters so many times, each with a part of one view; ``opacities``: whether these change."""
+    def run(self, iterations: int, rng: np.random.Generator, time: FitTime, opacities: bool = True) -> bool:
+        """Steps the parameters so many times, each with a part of one view, or as often as there is time for.
+
+        Args:
+            opacities: whether these change.
+
+        Returns:
+            False where there is time for too few steps: what was fitted so far is of no use.
+        """
+        began = perf_counter()
+        whole = self._stepped(iterations, rng, time.end, opacities)
+        time.spent += perf_counter() - began
+        return whole
+
+    def _stepped(self, iterations: int, rng: np.random.Generator, end: float | None, opacities: bool) -> bool:
         from scas4d_core.first_frame import initial_gaussians as columns
         from scas4d_core.kernels import activation
         from scas4d_core.kernels.adam import EVERY_ROW, adam
         from scas4d_core.update.picture_loss import view_order
+        from scas4d_core.update.schedule import PROBE, Stopping
 
         if not self._crops or not len(self._parameters):
-            return
+            return True
+        if end is not None and perf_counter() >= end:
+            return False
+        stopping = Stopping(iterations, end=end)
         parameters = self._parameters
         gradients, first, second = (np.zeros_like(parameters) for _ in range(3))
         rates = np.zeros(activation.COLUMNS, np.float32)
         rates[columns.MEAN], rates[columns.COLOUR] = POSITION * self._radius, COLOUR
         rates[columns.OPACITY], rates[columns.SCALE], rates[columns.QUATERNION] = LOGIT * opacities, SCALE, ROTATION
         for iteration, index in enumerate(view_order(len(self._crops), iterations, rng)):
+            planned = stopping.planned(iteration)
+            if iteration >= min(PROBE, planned) and planned < FEWEST * iterations:
+                return False
+            if iteration >= planned:
+                break
             crop = self._crops[index]
             n, born = crop.others, crop.born
             activation.activate(parameters, *born)
@@ -191,11 +232,12 @@ class _Fit:
                 parameters, *born[1:], found.means[n:], found.factors[n:], found.opacities[n:], found.features[n:],
                 gradients,
             )  # fmt: skip
-            left = END + (1 - END) * 0.5 * (1 + np.cos(np.pi * iteration / max(1, iterations - 1)))
+            left = END + (1 - END) * 0.5 * (1 + np.cos(np.pi * min(1.0, iteration / max(1, planned - 1))))
             adam(
                 parameters, gradients, first, second, (left * rates).astype(np.float32), EVERY_ROW, BETA1, BETA2,
                 iteration + 1,
             )  # fmt: skip
+        return True
 
     def gaussians(self) -> Gaussians:
         """The fitted Gaussians."""

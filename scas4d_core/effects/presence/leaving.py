@@ -41,17 +41,17 @@ def outside(state: Gaussians, rig: Rig) -> NDArray[np.bool_]:
         state: Θ_t. rig: the cameras inside, those that are not believed included: they come back.
     """
     rows = np.flatnonzero(state.moving)
-    means = state.means[rows].astype(np.float64)
-    width = WIDTHS * np.sqrt(np.square(state.factors[rows]).sum(axis=1).max(axis=1))
-    shown = np.zeros(len(rows), np.bool_)
-    for camera in rig.cameras:
-        uv, depth = camera.project(means)
+    for camera in rig.cameras:  # of most scenes the first cameras show all that moves
+        if not len(rows):
+            break
+        uv, depth = camera.project(state.means[rows].astype(np.float64))
+        width = WIDTHS * np.sqrt(np.square(state.factors[rows]).sum(axis=1).max(axis=1))
         with np.errstate(divide="ignore", invalid="ignore"):
             border = camera.fx * width / depth
             inside = (uv > -border[:, None]) & (uv < [camera.width, camera.height] + border[:, None])
-        shown |= (depth > 0) & inside.all(axis=1)
+        rows = rows[~((depth > 0) & inside.all(axis=1))]
     found = np.zeros(len(state), np.bool_)
-    found[rows] = ~shown
+    found[rows] = True
     return found
 
 
@@ -105,4 +105,5 @@ EFFECT = Leaving(
     auto=True,
     on_above=SHARE,
     off_below=IDLE_SHARE,
+    kept=("share",),
 )

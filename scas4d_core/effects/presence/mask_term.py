@@ -38,4 +38,5 @@ EFFECT = MaskTerm(
     says="Where masks are given, what moves and what stands must cover the pixels that the masks say.",
     gauge="Labels are those of frame 0 and no parameter: the term moves Gaussians, and relabels none.",
     cost="a fourth channel beside RGB, rendered forward and backward; without masks nothing",
+    without_masks=False,
 )

@@ -9,18 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_opening, binary_propagation, uniform_filter
 
+from scas4d_core.frame_outcome import Candidate
+
 if TYPE_CHECKING:
     from scas4d_core.cameras import Camera, Rig
     from scas4d_core.effects.evidence import Seen
     from scas4d_core.gaussians import Gaussians
     from scas4d_core.update.picture_loss import PictureLoss, TrainingView
+    from scas4d_core.update.result import Thinned, UpdateTrace
 
 Bool = NDArray[np.bool_]
 Array = NDArray[np.float32]
@@ -65,18 +68,79 @@ class Novelty:
         return int(self.new.sum()) - int(self.stale.sum())
 
 
+class Glimpse(NamedTuple):
+    """What a thinned rendering of the end of an update says, roughly, without another rendering.
+
+    Attributes:
+        view: of the frame. new, bare: shares of the pixels, see ``Novelty``; regions come out smaller by their rims.
+    """
+
+    view: TrainingView
+    new: float
+    bare: float
+
+
 GLANCE = 6
-"""Cameras that are looked at in each frame, others each time; all of them where these find something."""
+"""Cameras at most that are looked at in each frame before all are; where the update has left no rendering, others each
+time."""
+SEEMS = 0.5
+"""Of a share of pixels: a glimpse has to find so much of it. On the captures it finds 0.6 to 0.9 of such as count; of
+rims that are none, 0.2 to 0.6."""
 
 _said: WeakKeyDictionary[Gaussians, dict[str, Novelty]] = WeakKeyDictionary()
 """What cameras say, by state: several effects ask for the same."""
+_glimpsed: WeakKeyDictionary[UpdateTrace, list[Glimpse]] = WeakKeyDictionary()
+"""Those of an update."""
 
 
-def glance(seen: Seen) -> list[Novelty]:
-    """What some cameras say of a frame."""
+def glance(seen: Seen, least: int, new: float = 0.0, bare: float = 0.0) -> list[Novelty]:
+    """What some cameras say of a frame; nothing where too few of them can say that something is new, or bare.
+
+    Args:
+        least: cameras that have to. new, bare: share of its pixels that each of them has to see as such.
+    """
+    if seen.result.trace.shown and seen.result.trace.kept is Candidate.END:
+        seem = [one.view for one in _glimpses(seen) if one.new >= SEEMS * new and one.bare >= SEEMS * bare]
+        return said(seen, seem[: max(GLANCE, least)]) if len(seem) >= least else []
     count = len(seen.views)
     looked_at = min(GLANCE, count)
     return said(seen, [seen.views[(seen.index + count * k // looked_at) % count] for k in range(looked_at)])
+
+
+def _glimpses(seen: Seen) -> list[Glimpse]:
+    """Those of the cameras that the update rendered last."""
+    trace = seen.result.trace
+    if trace not in _glimpsed:
+        _glimpsed[trace] = [_glimpse(view, trace.shown[view.name]) for view in seen.views if view.name in trace.shown]
+    return _glimpsed[trace]
+
+
+def _glimpse(view: TrainingView, thinned: Thinned) -> Glimpse:
+    """One of a view and its rendering; four pixels that touch have to agree."""
+    every, shown = thinned
+    target = view.target[:, ::every, ::every]
+    gain, offset = view.exposure[:3, 0, None, None], view.exposure[:3, 1, None, None]
+    difference = sum(_corners(np.abs(target[:3] - (gain * shown[:3] + offset)).mean(axis=0))) / 4
+    label, rest = shown[3], shown[4]
+    if len(target) > 3:
+        new, stands = (target[3] > 0.5) & (label < ABSENT), (target[3] <= 0.5) & (label < ABSENT)
+        found = _all(new)
+    else:
+        stands = label < ABSENT
+        found = _all(label < THERE) & (difference > max(DIFFERENT, TIMES_USUAL * float(np.median(difference))))
+    bare = _all(stands & (rest > BARE)) & (difference > DIFFERENT)
+    return Glimpse(view, float(found.mean()), float(bare.mean()))
+
+
+def _corners(plane: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    """[h − 1, w − 1] four times, the pixels of each square of two by two."""
+    return plane[:-1, :-1], plane[:-1, 1:], plane[1:, :-1], plane[1:, 1:]
+
+
+def _all(plane: Bool) -> Bool:
+    one, two, three, four = _corners(plane)
+    found: Bool = one & two & three & four
+    return found
 
 
 def said(seen: Seen, views: Sequence[TrainingView]) -> list[Novelty]:
@@ -104,8 +168,10 @@ def novelties(
         state: Θ_t, updated to the frame. colours: [N, 3] RGB to render: of the frame before, so that what is new has
             not been painted on what stands. views: of the frame.
     """
-    features = state.features(colours)
-    return [_novelty(state, features, view, rig[view.name], picture) for view in views]
+    from scas4d_core.rasterize.shading import features_seen  # it loads the kernels
+
+    shown = state.replace(colours=colours)
+    return [_novelty(state, features_seen(shown, view.camera), view, rig[view.name], picture) for view in views]
 
 
 def _novelty(state: Gaussians, features: Array, view: TrainingView, camera: Camera, picture: PictureLoss) -> Novelty:

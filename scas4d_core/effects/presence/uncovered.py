@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from scas4d_core.effects.presence.uncovering import Uncovered, uncovered
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Seen
     from scas4d_core.effects.parts import Arrays, PartsBuilder
+    from scas4d_core.gaussians import Gaussians
     from scas4d_core.update.result import UpdateResult
 
 NAME = "uncovered"
@@ -32,9 +34,21 @@ BUDGET = 0.05
 """Gaussians that are born in a frame at most, as a share of those that are there."""
 
 
-def _found(seen: Seen, glanced: int) -> tuple[Uncovered, float] | None:
-    """What is uncovered, and the share of the squared error that it explains."""
-    if sum(one.bare.sum() >= SMALLEST * one.bare.size for one in glance(seen)) < glanced:
+Found = tuple[Uncovered, float]
+_found_in: WeakKeyDictionary[Gaussians, dict[int, Found | None]] = WeakKeyDictionary()
+"""What was found, by state and the cameras of a glance that were asked for: evidence and births ask for the same."""
+
+
+def _found(seen: Seen, glanced: int) -> Found | None:
+    """Points on what is uncovered, and the share of the squared error that they explain."""
+    known = _found_in.setdefault(seen.result.gaussians, {})
+    if glanced not in known:
+        known[glanced] = _looked_for(seen, glanced)
+    return known[glanced]
+
+
+def _looked_for(seen: Seen, glanced: int) -> Found | None:
+    if sum(one.bare.sum() >= SMALLEST * one.bare.size for one in glance(seen, glanced, bare=SMALLEST)) < glanced:
         return None
     everyone = said(seen, seen.views)
     found = uncovered(everyone, seen.result.gaussians, seen.picture)
@@ -51,13 +65,10 @@ class UncoveredEffect(Effect):
     """Births behind what moves away."""
 
     def evidence(self, seen: Seen) -> Evidence | None:
-        """What is bare has so much of the error; once something was born, what had it then."""
+        """What is bare has so much of the error; once something was born, fewer cameras have to see it."""
         if not seen.views:
             return None
-        left = seen.result.carried.get(NAME)
-        if left is not None:
-            return _evidence(float(left["share"]))
-        found = _found(seen, GLANCED)
+        found = _found(seen, GLANCED_ON if NAME in seen.result.carried else GLANCED)
         return Evidence(0.0, "") if found is None else _evidence(found[1])
 
     def populated(self, seen: Seen) -> UpdateResult:
@@ -75,9 +86,10 @@ class UncoveredEffect(Effect):
             return result
         if len(some) > most:
             some = np.sort(rng.choice(some, most, replace=False))
-        born = grown(
-            state, points.points[some], points.colours[some], seen.views, seen.rig, seen.picture, rng, moves=False
-        )
+        given = seen.views, seen.rig, seen.picture, rng
+        born = grown(state, points.points[some], points.colours[some], *given, moves=False, time=seen.time)
+        if born is None:
+            return result
         joins = np.full(len(born), -1, np.int64)
         left = result.carried.get(NAME)
         arrays: Arrays = {"share": np.array(share if left is None else max(share, float(left["share"])))}
@@ -101,8 +113,9 @@ EFFECT = UncoveredEffect(
     group=Group.PRESENCE,
     says="What moves uncovers what it hid: Gaussians that stand are born where nothing was known.",
     gauge="Only pixels in which the state has nothing are bare.",
-    cost="six pictures rendered a frame, shared with entering; where something is bare, about half an update more",
+    cost="a look at the pictures that an update rendered last; where something is bare, about half an update more",
     auto=True,
     on_above=SHARE,
     off_below=WORTH,
+    kept=("share",),
 )

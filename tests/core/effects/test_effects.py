@@ -15,7 +15,7 @@ from scas4d_core.effects import effect as effect_module
 from scas4d_core.effects.appearance.colours import Colours
 from scas4d_core.effects.coherence.floor import FloorPart
 from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
-from scas4d_core.effects.effect import Effect, Group, effect
+from scas4d_core.effects.effect import Effect, Group, effect, refused_at_zero, refused_on_gpu
 from scas4d_core.effects.evidence import Evidence, Seen
 from scas4d_core.effects.parts import Hooks, Part, PartsBuilder, Work
 from scas4d_core.effects.registry import EFFECTS
@@ -23,6 +23,8 @@ from scas4d_core.effects.switches import IDLE, Switch, decided, first_switches, 
 from scas4d_core.errors import InputError
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.settings import SceneSettings, Settings
+
+WEIGHTS = ("rigidity", "isometry", "rotation", "scale", "floor")
 
 
 @pytest.mark.parametrize("name", EFFECTS)
@@ -102,6 +104,20 @@ def test_contradictions_are_refused(given: dict[str, object], fault: str, remedy
     assert fault in caught.value.fault
     assert remedy in caught.value.remedy
     assert caught.value.setting.startswith("effects")
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_refusals_of_one_kind_have_one_text(name: str) -> None:
+    """A device, and a rate or weight of 0, are refused in the same words by all effects that refuse them."""
+    gpu, cpu = (effect(name).refused(Settings(device=device)) for device in ("cuda", "cpu"))
+    if gpu != cpu:
+        assert gpu == refused_on_gpu(Settings(device="cuda")) == ("device is 'cuda'", "set device to 'cpu'")
+    for key in ("rate_colour", "rate_colour_standing", "rate_scale", *(f"weights.{one}" for one in WEIGHTS)):
+        first, _, last = key.partition(".")
+        zero = Settings.model_validate({"update": {first: {last: 0} if last else 0}, "scene": {"floor": (0, 1, 0, 0)}})
+        refusal = effect(name).refused(zero)
+        assert refusal in (None, refused_at_zero(zero, key))
+        assert refusal is None or f"update.{key} is 0" == refusal[0]
 
 
 def test_a_pinned_effect_is_on_or_off() -> None:

@@ -45,8 +45,7 @@ def views(frame: Frame) -> list[TrainingView]:
 
 
 def error(state: Gaussians, frame: Frame) -> float:
-    features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
-    found = ProbeViews(FACTORY, PICTURE, views(frame)).errors(state.means, state.factors, state.opacities, features)
+    found = ProbeViews(FACTORY, PICTURE, views(frame)).errors(state)
     return mean_error(found, list(found))
 
 

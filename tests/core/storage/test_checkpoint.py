@@ -313,7 +313,7 @@ def test_a_failed_update_leaves_labels_and_motion_as_they_were(undisturbed, tmp_
     change = KINDS[kind][1]
     with monkeypatch.context() as patch:
 
-        def full(*_: object) -> None:
+        def full(*_: object, **__: object) -> None:
             raise OSError("disk full")
 
         patch.setattr(History, "append", full)

@@ -78,6 +78,9 @@ def test_the_state_has_the_same_bits(monkeypatch: pytest.MonkeyPatch, masks: boo
             )
         for name, fit in whole.trace.cameras.items():
             np.testing.assert_allclose(part.trace.cameras[name]["colour_shift"], fit["colour_shift"], atol=1e-5)
+        assert part.trace.shown.keys() == whole.trace.shown.keys() != set()
+        for name, shown in whole.trace.shown.items():
+            np.testing.assert_array_equal(part.trace.shown[name].planes, shown.planes, err_msg=name)
 
 
 def test_what_stands_is_rendered_anew_once_it_changed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -451,5 +451,5 @@ def test_an_update_that_tells_less_finds_the_same_bits() -> None:
     for name, array in told.gaussians.arrays().items():
         np.testing.assert_array_equal(array, quiet.gaussians.arrays()[name])
     assert all(fit["colour_shift"] is not None for fit in told.trace.cameras.values())
-    assert all(fit["colour_shift"] is None for fit in quiet.trace.cameras.values())
+    assert quiet.trace.cameras == told.trace.cameras  # gains of cameras are told from them
     assert quiet.trace.losses != told.trace.losses

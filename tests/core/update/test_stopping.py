@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from scas4d_core.update.schedule import AFTER_S, COOLING, LOOK_EVERY, MOST_TIMED, PROBE, RATE, Stopping, TimeBudget
+from scas4d_core.update.schedule import (
+    AFTER_S,
+    COOLING,
+    FOR_BIRTHS,
+    LOOK_EVERY,
+    MOST_TIMED,
+    PROBE,
+    RATE,
+    Stopping,
+    TimeBudget,
+)
 
 
 class Clock:
@@ -115,3 +125,12 @@ def test_one_slow_frame_costs_the_next_one_its_iterations_but_no_more() -> None:
 
 def test_without_a_budget_there_is_no_end() -> None:
     assert TimeBudget(None).end(3.0) is None
+    assert TimeBudget(None).end_of_births(3.0) is None
+
+
+def test_births_have_a_part_of_the_budget_where_the_frame_before_had_some() -> None:
+    budget = TimeBudget(500.0)
+    assert budget.end_of_births(10.0) == budget.end(10.0)
+    budget.births = True
+    assert budget.end_of_births(10.0) == pytest.approx(10.5 - AFTER_S)
+    assert budget.end(10.0) == pytest.approx(10.5 - AFTER_S - FOR_BIRTHS * 0.5)

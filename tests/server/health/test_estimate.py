@@ -8,10 +8,12 @@ import sys
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 from running import Running, fake_settings, make_rig, problem
 
 from client.wire import RigModel
+from server.health.estimate import NOVEL_PIXEL
 
 ROOT = Path(__file__).parents[3]
 
@@ -45,14 +47,26 @@ def test_an_estimate_creates_nothing(http):
     problem(http.post("/v1/estimate", json={"rig": {}}), 422)
 
 
+def test_what_the_cameras_say_of_what_is_new_is_counted_where_anything_may_be_born(http):
+    found = {}
+    for modes in ({}, {"entering": "off"}, {"uncovered": "off"}, {"entering": "off", "uncovered": "off"}):
+        body = {"rig": rig(1000), "settings": {"effects": modes}}
+        found[tuple(modes)] = http.post("/v1/estimate", json=body).json()["pictures_mb"]
+    without = found.pop(("entering", "uncovered"))
+    assert set(found.values()) == {without + NOVEL_PIXEL * 2.0}
+    # A frame's pictures, errors and masks by camera, as the cameras' words on it are kept, are in that.
+    said = sum(np.dtype(kind).itemsize * times for kind, times in ((np.float32, 3 + 1), (np.bool_, 5)))
+    assert said + 2 * np.dtype(np.float64).itemsize <= NOVEL_PIXEL
+
+
 def test_what_will_not_fit_is_refused_with_what_would(tmp_path):
-    running = Running(fake_settings(tmp_path, max_scene_memory_mb=1500))
+    running = Running(fake_settings(tmp_path, max_scene_memory_mb=1600))
     try:
         refused = httpx.post(f"{running.url}/v1/scenes", json={"rig": rig(2000)})
         document = problem(refused, 422)
         assert document["field"] == "rig.cameras"
         assert "image_scale to 0.5" in document["remedy"]
-        assert document["estimate"]["memory_mb"] > 1500
+        assert document["estimate"]["memory_mb"] > 1600
         body = {"rig": rig(2000), "settings": {"scene": {"image_scale": 0.5}}}
         assert httpx.post(f"{running.url}/v1/scenes", json=body, timeout=30).status_code == 201
     finally:

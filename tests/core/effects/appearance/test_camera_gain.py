@@ -12,10 +12,15 @@ from scipy.spatial.transform import Rotation
 from scas4d_core.captures.frame import Frame
 from scas4d_core.effects.appearance.camera_gain import FOOT, NAME, POWER, exposure_of, known_gains, measured
 from scas4d_core.effects.effect import effect
-from scas4d_core.effects.switches import contradictions
+from scas4d_core.effects.parts import PartsBuilder
+from scas4d_core.effects.switches import contradictions, joined
 from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.reconstruction import Reconstruction
-from scas4d_core.settings import Settings
+from scas4d_core.settings import SceneSettings, Settings, UpdateSettings
+from scas4d_core.structure.hierarchy import build_hierarchy
+from scas4d_core.update.frame_update import FrameUpdate
+from scas4d_core.update.picture_loss import ViewFactory
 
 RIG = make_rig()
 BOX = make_box().replace(colours=np.random.default_rng(1).uniform(0.2, 0.7, (448, 3)).astype(np.float32))
@@ -122,3 +127,29 @@ def test_another_device_is_refused() -> None:
     settings = Settings.model_construct(device="cuda", effects={NAME: "on"})
     assert [name for name, *_ in contradictions(settings)] == [NAME]
     assert effect(NAME).refused(Settings()) is None
+
+
+def test_an_attempt_starts_from_the_exposures_of_the_frame_and_not_from_those_of_another() -> None:
+    settings = UpdateSettings(clusters=(2, 12), iterations=24)
+    factory = ViewFactory(RIG)
+    hierarchy = build_hierarchy(BOX.means, BOX.moving, settings.clusters, SMALLEST_CLUSTER)
+    parts = joined(PartsBuilder(SceneSettings(), settings, factory, hierarchy, BOX), [NAME])
+    updater = FrameUpdate(factory, SceneSettings(), settings, hierarchy, None, BOX, parts)
+    views = factory.views(shot(1, GAINS), {})
+    first, second = (updater.run(BOX, views, None, 1 / 30, seed=1) for _ in range(2))
+    assert all((view.exposure[:3] == [1, 0]).all() for view in views)
+    np.testing.assert_array_equal(first.carried[NAME]["gains"], second.carried[NAME]["gains"])
+    for view, gain in zip(first.views, first.carried[NAME]["gains"], strict=True):
+        np.testing.assert_array_equal(view.exposure[:3], exposure_of(gain))
+        assert not (view.exposure[:3] == [1, 0]).all()
+
+
+def test_evidence_is_the_same_where_no_report_is_told() -> None:
+    said = []
+    for tells in (True, False):
+        scene = started("auto", told=True)
+        scene._updater.tells = tells  # type: ignore[attr-defined]
+        scene.step(shot(1, GAINS))
+        said.append(scene._carried.switches[NAME])
+    assert said[0] == said[1]
+    assert said[0].on

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from box_scene import look_at, photograph
+from box_scene import look_at
 from effect_cases import BEFORE, UPDATE, same, updated
+from effect_cases.glossy_ball import COUNT, RADIUS, frame, picture, rig, sphere
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from scas4d_core.cameras import Camera, Rig, WorldFrame
-from scas4d_core.captures.frame import Frame
+from scas4d_core.cameras import WorldFrame
 from scas4d_core.effects.appearance.direction import EFFECT
 from scas4d_core.effects.evidence import Evidence, Seen
 from scas4d_core.effects.parts import PartsBuilder
@@ -22,7 +22,7 @@ from scas4d_core.first_frame.normals import surface_normals
 from scas4d_core.first_frame.static_scene import StaticResult, first_trainer
 from scas4d_core.first_frame.strengths import strengths_seen
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.kernels.appearance.direction import CELLS, MIDDLE, NEARNESS, ROWS, SHEEN, SIDE
+from scas4d_core.kernels.appearance.direction import CELLS, MIDDLE, NEARNESS, SIDE
 from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.query.committed import CommittedScene
 from scas4d_core.query.harmonics import basis_of
@@ -34,42 +34,6 @@ from scas4d_core.storage.history import History
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
-
-RADIUS, COUNT, SIZE = 0.3, 1500, 96
-
-
-def rig() -> Rig:
-    """Twelve cameras all round, at three heights."""
-    angles = [(2 * np.pi * k / 12, (-0.7, 0.1, 0.8)[k % 3]) for k in range(12)]
-    return Rig(tuple(look_at(f"c{k}", [np.sin(a), h, np.cos(a)], 140, SIZE) for k, (a, h) in enumerate(angles)))
-
-
-def sphere(glossy: bool = True) -> Gaussians:
-    """A ball with patches of colour, and lamps that it mirrors."""
-    k = np.arange(COUNT) + 0.5
-    z, turn = 1 - 2 * k / COUNT, np.pi * (1 + 5**0.5) * k
-    normals = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
-    axes = [Rotation.align_vectors([n], [[0, 0, 1]])[0].as_matrix() for n in normals]
-    factors = np.stack(axes) * [0.013, 0.013, 0.003]
-    colours = 0.15 + 0.4 * (np.sin(9 * normals) > 0)
-    state = Gaussians.of_points(RADIUS * normals, 0.01, colours).replace(factors=factors.astype(np.float32))
-    if not glossy:
-        return state
-    environment = np.zeros((ROWS, 3), np.float32)
-    for cell in (5 * SIDE + 6, 10 * SIDE + 10, 12 * SIDE + 3):
-        environment[[cell, cell + 1, cell + SIDE]] = 1.5
-    environment[:CELLS] -= 0.05
-    environment[SHEEN] = 0.4
-    return state.replace(gloss=(0.5 * normals).astype(np.float32), environment=environment)
-
-
-def picture(state: Gaussians, camera: Camera) -> np.ndarray:
-    """[H, W, 3] 8 bit, as a camera sees it."""
-    return photograph(state.replace(colours=colours_seen(state, CameraArrays.of(camera))), camera)[0]
-
-
-def frame(state: Gaussians, index: int = 0) -> Frame:
-    return Frame(index, float(index), {camera.name: picture(state, camera) for camera in rig().cameras}, {})
 
 
 def fitted(state: Gaussians, mode: str, iterations: int = 1200) -> StaticResult:

@@ -95,7 +95,7 @@ def test_on_a_gpu_colours_follow_in_every_iteration_instead() -> None:
 def test_an_update_that_is_not_kept_teaches_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     truth = shaded(0.3)
     monkeypatch.setattr(
-        "scas4d_core.update.best_state.BestState.end", lambda self, colours, iterations, left_out: Candidate.STILL
+        "scas4d_core.update.best_state.BestState.end", lambda self, look, iterations, left_out: Candidate.STILL
     )
     np.testing.assert_array_equal(followed("on", truth, frames=1).history.newest.colours, STATE.colours)
 

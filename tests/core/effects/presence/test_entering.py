@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 
+from scas4d_core.effects.evidence import FitTime, Seen
 from scas4d_core.effects.presence import entering
 from scas4d_core.effects.presence.carving import carve_new
 from scas4d_core.effects.presence.entering import EFFECT, NOBODY, SETTLED, entered
 from scas4d_core.effects.presence.novelty import novelties, said
+from scas4d_core.update.result import UpdateResult
+from scas4d_core.update.schedule import Stopping
 from tests.helpers.effect_cases.visited_room import BALL, CENTRE, known, psnr, scene, seen, sphere, visitor
 
 
@@ -138,3 +144,47 @@ def test_what_no_camera_confirms_is_retired() -> None:
     assert gone.retired[count:].mean() > 0.8
     assert not gone.retired[:count].any()
     assert not EFFECT.populated(seen(state, state, 9, carried=carried)).gaussians.retired.any()
+
+
+class Ticks:
+    """A clock that goes on by a tick whenever it is looked at."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        self.now += 1.0
+        return self.now
+
+
+def timed(monkeypatch: pytest.MonkeyPatch, end: float) -> tuple[Seen, UpdateResult]:
+    """A frame with a thing that is new and what comes of it, by a clock that ticks."""
+    clock = Ticks()
+    monkeypatch.setattr("scas4d_core.update.schedule.Stopping", partial(Stopping, clock=clock))
+    monkeypatch.setattr("scas4d_core.effects.presence.growing.perf_counter", clock)
+    frame = replace(seen(scene(known()), scene(known(), visitor())), time=FitTime(end))
+    return frame, EFFECT.populated(frame)
+
+
+def test_what_there_is_no_time_for_is_not_born_and_the_frame_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    for end in (0.5, 25.0):  # of 120 iterations none, or some twenty
+        frame, result = timed(monkeypatch, end)
+        assert result is frame.result
+        assert len(frame.time.put_off) == 1
+        assert "Gaussians that move were not born" in frame.time.put_off[0]
+
+
+def test_with_some_time_it_is_fitted_in_fewer_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
+    frame, result = timed(monkeypatch, 60.0)
+    assert frame.time.put_off == []
+    assert frame.time.spent == pytest.approx(60, abs=3)
+    assert psnr(result.gaussians, frame) > psnr(frame.result.gaussians, frame) + 3
+    assert frame.time.end is not None
+
+
+def test_without_time_the_young_stay_as_they_are() -> None:
+    true = scene(known(), visitor())
+    rows = np.arange(len(scene(known())), len(true))
+    carried = {"entering": NOBODY | {"rows": rows, "age": np.zeros(len(rows), np.int64)}}
+    frame = replace(seen(true, true, 6, carried=carried), time=FitTime(0.0))
+    assert EFFECT.populated(frame).gaussians is true
+    assert frame.time.put_off == [f"{len(rows)} young Gaussians were not settled"]

@@ -28,6 +28,14 @@ def test_without_the_mask_term_masks_pull_at_nothing() -> None:
     assert not same(updated(without), updated(usual()))
 
 
+def test_a_scene_without_masks_says_that_it_has_no_mask_term() -> None:
+    with_masks, without = (start("auto", masks)._carried.switches["mask_term"] for masks in (True, False))
+    assert (with_masks.on, with_masks.text) == (True, "")
+    assert (without.on, without.text) == (False, "the first frame has no masks")
+    report = start("auto").history.report(0)["effects"]["mask_term"]
+    assert not report["on"]
+
+
 @pytest.mark.parametrize("update", [{"use_masks": False}, {"weights": {"mask": 0, "mask_alone": 0}}])
 def test_a_mask_term_that_the_settings_contradict_is_refused(update: dict[str, object]) -> None:
     assert not first_switches(preset("scas4d", {"update": update}), 0)["mask_term"].on

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from scas4d_core.effects.presence.novelty import said
-from scas4d_core.effects.presence.uncovered import EFFECT
+from scas4d_core.effects.presence.uncovered import EFFECT, NAME
 from scas4d_core.effects.presence.uncovering import uncovered
+from scas4d_core.effects.switches import IDLE, Switch, decided
+from scas4d_core.settings import Settings
 from tests.helpers.effect_cases.visited_room import BOX, FLOOR, known, psnr, scene, seen
 
 HOLE = 0.15
@@ -53,3 +55,34 @@ def test_black_space_is_not_bare() -> None:
     state = known(ASIDE)  # alone, before nothing: the pictures are black where the state has nothing
     frame = seen(state, state)
     assert not any(one.bare.any() for one in said(frame, frame.views))
+
+
+def test_it_goes_off_where_nothing_more_is_uncovered_and_no_sooner() -> None:
+    before, true = scene(known(ASIDE), hole=HOLE), scene(known(ASIDE))
+    switches = {NAME: Switch(on=False, since=0)}
+    first = seen(before, true)
+    switches = decided(switches, Settings(), first)
+    assert switches[NAME].on
+    born = EFFECT.populated(first)
+    on = []
+    for index in range(IDLE):
+        later = seen(true, true, 6 + index, carried=dict(born.carried))
+        switches = decided(switches, Settings(), later)
+        on.append(switches[NAME].on)
+    assert on == [True] * (IDLE - 1) + [False]
+    again = decided(switches, Settings(), seen(before, true, 20, carried=dict(born.carried)))
+    assert again[NAME].on
+
+
+def test_evidence_and_births_look_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    monkeypatch.setattr(
+        "scas4d_core.effects.presence.uncovered.uncovered", lambda *given: asked.append(1) or uncovered(*given)
+    )
+    carried = {NAME: {"share": np.array(0.1)}}
+    frame = seen(scene(known(ASIDE), hole=HOLE), scene(known(ASIDE)), carried=carried)
+    evidence = EFFECT.evidence(frame)
+    assert evidence is not None
+    assert evidence.share > EFFECT.on_above
+    assert len(EFFECT.populated(frame).gaussians) > len(frame.before)
+    assert len(asked) == 1

@@ -1,0 +1,211 @@
+"""``scripts/bench effects``: what each effect is worth and costs, against `auto`, in turns.
+
+Two reconstructions start from the same frame 0 and are updated in turns, frame by frame, in one process: one as
+`auto` decides, one with effects pinned. An effect that waits for evidence is tried "on", "off" and "removed": without
+its line in the registry, which shows what it costs while it is off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from time import perf_counter, process_time
+from typing import Any
+
+import numpy as np
+
+from client.cli.evaluate import Report, check_test_cameras, recorded
+from client.cli.scores import Column, Row, digest, markdown, read_row, write_row
+from scas4d_core import metrics
+from scas4d_core.captures import Capture, open_capture
+from scas4d_core.effects.effect import effect
+from scas4d_core.effects.registry import EFFECTS
+from scas4d_core.effects.switches import contradictions
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.settings import Settings
+from scas4d_core.warm_up import warm_up_elsewhere
+from studies.machine import core_version, machine
+from studies.quality.first_frame import first_of
+from studies.quality.settings import settings_of
+
+Pins = Mapping[str, str]
+"""Modes by effect: "on", "off", or "removed"."""
+
+COLUMNS = (
+    Column("capture", "capture"),
+    Column("seed", "seed", "d"),
+    Column("pinned", "pinned"),
+    Column("in auto", "in_auto"),
+    Column("updates", "updates", "d"),
+    Column("auto dB", "psnr_auto"),
+    Column("pinned − auto dB", "gain", "+.3f"),
+    Column("last five", "gain_last", "+.3f"),
+    Column("auto s", "seconds_auto"),
+    Column("time of pinned", "seconds_ratio", ".3f"),
+    Column("processor time", "cpu_ratio", ".3f"),
+    Column("same bits", "same_bits"),
+)
+
+
+def run(
+    captures: Sequence[Path],
+    out: Path,
+    *,
+    names: Sequence[str] = (),
+    pins: Sequence[Pins] = (),
+    preset: str = "scas4d",
+    seeds: Sequence[int] = (0,),
+    frames: int | None = None,
+    changes: Sequence[str] = (),
+    again: bool = False,
+    report: Report = print,
+) -> list[Row]:
+    """Measures every variant of each capture; prints the table and leaves it in ``out/effects.md``.
+
+    Args:
+        captures: folders with test cameras. out: a file a finished run goes here; run again to go on.
+        names: of the effects; none: all, unless there are ``pins``. pins: further variants, effects pinned together.
+        preset, changes: the settings that both share. seeds: of frame 0 and the updates, each tried.
+        frames: only so many; None: all. again: measure anew what ``out`` holds. report: takes the printed lines.
+
+    Raises:
+        ValueError: an unknown effect or setting, a pin that the settings contradict, or fewer than two frames.
+    """
+    if frames is not None and frames < 2:
+        raise ValueError("effects are compared in updates: give two frames or more")
+    warm_up_elsewhere()
+    rows = []
+    for folder in captures:
+        for seed in seeds:
+            settings = settings_of(preset, None, seed, changes)
+            singles = variants(names or (() if pins else tuple(EFFECTS)), settings)
+            for variant in [*singles, *pins]:
+                row = _row(folder, out, settings, variant, frames, again)
+                report(f"{row['capture']}, seed {seed}, {row['pinned']}: {row['gain']:+.2f} dB")
+                rows.append(row)
+    table = markdown(rows, COLUMNS)
+    (out / "effects.md").write_text(table + "\n")
+    report(table)
+    return rows
+
+
+def variants(names: Sequence[str], settings: Settings) -> list[Pins]:
+    """The pins of single effects that the settings allow; where an effect is on in every scene, "off" alone.
+
+    Raises:
+        ValueError: an effect is unknown.
+
+    >>> variants(["rigidity", "entering"], Settings())
+    [{'rigidity': 'off'}, {'entering': 'off'}, {'entering': 'removed'}, {'entering': 'on'}]
+    """
+    found: list[Pins] = []
+    for name in names:
+        if name not in EFFECTS:
+            raise ValueError(f"effect {name!r} is unknown; docs/effects.md lists all")
+        one = effect(name)
+        modes = ("off",) if one.always(settings) else ("off", "removed", "on")
+        refused = one.refused(settings) is not None
+        for mode in modes:
+            contradicts = mode != "removed" and any(contradictions(pinned(settings, {name: mode})))
+            if not contradicts and not (refused and mode != "removed"):
+                found.append({name: mode})
+    return found
+
+
+def pinned(settings: Settings, pins: Pins) -> Settings:
+    """The settings with effects pinned; what is removed is not named in them.
+
+    Raises:
+        ValueError: an effect or a mode is unknown.
+    """
+    effects = {**settings.effects, **pins}
+    effects = {name: mode for name, mode in effects.items() if pins.get(name) != "removed"}
+    return Settings.model_validate({**settings.model_dump(), "effects": effects})
+
+
+@contextmanager
+def without(pins: Pins) -> Iterator[None]:
+    """Takes the lines of the effects that are "removed" out of the registry for a while.
+
+    >>> with without({"entering": "removed"}):
+    ...     "entering" in EFFECTS
+    False
+    """
+    before = dict(EFFECTS)
+    for name, mode in pins.items():
+        if mode == "removed":
+            del EFFECTS[name]
+    try:
+        yield
+    finally:
+        EFFECTS.clear()
+        EFFECTS.update(before)
+
+
+def _row(folder: Path, out: Path, settings: Settings, pins: Pins, frames: int | None, again: bool) -> Row:
+    """The row of a variant, measured where it is not on disk yet."""
+    capture = open_capture(folder)
+    check_test_cameras(capture, folder)
+    count = min(frames or capture.frame_count, capture.frame_count)
+    words = ", ".join(f"{name} {mode}" for name, mode in pins.items())
+    seed = settings.update.seed
+    file = "-".join([capture.name, f"s{seed}", *(f"{name}-{mode}" for name, mode in pins.items())])
+    path = out / "effects" / f"{file}-{digest(recorded(settings, ()), count)}.json"
+    found = None if again else read_row(path)
+    if found is not None:
+        return found
+    known: Row = {"key": path.stem, "capture": capture.name, "seed": seed, "pinned": words, "frames": count}
+    of = {"settings": recorded(settings, ()), "core": core_version(), "machine": machine()}
+    row = known | _compared(capture, folder, out, settings, pins, count) | of
+    write_row(path, row)
+    return row
+
+
+def _compared(capture: Capture, folder: Path, out: Path, settings: Settings, pins: Pins, count: int) -> Row:
+    """Figures of a variant against auto."""
+    given = (settings, pinned(settings, pins))
+    scenes, psnr = [], np.zeros((2, count - 1))
+    wall, cpu = np.zeros((2, count - 1)), np.zeros((2, count - 1))
+    taken: tuple[Pins, Pins] = ({}, pins)
+    for one, removed in zip(given, taken, strict=True):
+        first: dict[str, Any] = {"points": capture.points, "static": first_of(capture, out, one)}
+        with without(removed):
+            scenes.append(Reconstruction.start(capture.rig, capture.frame(0), one, **first))
+    truth, same = open_capture(folder, image_scale=settings.scene.image_scale), True
+    rig = truth.test_rig
+    assert rig is not None
+    for index in range(1, count):
+        shown = truth.test_frame(index).images
+        for which in (0, 1) if index % 2 else (1, 0):  # the one that comes second finds pictures in the system's cache
+            frame = capture.frame(index)
+            with without(taken[which]):
+                began, spent = perf_counter(), process_time()
+                scenes[which].step(frame)
+                wall[which, index - 1], cpu[which, index - 1] = perf_counter() - began, process_time() - spent
+            drawn = [metrics.psnr(scenes[which].render(one, index).colour, shown[one.name]) for one in rig.cameras]
+            psnr[which, index - 1] = np.mean(drawn)
+        auto, other = (scene.history.newest.arrays() for scene in scenes)
+        same &= auto.keys() == other.keys() and all(np.array_equal(auto[key], other[key]) for key in auto)
+    timed = slice(1 if count > 2 else 0, None)  # the first update loads kernels, and looks for the motion
+    report = scenes[0].report
+    return {
+        "updates": count - 1,
+        "in_auto": _words(scenes[0], pins),
+        "psnr_auto": float(psnr[0].mean()),
+        "gain": float((psnr[1] - psnr[0]).mean()),
+        "gain_last": float((psnr[1] - psnr[0])[-5:].mean()),
+        "psnr_by_frame": psnr.round(3).tolist(),
+        "seconds_auto": float(np.median(wall[0, timed])),
+        "seconds_ratio": float(np.median(wall[1, timed] / wall[0, timed])),
+        "cpu_ratio": float(cpu[1, timed].sum() / cpu[0, timed].sum()),
+        "same_bits": "yes" if same else "no",
+        "gaussians": 0 if report is None else report.gaussians,
+    }
+
+
+def _words(scene: Reconstruction, pins: Pins) -> str:
+    """The switches of these effects in auto at the end, and since when they are on."""
+    record: Any = scene.history.report(scene.history.indices[-1]).get("effects", {})
+    switches = {name: record[name] for name in pins if name in record}
+    return ", ".join(f"on since {one['since']}" if one["on"] else "off" for one in switches.values())

@@ -1,0 +1,106 @@
+"""``scripts/bench switches``: which effects a stream calls for, and how often each is switched.
+
+A capture is played forwards and backwards, so that a stream may be longer than the capture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from client.cli.evaluate import Report, recorded
+from client.cli.scores import Column, Row, digest, markdown, read_row, write_row
+from scas4d_core.captures import Capture, open_capture
+from scas4d_core.captures.frame import Frame
+from scas4d_core.effects.effect import effect
+from scas4d_core.effects.registry import EFFECTS
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.settings import Settings
+from studies.machine import core_version, machine
+from studies.quality.first_frame import first_of
+from studies.quality.settings import settings_of
+
+COLUMNS = (
+    Column("capture", "capture"),
+    Column("seed", "seed", "d"),
+    Column("updates", "updates", "d"),
+    Column("on at the end", "on"),
+    Column("switches after frame 0", "switches"),
+    Column("of one effect", "most", "d"),
+)
+
+
+def run(
+    captures: Sequence[Path],
+    out: Path,
+    *,
+    updates: int = 50,
+    preset: str = "scas4d",
+    seeds: Sequence[int] = (0,),
+    changes: Sequence[str] = (),
+    again: bool = False,
+    report: Report = print,
+) -> list[Row]:
+    """Updates each capture so many times, prints the table and leaves it in ``out/switches.md``.
+
+    Args:
+        captures: folders. out: a file a finished run goes here; run again to go on. updates: of each.
+        preset, changes: the settings. seeds: of frame 0 and the updates, each tried. again: measure anew.
+        report: takes the printed lines.
+    """
+    rows = []
+    for folder in captures:
+        for seed in seeds:
+            settings = settings_of(preset, None, seed, changes)
+            path = out / "switches" / f"{folder.resolve().name}-s{seed}-{digest(recorded(settings, ()), updates)}.json"
+            row = None if again else read_row(path)
+            if row is None:
+                row = {"key": path.stem, "seed": seed, **_played(open_capture(folder), out, settings, updates)}
+                row |= {"settings": recorded(settings, ()), "core": core_version(), "machine": machine()}
+                write_row(path, row)
+            report(f"{row['capture']}, seed {seed}: {row['switches']}")
+            rows.append(row)
+    table = markdown(rows, COLUMNS)
+    (out / "switches.md").write_text(table + "\n")
+    report(table)
+    return rows
+
+
+def _played(capture: Capture, out: Path, settings: Settings, updates: int) -> Row:
+    """The switches of the effects that wait for evidence."""
+    scene = Reconstruction.start(
+        capture.rig, capture.frame(0), settings, points=capture.points, static=first_of(capture, out, settings)
+    )
+    auto = [name for name in EFFECTS if effect(name).auto]
+    on = [{name: bool(scene.history.report(0)["effects"].get(name, {}).get("on")) for name in auto}]
+    changed: dict[str, list[int]] = {}
+    for index in range(1, updates + 1):
+        record = scene.step(played(capture, index)).index
+        switches = scene.history.report(record)["effects"]
+        on.append({name: bool(switches.get(name, {}).get("on")) for name in auto})
+        for name in auto:
+            if on[-1][name] != on[-2][name]:
+                changed.setdefault(name, []).append(index)
+    return {
+        "capture": capture.name,
+        "updates": updates,
+        "on": ", ".join(name for name in auto if on[-1][name]) or "none",
+        "switches": ", ".join(f"{name} at {', '.join(map(str, at))}" for name, at in changed.items()) or "none",
+        "most": max(map(len, changed.values()), default=0),
+        "by_frame": {name: [frame[name] for frame in on] for name in auto},
+    }
+
+
+def played(capture: Capture, index: int) -> Frame:
+    """Frame ``index`` of a capture that is played forwards and backwards without an end.
+
+    >>> capture = open_capture("samples/robot")
+    >>> last = capture.frame_count - 1
+    >>> back = played(capture, last + 1)
+    >>> back.index == last + 1, sorted(back.images) == sorted(capture.frame(last - 1).images)
+    (True, True)
+    """
+    last = capture.frame_count - 1
+    turn = index % (2 * last)
+    return replace(capture.frame(min(turn, 2 * last - turn)), index=index, time=index / capture.fps)

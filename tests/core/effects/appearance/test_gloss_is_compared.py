@@ -1,0 +1,129 @@
+"""Wherever a glossy state is compared with pictures, it is compared as the cameras see it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from effect_cases.glossy_ball import COUNT, frame, rig, sphere
+from scipy.spatial import cKDTree
+
+from scas4d_core.effects.evidence import FitTime
+from scas4d_core.effects.parts import PartsBuilder
+from scas4d_core.effects.presence.growing import _Fit, settled
+from scas4d_core.effects.presence.novelty import novelties
+from scas4d_core.effects.switches import joined
+from scas4d_core.frame_outcome import Candidate
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.preparation import SMALLEST_CLUSTER
+from scas4d_core.rasterize.shading import colours_seen
+from scas4d_core.robust.checks import gain_of
+from scas4d_core.robust.relocation import find_jump, shifted
+from scas4d_core.robust.solve_frame import FrameSolver
+from scas4d_core.settings import SceneSettings, UpdateSettings
+from scas4d_core.structure.hierarchy import build_hierarchy
+from scas4d_core.update.best_state import BestState, ProbeViews, mean_error
+from scas4d_core.update.deformation import CpuDeformation
+from scas4d_core.update.frame_update import FrameUpdate
+from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
+from scas4d_core.update.result import AttemptOptions, UpdateResult
+from scas4d_core.update.schedule import Stopping
+
+BALL = sphere()
+PLAIN = BALL.replace(gloss=None, environment=None)
+FACTORY = ViewFactory(rig())
+PICTURE = PictureLoss(FACTORY, (0.0, 0.0, 0.0), 1.0, 0.0)
+SETTINGS = UpdateSettings(iterations=24, clusters=(2, 12))
+CLOSE = 0.7
+"""Of the error without the gloss, that is left with it: probe views are coarser than the pictures."""
+
+
+def views(truth: Gaussians = BALL) -> list[TrainingView]:
+    return FACTORY.views(frame(truth, 1), {}, use_masks=False)
+
+
+def run(before: Gaussians) -> UpdateResult:
+    hierarchy = build_hierarchy(before.means, before.moving, (2, 12), SMALLEST_CLUSTER)
+    parts = joined(PartsBuilder(SceneSettings(), SETTINGS, FACTORY, hierarchy, before), ["moving_colour", "direction"])
+    updater = FrameUpdate(FACTORY, SceneSettings(), SETTINGS, hierarchy, None, before, parts)
+    return updater.run(before, views(), None, 1.0, seed=1, options=AttemptOptions(stopping=Stopping(24), compare=True))
+
+
+def mean(errors: dict[str, float]) -> float:
+    return mean_error(errors, list(errors))
+
+
+def test_the_candidates_of_an_update_have_the_gloss_that_they_are_committed_with() -> None:
+    plain = mean(ProbeViews(FACTORY, PICTURE, views()).errors(PLAIN))
+    known = run(BALL).trace.errors
+    assert mean(known[Candidate.STILL]) < CLOSE * plain
+    assert BALL.environment is not None
+    learnt = run(BALL.replace(environment=0 * BALL.environment))
+    state, errors = learnt.gaussians, learnt.trace.errors[Candidate.END]
+    assert learnt.trace.kept is Candidate.END
+    assert state.environment is not None
+    assert state.environment.any()
+    # The gloss of the committed state is turned with its neighbourhood, that of the candidate with each Gaussian.
+    assert mean(errors) == pytest.approx(mean(ProbeViews(FACTORY, PICTURE, views()).errors(state)), rel=0.02)
+    assert mean(errors) < 0.98 * mean(ProbeViews(FACTORY, PICTURE, views()).errors(state.replace(gloss=None)))
+
+
+def test_a_candidate_is_seen_with_its_normals_turned() -> None:
+    hierarchy = build_hierarchy(BALL.means, BALL.moving, (2,), SMALLEST_CLUSTER)
+    deformation = CpuDeformation(hierarchy, None, np.ones((COUNT, 3), np.float32), "centred", "entangled")
+    deformation.start(BALL)
+    best = BestState(ProbeViews(FACTORY, PICTURE, views()), deformation, BALL, None, 1.0, 0.5)
+    best.start()
+    still = best.error(BALL)
+    deformation.clusters[0][:, :3] = [0.0, 0.4, 0.0]
+    turned = best.error(BALL)
+    assert turned > still
+    deformation.turns[:] = [1, 0, 0, 0]
+    stays = mean(best._probes.errors(BALL.replace(means=deformation.means, factors=deformation.factors)))
+    assert abs(turned - stays) > 1e-3 * stays
+
+
+def test_cameras_that_are_looked_at_again_see_the_gloss() -> None:
+    solver = FrameSolver(None, FACTORY, PICTURE, SETTINGS)  # type: ignore[arg-type]
+    seen, plain = solver._measured(views(), BALL), solver._measured(views(), PLAIN)
+    assert min(seen.values()) > max(plain.values())
+    assert min(seen.values()) > 40
+
+
+def test_the_light_is_not_brighter_by_what_is_mirrored() -> None:
+    assert gain_of(PICTURE, BALL, views()) == pytest.approx(1.0, abs=0.005)
+    assert gain_of(PICTURE, PLAIN, views()) != pytest.approx(1.0, abs=0.02)
+
+
+def test_what_stands_is_not_taken_for_what_jumped_by_its_gloss() -> None:
+    """A dull thing jumps above a glossy one that stands, whose highlights are no pixels that differ."""
+    thing = Gaussians.of_points(0.1 * PLAIN.means[::10] + np.float32([0, -0.32, 0]), 0.02, [0.2, 0.9, 0.2])
+    state = BALL.replace(foreground=np.zeros(COUNT, np.float32)).joined(thing)
+    way = np.array([0.1, 0.0, 0.05])
+    jumped = find_jump(state, views(shifted(state, way)), PICTURE, rig())
+    assert jumped is not None
+    np.testing.assert_allclose(jumped, way, atol=0.02)
+
+
+def test_a_glossy_thing_has_nothing_new() -> None:
+    said = novelties(BALL.replace(foreground=np.zeros(COUNT, np.float32)), BALL.colours, views(), rig(), PICTURE)
+    assert sum(int(one.new.sum()) for one in said) == 0
+    assert max(float(one.error.max()) for one in said) < 3e-3
+
+
+def test_what_is_born_is_fitted_beside_what_the_cameras_see() -> None:
+    parameters = np.zeros((1, 15), np.float32)
+    fit = _Fit(BALL, parameters, views(), rig(), PICTURE)
+    assert len(fit._crops) == 12
+    for crop in fit._crops:
+        rows = cKDTree(BALL.means).query(crop.means[: crop.others])[1]
+        np.testing.assert_allclose(crop.features[: crop.others, :3], colours_seen(BALL, crop.view.camera)[rows])
+
+
+def test_what_is_glossy_and_came_back_is_not_settled() -> None:
+    grown = BALL.joined(Gaussians.of_points(BALL.means[:5] + np.float32(0.02), 0.01))
+    rng = np.random.default_rng(0)
+    rows = np.array([3, 4, COUNT + 1])
+    after = settled(grown, rows, views(), rig(), PICTURE, rng, FitTime())
+    assert np.array_equal(after.means[:COUNT], grown.means[:COUNT])
+    assert not np.array_equal(after.means[COUNT + 1], grown.means[COUNT + 1])
+    assert settled(grown, rows[:2], views(), rig(), PICTURE, rng, FitTime()) is grown

@@ -1,0 +1,49 @@
+"""What was born in the frame before is looked for from where an attempt starts, wherever that is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scas4d_core.effects.parts import PartsBuilder, Work
+from scas4d_core.effects.presence.catching import Catching
+from scas4d_core.effects.presence.entering import EFFECT, NAME
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.preparation import SMALLEST_CLUSTER
+from scas4d_core.settings import SceneSettings, UpdateSettings
+from scas4d_core.structure.hierarchy import build_hierarchy
+from scas4d_core.update.deformation import CpuDeformation
+from scas4d_core.update.picture_loss import ViewFactory
+from tests.helpers.effect_cases.visited_room import CENTRE, known, scene, seen, visitor
+
+WAY = np.array([-0.05, -0.12, 0.08])
+
+
+@pytest.fixture(autouse=True)
+def _small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scas4d_core.effects.presence.growing.ITERATIONS", 60)
+
+
+def test_an_attempt_from_where_another_ended_moves_it_no_second_time() -> None:
+    before = scene(known())
+    result = EFFECT.populated(seen(before, scene(known(), visitor())))
+    state, young = result.gaussians, np.arange(len(before), len(result.gaussians))
+    now = seen(state, scene(known(), visitor(CENTRE + WAY)), 6)
+    hierarchy = build_hierarchy(state.means, state.moving, (2, 12), SMALLEST_CLUSTER)
+    builder = PartsBuilder(SceneSettings(), UpdateSettings(), ViewFactory(now.rig), hierarchy, state)
+
+    def caught(start: Gaussians) -> np.ndarray:
+        """[Y, 3] where the start of an attempt from a state puts the young."""
+        deformation = CpuDeformation(hierarchy, None, np.ones((len(hierarchy.rows), 3), np.float32), "centred")
+        deformation.start(start)
+        views = list(now.views)
+        Catching(builder, NAME).start(Work(start, deformation, None, views, now.picture, dict(result.carried)))  # type: ignore[arg-type]
+        deformation.forward()
+        return deformation.means[young]
+
+    away = state.means[young].mean(axis=0) + WAY
+    np.testing.assert_allclose(caught(state).mean(axis=0), away, atol=0.02)
+    means = state.means.copy()
+    for share in (1.0, 0.5):  # it had been followed, or half of the way
+        means[young] = state.means[young] + np.float32(share * WAY)
+        np.testing.assert_allclose(caught(state.replace(means=means)).mean(axis=0), away, atol=0.02)
