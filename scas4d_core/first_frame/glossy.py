@@ -19,6 +19,7 @@ from scas4d_core.effects.evidence import Evidence
 from scas4d_core.effects.registry import Mode
 from scas4d_core.first_frame.normals import surface_normals
 from scas4d_core.first_frame.static_scene import StaticResult, StaticTrainer
+from scas4d_core.first_frame.strengths import strengths_seen
 from scas4d_core.kernels.adam import EVERY_ROW, adam
 from scas4d_core.rasterize.shading import GLOSS, Shading, without_turn
 
@@ -61,6 +62,16 @@ def fit_by_direction(
         losses = GlossyFit(trainer, before).train(progress)
     found = {} if trial.evidence is None else {"direction": trial.evidence}
     return replace(trainer.result(losses), evidence=found)
+
+
+def gloss_seen(trainer: StaticTrainer, environment: Array | None) -> tuple[Array, Array]:
+    """[N, 3] normals times strengths of the surface that a fit has, and its means; without environment, the start's."""
+    means, factors, opacities, _ = trainer.shapes()
+    shape, views, rasterizer = (means, factors, opacities), trainer.views, trainer.loss.rasterizer
+    normals = surface_normals(*shape, views, rasterizer)
+    if environment is None:
+        return GLOSS * normals, means
+    return strengths_seen(normals, environment, *shape, views, rasterizer) * normals, means
 
 
 class GlossTrial:
@@ -123,9 +134,8 @@ class GlossTrial:
         environment = None
         for iteration in range(done, max(done + 1, round(LEARNT * whole))):
             if (iteration - done) % every == 0:
-                means, factors, opacities, _ = trainer.shapes()
-                normals = surface_normals(means, factors, opacities, trainer.views, trainer.loss.rasterizer)
-                trainer.shading = Shading.fresh(GLOSS * normals, means, environment)
+                gloss, means = gloss_seen(trainer, environment)
+                trainer.shading = Shading.fresh(gloss, means, environment)
                 environment = trainer.shading.environment
             trainer.step(trainer.views[int(trainer.random.integers(len(trainer.views)))], iteration)
         return trainer
@@ -141,17 +151,18 @@ class GlossyFit:
     def __init__(self, trainer: StaticTrainer, before: StaticTrainer) -> None:
         assert before.shading is not None
         self._trainer = trainer
-        means, factors, opacities, _ = before.shapes()
-        normals = surface_normals(means, factors, opacities, before.views, before.loss.rasterizer)
-        self._tree, self._normals = cKDTree(means), normals
+        gloss, means = gloss_seen(before, before.shading.environment)
+        self._strengths = np.linalg.norm(gloss, axis=1, keepdims=True)
+        self._tree, self._normals = cKDTree(means), gloss / self._strengths
         trainer.shading = Shading.fresh(self._placed(None), means, before.shading.environment)
 
     def _placed(self, gloss: Array | None) -> Array:
-        """[N, 3] gloss with the normals of the first surface; strengths as they are."""
-        normals = self._normals[self._tree.query(self._trainer.parameters[:, :3], 6)[1]].mean(axis=1)
+        """[N, 3] gloss with the normals of the first surface; strengths as they are, at first those of it, too."""
+        near = self._tree.query(self._trainer.parameters[:, :3], 6)[1]
+        normals = self._normals[near].mean(axis=1)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-        strength = GLOSS if gloss is None else np.linalg.norm(gloss, axis=1, keepdims=True)
-        placed: Array = (strength * normals).astype(np.float32)
+        own = self._strengths[near].mean(axis=1) if gloss is None else np.linalg.norm(gloss, axis=1, keepdims=True)
+        placed: Array = (own * normals).astype(np.float32)
         return placed
 
     def train(self, progress: Callable[[int, float], None] | None) -> list[float]:

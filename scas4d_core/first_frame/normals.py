@@ -20,8 +20,13 @@ BLUR = 1.5
 """Pixels, over which depth is averaged before its slope is taken."""
 STEEPEST = 0.2
 """Cosine to the viewing ray below which a pixel says nothing about its normal."""
-REACH, NEAR = 0.02, 32
+REACH, NEAR = 0.03, 64
 """Of the extent, and in number: neighbours over which normals are averaged."""
+SKIN = 1 / 3
+"""Power that opacities are taken to: the surface of things is a haze before opaque Gaussians, and the depth is to be
+that of the haze. On `gloss` it lay 15 mm behind the surface; normals were 8 and 6 degrees off (median, vase and ring)
+as rendered, 4 and 4 degrees with this, 3 and 4 with twice the neighbours and half as far again."""
+OPAQUE = 0.99
 SOLID = 0.5
 """Alpha from which a pixel shows a surface."""
 TINY = 1e-9
@@ -39,6 +44,7 @@ def surface_normals(
         means, factors, opacities: of the state. views: of it, whose cameras are looked through.
     """
     count, black = len(means), np.zeros(4, np.float32)
+    opacities = np.minimum(opacities**SKIN, OPAQUE).astype(np.float32)
     features = np.zeros((count, 4), np.float32)
     reach = REACH * float(np.max(np.percentile(means, 99, axis=0) - np.percentile(means, 1, axis=0)))
     total, outwards = np.zeros((count, 4)), np.zeros((count, 3))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from box_scene import look_at
 from effect_cases import BEFORE, UPDATE, same, updated
 from effect_cases.glossy_ball import COUNT, RADIUS, frame, picture, rig, sphere
@@ -19,6 +20,7 @@ from scas4d_core.effects.switches import first_switches, joined, names_on
 from scas4d_core.first_frame.glossy import fit_by_direction
 from scas4d_core.first_frame.normals import surface_normals
 from scas4d_core.first_frame.static_scene import StaticResult, first_trainer
+from scas4d_core.first_frame.strengths import strengths_seen
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels.appearance.direction import CELLS, MIDDLE, NEARNESS, SIDE
 from scas4d_core.preparation import SMALLEST_CLUSTER
@@ -94,6 +96,40 @@ def test_normals_are_those_of_the_ball() -> None:
     cosines = np.clip(np.einsum("nc,nc->n", found, state.means / RADIUS), -1, 1)
     assert np.degrees(np.arccos(cosines)).max() < 25
     assert np.degrees(np.arccos(np.median(cosines))) < 6
+
+
+def test_the_surface_of_a_rough_body_in_a_haze_is_the_haze(monkeypatch: pytest.MonkeyPatch) -> None:
+    ball = sphere(False)
+    depth = np.random.default_rng(2).uniform(0.8, 0.98, (COUNT, 1)).astype(np.float32)
+    body = ball.replace(means=depth * ball.means, factors=np.tile(np.float32(0.012) * np.eye(3), (COUNT, 1, 1)))
+    haze = ball.replace(opacities=np.full(COUNT, 0.15, np.float32))
+    state = body.replace(factors=body.factors.astype(np.float32)).joined(haze)
+    views = ViewFactory(rig()).views(frame(state), {})
+
+    def median_angle() -> float:
+        found = surface_normals(state.means, state.factors, state.opacities, views, CpuRasterizer())[COUNT:]
+        cosines = np.einsum("nc,nc->n", found, ball.means / RADIUS)
+        return float(np.degrees(np.arccos(np.median(cosines))))
+
+    angle = median_angle()
+    monkeypatch.setattr("scas4d_core.first_frame.normals.SKIN", 1)
+    assert angle < 0.8 * median_angle()
+
+
+def test_strengths_tell_what_is_glossy_from_what_is_dull() -> None:
+    truth = sphere()
+    assert truth.gloss is not None
+    assert truth.environment is not None
+    dull = truth.means[:, 0] < 0
+    half = truth.replace(gloss=np.where(dull[:, None], 0, truth.gloss).astype(np.float32))
+    views = ViewFactory(rig()).views(frame(half), {})
+    shape = truth.means, truth.factors, truth.opacities
+    normals = (truth.means / RADIUS).astype(np.float32)
+    found = strengths_seen(normals, truth.environment, *shape, views, CpuRasterizer())[:, 0]
+    far = np.abs(truth.means[:, 0]) > 0.05  # neighbours share a strength
+    assert np.median(found[dull & far]) < 0.15
+    assert 0.3 < np.median(found[~dull & far]) < 0.7
+    assert np.isfinite(found).all()
 
 
 def test_what_is_seen_from_everywhere_is_colour_and_not_environment() -> None:
