@@ -31,6 +31,7 @@ from scas4d_core.effects.switches import (
     first_switches,
     joined,
     names_on,
+    refusal,
     switched_by,
 )
 from scas4d_core.first_frame.static_scene import StaticResult
@@ -137,6 +138,8 @@ class Preparation:
         """
         # An earlier version left no switches, or not those of effects that are new.
         switches = {**first_switches(self._settings, 0), **carried.switches}
+        unknown = {name for name in EFFECTS if switches[name].on and refusal(name, self._settings) is not None}
+        switches |= {name: replace(switches[name], on=False) for name in unknown}  # to another device than before
         carried = replace(carried, switches={name: switches[name] for name in EFFECTS})
         updater, structure = self.updater(labelled(first, carried.labels), carried.switches)
         same = carried.structure == structure

@@ -273,7 +273,8 @@ class Reconstruction(CommittedScene):
             seen = Seen(frame.index, given.state, result, self.rig, learnt, self._picture, room, fits)
             populates, follow = self.populates and exposure == 1.0, self._preparation.followed
             result, updater, carried, roots = follow(updater, carried, seen, roots, populates)
-            self._budget.births = bool(fits.spent or fits.put_off)
+            tried = self._budget.births  # time that was kept and not enough is not kept again
+            self._budget.births = bool(fits.spent or fits.put_off) and not (tried and fits.put_off)
             watch.lap("presence")
         report = report_of_update(
             frame, result, self.history.newest, left_out, self.rig.names, watch, dropped, fits.put_off

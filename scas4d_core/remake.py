@@ -11,6 +11,7 @@ from typing import Any
 
 from scas4d_core.cameras import Rig
 from scas4d_core.captures.frame import Frame
+from scas4d_core.effects.effect import Group, effect
 from scas4d_core.frame_outcome import outcome_of
 from scas4d_core.gaussians import PER_FRAME, WHOLES
 from scas4d_core.reconstruction import Reconstruction, StepError
@@ -58,5 +59,8 @@ def remake(
         raise StepError(f"frame {frame.index} does not fit the frame before it: {report['degraded']}")
     arrays = history.completed(frame.index, aside.history.gaussians(frame.index)).arrays()
     kept = {name: arrays[name] for name in (*PER_FRAME, *WHOLES) if name in arrays}
-    history.replace(frame.index, frame.time, kept, report, aside.history.effects(frame.index))
+    # Who was young in it is not known: its births are those of the history, not of this update.
+    left = aside.history.effects(frame.index)
+    left = {name: given for name, given in left.items() if effect(name).group is not Group.PRESENCE}
+    history.replace(frame.index, frame.time, kept, report, left)
     return report

@@ -17,6 +17,7 @@ from scas4d_core.effects.registry import EFFECTS, Mode
 from scas4d_core.errors import InputError
 
 Positive = Annotated[float, Field(gt=0)]
+Unit = Annotated[float, Field(ge=0, le=1)]
 NotNegative = Annotated[float, Field(ge=0)]
 
 
@@ -85,13 +86,12 @@ class SceneSettings(SettingsModel):
         "camera tells no size: give a number such that what it sees is about 3 m away.",
     )
     image_scale: float = Field(1.0, gt=0, le=1, description="Pictures are resized by this before anything else.")
-    background: tuple[float, float, float] | Literal["auto"] = Field(
+    background: tuple[Unit, Unit, Unit] | Literal["auto"] = Field(
         "auto", description="RGB in 0…1 behind all. 'auto': of a plain backdrop, else the mean of frame 0's pictures."
     )
     near: Positive | Literal["auto"] = Field(
         default="auto",
-        description="Metres; nothing nearer to a camera is drawn. 'auto': a tenth of the rig's radius. Nothing in the "
-        "pictures tells how it looks right before a camera that is not there, and one stray Gaussian hides all.",
+        description="Metres; nothing nearer to a camera is drawn, a stray Gaussian hides all. 'auto': radius / 10.",
     )
     floor: tuple[float, float, float, float] | None = Field(
         None, description="Plane (a, b, c, d), user's world: a·x + b·y + c·z + d > 0 lies below. None: no floor term."

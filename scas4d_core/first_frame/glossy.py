@@ -153,7 +153,7 @@ class GlossyFit:
         self._trainer = trainer
         gloss, means = gloss_seen(before, before.shading.environment)
         self._strengths = np.linalg.norm(gloss, axis=1, keepdims=True)
-        self._tree, self._normals = cKDTree(means), gloss / self._strengths
+        self._tree, self._normals = cKDTree(means), gloss / np.maximum(self._strengths, 1e-9)
         trainer.shading = Shading.fresh(self._placed(None), means, before.shading.environment)
 
     def _placed(self, gloss: Array | None) -> Array:

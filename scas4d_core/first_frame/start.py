@@ -25,6 +25,9 @@ Colour = tuple[float, float, float]
 
 PLAIN = 0.2
 """Share of all pixels that have one colour, from which it is that of a plain backdrop; most cameras have half of it."""
+SAME = 0.05
+"""Of pixels that have exactly one colour, from which it was painted behind a rendered or cut-out thing. Rooms whose
+colours are quantized have up to 0.03."""
 ALIKE = 8
 """Levels of 255 by which the pixels of one colour may differ: noise, and the traces of JPEG."""
 EVERY = 4
@@ -47,13 +50,30 @@ def with_background(settings: Settings, images: Mapping[str, NDArray[np.uint8]])
     """
     if settings.scene.background != "auto":
         return settings
-    pixels = [image[EVERY // 2 :: EVERY, EVERY // 2 :: EVERY].reshape(-1, 3) for image in images.values()]
+    pictures = [image for image in images.values() if image.ndim == 3 and image.shape[2] == 3]
+    pictures = [image for image in pictures if min(image.shape[:2]) > EVERY]
+    if not pictures:  # they are refused later, in words
+        return settings
+    pixels = [image[EVERY // 2 :: EVERY, EVERY // 2 :: EVERY].reshape(-1, 3) for image in pictures]
     everyone = np.concatenate(pixels)
+    codes, counts = np.unique(everyone @ np.array([1 << 16, 1 << 8, 1]), return_counts=True)
+    code = int(codes[counts.argmax()])
+    painted = np.array([code >> 16, code >> 8 & 255, code & 255])
+    if _plain([(some == painted).all(axis=1) for some in pixels], SAME):
+        return _over(settings, painted)
     cells = np.ravel_multi_index(tuple(everyone.T // ALIKE), (256 // ALIKE,) * 3)
     common = np.median(everyone[cells == np.bincount(cells).argmax()], axis=0)
-    of_it = [(np.abs(some - common) <= ALIKE).all(axis=1) for some in pixels]
-    plain = np.concatenate(of_it).mean() >= PLAIN and np.median([some.mean() for some in of_it]) >= PLAIN / 2
-    red, green, blue = np.round((common if plain else everyone.mean(axis=0)) / 255, 4).tolist()
+    plain = _plain([(np.abs(some - common) <= ALIKE).all(axis=1) for some in pixels], PLAIN)
+    return _over(settings, common if plain else everyone.mean(axis=0))
+
+
+def _plain(of_it: list[NDArray[np.bool_]], share: float) -> bool:
+    """Whether so many pixels are of a backdrop, and in most cameras half as many; ``of_it``: by camera."""
+    return bool(np.concatenate(of_it).mean() >= share and np.median([some.mean() for some in of_it]) >= share / 2)
+
+
+def _over(settings: Settings, levels: NDArray[Any]) -> Settings:
+    red, green, blue = np.round(levels / 255, 4).tolist()
     scene = settings.scene.model_copy(update={"background": (red, green, blue)})
     return settings.model_copy(update={"scene": scene})
 

@@ -55,14 +55,14 @@ def strengths_seen(
 
     count, black = len(means), np.zeros(4, np.float32)
     features, shown = np.zeros((count, 4), np.float32), np.zeros((count, 4), np.float32)
-    shape = len(views), count, 3
-    light, mirrored, weights = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    for view, own, seen, weight in zip(views, light, mirrored, weights, strict=True):
+    sums = np.zeros((5, count, 3))  # of weights, light, mirrored, mirrored × light, mirrored²
+    for view in views:
         rasterizer.forward(means, factors, opacities, features, view.camera, black)
         g_image, g_alpha = rasterizer.gradient_buffers()
         g_image[:], g_alpha[:] = 0, 0
         height, width = view.target.shape[1:]
-        g_image[:3, :height, :width] = view.target[:3]
+        gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
+        g_image[:3, :height, :width] = (view.target[:3] - offset) / gain
         g_image[3, :height, :width] = 1
         found = rasterizer.backward(g_image, g_alpha, 3).features
         g_image[:] = 0
@@ -71,18 +71,22 @@ def strengths_seen(
         ahead = centre - means
         facing = np.einsum("nc,nc->n", ahead, normals) / np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)
         counts = (found[:, 3] > ENOUGH) & (facing > FLATTEST)
-        weight[:] = np.where(counts[:, None] & (colours < WHITE), np.minimum(found[:, 3:], 1), 0)
-        own[:] = np.square(colours)
+        white = colours * gain[:, 0, 0] + offset[:, 0, 0] >= WHITE
+        weight = np.where(counts[:, None] & ~white, np.minimum(found[:, 3:], 1), 0).astype(np.float64)
         shade(means, normals, without_turn(count), np.zeros((count, 3), np.float32), environment, centre, shown)
         value = np.where(shown[:, :3] > 1, 1 + (shown[:, :3] - 1) / OVER, shown[:, :3])
-        seen[:] = value * np.maximum(np.abs(value), np.sqrt(DARK))
+        seen = value * np.maximum(np.abs(value), np.sqrt(DARK))
         fall = np.float32(FALL) * np.clip(1 - facing, 0, 1) ** 4
-        seen -= fall[:, None] * np.square(colours)
-    total = np.maximum(weights.sum(axis=0), 1e-6)
-    light -= (weights * light).sum(axis=0) / total
-    mirrored -= (weights * mirrored).sum(axis=0) / total
+        light = np.square(colours)
+        seen -= fall[:, None] * light
+        sums += weight * np.stack([np.ones_like(light), light, seen, seen * light, np.square(seen)])
+    total = np.maximum(sums[0], 1e-6)
     both = np.stack(
-        [(weights * mirrored * light).sum(axis=(0, 2)), (weights * np.square(mirrored)).sum(axis=(0, 2))], 1
+        [
+            (sums[3] - sums[1] * sums[2] / total).sum(axis=1),
+            np.maximum(sums[4] - np.square(sums[2]) / total, 0).sum(axis=1),
+        ],
+        1,
     )
     near = cKDTree(means).query(means, min(NEAR, count))[1].reshape(count, -1)
     same = np.einsum("nkc,nc->nk", normals[near], normals) > SAME_SIDE

@@ -337,7 +337,8 @@ def _retold(result: UpdateResult, first: UpdateResult) -> UpdateResult:
     errors.pop(Candidate.END, None)
     if result.trace.errors:
         errors[Candidate.END] = result.trace.errors[result.trace.kept]
-    return replace(result, trace=replace(result.trace, errors=errors, kept=Candidate.END))
+    shown = result.trace.shown if result.trace.kept is Candidate.END else {}
+    return replace(result, trace=replace(result.trace, errors=errors, kept=Candidate.END, shown=shown))
 
 
 def _usual(before: Mapping[str, float], now: Mapping[str, float]) -> dict[str, float]:

@@ -23,6 +23,7 @@ from scas4d_core.storage.frame_files import (
     Stamp,
     UnreadableFrameError,
 )
+from scas4d_core.storage.npz import member
 
 EVENTS = "events"
 """Array of a frame's file: the log of births, retirements and revivals up to it; only where there are any."""
@@ -181,7 +182,10 @@ class FramesReader:
             HistoryError: its file is damaged, and the copy as well.
         """
         if self._background is None and self._times:
-            red, green, blue = self.report(next(iter(self._times))).get("background", (0.0, 0.0, 0.0))
+            found = self.report(next(iter(self._times))).get("background")
+            if found is None:  # of an earlier version; or the first frame cannot be read, for now
+                return 0.0, 0.0, 0.0
+            red, green, blue = found
             self._background = (red, green, blue)
         return self._background or (0.0, 0.0, 0.0)
 
@@ -313,7 +317,7 @@ def unpacked(given: NDArray[np.uint8] | None) -> dict[str, Arrays]:
         with np.load(BytesIO(given.tobytes()), allow_pickle=False) as file:
             for name in file.files:
                 effect, _, key = name.partition(".")
-                found.setdefault(effect, {})[key] = file[name]
+                found.setdefault(effect, {})[key] = file[member(name)]
     return found
 
 

@@ -309,7 +309,7 @@ class History(HistoryReader):
         if self._files is None or frame is None or text is None or index not in self._times:
             return False
         self._stamps[index] = self._files.write(
-            index, as_written(frame, self._times[index], text, self._log_at(index), self._packed.get(index))
+            index, as_written(frame, self._times[index], text, self._log_at(index), self._left(index))
         )
         return True
 

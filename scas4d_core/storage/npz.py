@@ -123,6 +123,11 @@ def sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
+def member(name: str) -> str:
+    """The file of an array in an npz; by its own name numpy finds another where that ends in ".npy"."""
+    return f"{name}.npy"
+
+
 def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
     """Reads named arrays of an npz, or all, and compares each with its checksum; nothing is unpickled.
 
@@ -147,7 +152,7 @@ def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             checksums = _checksums(file.zip)
             wanted = file.files if names is None else [*names, *(name for name in optional if name in file.files)]
-            found = {name: np.asarray(file[name]) for name in wanted}
+            found = {name: np.asarray(file[member(name)]) for name in wanted}
             if checksums is not None:
                 for name, array in found.items():
                     if not _agrees(checksums[name], _digest(array)):

@@ -50,7 +50,10 @@ class HardScene:
         cameras = Rig(tuple(_in_users_world(camera, self.user) for camera in self.rig.cameras))
         world = cameras.world_frame(self.metres_per_unit)
         settings = Settings.model_validate(
-            {"scene": {"metres_per_unit": self.metres_per_unit}, "update": {"iterations": 60, "clusters": [4, 16]}}
+            {
+                "scene": {"metres_per_unit": self.metres_per_unit, "background": (0, 0, 0)},  # as in the photographs
+                "update": {"iterations": 60, "clusters": [4, 16]},
+            }
         )
         first = _inside(states[0], self.user, world)
         static = StaticResult(gaussians=first, exposures={}, losses=[])

@@ -148,6 +148,8 @@ def _row(folder: Path, out: Path, settings: Settings, pins: Pins, frames: int | 
     capture = open_capture(folder)
     check_test_cameras(capture, folder)
     count = min(frames or capture.frame_count, capture.frame_count)
+    if count < 2:
+        raise ValueError(f"effects are compared in updates: {capture.name} has one frame")
     words = ", ".join(f"{name} {mode}" for name, mode in pins.items())
     seed = settings.update.seed
     file = "-".join([capture.name, f"s{seed}", *(f"{name}-{mode}" for name, mode in pins.items())])

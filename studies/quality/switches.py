@@ -102,5 +102,5 @@ def played(capture: Capture, index: int) -> Frame:
     (True, True)
     """
     last = capture.frame_count - 1
-    turn = index % (2 * last)
+    turn = index % max(1, 2 * last)
     return replace(capture.frame(min(turn, 2 * last - turn)), index=index, time=index / capture.fps)

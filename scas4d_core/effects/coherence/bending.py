@@ -92,6 +92,8 @@ def bend(before: Gaussians, after: Gaussians) -> float | None:
 class Bends(Part):
     """Lets rigidity fall along an update: at its end the positions know better than the turns."""
 
+    known_to_devices = True  # where no update calls it, rigidity keeps its weight
+
     def __init__(self, terms: NeighbourTerms) -> None:
         self._terms, self._rigidity = terms, terms.strengths[0]
 

@@ -99,8 +99,9 @@ def glance(seen: Seen, least: int, new: float = 0.0, bare: float = 0.0) -> list[
     Args:
         least: cameras that have to. new, bare: share of its pixels that each of them has to see as such.
     """
-    if seen.result.trace.shown and seen.result.trace.kept is Candidate.END:
-        seem = [one.view for one in _glimpses(seen) if one.new >= SEEMS * new and one.bare >= SEEMS * bare]
+    glimpses = _glimpses(seen) if seen.result.trace.kept is Candidate.END else []
+    if len(glimpses) >= min(GLANCE, len(seen.views)) > 0:  # fewer say too little: it ended otherwise than planned
+        seem = [one.view for one in glimpses if one.new >= SEEMS * new and one.bare >= SEEMS * bare]
         return said(seen, seem[: max(GLANCE, least)]) if len(seem) >= least else []
     count = len(seen.views)
     looked_at = min(GLANCE, count)

@@ -94,3 +94,19 @@ def test_a_history_that_says_nothing_has_black() -> None:
     away = Camera("away", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], FAR_AWAY, 16, 16)
     assert not CommittedScene(history, WorldFrame(np.zeros(3))).render(away).colour.any()
     assert as_begun(Settings(), history).scene.behind == (0.0, 0.0, 0.0)
+
+
+def test_a_thing_that_fills_the_pictures_has_the_colour_painted_behind_it() -> None:
+    picture = noise(0, 256)
+    picture[:10] = (0, 0, 0)  # a tenth
+    assert found(picture, picture) == (0.0, 0.0, 0.0)
+
+
+def test_pictures_that_are_refused_later_are_not_looked_at() -> None:
+    for images in ({}, {"c0": np.zeros((48, 64), np.uint8)}, {"c0": np.zeros((1, 2, 3), np.uint8)}):
+        assert with_background(Settings(), images).scene.behind == (0.0, 0.0, 0.0)
+
+
+def test_a_colour_beyond_1_is_refused() -> None:
+    with pytest.raises(ValueError, match="less than or equal to 1"):
+        Settings.model_validate({"scene": {"background": [255, 255, 255]}})

@@ -77,10 +77,15 @@ def test_what_is_uncovered_is_found(rendered: list[str]) -> None:
 
 
 def test_fewer_cameras_than_are_asked_for_render_nothing(rendered: list[str]) -> None:
-    frame = shown(seen(scene(known()), scene(known(), visitor())), most=1)
+    frame = shown(seen(scene(known()), scene(known())))
     assert glance(frame, 2, new=entering.SMALLEST) == []
     assert rendered == []
-    assert len(glance(frame, 1, new=entering.SMALLEST)) == 1
+
+
+def test_too_few_renderings_say_nothing_and_cameras_are_looked_at(rendered: list[str]) -> None:
+    frame = shown(seen(scene(known()), scene(known(), visitor())), most=GLANCE - 1)
+    assert len(glance(frame, 2, new=entering.SMALLEST)) == GLANCE
+    assert len(rendered) == GLANCE
 
 
 def test_without_renderings_of_what_was_kept_some_cameras_are_looked_at(rendered: list[str]) -> None:
