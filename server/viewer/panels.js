@@ -58,13 +58,18 @@ const called = (name) => name[0].toUpperCase() + name.slice(1).replaceAll("_", "
 /** Lists the effects that evidence or the settings have switched; the words name those that are always on. */
 export function showEffects(list, words, effects) {
   const all = Object.entries(effects);
-  const told = all.filter(([, one]) => one.pinned || one.text);
+  const first = Math.min(...all.map(([, one]) => one.since));
+  const told = all.filter(([, one]) => one.pinned || one.text || one.since > first);
   list.replaceChildren(...told.map(([name, one]) => {
     const state = one.pinned ? `pinned ${one.on ? "on" : "off"}` : `${one.on ? "on" : "off"} since frame ${one.since}`;
     return node("li", { title: one.says, class: one.on ? "on" : "off" }, `${called(name)}: ${state}${one.text ? `, ${one.text}` : ""}`);
   }));
-  const usual = all.filter(([, one]) => one.on && !one.pinned && !one.text).map(([name]) => called(name).toLowerCase());
-  words.textContent = usual.length ? `In every update: ${usual.join(", ")}.` : "";
+  const rest = (on) => all.filter((one) => !told.includes(one) && one[1].on === on).map(([name]) => called(name).toLowerCase());
+  const [usual, idle] = [rest(true), rest(false)];
+  words.textContent = [
+    ...(usual.length ? [`In every update: ${usual.join(", ")}.`] : []),
+    ...(idle.length ? [`Not called for: ${idle.join(", ")}.`] : []),
+  ].join(" ");
 }
 
 /** Draws one box for each place in the queue; the words say the same. */
