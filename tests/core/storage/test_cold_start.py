@@ -17,7 +17,9 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.remake import remake
 from scas4d_core.settings import Settings
+from scas4d_core.storage.frames_reader import packed, unpacked
 from scas4d_core.storage.history import History
+from scas4d_core.storage.npz import read_npz, write_npz
 
 RIG = make_rig()
 BOX = make_box()
@@ -81,10 +83,23 @@ def test_a_file_that_is_written_again_has_them(tmp_path: Path) -> None:
     file.write_bytes(b"")
     assert scene.history.write_again(3)
     assert file.read_bytes() == whole
+    reopened = History.open(tmp_path)
+    reopened.gaussians(3), reopened.report(3)  # in memory, and not written by this process
+    assert reopened.write_again(3)
+    assert file.read_bytes() == whole
     (tmp_path / "frame_000002.npz").write_bytes(b"")
     history = History.open(tmp_path)
     remake(RIG, SETTINGS, history, 1, take_frame(2, 2 / 30, shown(0.2), RIG), {})
     assert set(History.load(tmp_path).effects(2)) >= {camera_gain.NAME}
+
+
+def test_cameras_with_alike_names_keep_their_own_arrays(tmp_path: Path) -> None:
+    given = {"shadows": {"cam": np.arange(2), "cam.npy": np.arange(5)}}
+    for key, array in unpacked(packed(given))["shadows"].items():
+        np.testing.assert_array_equal(array, given["shadows"][key])
+    write_npz(tmp_path / "a.npz", given["shadows"])
+    for key, array in read_npz(tmp_path / "a.npz").items():
+        np.testing.assert_array_equal(array, given["shadows"][key])
 
 
 def test_what_is_damaged_costs_no_state(tmp_path: Path) -> None:
