@@ -51,6 +51,8 @@ LARGEST = 2.0
 # on basketball, whose gains frame 0 knows, and that gains 0.03 dB with these; 0.078 to 0.094 on lamps.
 CAMERAS = 4
 """At least, of which the gains can be told from colours that a few cameras see."""
+ENOUGH = 0.5
+"""Share of the rig's cameras from which a frame teaches gains: between a few, each one's faults pass for gains."""
 
 
 def known_gains(exposures: dict[str, Array], carried: Mapping[str, Arrays], names: tuple[str, ...]) -> dict[str, Array]:
@@ -123,7 +125,7 @@ class CameraGains(Part):
     def _settle(self, work: Work) -> None:
         """Gains take a part of the way; the mean logarithm of those that were found is what it was: that is light."""
         rows = [row for row, found in self._found.items() if np.isfinite(found).all()]
-        if len(rows) >= CAMERAS:
+        if len(rows) >= CAMERAS and len(work.views) >= ENOUGH * len(self._rows):
             before = np.log(self._gains[rows])
             way = np.log(np.stack([self._found[row] for row in rows])) - before
             way -= way.mean(axis=0)
