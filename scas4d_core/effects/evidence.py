@@ -47,8 +47,8 @@ class Seen:
 
     Attributes:
         index: of the frame. before: Θ_{t−1}. result: Θ_t, the trace of its update, arrays of the effects.
-        rig: the cameras inside. views: that were learnt from. picture: renders
-            them. room: Gaussians that may still be born in the scene. time: for fitting them.
+        rig: the cameras inside. views: that were learnt from. picture: renders them.
+        room: Gaussians that may still be born in the scene. time: for fitting them.
     """
 
     index: int

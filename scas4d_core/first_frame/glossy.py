@@ -97,9 +97,8 @@ class GlossTrial:
         few = len(self._trainer.views) < FEWEST_VIEWS or self._trainer.settings.iterations < FEWEST_ITERATIONS
         if few and self._mode != "on":
             return False
-        means, factors, opacities, _ = self._trainer.shapes()
-        normals = surface_normals(means, factors, opacities, self._trainer.views, self._trainer.loss.rasterizer)
-        without, seen = self._left(None), self._left(Shading.fresh(GLOSS * normals, means))
+        gloss, means = gloss_seen(self._trainer, None)
+        without, seen = self._left(None), self._left(Shading.fresh(gloss, means))
         share = max(0.0, 1 - seen / max(without, 1e-12))
         self.evidence = Evidence(share, f"explains {100 * share:.0f} % of the residual of frame 0")
         self.on = self._mode == "on" or share >= effect("direction").on_above

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -60,11 +60,16 @@ def with_background(settings: Settings, images: Mapping[str, NDArray[np.uint8]])
     code = int(codes[counts.argmax()])
     painted = np.array([code >> 16, code >> 8 & 255, code & 255])
     if _plain([(some == painted).all(axis=1) for some in pixels], SAME):
-        return _over(settings, painted)
+        return _over(settings, _colour(painted))
     cells = np.ravel_multi_index(tuple(everyone.T // ALIKE), (256 // ALIKE,) * 3)
     common = np.median(everyone[cells == np.bincount(cells).argmax()], axis=0)
     plain = _plain([(np.abs(some - common) <= ALIKE).all(axis=1) for some in pixels], PLAIN)
-    return _over(settings, common if plain else everyone.mean(axis=0))
+    return _over(settings, _colour(common if plain else everyone.mean(axis=0)))
+
+
+def _colour(levels: NDArray[Any]) -> list[float]:
+    found: list[float] = np.round(levels / 255, 4).tolist()
+    return found
 
 
 def _plain(of_it: list[NDArray[np.bool_]], share: float) -> bool:
@@ -72,9 +77,8 @@ def _plain(of_it: list[NDArray[np.bool_]], share: float) -> bool:
     return bool(np.concatenate(of_it).mean() >= share and np.median([some.mean() for some in of_it]) >= share / 2)
 
 
-def _over(settings: Settings, levels: NDArray[Any]) -> Settings:
-    red, green, blue = np.round(levels / 255, 4).tolist()
-    scene = settings.scene.model_copy(update={"background": (red, green, blue)})
+def _over(settings: Settings, background: Sequence[float]) -> Settings:
+    scene = settings.scene.model_copy(update={"background": tuple(background)})
     return settings.model_copy(update={"scene": scene})
 
 
@@ -83,8 +87,7 @@ def as_begun(settings: Settings, history: History) -> Settings:
     if settings.scene.background != "auto":
         return settings
     with suppress(HistoryError, KeyError):
-        scene = settings.scene.model_copy(update={"background": history.background})
-        return settings.model_copy(update={"scene": scene})
+        return _over(settings, history.background)
     return settings
 
 

@@ -55,7 +55,7 @@ export function showFacts(list, status) {
 
 const called = (name) => name[0].toUpperCase() + name.slice(1).replaceAll("_", " ");
 
-/** Lists the effects that evidence or the settings have switched; the words name those that are always on. */
+/** Lists the effects that evidence or the settings have switched; the words name all others, on or off. */
 export function showEffects(list, words, effects) {
   const all = Object.entries(effects);
   const first = Math.min(...all.map(([, one]) => one.since));

@@ -76,8 +76,8 @@ def _played(capture: Capture, out: Path, settings: Settings, updates: int) -> Ro
     on = [{name: bool(scene.history.report(0)["effects"].get(name, {}).get("on")) for name in auto}]
     changed: dict[str, list[int]] = {}
     for index in range(1, updates + 1):
-        record = scene.step(played(capture, index)).index
-        switches = scene.history.report(record)["effects"]
+        scene.step(played(capture, index))
+        switches = scene.history.report(index)["effects"]
         on.append({name: bool(switches.get(name, {}).get("on")) for name in auto})
         for name in auto:
             if on[-1][name] != on[-2][name]:

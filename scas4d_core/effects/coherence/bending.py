@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, Group, refused_at_zero
 from scas4d_core.effects.evidence import Evidence, Seen
 from scas4d_core.effects.parts import Part, PartsBuilder, Work
 
@@ -115,9 +115,7 @@ class Bending(Effect):
         mode = settings.effects.get("rotation", "auto")
         if mode != "auto":
             return f"effects.rotation is '{mode}'", "leave rotation 'auto'"
-        if settings.update.weights.rotation > 0:
-            return None
-        return "update.weights.rotation is 0", "give it a weight above 0"
+        return refused_at_zero(settings, "weights.rotation")
 
     def evidence(self, seen: Seen) -> Evidence | None:
         """The turn of neighbourhoods against those around them, from a frame to the next."""
