@@ -269,10 +269,11 @@ class Reconstruction(CommittedScene):
         roots, fits = self._roots, FitTime(self._budget.end_of_births(watch.began))
         if result.outcome.learnt and result.exposure == 1.0:  # in a light that is taken out again much looks new
             learnt = [view for view in result.views or believed if view.name not in result.trace.left_out]
+            aside = [view for view in views if view.name not in {view.name for view in learnt}]
             room = room_for_births(len(self.history.first), len(result.gaussians))
-            seen = Seen(frame.index, given.state, result, self.rig, learnt, self._picture, room, fits)
-            populates, follow = self.populates and exposure == 1.0, self._preparation.followed
-            result, updater, carried, roots = follow(updater, carried, seen, roots, populates)
+            looked_at = (result, self._factory.posed, learnt, self._picture, room, fits, aside)
+            seen, populates = Seen(frame.index, given.state, *looked_at), self.populates and exposure == 1.0
+            result, updater, carried, roots = self._preparation.followed(updater, carried, seen, roots, populates)
             tried = self._budget.births  # time that was kept and not enough is not kept again
             self._budget.births = bool(fits.spent or fits.put_off) and not (tried and fits.put_off)
             watch.lap("presence")
@@ -303,10 +304,9 @@ class Reconstruction(CommittedScene):
         return seconds
 
     def _views(self, frame: Frame) -> list[TrainingView]:
-        """The views of a frame; without masks where no term asks for them: they are not even read."""
+        """The views of a frame, as the scene knows its cameras by now."""
         try:
-            exposures = self._preparation.exposures(self._fixed.exposures, self._carried)
-            return self._factory.views(self._factory.scaled(frame), exposures, self._preparation.parts.mask > 0)
+            return self._preparation.views(frame, self._fixed.exposures, self._carried)
         except ValueError as error:
             raise StepError(str(error)) from error
 

@@ -96,7 +96,7 @@ class FrameSolver:
     def __init__(self, updater: Updater, factory: ViewFactory, picture: PictureLoss, settings: UpdateSettings) -> None:
         self._updater = updater
         self._picture = picture
-        self._factory, self._rig = factory, factory.rig
+        self._factory, self._rig = factory, factory.posed
         self._settings = settings
         self.judging = 0.0
 
@@ -185,7 +185,7 @@ class FrameSolver:
 
     def _validated(self, given: UpdateInput, start: Gaussians, result: UpdateResult) -> Validated:
         with self._timed():
-            return validated(start, result, self._updater.hierarchy.rows, self._rig.radius, given.lengths)
+            return validated(start, result, self._updater.hierarchy.rows, self._factory.rig.radius, given.lengths)
 
     @contextmanager
     def _timed(self) -> Iterator[None]:

@@ -86,6 +86,7 @@ class ChangedPixels(PictureLoss):
         self._standing = np.flatnonzero(~self._moves)
         self._stood: State | None = None
         self._bases: dict[tuple[str, int, int], Array] = {}
+        self._poses: dict[tuple[str, int, int], Array] = {}
         self._base_rests: dict[tuple[str, int, int], Array] = {}
         self._base_means: dict[tuple[str, int, int], NDArray[np.float64]] = {}
         self._regions: dict[tuple[str, int, int], Region] = {}
@@ -190,8 +191,9 @@ class ChangedPixels(PictureLoss):
     def _base(self, view: TrainingView) -> Array:
         """[4, H, W] of what stands alone."""
         key = _key(view)
-        if key not in self._bases:
+        if key not in self._bases or not np.array_equal(self._poses[key], view.camera.pose):
             assert self._stood is not None
+            self._poses[key] = view.camera.pose
             picture = self.rasterizer.forward(*self._stood, view.camera, self._background)
             self._bases[key], self._base_rests[key] = picture.features.copy(), picture.rest.copy()
             self._base_means[key] = means(self._bases[key][:3])

@@ -73,10 +73,13 @@ class ViewFactory:
 
     Args:
         rig: the cameras inside. source: the cameras as the pictures come in, where they are to be resized.
+
+    Attributes:
+        posed: the rig as it stands by now, of which the views are.
     """
 
     def __init__(self, rig: Rig, source: Rig | None = None) -> None:
-        self.rig = rig
+        self.rig = self.posed = rig
         self._source = source
         self._scratch: dict[tuple[int, int, int], Array] = {}
 
@@ -120,7 +123,7 @@ class ViewFactory:
         for name in self.rig.names:
             if name not in frame.images:
                 continue
-            camera = CameraArrays.of(self.rig[name])
+            camera = CameraArrays.of(self.posed[name])
             image, mask = pictures_of(frame, name, (camera.width, camera.height), use_masks)
             masked = mask is not None
             target = np.empty((3 + masked, camera.height, camera.width), np.float32)
@@ -136,7 +139,7 @@ class ViewFactory:
 
     def coarser(self, view: TrainingView, scale: float) -> TrainingView:
         """The view with its pictures resized by area averaging, and the camera that sees them so."""
-        camera = self.rig[view.name].scaled(scale)
+        camera = self.posed[view.name].scaled(scale)
         target = np.moveaxis(view.target, 0, -1)
         rows, columns = view.camera.height // camera.height, view.camera.width // camera.width
         if (rows * camera.height, columns * camera.width) == (view.camera.height, view.camera.width):
