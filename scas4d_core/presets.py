@@ -17,7 +17,7 @@ TIES = ("rigidity", "isometry", "rotation")
 """Effects that tie neighbours together."""
 
 
-OURS = ("bending", "shadows", "camera_gain", "light", "direction", "uncovered", "entering", "leaving")
+OURS = ("bending", "shadows", "camera_gain", "pose_drift", "light", "direction", "uncovered", "entering", "leaving")
 """Effects that Dynamic3DGaussians does not have."""
 
 
