@@ -89,6 +89,40 @@ def test_it_is_worth_it_for_what_that_camera_sees() -> None:
     assert fits[1] > fits[0] + 2
 
 
+def out(scene: Reconstruction) -> bool:
+    return scene._carried.past.is_out("c2")
+
+
+def test_a_camera_that_was_set_aside_is_looked_at_and_comes_back() -> None:
+    """The outlying camera is left out from the next frame on, as without the effect, until its pose is found."""
+    scene, without = (play(play(started(mode), range(1, 4), {}), range(4, 6), OFF) for mode in ("auto", "off"))
+    assert out(scene)
+    assert out(without)
+    for one in (scene, without):
+        play(one, range(6, 12), OFF)
+    assert not out(scene)
+    assert out(without)
+    np.testing.assert_allclose(off_by(scene, "c2"), OFF["c2"], atol=0.15)
+
+
+def test_a_camera_that_was_moved_further_stays_set_aside() -> None:
+    scene = play(play(started("auto"), range(1, 4), {}), range(4, 14), {"c2": np.array([2.0, 0, 0])})
+    assert out(scene)
+    if "twists" in arrays(scene):
+        assert np.linalg.norm(off_by(scene, "c2")[:2]) < 1.05 * 0.02 * 48
+
+
+def test_a_camera_that_is_shifted_is_followed() -> None:
+    twist = np.array([0.016, 0, 0, 0, 0, 0])
+    there = replace(RIG["c2"], world_to_camera=motion_of(twist) @ RIG["c2"].world_to_camera)
+    rig = Rig(tuple(there if camera.name == "c2" else camera for camera in RIG.cameras))
+    scene = started("on")
+    for index in range(1, 15):
+        box = moved(BOX, Rotation.from_rotvec([0, 0.02 * index, 0]), np.array([0.004 * index, 0, 0]))
+        scene.step(take_frame(index, index / 30, box, rig))
+    np.testing.assert_allclose(off_by(scene, "c2"), offset_of(LENS, twist, 1.3), atol=0.25)
+
+
 def test_a_drift_is_followed_a_frame_late() -> None:
     scene = play(started("on"), range(1, 13), {"c4": np.array([0.0, 0.9, 0.0])}, drift=True)
     np.testing.assert_allclose(off_by(scene, "c4"), [0, 0.9, 0], atol=0.25)  # 0.075 pixels a frame, half of the way
