@@ -207,11 +207,28 @@ def test_evidence_waits_for_frames_that_agree() -> None:
     for told in (here, there, here, there):  # a thing that swings
         poses.look(2, told)
         assert poses.shares[2] < effect(NAME).off_below
+    nothing = here._replace(vector=np.zeros(3))
     for _ in range(4):
         poses.look(4, here)
+        for row in (0, 1, 3, 5):
+            poses.look(row, nothing)
     assert poses.shares[4] > 0.5
     assert poses.off().tolist() == [False] * 4 + [True, False]
     assert np.linalg.norm(poses.offsets[4]) == pytest.approx(0.8, abs=0.01)
+
+
+def test_where_most_cameras_seem_to_be_off_none_is() -> None:
+    poses = Poses.of({}, 6)
+    for _ in range(4):
+        for row in range(6):
+            way = np.array([0.5 + 0.1 * row, 0, 0])
+            poses.look(row, Equations(400 * np.eye(3), 400 * way, 400.0, 1.0))
+    assert poses.shares.min() > 0.2
+    assert not poses.off().any()
+    seen: Any = SimpleNamespace(result=SimpleNamespace(carried={NAME: poses.arrays()}), rig=RIG)
+    found = effect(NAME).evidence(seen)
+    assert found is not None
+    assert found.share == 0
 
 
 def test_residuals_that_are_told_of_a_pose_in_use_count_from_the_calibration() -> None:
