@@ -1,4 +1,4 @@
-"""`scripts/bench quality`, `refit`, `effects`, `switches`, `targets`, `table` and `processors`."""
+"""`scripts/bench quality`, `refit`, `effects`, `switches`, `drift`, `targets`, `table` and `processors`."""
 
 from __future__ import annotations
 
@@ -146,6 +146,24 @@ def switches(
     from studies.quality.switches import run
 
     run(captures, out, updates=updates, seeds=seed or (0,), changes=changes or (), again=again)
+
+
+def drift(
+    captures: Captures,
+    out: Study = QUALITY,
+    updates: Annotated[int, typer.Option(min=1, help="Of each capture.")] = 14,
+    pixels: Annotated[float, typer.Option(min=0, help="Of the files, that a camera drifts by in a frame.")] = 0.3,
+    most: Annotated[float, typer.Option(min=0, help="Of the files, that it drifts by in all.")] = 4.0,
+    again: Again = False,
+    changes: Changes = None,
+) -> None:
+    """Updates captures of which two cameras drift, or none, with the effect pose_drift and without.
+
+    Leaves drift.md in the study's folder; a run that was measured is not measured again.
+    """
+    from studies.quality.pose_drift import run
+
+    run(captures, out, updates=updates, pixels=pixels, most=most, changes=changes or (), again=again)
 
 
 def targets(
