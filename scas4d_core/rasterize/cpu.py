@@ -73,10 +73,12 @@ class Drawing(NamedTuple):
     Attributes:
         blocks: [tiles] uint64, bits as of ``tiles.cover``. learnt: [N] uint8, 1 for the Gaussians that change: they
             have to stay within (``CpuRasterizer.escaped`` tells whether one did not), and they alone get gradients.
+        narrow: whether only those of the blocks are drawn that these Gaussians reach: ``CpuRasterizer.drawn``.
     """
 
     blocks: NDArray[np.uint64]
     learnt: NDArray[np.uint8]
+    narrow: bool = False
 
 
 class ForwardPass(NamedTuple):
@@ -107,6 +109,7 @@ class CpuRasterizer:
     Attributes:
         guards: number of times that each guard acted since the last ``reset`` of the counts.
         escaped: whether a Gaussian that is learnt reached a block that the last forward pass did not draw.
+        drawn: [tiles] uint64, the blocks that it drew.
 
     >>> from scas4d_core.gaussians import Gaussians
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
@@ -128,6 +131,7 @@ class CpuRasterizer:
         self.guards = GuardCounts(*projection.ACTED, *projection.ACTED_BACKWARD)
         self.limits = np.array(limits, dtype=np.float32)
         self.escaped = False
+        self.drawn = np.zeros(0, np.uint64)
         self._last: ForwardPass
         self._buffers: dict[str, NDArray[Any]] = {}
         self._views: dict[str, NDArray[Any]] = {}
@@ -199,6 +203,11 @@ class CpuRasterizer:
         if depth_channel >= 0:
             features[:, depth_channel] = splats[:, projection.DEPTH]
         drawing = drawing or self._whole(tiles_x * tiles_y, count)
+        self.escaped, self.drawn, learnt = False, drawing.blocks, drawing.learnt
+        if drawing.narrow:
+            marks = np.zeros(tiles_x * tiles_y, np.uint64)
+            tiles.mark_blocks(splats, rects, learnt, tiles_x, marks)
+            self.escaped, self.drawn = bool((marks & ~drawing.blocks).any()), marks & drawing.blocks
         visible, order = tiles.depth_order(
             splats,
             counts,
@@ -217,10 +226,10 @@ class CpuRasterizer:
         pair_covers = self._buffer("pair_covers", (most,), np.uint64)
         tile_counts = self._buffer("tile_counts", (tasks, tiles_x * tiles_y), np.int32)
         left = tiles.cover_tiles(
-            splats, rects, order, visible, tiles_x, *drawing, begins, ends, counts, firsts, pairs, pair_covers,
-            tile_counts,
+            splats, rects, order, visible, tiles_x, self.drawn, learnt, begins, ends, counts, firsts, pairs,
+            pair_covers, tile_counts,
         )  # fmt: skip
-        self.escaped = left > 0
+        self.escaped |= left > 0
         starts = self._buffer("starts", (tiles_x * tiles_y + 1,), np.int64)
         cursors = self._buffer("cursors", (tasks, tiles_x * tiles_y), np.int64)
         entries = tiles.tile_offsets(tile_counts, starts, cursors)
@@ -230,16 +239,16 @@ class CpuRasterizer:
         tiles.fill_tiles(begins, ends, pairs, pair_covers, cursors, items, slots, covers)
         # Heavy tiles first, dealt out in turn: the tasks end together.
         tile_order = np.argsort(starts[:-1] - starts[1:], kind="stable")
-        tile_order = tile_order[drawing.blocks[tile_order] != 0]
+        tile_order = tile_order[self.drawn[tile_order] != 0]
         image = self._buffer("image", (channels, tiles_y * TILE, tiles_x * TILE))
         rest = self._buffer("rest", (tiles_y * TILE, tiles_x * TILE))
         blend_kernels.blend(
-            splats, features, (0,) * (channels // blend_kernels.GROUP), starts, items, covers, drawing.blocks,
+            splats, features, (0,) * (channels // blend_kernels.GROUP), starts, items, covers, self.drawn,
             tile_order, tasks, (width, height), background, self.limits, image, rest,
         )  # fmt: skip
         self._last = ForwardPass(
             means, factors, features, camera, depth_channel, splats, counts, firsts, starts, items, slots, covers,
-            drawing.learnt, tile_order, image, rest, most,
+            learnt, tile_order, image, rest, most,
         )  # fmt: skip
         return self.picture
 

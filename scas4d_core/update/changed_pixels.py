@@ -2,8 +2,9 @@
 
 What moves changes the blocks (4×4 pixels) that its supports meet. There, the moving Gaussians and those of the standing
 that meet these blocks are drawn, in the order of the whole picture, so that each pixel and each gradient has the bits
-that it has there. All other pixels show what stands alone: they were rendered once, when that last changed. The image
-loss is computed in the box around the changed blocks; that of the rest is a number a frame and view.
+that it has there. All other pixels show what stands alone: they were rendered once, when that last changed. The standing
+Gaussians to choose from are found once a frame and view, around where what moves is then; the blocks in each iteration.
+The image loss is computed in the box around all of these blocks; that of the rest is a number a frame and view.
 """
 
 from __future__ import annotations
@@ -38,12 +39,11 @@ MOST = 0.6
 
 @dataclass(eq=False)
 class Region:
-    """That which is drawn of one camera's pictures.
+    """That which may be drawn of one camera's pictures in a frame.
 
     Attributes:
-        blocks: [tiles] uint64. rows: [R] int64, the Gaussians drawn, ascending. learnt: [R] uint8, 1 for the moving.
-        box: rows and columns of the picture that hold the blocks and ``REACH`` around. shown: [h, w] bool, the box's
-            pixels that are drawn.
+        blocks: [tiles] uint64; each time those are drawn that what moves reaches then. rows: [R] int64, the Gaussians drawn, ascending. learnt: [R] uint8, 1 for the moving.
+        box: rows and columns of the picture that hold the blocks and ``REACH`` around.
         view: whose pictures the following belong to; None: nobody's yet.
         target: [C, h, w], moments: twice the same, of the view in the box. rest: image loss, mask loss and squared
             error of the view outside of the box.
@@ -53,7 +53,6 @@ class Region:
     rows: NDArray[np.int64]
     learnt: NDArray[np.uint8]
     box: tuple[slice, slice]
-    shown: NDArray[np.bool_]
     view: TrainingView | None = None
     target: Array = field(default_factory=lambda: np.empty((0, 0, 0), np.float32))
     moments: tuple[Array, Array] = ()  # type: ignore[assignment]
@@ -90,7 +89,7 @@ class ChangedPixels(PictureLoss):
         self._base_means: dict[tuple[str, int, int], NDArray[np.float64]] = {}
         self._regions: dict[tuple[str, int, int], Region] = {}
         self._gradients: Gradients | None = None
-        self._scratch = np.empty(0, np.float32)
+        self._scratch, self._planes = np.empty(0, np.float32), np.empty(0, np.float32)
         self._shown_mean = np.zeros(3)
 
     def begin(self, previous: Gaussians) -> None:
@@ -133,10 +132,10 @@ class ChangedPixels(PictureLoss):
 
     def shown(self, view: TrainingView) -> Picture:
         """See ``PictureLoss``."""
-        region, drawn = self._regions[_key(view)], self.rasterizer.picture
+        drawn, shown = self.rasterizer.picture, _pixels(self.rasterizer.drawn, view.camera)
         whole = Picture(self._base(view).copy(), self._base_rests[_key(view)].copy())
         for plane, new in zip((*whole.features, whole.rest), (*drawn.features, drawn.rest), strict=True):
-            np.copyto(plane[region.box], new[region.box], where=region.shown)
+            np.copyto(plane, new, where=shown)
         return whole
 
     def colour_shift(self, view: TrainingView) -> tuple[float, float, float]:
@@ -154,7 +153,8 @@ class ChangedPixels(PictureLoss):
             region = self._regions[key] = self._made(self._marks(state, view.camera), view)
         while True:
             part = taken(state, region.rows)
-            self.rasterizer.forward(*part, view.camera, self._background, drawing=Drawing(region.blocks, region.learnt))
+            drawing = Drawing(region.blocks, region.learnt, narrow=True)
+            self.rasterizer.forward(*part, view.camera, self._background, drawing=drawing)
             if not self.rasterizer.escaped:
                 return region
             region = self._regions[key] = self._made(self._marks(state, view.camera) | region.blocks, view)
@@ -170,9 +170,7 @@ class ChangedPixels(PictureLoss):
         meets = np.empty(len(self._standing), bool)
         tiles.find_meeting(splats, rects, _tiles(camera)[0], blocks, meets)
         rows = np.sort(np.concatenate([self._moving, self._standing[meets]]))
-        shown = np.repeat(np.repeat(as_grid(blocks, camera), BLOCK, 0), BLOCK, 1)[: camera.height, : camera.width]
-        box = _box(shown)
-        region = Region(blocks, rows, self._moves[rows].astype(np.uint8), box, np.ascontiguousarray(shown[box]))
+        region = Region(blocks, rows, self._moves[rows].astype(np.uint8), _box(_pixels(blocks, camera)))
         self._follow(region, view)
         return region
 
@@ -199,18 +197,27 @@ class ChangedPixels(PictureLoss):
 
     def _compare_box(self, region: Region, view: TrainingView) -> None:
         """Fills the losses of what was rendered, and the gradient of what is drawn."""
-        where = (slice(None), *region.box)
-        base, planes = self._base(view)[where], self.rasterizer.planes[where]
-        part = np.where(region.shown, planes, base)
-        g_part = np.empty_like(part)
+        base, (rows, columns) = self._base(view), region.box
+        box = (rows.start, rows.stop, columns.start, columns.stop)
+        part, g_part = self._part(len(base), box)
+        drawn, tiles_x = self.rasterizer.drawn, _tiles(view.camera)[0]
+        shifts = np.zeros(len(base))
+        tiles.take_blocks(self.rasterizer.planes, base, drawn, tiles_x, box, part, shifts)
         sums = region.rest + self._losses(part, view, region.target, region.moments, g_part)
         g_image, _ = self.rasterizer.gradient_buffers()
-        g_image[where] = g_part
+        tiles.put_blocks(g_part, drawn, tiles_x, box, g_image)
         self.image_part, self.mask_part = float(sums[0]), float(sums[1])
         pixels = view.camera.height * view.camera.width
         self.psnr = 10 * log10(3 * pixels / max(float(sums[2]), SMALLEST_SQUARE))
-        key = _key(view)
-        self._shown_mean = self._base_means[key] + (part[:3] - base[:3]).sum(axis=(1, 2), dtype=np.float64) / pixels
+        self._shown_mean = self._base_means[_key(view)] + shifts[:3] / pixels
+
+    def _part(self, channels: int, box: tuple[int, int, int, int]) -> tuple[Array, Array]:
+        """[C, h, w] twice, of a box: buffers for what it shows and for the gradient of that."""
+        shape = (2, channels, box[1] - box[0], box[3] - box[2])
+        if self._planes.size < (size := int(np.prod(shape))):
+            self._planes = np.empty(size + size // 4, np.float32)
+        part, g_part = self._planes[:size].reshape(shape)
+        return part, g_part
 
     def _losses(
         self, planes: Array, view: TrainingView, target: Array, moments: tuple[Array, Array], gradient: Array
@@ -251,7 +258,7 @@ def reached(
     splats, rects, _ = rasterizer.project(*taken(state, rows), camera)
     tiles_x, tiles_y = _tiles(camera)
     marks = np.zeros(tiles_x * tiles_y, np.uint64)
-    tiles.mark_blocks(splats, rects, tiles_x, marks)
+    tiles.mark_blocks(splats, rects, np.ones(len(rects), np.uint8), tiles_x, marks)
     return marks
 
 
@@ -272,6 +279,12 @@ def as_grid(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bool
     bits = np.unpackbits(blocks.astype("<u8").view(np.uint8).reshape(-1, 8), axis=1, bitorder="little")
     grid = bits.reshape(tiles_y, tiles_x, side, side).transpose(0, 3, 1, 2)
     return grid.reshape(tiles_y * side, tiles_x * side).astype(bool)
+
+
+def _pixels(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bool_]:
+    """[H, W] the pixels of blocks."""
+    grid = as_grid(blocks, camera)
+    return np.repeat(np.repeat(grid, BLOCK, 0), BLOCK, 1)[: camera.height, : camera.width]
 
 
 def as_blocks(grid: NDArray[np.bool_], camera: CameraArrays) -> NDArray[np.uint64]:
