@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import Camera
 from scas4d_core.guards import GuardCounts
 from scas4d_core.kernels import blend as blend_kernels
-from scas4d_core.kernels import projection, tiles
+from scas4d_core.kernels import feature_gradients, projection, tiles
 from scas4d_core.kernels.jit import threads
 from scas4d_core.rasterize.limits import DEFAULT, Limits
 
@@ -209,14 +209,10 @@ class CpuRasterizer:
             tiles.mark_blocks(splats, rects, learnt, tiles_x, marks)
             self.escaped, self.drawn = bool((marks & ~drawing.blocks).any()), marks & drawing.blocks
         visible, order = tiles.depth_order(
-            splats,
-            counts,
-            self._buffer("keys", (count,), np.uint32),
-            self._buffer("order", (count,), np.int32),
-            self._buffer("keys_too", (count,), np.uint32),
-            self._buffer("order_too", (count,), np.int32),
+            splats, counts, self._buffer("keys", (count,), np.uint32), self._buffer("order", (count,), np.int32),
+            self._buffer("keys_too", (count,), np.uint32), self._buffer("order_too", (count,), np.int32),
             self._histogram,
-        )
+        )  # fmt: skip
         tasks = threads()
         begins, ends = self._buffer("begins", (2, tasks), np.int64)
         # One more: a pair that is not reached is written and then overwritten.
@@ -307,21 +303,26 @@ class CpuRasterizer:
         shape = (-(-count // projection.CHUNK), len(projection.ACTED_BACKWARD))
         acted = self._buffer("acted_backward", shape, np.int64)
         projection.project_backward(
-            last.means,
-            last.factors,
-            last.camera.pose,
-            last.camera.lens,
-            self.limits,
-            last.splats,
-            last.counts * last.learnt,
-            last.firsts,
-            records,
-            last.depth_channel,
-            *gradients,
-            acted,
-        )
+            last.means, last.factors, last.camera.pose, last.camera.lens, self.limits, last.splats,
+            last.counts * last.learnt, last.firsts, records, last.depth_channel, *gradients, acted,
+        )  # fmt: skip
         self.guards.add(projection.ACTED_BACKWARD, acted)
         return gradients
+
+    def feature_gradients(self, g_image: Array) -> Array:
+        """[N, 4] the gradients of features that ``backward`` finds, alone; of pictures of four channels."""
+        last, count = self._last, len(self._last.features)
+        records = self._buffer("records", (last.pairs, blend_kernels.record_columns(blend_kernels.GROUP)))
+        feature_gradients.blend_features(
+            last.splats, last.starts, last.items, last.slots, last.covers, last.learnt, last.tile_order, threads(),
+            (last.camera.width, last.camera.height), self.limits, g_image, records,
+        )  # fmt: skip
+        found = self._buffer("g_features", (count, blend_kernels.GROUP))
+        shape = (-(-count // projection.CHUNK), len(projection.ACTED_BACKWARD))
+        acted = self._buffer("acted_backward", shape, np.int64)
+        feature_gradients.sum_features(last.counts * last.learnt, last.firsts, records, found, acted)
+        self.guards.add(projection.ACTED_BACKWARD, acted)
+        return found
 
     @property
     def planes(self) -> Array:
