@@ -1,7 +1,7 @@
 """The gradients of features alone, where nothing asks for those of places and shapes. Twin: ``rasterize.twin.render``.
 
-A feature's gradient is the incoming gradient summed with the weights that its Gaussian was blended with. These are found
-front to back, as ``blend`` finds them, and what lies behind is not asked for. They have the bits of ``blend_backward``.
+A feature's gradient is the incoming gradient summed with the weights that its Gaussian was blended with. These are
+found front to back, as ``blend`` finds them, and what lies behind is not asked for: the bits of ``blend_backward``.
 """
 
 from __future__ import annotations

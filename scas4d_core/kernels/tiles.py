@@ -28,6 +28,9 @@ DIGITS = 1 << RADIX_BITS
 BLOCK = lanes.ACROSS
 """Pixels of a block's side."""
 
+SOME = 4096
+"""Rows a task."""
+
 AHEAD = 8
 """Gaussians by which numbers are prefetched: in depth order they lie anywhere in memory."""
 
@@ -204,6 +207,19 @@ def find_meeting(splats, rects, tiles_x, drawn, meets):
                     meets[i] = True
 
 
+@parallel_kernel
+def put_rows(rows, places, part, whole):
+    """Copies rows of an array to places of another.
+
+    Args:
+        rows, places: [M] int64. part: [P, K], whole: out [W, K] float32.
+    """
+    for task in prange((rows.shape[0] + SOME - 1) // SOME):
+        for k in range(task * SOME, min(rows.shape[0], (task + 1) * SOME)):
+            for column in range(part.shape[1]):
+                whole[places[k], column] = part[rows[k], column]
+
+
 @inline
 def holds(blocks, tiles_x, y, x):
     """Whether the block of a pixel is among the marked ones."""
@@ -226,11 +242,13 @@ def take_blocks(planes, base, blocks, tiles_x, box, part, shifts):
         shifts[channel] = 0.0
         for y in range(top, bottom):
             part[channel, y - top] = base[channel, y, left:right]
+            shift = 0.0
             for x in range(left // BLOCK * BLOCK, right, BLOCK):
                 if holds(blocks, tiles_x, y, x):
                     for k in range(max(x, left), min(x + BLOCK, right)):
-                        shifts[channel] += np.float64(planes[channel, y, k] - base[channel, y, k])
+                        shift += np.float64(planes[channel, y, k] - base[channel, y, k])
                         part[channel, y - top, k - left] = planes[channel, y, k]
+            shifts[channel] += shift
 
 
 @kernel

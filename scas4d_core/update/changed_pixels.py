@@ -2,9 +2,10 @@
 
 What moves changes the blocks (4×4 pixels) that its supports meet. There, the moving Gaussians and those of the standing
 that meet these blocks are drawn, in the order of the whole picture, so that each pixel and each gradient has the bits
-that it has there. All other pixels show what stands alone: they were rendered once, when that last changed. The standing
-Gaussians to choose from are found once a frame and view, around where what moves is then; the blocks in each iteration.
-The image loss is computed in the box around all of these blocks; that of the rest is a number a frame and view.
+that it has there. All other pixels show what stands alone: they were rendered once, when that last changed.
+
+The standing Gaussians to draw from are found once a frame and view, around where what moves is then; the blocks that
+are drawn, in each iteration. The image loss is computed near all that may be drawn; the rest is a number a frame.
 """
 
 from __future__ import annotations
@@ -42,8 +43,11 @@ class Region:
     """That which may be drawn of one camera's pictures in a frame.
 
     Attributes:
-        blocks: [tiles] uint64; each time those are drawn that what moves reaches then. rows: [R] int64, the Gaussians drawn, ascending. learnt: [R] uint8, 1 for the moving.
+        blocks: [tiles] uint64; each time those of them are drawn that what moves reaches then.
+        rows: [R] int64, the Gaussians drawn, ascending. learnt: [R] uint8, 1 for the moving. moving: [M] int64, which
+            of the R these are.
         box: rows and columns of the picture that hold the blocks and ``REACH`` around.
+        near: [h, columns] uint8, where in the box the losses can change, see ``image_loss.near``.
         view: whose pictures the following belong to; None: nobody's yet.
         target: [C, h, w], moments: twice the same, of the view in the box. rest: image loss, mask loss and squared
             error of the view outside of the box.
@@ -52,7 +56,9 @@ class Region:
     blocks: NDArray[np.uint64]
     rows: NDArray[np.int64]
     learnt: NDArray[np.uint8]
+    moving: NDArray[np.int64]
     box: tuple[slice, slice]
+    near: NDArray[np.uint8]
     view: TrainingView | None = None
     target: Array = field(default_factory=lambda: np.empty((0, 0, 0), np.float32))
     moments: tuple[Array, Array] = ()  # type: ignore[assignment]
@@ -119,9 +125,8 @@ class ChangedPixels(PictureLoss):
         if self._gradients is None or self._gradients.features.shape != features.shape:
             shapes = (means.shape, factors.shape, opacities.shape, features.shape, (len(means), 2))
             self._gradients = Gradients(*(np.zeros(shape, np.float32) for shape in shapes))
-        moves = np.flatnonzero(region.learnt)
-        for whole, part in zip(self._gradients, found, strict=True):
-            whole[self._moving] = part[moves]
+        for whole, part in zip(self._gradients, found, strict=True) if len(self._moving) else ():
+            tiles.put_rows(region.moving, self._moving, part.reshape(len(part), -1), whole.reshape(len(whole), -1))
         lap("render backward")
         return self._gradients
 
@@ -170,7 +175,9 @@ class ChangedPixels(PictureLoss):
         meets = np.empty(len(self._standing), bool)
         tiles.find_meeting(splats, rects, _tiles(camera)[0], blocks, meets)
         rows = np.sort(np.concatenate([self._moving, self._standing[meets]]))
-        region = Region(blocks, rows, self._moves[rows].astype(np.uint8), _box(_pixels(blocks, camera)))
+        learnt, shown = self._moves[rows].astype(np.uint8), _pixels(blocks, camera)
+        box = _box(shown)
+        region = Region(blocks, rows, learnt, np.flatnonzero(learnt), box, image_loss.near(shown[box]))
         self._follow(region, view)
         return region
 
@@ -180,10 +187,11 @@ class ChangedPixels(PictureLoss):
         where = (slice(None), *region.box)
         region.view, region.target = view, np.ascontiguousarray(view.target[where])
         region.moments = (np.ascontiguousarray(view.moments[0][where]), np.ascontiguousarray(view.moments[1][where]))
-        whole = self._losses(base, view, view.target, view.moments, np.empty_like(base))
+        whole = self._losses(base, view, view.target, view.moments, image_loss.LOSS_ALONE, base)
         view.__dict__.pop("moments", None)  # those of the box are kept, and nobody needs both
         part = np.ascontiguousarray(base[where])
-        region.rest = whole - self._losses(part, view, region.target, region.moments, np.empty_like(part))
+        near = region.near & (image_loss.WINDOWS | image_loss.LOSS)
+        region.rest = whole - self._losses(part, view, region.target, region.moments, near, part)
 
     def _base(self, view: TrainingView) -> Array:
         """[4, H, W] of what stands alone."""
@@ -203,7 +211,7 @@ class ChangedPixels(PictureLoss):
         drawn, tiles_x = self.rasterizer.drawn, _tiles(view.camera)[0]
         shifts = np.zeros(len(base))
         tiles.take_blocks(self.rasterizer.planes, base, drawn, tiles_x, box, part, shifts)
-        sums = region.rest + self._losses(part, view, region.target, region.moments, g_part)
+        sums = region.rest + self._losses(part, view, region.target, region.moments, region.near, g_part)
         g_image, _ = self.rasterizer.gradient_buffers()
         tiles.put_blocks(g_part, drawn, tiles_x, box, g_image)
         self.image_part, self.mask_part = float(sums[0]), float(sums[1])
@@ -220,16 +228,26 @@ class ChangedPixels(PictureLoss):
         return part, g_part
 
     def _losses(
-        self, planes: Array, view: TrainingView, target: Array, moments: tuple[Array, Array], gradient: Array
+        self,
+        planes: Array,
+        view: TrainingView,
+        target: Array,
+        moments: tuple[Array, Array],
+        near: NDArray[np.uint8],
+        gradient: Array,
     ) -> NDArray[np.float64]:
-        """Image loss, mask loss and squared error of a part of a view's picture; its gradient is filled."""
+        """Image loss, mask loss and squared error of a part of a view's picture; its gradient is filled where wanted.
+
+        Without ``image_loss.GRADIENT`` it may be the picture itself, which stays as it is.
+        """
         channels, height, width = target.shape
         rows, g_exposure = np.empty((channels, height, 2), np.float32), np.empty((channels, height, 2), np.float32)
         image_loss.image_loss(
             planes, view.exposure, target, *moments, self._weights[:channels], view.camera.height * view.camera.width,
-            self._cleared(channels, height, width), gradient, rows, g_exposure,
+            self._cleared(channels, height, width), near, gradient, rows, g_exposure,
         )  # fmt: skip
-        gradient[channels:] = 0
+        if gradient is not planes:
+            gradient[channels:] = 0
         sums = rows.sum(axis=1, dtype=np.float64)
         return np.array([sums[:3, 0].sum(), sums[LABEL:, 0].sum(), sums[:3, 1].sum()])
 

@@ -279,7 +279,8 @@ class PictureLoss:
         g_exposure = np.empty((channels, height, 2), np.float32)
         image_loss.image_loss(
             self.rasterizer.planes, view.exposure, view.target, *view.moments, self._weights[:channels],
-            height * width, self._factory.scratch(channels, height, width), g_image, rows, g_exposure,
+            height * width, self._factory.scratch(channels, height, width), image_loss.EVERYWHERE, g_image, rows,
+            g_exposure,
         )  # fmt: skip
         g_image[channels:] = 0
         sums = rows.sum(axis=1, dtype=np.float64)
