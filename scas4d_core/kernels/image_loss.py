@@ -110,7 +110,7 @@ def exposed(value, gain, offset):
 
 @inline
 def asked(what, wanted, y, x):
-    """Whether something is computed of the sixteen columns from x on."""
+    """True where something is computed of the sixteen columns from x on."""
     return (wanted[0, 0] if wanted.shape[0] == 1 else wanted[y, x // lanes.COUNT]) & what != 0
 
 

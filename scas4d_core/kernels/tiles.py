@@ -222,7 +222,7 @@ def put_rows(rows, places, part, whole):
 
 @inline
 def holds(blocks, tiles_x, y, x):
-    """Whether the block of a pixel is among the marked ones."""
+    """True where the block of a pixel is among the marked ones."""
     number = x % TILE // BLOCK * (TILE // BLOCK) + y % TILE // BLOCK
     return (blocks[y // TILE * tiles_x + x // TILE] >> np.uint64(number)) & np.uint64(1) != 0
 

@@ -40,7 +40,7 @@ MOST = 0.6
 
 @dataclass(eq=False)
 class Region:
-    """That which may be drawn of one camera's pictures in a frame.
+    """Part of one camera's pictures that may be drawn in a frame.
 
     Attributes:
         blocks: [tiles] uint64; each time those of them are drawn that what moves reaches then.
