@@ -84,8 +84,7 @@ def moving_between(
         if view.name not in earlier:
             continue
         changed = changed_pixels(earlier[view.name].target[:3], view.target[:3])
-        total = picture.coverage(*state, view)
-        inside = picture.coverage(*state, view, changed)
+        total, inside = picture.coverage(*state, view, changed)
         sees = total > SEEN_PIXELS
         asked += sees
         says += sees & (inside > IN_CHANGE * total)

@@ -282,7 +282,8 @@ class PictureLoss:
         g_exposure = np.empty((channels, height, 2), np.float32)
         image_loss.image_loss(
             self.rasterizer.planes, view.exposure, view.target, *view.moments, self._weights[:channels],
-            height * width, self._factory.scratch(channels, height, width), g_image, rows, g_exposure,
+            height * width, self._factory.scratch(channels, height, width), image_loss.EVERYWHERE, g_image, rows,
+            g_exposure,
         )  # fmt: skip
         g_image[channels:] = 0
         sums = rows.sum(axis=1, dtype=np.float64)
@@ -319,12 +320,12 @@ class PictureLoss:
         blocks = np.full(-(-width // TILE) * -(-height // TILE), 2**64 - 1, np.uint64)
         drawing = Drawing(blocks, learnt)
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background, drawing=drawing)
-        g_image, g_alpha = self.rasterizer.gradient_buffers()
+        g_image, _ = self.rasterizer.gradient_buffers()
         gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
         here = (slice(None, 3), slice(height), slice(width))
         g_image[here] = (view.target[:3] - offset) / gain - self.rasterizer.planes[here]
         g_image[LABEL, :height, :width] = 1
-        found = self.rasterizer.backward(g_image, g_alpha, LABEL).features
+        found = self.rasterizer.feature_gradients(g_image)
         return found[:, :3].copy(), found[:, LABEL].copy()
 
     def coverage(
@@ -334,17 +335,18 @@ class PictureLoss:
         opacities: Array,
         features: Array,
         view: TrainingView,
-        pixels: Array | float = 1.0,
+        *pixels: Array,
     ) -> Array:
-        """[N] pixels' worth of blending weight of each Gaussian in a view; the gradient of a channel's sum.
+        """[1 + P, N] pixels' worth of blending weight of each Gaussian in a view; the gradients of channels' sums.
 
         Args:
-            pixels: [H, W] what each pixel counts.
+            pixels: P times [H, W], up to three, what each pixel counts; before these come all, each counted once.
         """
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background)
-        g_image, g_alpha = self.rasterizer.gradient_buffers()
+        g_image, _ = self.rasterizer.gradient_buffers()
         g_image[:] = 0
-        g_image[LABEL, : view.camera.height, : view.camera.width] = pixels
-        weights = self.rasterizer.backward(g_image, g_alpha, LABEL).features[:, LABEL].copy()
+        for plane, count in zip(g_image, (1.0, *pixels), strict=False):
+            plane[: view.camera.height, : view.camera.width] = count
+        weights = self.rasterizer.feature_gradients(g_image).T[: 1 + len(pixels)].copy()
         g_image[:] = 0
         return weights
