@@ -61,7 +61,6 @@ PRESETS: dict[str, Settings] = {
             rate_colour_standing=0.0025,
             momentum=1.0,
             cold_start=1.0,
-            cold_longer=1.0,
             judge=False,
             still=-1.0,
             weights=Weights(mask=3.0, mask_alone=3.0, isometry=2.0, scale=0.0),

@@ -278,7 +278,7 @@ class UpdateSettings(SettingsModel):
         "of clusters begin one after the other before.",
     )
     cold_longer: float = Field(
-        2.0, gt=0, description="Times the iterations without motion or budget_ms: on from the end for those beyond 1."
+        1.0, gt=0, description="Factor on the iterations where there is no motion to start from."
     )
     cold_start: float = Field(
         2.0, ge=1, description="Factor on the layers' rates where there is no motion to start from: further to go."

@@ -150,7 +150,7 @@ class FrameSolver:
             result = self._go_on(given, result, attempts)
         elif outcome is FrameOutcome.UPDATED and self._far(given):
             other = replace(given, seed=given.seed + 1)  # another order of the views
-            result = self._go_on(other, result, attempts, settings.cold_longer - 1)
+            result = self._go_on(other, result, attempts, longer=1.0)
         result = replace(result, outcome=outcome, reason=reason, attempts=attempts, exposure=exposure)
         return self._committed(given, result)
 
@@ -197,7 +197,8 @@ class FrameSolver:
     def _options(self, given: UpdateInput, template: AttemptOptions) -> AttemptOptions:
         """The options of an attempt at a frame, in the manner of a template."""
         settings, past = self._settings, given.past
-        most, end = round(template.longer * settings.iterations), None
+        longer = max(template.longer, settings.cold_longer if given.motion is None else 1.0)
+        most, end = round(longer * settings.iterations), None
         if given.end is not None:
             most, end = MOST_TIMED, self._until(given, template, given.end)
         stopping = Stopping(most, end=end, each=given.each, gain=settings.stop_gain, first=all_begun(settings))
@@ -261,9 +262,12 @@ class FrameSolver:
         return None
 
     def _far(self, given: UpdateInput) -> bool:
-        """True where no motion was known to start from: there was far to go; a budget is kept all the same."""
+        """True where no motion was known to start from, and the update was no longer for it: there was far to go.
+
+        A budget in milliseconds is kept all the same.
+        """
         settings = self._settings
-        return settings.judge and settings.cold_longer > 1 and given.motion is None and given.end is None
+        return settings.judge and settings.cold_longer <= 1 and given.motion is None and given.end is None
 
     def _go_on(
         self, given: UpdateInput, tried: UpdateResult, attempts: list[str], longer: float = SEARCH.longer
