@@ -32,7 +32,7 @@ from scas4d_core.robust.solve_frame import FrameSolver, UpdateInput
 from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.storage.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, cold_start, find_commit
 from scas4d_core.storage.history import History, HistoryError
-from scas4d_core.structure.motion_mask import labelled, with_reliable_labels
+from scas4d_core.structure.motion_mask import first_labels, labelled
 from scas4d_core.torch_backend.device import require_device
 from scas4d_core.update.frame_update import Updater
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
@@ -123,7 +123,7 @@ class Reconstruction(CommittedScene):
         began, scaled = perf_counter(), self._factory.scaled(frame)
         told = progress or (lambda _: None)
         result = static or fit_first(scaled, points, self._factory, self.settings, self.world, told)
-        self.static = result = replace(result, gaussians=with_reliable_labels(result.gaussians))
+        self.static = result = replace(result, gaussians=first_labels(result.gaussians, self.rig, scaled.masks))
         fitted = perf_counter()
         lengths = axis_lengths(result.gaussians)
         self._fixed = FirstFrame(len(frame.masks) > 0, result.exposures, lengths, self.settings.scene.behind)
