@@ -329,13 +329,7 @@ class PictureLoss:
         return found[:, :3].copy(), found[:, LABEL].copy()
 
     def coverage(
-        self,
-        means: Array,
-        factors: Array,
-        opacities: Array,
-        features: Array,
-        view: TrainingView,
-        *pixels: Array,
+        self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView, *pixels: Array
     ) -> Array:
         """[1 + P, N] pixels' worth of blending weight of each Gaussian in a view; the gradients of channels' sums.
 
