@@ -3,8 +3,8 @@
 ``train_meta.json`` and ``test_meta.json`` hold ``w``, ``h``, ``k[t][c]`` (3×3, pixels), ``w2c[t][c]`` (4×4, OpenCV
 axes), ``fn[t][c]`` (path under ``ims/``) and ``cam_id[t][c]``. Masks lie under ``seg/`` with the same path, ending in
 ``.png``. ``init_pt_cld.npz`` holds ``data`` [P, 7]: x y z, r g b (0…1), foreground (0…1). Beyond that layout,
-``train_meta.json`` may hold ``fps``, ``w`` and ``h`` may be lists of one number a camera where sizes differ, and a cloud
-without known foreground has six columns.
+``train_meta.json`` may hold ``fps``; ``w`` and ``h`` may be lists of one number a camera, where sizes differ; and a
+cloud without known foreground has six columns.
 (JonathonLuiten/Dynamic3DGaussians, ``train.py``.)
 """
 
