@@ -33,7 +33,9 @@ class Fit(StrEnum):
 
 
 def _options(
-    calibration: Annotated[Path | None, typer.Option(help="The calibration, if it is not in CAPTURE.")] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration, a file or a folder, if it is not in CAPTURE; docs/captures.md.")
+    ] = None,
     pictures: Annotated[
         PicturesFrom | None, typer.Option(help="Kind of pictures to take, where a capture has several.")
     ] = None,
@@ -73,12 +75,12 @@ def takes_capture(command: Callable[..., None]) -> Callable[..., None]:
     >>> count(folder, test=["1"])
     4 ('1',)
     """
-    signature, hints = inspect.signature(command), get_type_hints(command, include_extras=True)
-    own = [parameter for name, parameter in signature.parameters.items() if name != "options"]
+    given, shared = _parameters(command), _parameters(_options)
+    own = [parameter for name, parameter in given.items() if name != "options"]
     added = [
         parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-        for name, parameter in inspect.signature(_options).parameters.items()
-        if name not in signature.parameters
+        for name, parameter in shared.items()
+        if name not in given
     ]
     names = {parameter.name for parameter in added}
 
@@ -88,12 +90,16 @@ def takes_capture(command: Callable[..., None]) -> Callable[..., None]:
         command(*given, options=options, **named)
 
     del run.__wrapped__
-    run.__signature__ = signature.replace(parameters=[*own, *added])  # type: ignore[attr-defined]
-    run.__annotations__ = {
-        **{name: hint for name, hint in hints.items() if name != "options"},
-        **{name: hint for name, hint in get_type_hints(_options, include_extras=True).items() if name in names},
-    }
+    run.__signature__ = inspect.Signature([*own, *added])  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in (*own, *added)}
     return run
+
+
+def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+    """The parameters of a function by name; their annotations are values, not strings."""
+    hints = get_type_hints(function, include_extras=True)
+    found = inspect.signature(function).parameters
+    return {name: parameter.replace(annotation=hints[name]) for name, parameter in found.items()}
 
 
 def opened(folder: Path, options: CaptureOptions, **more: Any) -> Capture:
