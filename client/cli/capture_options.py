@@ -25,7 +25,7 @@ class PicturesFrom(StrEnum):
 
 
 class Fit(StrEnum):
-    """How pictures of another shape than calibrated came about."""
+    """Ways in which pictures of another shape than calibrated came about."""
 
     CORNER = "corner"
     CENTRE = "centre"

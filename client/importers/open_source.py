@@ -21,7 +21,7 @@ PicturesFrom = Literal["images", "videos", "named"]
 
 @dataclass(frozen=True)
 class CaptureOptions:
-    """How a capture is read, the same for every command and study; each is an argument of `open_source`."""
+    """Options on how a capture is read, the same for every command and study; each is an argument of `open_source`."""
 
     calibration: Path | None = None
     pictures: PicturesFrom | None = None

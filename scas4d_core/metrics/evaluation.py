@@ -129,9 +129,10 @@ def measure_parts(reconstruction: Reconstruction, capture: Capture, indices: Seq
     rendered, true = [], []
     for camera in cameras:
         for index in indices:
-            rendered.append(render_parts(reconstruction, camera, index, labels))
-            true.append(truth.labels(camera.name, index))
-    return {"parts_ari": metrics.adjusted_rand_index(np.stack(rendered), np.stack(true)), "parts_count": float(count)}
+            rendered.append(render_parts(reconstruction, camera, index, labels).ravel())  # cameras differ in size
+            true.append(truth.labels(camera.name, index).ravel())
+    index_of_all = metrics.adjusted_rand_index(np.concatenate(rendered), np.concatenate(true))
+    return {"parts_ari": index_of_all, "parts_count": float(count)}
 
 
 def measure_flicker(reconstruction: Reconstruction, capture: Capture, indices: Sequence[int]) -> Scores:

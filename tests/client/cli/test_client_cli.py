@@ -114,7 +114,7 @@ def test_import_makes_a_capture_that_can_be_pushed(service, tmp_path):
 
 def test_unlike_cameras_are_pushed_straight_from_their_folder(service, tmp_path):
     pytest.importorskip("cv2")
-    from mixed_rig import COUNT, write_rig
+    from made_rigs.mixed import COUNT, write_rig
 
     folder = write_rig(tmp_path / "mixed")
     done = scas4d("push", str(folder), "--url", service.url, "--test", "c8", COLUMNS="200")

@@ -72,7 +72,7 @@ def test_a_capture_without_test_cameras_is_measured_on_those_it_has_and_says_so(
 def test_unlike_cameras_are_reconstructed_straight_from_their_folder(tmp_path):
     """Three sizes, a fisheye, grey, 16 bits and a palette; two cameras of other sizes are held out."""
     pytest.importorskip("cv2")
-    from mixed_rig import write_rig
+    from made_rigs.mixed import write_rig
 
     folder = write_rig(tmp_path / "mixed")
     given = open_source(folder, test=("c0", "c5"))

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("cv2")
 
-from mixed_rig import COUNT, DEEP, FISHEYE, GREY, PALETTE, SIZES, STEP, camera, seen_by, write_rig
+from made_rigs.mixed import COUNT, DEEP, FISHEYE, GREY, PALETTE, SIZES, STEP, camera, seen_by, write_rig
 from PIL import Image
 
 from client.importers.open_source import open_source
