@@ -65,7 +65,7 @@ class Undistorter:
             return None
         return (
             f"camera {self.lens.name!r}: its distortion turns back towards the corners, where its calibration had no "
-            f"points; {1 - self._view.kept:.0%} of its picture are cut off"
+            f"points; {1 - self._view.kept:.0%} of its picture is cut off"
         )
 
     @cached_property

@@ -158,7 +158,7 @@ def test_a_lens_that_turns_back_towards_the_corners_is_cut_and_says_so(model, ch
     back = straightened(lens, np.stack([u, v], -1).reshape(-1, 2))
     shown = back * pinhole.intrinsics.diagonal()[:2] + pinhole.intrinsics[:2, 2]
     lost = 1 - ((shown > 0) & (shown < [WIDTH, HEIGHT])).all(axis=1).mean()
-    said = re.match(r"camera 'c0': its distortion turns back .*; (\d+)% of its picture are cut off", undistorter.remark)
+    said = re.match(r"camera 'c0': its distortion turns back .*; (\d+)% of its picture is cut off", undistorter.remark)
     assert abs(int(said[1]) / 100 - lost) < 0.015
     points = points_before(pinhole)
     picture = undistorter.picture(painted(seen(lens, points)))
