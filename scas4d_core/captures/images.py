@@ -229,7 +229,10 @@ def mixed_colours(grey: Mapping[str, bool]) -> list[str]:
     if len(set(grey.values())) < 2:
         return []
     listed = ", ".join(name for name, is_grey in grey.items() if is_grey)
-    return [f"grey cameras beside colour ones: {listed}; their values stand for all three channels"]
+    return [
+        f"grey cameras beside colour ones: {listed}; their grey stands for all three channels, which dulls the colours; "
+        "hold them out (--test) where the others are enough"
+    ]
 
 
 def area_average(picture: NDArray[np.float64], size: Size) -> NDArray[np.float64]:
