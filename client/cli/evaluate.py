@@ -99,7 +99,9 @@ class Job:
             if name not in ("update.iterations", "update.seed", "static.seed") and dict(_flat(usual)).get(name) != value
         ]
         words += ["no masks"] * (not self.masks) + ["no points"] * (not self.points)
-        return ", ".join(words + [f"{name}={value}" for name, value in self.options.changed.items()])
+        words += [f"held out {', '.join(self.options.test)}"] if self.options.test else []
+        words += [f"{name}={value}" for name, value in self.options.changed.items() if name != "test"]
+        return ", ".join(words)
 
     @property
     def key(self) -> str:

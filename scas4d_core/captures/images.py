@@ -230,7 +230,7 @@ def mixed_colours(grey: Mapping[str, bool]) -> list[str]:
         return []
     listed = ", ".join(name for name, is_grey in grey.items() if is_grey)
     return [
-        f"grey cameras beside colour ones: {listed}; their grey stands for all three channels, which dulls the colours; "
+        f"grey cameras beside colour ones: {listed}; their grey stands for all three channels, which dulls colours; "
         "hold them out (--test) where the others are enough"
     ]
 

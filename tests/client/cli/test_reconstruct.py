@@ -63,6 +63,7 @@ def test_a_capture_without_test_cameras_is_measured_on_those_it_has_and_says_so(
     held = CaptureOptions(test=("1",))
     other = evaluate(folder, tmp_path / "out", options=held, frames=2, changes=CHANGES, report=said.append)
     assert (other["measured_on"], other["key"] == row["key"]) == ("test cameras", False)
+    assert "static.iterations=2, held out 1 |" in said[-1]
     assert [path.name for path in sorted((tmp_path / "out/pictures" / other["key"]).glob("frame*"))] == [
         "frame0000_camera1.png",
         "frame0001_camera1.png",
