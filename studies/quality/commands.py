@@ -7,13 +7,17 @@ from typing import Annotated
 
 import typer
 
+from client.cli.capture_options import takes_capture
+from client.importers.open_source import CaptureOptions
 from studies.options import QUALITY, Again, Captures, Changes, write_page
 
 Study = Annotated[Path, typer.Option(help="Folder of the study: rows, pictures, frames 0. Run again to go on.")]
 
 
+@takes_capture
 def quality(
     captures: Captures,
+    options: CaptureOptions,
     out: Study = QUALITY,
     preset: Annotated[
         list[str] | None, typer.Option(help="Preset: scas4d (the default), adaptive or dynamic3dgs. May be repeated.")
@@ -56,13 +60,16 @@ def quality(
         points=points,
         lpips=lpips,
         again=again,
+        options=options,
     )
     if any("error" in row for row in rows):
         raise typer.Exit(1)
 
 
+@takes_capture
 def refit(
     captures: Captures,
+    options: CaptureOptions,
     out: Study = QUALITY,
     frame: Annotated[int, typer.Option(help="Frame that is fitted; negative ones count from the end.")] = -1,
     preset: Annotated[str, typer.Option(help="Named settings.")] = "scas4d",
@@ -89,11 +96,14 @@ def refit(
         points=points,
         changes=changes or (),
         again=again,
+        options=options,
     )
 
 
+@takes_capture
 def effects(
     captures: Captures,
+    options: CaptureOptions,
     out: Annotated[Path, typer.Option(help="Folder of the study. Run again to go on.")] = Path("out/effects"),
     name: Annotated[
         list[str] | None, typer.Option(help="Only this effect, by name; all when left out. May be repeated.")
@@ -128,6 +138,7 @@ def effects(
         frames=frames,
         changes=changes or (),
         again=again,
+        options=options,
     )
 
 
