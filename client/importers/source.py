@@ -142,7 +142,7 @@ class ImportedSource:
         self.points = calibration.points
         self.frame_count = pictures.frame_count
         self.fps = fps or pictures.fps or calibration.fps or 30.0
-        self.remarks = list(pictures.remarks)
+        self.remarks = [*calibration.remarks, *pictures.remarks]
         self._pictures = pictures
         self._masks = masks
         self._encoding = encoding
