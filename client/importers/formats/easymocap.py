@@ -2,7 +2,8 @@
 
 `names` lists the cameras. `intri.yml` has by camera `K_<name>` [3, 3] and `dist_<name>` (or `D_<name>`), and in some
 versions `H_<name>`, `W_<name>`; without these the size is that of the camera's pictures. `extri.yml` has `Rot_<name>`
-[3, 3], or only `R_<name>` [3] (Rodrigues' vector), and `T_<name>` [3], world to camera.
+[3, 3], or only `R_<name>` [3] (Rodrigues' vector), and `T_<name>` [3], world to camera. A camera without a pose is left
+out, with a remark.
 (github.com/zju3dv/EasyMocap, `easymocap/mytools/camera_utils.py`.)
 """
 
@@ -47,8 +48,11 @@ def read_easymocap(folder: Path, capture: Path) -> Calibration:
     if not isinstance(names, list) or not names:
         raise CaptureError(f"{folder / INTRINSICS}: has no list `names` of its cameras")
     texts = [name if isinstance(name, str) else f"{name:g}" for name in names if isinstance(name, str | float)]
-    cameras = [_camera(folder, capture, name, intrinsics, extrinsics) for name in texts if name != "none"]
-    return calibration_of_cameras(folder, cameras)
+    posed = [name for name in texts if extrinsics.get(f"T_{name}") is not None]
+    left_out = ", ".join(name for name in texts if name not in posed and name != "none")
+    remarks = [f"{INTRINSICS}: left out, without a pose in {EXTRINSICS}: {left_out}"] if left_out else []
+    cameras = [_camera(folder, capture, name, intrinsics, extrinsics) for name in posed]
+    return calibration_of_cameras(folder, cameras, remarks)
 
 
 def _camera(

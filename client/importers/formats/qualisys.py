@@ -39,8 +39,8 @@ LARGEST_FILE = 16 << 20
 FLIP = np.diag([1.0, -1.0, -1.0])
 """OpenGL's camera axes to OpenCV's."""
 METRES = 1e-3
-WHOLE = 0.02
-"""How far the subpixels of a pixel may be from a whole number: 69568 over 1087 or 1088 pixels are 64 or 63.9."""
+WHOLE = 0.1
+"""How far the subpixels of a pixel may be from a whole number: files have 69568 over 1087 and 122879 over 1919 pixels."""
 
 
 @dataclass
@@ -118,7 +118,7 @@ def _lens(path: Path, camera: _Camera) -> LensCamera:
         sensor = number("intrinsic", f"sensorMax{axis}") - number("intrinsic", f"sensorMin{axis}")
         pixels = number(window, high) - number(window, low)
         ratio = sensor / pixels if pixels > 0 else 0.0
-        if round(ratio) < 2 or abs(ratio / round(ratio) - 1) > WHOLE:
+        if round(ratio) < 2 or abs(ratio - round(ratio)) > WHOLE or round(ratio) != (unit or [round(ratio)])[0]:
             raise CaptureError(
                 f"{where}: sensorMax{axis} is {sensor:g} for the {pixels + 1:g} pixels of {window}: {ratio:.3g} "
                 "subpixels a pixel, where QTM has 64; export the calibration from QTM"
