@@ -16,6 +16,7 @@ from client.cli.progress import Bars, console
 from client.importers.open_source import open_prepared
 from scas4d_core.captures import Capture, open_capture
 from scas4d_core.presets import preset as named
+from scas4d_core.rig_checks import check_rig
 from scas4d_core.settings import Settings
 
 if TYPE_CHECKING:
@@ -98,6 +99,7 @@ def reconstruct(folder: Path, out: Path, *, frames: int | None, preset: str, cha
     from scas4d_core.storage.history import History
 
     settings = named(preset, changes)
+    check_rig(given.rig, settings.scene, None if given.points is None else given.points.positions)
     capture = open_capture(folder, image_scale=settings.scene.image_scale)
     count = min(frames or capture.frame_count, capture.frame_count)
     rig = capture.test_rig or capture.rig

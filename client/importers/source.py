@@ -16,6 +16,7 @@ from client.importers.calibration import Calibration
 from client.importers.undistort import Undistorter
 from scas4d_core.cameras import Rig
 from scas4d_core.captures import Capture, CaptureError, InitialPoints, decode_mask
+from scas4d_core.rig_checks import pose_warnings
 
 Picture = NDArray[np.uint8]
 Encoding = Literal["jpeg", "png"]
@@ -70,7 +71,7 @@ class CaptureSource:
         self.frame_count = capture.frame_count
         self.fps = capture.fps
         self.points = capture.points
-        self.remarks: list[str] = []
+        self.remarks = pose_warnings(self.rig, None if self.points is None else self.points.positions)
 
     def time(self, index: int) -> float:
         """Seconds since frame 0."""
@@ -142,7 +143,7 @@ class ImportedSource:
         self.points = calibration.points
         self.frame_count = pictures.frame_count
         self.fps = fps or pictures.fps or calibration.fps or 30.0
-        self.remarks = [*calibration.remarks, *pictures.remarks]
+        self.remarks = [*calibration.remarks, *_suspicions(calibration), *pictures.remarks]
         self._pictures = pictures
         self._masks = masks
         self._encoding = encoding
@@ -193,6 +194,12 @@ class ImportedSource:
                     f"{self.name}: frame {index} is at {now:g} s, not after the one before, {before:g} s"
                 )
             before = now
+
+
+def _suspicions(calibration: Calibration) -> list[str]:
+    """Remarks on poses that seem to be the wrong way round; a lens's distortion does not matter for that."""
+    rig = Rig(tuple(lens.pinhole() for lens in calibration.cameras))
+    return pose_warnings(rig, None if calibration.points is None else calibration.points.positions)
 
 
 def encode(picture: Picture, encoding: Encoding) -> bytes:

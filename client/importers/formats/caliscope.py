@@ -56,5 +56,5 @@ def read_caliscope(path: Path, document: Mapping[str, Any]) -> Calibration:
 
 
 def _calibrated(table: Mapping[str, Any]) -> bool:
-    """Whether intrinsics and a pose are there; rtoml wrote the text "null" for none."""
+    """True where intrinsics and a pose are there; rtoml wrote the text "null" for none."""
     return all(isinstance(table.get(field), list) for field in ("matrix", "rotation", "translation"))

@@ -40,7 +40,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 """OpenGL's camera axes to OpenCV's."""
 METRES = 1e-3
 WHOLE = 0.1
-"""How far the subpixels of a pixel may be from a whole number: files have 69568 over 1087 and 122879 over 1919 pixels."""
+"""How far the subpixels of a pixel may be from a whole number; 69568 over 1087 and 122879 over 1919 are found."""
 
 
 @dataclass
@@ -113,7 +113,7 @@ def _lens(path: Path, camera: _Camera) -> LensCamera:
         return value
 
     window = "fov_video_max" if "fov_video_max" in camera.parts else "fov_video"
-    unit = []
+    unit: list[float] = []
     for axis, low, high in (("U", "left", "right"), ("V", "top", "bottom")):
         sensor = number("intrinsic", f"sensorMax{axis}") - number("intrinsic", f"sensorMin{axis}")
         pixels = number(window, high) - number(window, low)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from lenses import HEIGHT, WIDTH
-from rigs import NAMES, lenses, write_pictures
-from tool_files import easymocap, opencv_file, opencv_matrix
+from rigs import NAMES, easymocap, lenses, opencv_file, opencv_matrix, write_pictures
 
 from client.importers.open_source import open_source, read_calibration
 from scas4d_core.captures import CaptureError

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rigs import lenses, transforms, write, write_pictures
-from tool_files import anipose, caliscope, qualisys
+from lenses import camera, pose
+from rigs import anipose, caliscope, fields, lenses, qualisys, transforms, write, write_pictures
 
 from client.importers.open_source import open_source, read_calibration
 from scas4d_core.captures import CaptureError
@@ -201,3 +201,26 @@ def test_files_of_other_kinds_are_refused(tmp_path):
         (tmp_path / name).write_text(text)
         with pytest.raises(CaptureError, match=said):
             read_calibration(tmp_path, tmp_path / name)
+
+
+def test_left_handed_rotations_are_named(tmp_path):
+    lens = lenses()["cam1"]
+    mirrored = lens.world_to_camera[:3, :3] * [1, 1, -1]
+    (tmp_path / "camera_array.toml").write_text("\n".join(["[cameras.1]", *fields(lens, rotation=mirrored)]))
+    with pytest.raises(CaptureError, match=r"\[cameras.1\]: camera 'cam_1': .*determinant -1: a left-handed frame"):
+        read_calibration(tmp_path)
+
+
+def test_poses_the_wrong_way_round_are_remarked(tmp_path):
+    rig = {}
+    for i, angle in enumerate(np.linspace(0, 2 * np.pi, 6, endpoint=False)):
+        to_camera = pose(angle)
+        to_camera[:2, 3] = 0
+        rig[f"c{i}"] = camera("PINHOLE", f"c{i}", to_camera)
+    write_pictures(tmp_path / "images", names=rig)
+    (tmp_path / "calibration.toml").write_text(anipose(rig))
+    assert open_source(tmp_path).remarks == []
+    wrong = {name: camera("PINHOLE", name, np.linalg.inv(lens.world_to_camera)) for name, lens in rig.items()}
+    (tmp_path / "calibration.toml").write_text(anipose(wrong))
+    (remark,) = open_source(tmp_path).remarks
+    assert "the poses seem to be the wrong way round" in remark
