@@ -252,7 +252,9 @@ class UpdateSettings(SettingsModel):
         "do not count. A light that stays for so many is the scene's own.",
     )
     clusters: tuple[Count, ...] = Field(
-        (64, 320, 1280), max_length=16, description="Clusters per layer, coarse to fine (the paper's); empty: none."
+        (64, 320, 1280),
+        max_length=16,
+        description="Clusters per layer, coarse to fine (the paper's); empty: each Gaussian alone.",
     )
     cluster_map: Literal["centred", "published"] = Field(
         "centred", description="Scaling about the pivot (translation-equivariant) or about the world origin (paper)."

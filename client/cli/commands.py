@@ -48,9 +48,7 @@ Token = Annotated[
     str | None, typer.Option(envvar="SCAS4D_TOKEN", help="Token of the service; better given in SCAS4D_TOKEN.")
 ]
 Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene.")]
-Calibration = Annotated[
-    Path | None, typer.Option(help="A transforms.json or the folder of a COLMAP model, if not in CAPTURE.")
-]
+Calibration = Annotated[Path | None, typer.Option(help="A calibration (docs/captures.md), if not in CAPTURE.")]
 From = Annotated[
     PicturesFrom | None, typer.Option("--pictures", help="Kind of pictures to take, where a capture has several.")
 ]
