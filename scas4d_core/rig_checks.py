@@ -158,9 +158,9 @@ def check_points(rig: Rig, positions: Float) -> None:
     Raises:
         RigError: no camera can see any.
     """
-    some = _some(positions)
-    if any((camera.to_camera(some)[:, 2] > 0).any() for camera in rig.cameras):
-        return
+    for cloud in (_some(positions), positions):  # one of few is before a camera mostly
+        if any((camera.to_camera(cloud)[:, 2] > 0).any() for camera in rig.cameras):
+            return
     raise RigError(
         "all points lie behind all cameras",
         "give world_to_camera with OpenCV axes (z forward), and points in the same world; poses from camera to world "

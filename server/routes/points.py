@@ -43,7 +43,7 @@ async def put(scene: TheScene, request: Request) -> PointsReceipt:
     sha256 = hashlib.sha256(body).hexdigest()
     arrays = await asyncio.to_thread(read_points, body, MOST_POINTS)
     try:
-        check_points(scene.rig, arrays["positions"])
+        await asyncio.to_thread(check_points, scene.rig, arrays["positions"])
     except RigError as error:
         raise of_rig(error) from None
     receipt = PointsReceipt(points=len(arrays["positions"]), sha256=sha256)
@@ -65,7 +65,7 @@ async def put(scene: TheScene, request: Request) -> PointsReceipt:
                 raise full_disk(error) from None
             raise
         scene.points_sha256 = sha256
-        scene.warnings = pose_warnings(scene.rig, arrays["positions"])
+        scene.warnings = await asyncio.to_thread(pose_warnings, scene.rig, arrays["positions"])
     return receipt
 
 

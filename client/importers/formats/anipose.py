@@ -1,4 +1,4 @@
-"""Reads anipose's `calibration.toml` (aniposelib), and Pose2Sim's `Calib*.toml`, which has the same fields.
+"""Reads anipose's `calibration.toml` (aniposelib), and Pose2Sim's and FreeMoCap's files, which have the same fields.
 
 A table a camera: `name`, `size` (width, height), `matrix` [3][3], `distortions` [5] or [4], `rotation` [3] (Rodrigues'
 vector) and `translation` [3], world to camera; `fisheye = true` for coefficients of `cv2.fisheye`. `[metadata]` says

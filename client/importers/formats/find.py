@@ -19,8 +19,8 @@ FOLDERS = (".", "calibration")
 """Where they are looked for in a capture."""
 CALISCOPE = "camera_array.toml"
 READ = (
-    f"caliscope's {CALISCOPE}, anipose's calibration.toml, Pose2Sim's Calib*.toml, Qualisys' *{QUALISYS}, EasyMocap's "
-    f"{INTRINSICS} with {EXTRINSICS}, or OpenCV's <camera>{ENDS[0]} files"
+    f"caliscope's {CALISCOPE}, anipose's calibration.toml, FreeMoCap's *_calibration.toml, Pose2Sim's Calib*.toml, "
+    f"Qualisys' *{QUALISYS}, EasyMocap's {INTRINSICS} with {EXTRINSICS}, or OpenCV's <camera>{ENDS[0]} files"
 )
 
 
@@ -34,12 +34,18 @@ def _found_here(folder: Path) -> list[Path]:
         return []
     names = sorted(path for path in folder.iterdir() if path.is_file())
     found = [path for path in names if path.name == CALISCOPE or path.name.lower().endswith(QUALISYS)]
-    found += [path for path in names if path.suffix == ".toml" and path.name.lower().startswith("calib")]
+    found += [path for path in names if _is_toml(path)]
     if is_easymocap(folder):
         found.append(folder / INTRINSICS)
     elif camera_files(folder):
         found.append(folder)
     return found
+
+
+def _is_toml(path: Path) -> bool:
+    """True for calibration.toml, Calib*.toml, and FreeMoCap's <recording>_camera_calibration.toml."""
+    name = path.name.lower()
+    return name.endswith("_calibration.toml") or (name.startswith("calib") and name.endswith(".toml"))
 
 
 def is_calibration(path: Path) -> bool:
@@ -66,7 +72,7 @@ def read_found(path: Path, capture: Path) -> Calibration:
         return read_found(only(here, path), capture)
     if path.name.lower().endswith(QUALISYS):
         return read_qualisys(path)
-    if path.suffix == ".toml":
+    if path.suffix.lower() == ".toml":
         return _read_toml(path)
     if path.name in (INTRINSICS, EXTRINSICS):
         return read_easymocap(path.parent, capture)

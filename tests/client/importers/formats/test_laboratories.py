@@ -44,7 +44,7 @@ def test_anipose_by_opencv(tmp_path):
     assert np.allclose(found, wanted, atol=1e-6)
 
 
-@pytest.mark.parametrize("file", ["Calib_scene.toml", "calibration/Calib.toml"])
+@pytest.mark.parametrize("file", ["Calib_scene.toml", "calibration/Calib.toml", "walk_camera_calibration.toml"])
 def test_pose2sim_names_cameras_by_the_folders_of_their_boards(tmp_path, file):
     rig = lenses()
     (tmp_path / file).parent.mkdir(exist_ok=True)
