@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 from lenses import HEIGHT, WIDTH
 from rigs import NAMES, easymocap, lenses, opencv_file, opencv_matrix, write_pictures
 
+from client.importers.extras import MissingExtra
 from client.importers.open_source import open_source, read_calibration
 from scas4d_core.captures import CaptureError
 
@@ -120,6 +123,13 @@ def test_files_that_opencv_wrote(tmp_path):
         storage.write("T", lens.world_to_camera[:3, 3])
         storage.release()
     assert_same(read_calibration(tmp_path), rig)
+
+
+def test_opencv_is_asked_for_by_name(tmp_path, monkeypatch):
+    easymocap(lenses(), tmp_path, sizes=True)
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(MissingExtra, match=r"reading OpenCV's YAML and XML files needs OpenCV .*\[importers\]"):
+        read_calibration(tmp_path)
 
 
 def test_a_camera_without_a_pose_is_refused(tmp_path):
