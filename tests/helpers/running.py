@@ -65,9 +65,9 @@ def make_rig(count=2):
 
 
 def beside(number):
-    """World to camera: 3 before the origin, and as many tenths to its right."""
+    """World to camera: 3 before the origin, micrometres beside one another: two places, with the same pictures."""
     pose = np.eye(4)
-    pose[:3, 3] = [-0.1 * number, 0, 3]
+    pose[:3, 3] = [-4e-6 * number, 0, 3]
     return pose
 
 
