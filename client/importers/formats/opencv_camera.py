@@ -54,8 +54,8 @@ def opencv_camera(
     >>> lens = [[100, 0, 31.5], [0, 100, 23.5], [0, 0, 1]]
     >>> camera = opencv_camera("rig.toml", "front", matrix=lens, distortions=[0, 0, 0, 0, 0], rotation=[0, 0, np.pi],
     ...                        translation=[0, 0, 2], size=(64, 48))
-    >>> camera.model, camera.intrinsics[:2, 2].tolist(), np.round(camera.world_to_camera[0]).tolist()
-    ('PINHOLE', [32.0, 24.0], [-1.0, 0.0, 0.0, 0.0])
+    >>> camera.model, camera.intrinsics[:2, 2].tolist(), camera.pinhole().centre.round(6).tolist()[2]
+    ('PINHOLE', [32.0, 24.0], -2.0)
     """
     k = numbers(where, "the camera matrix", matrix, (9,)).reshape(3, 3)
     if np.abs(k[2, :2]).max() > 0 and not k[:2, 2].any():
