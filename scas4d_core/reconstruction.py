@@ -26,6 +26,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import Preparation, room_for_births
 from scas4d_core.query.committed import CommittedScene, View
 from scas4d_core.rasterize.limits import scene_limits
+from scas4d_core.rig_checks import check_rig
 from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness, fingerprints, goes_on, lit, noted
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import FrameSolver, UpdateInput
@@ -107,18 +108,18 @@ class Reconstruction(CommittedScene):
         Args:
             rig: training cameras, user's world and units, at the size of the frame's pictures.
             frame: with a picture of every camera, or of most; masks where there are.
-            points: a first cloud in the user's world; without it one is made from the pictures.
-            progress: told of each stage.
-            history: to commit to; None: in memory.
-            static: a frame 0 that was fitted before, taken as it is.
+            points: a first cloud in the user's world; without it one is made from the pictures. progress: told of each
+                stage. history: to commit to; None: in memory. static: a frame 0 that was fitted before, taken as it is.
             dropped, notes, started: see ``step``; the stage "load" has the time before: decoding, loading the kernels.
 
         Raises:
-            DeviceError: the settings' device cannot be had here.
+            DeviceError: the settings' device cannot be had here. RigError: the rig cannot work with these settings.
             ValueError: a time that is not finite, or pictures of another size.
         """
         if not isfinite(frame.time):
             raise ValueError(f"frame {frame.index}: time {frame.time} s must be finite")
+        if static is None:
+            check_rig(rig, settings.scene, None if points is None else points.positions)
         self = cls(rig, with_background(settings, frame.images), History() if history is None else history)
         began, scaled = perf_counter(), self._factory.scaled(frame)
         told = progress or (lambda _: None)
@@ -134,9 +135,8 @@ class Reconstruction(CommittedScene):
         load = {} if started is None else {"load": began - started}
         seconds = {**load, "fit": fitted - began, "prepare": perf_counter() - fitted}
         report = report_of_first(frame, result, self.rig.names, len(self._updater.hierarchy.rows), seconds, dropped)
-        psnr = {name: fit["psnr"] for name, fit in result.cameras.items()}
+        psnr, shown = {name: fit["psnr"] for name, fit in result.cameras.items()}, fingerprints(frame.images)
         past = replace(Past.of_first(psnr, brightness(frame.images)), fitted=frame.time)
-        shown = fingerprints(frame.images)
         carried = CarryOver(seen=seen, structure=structure, past=past, shown=shown, switches=switches, effects=effects)
         self._commit(report, result.gaussians, carried, {**self._fixed.record(), **(notes or {})})
         return self

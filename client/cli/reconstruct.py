@@ -15,6 +15,7 @@ from client.cli import pictures
 from client.cli.progress import Bars, console
 from scas4d_core.captures import Capture
 from scas4d_core.presets import preset as named
+from scas4d_core.rig_checks import check_rig
 from scas4d_core.settings import Settings
 
 if TYPE_CHECKING:
@@ -97,6 +98,7 @@ def reconstruct(given: Capture, out: Path, *, frames: int | None, preset: str, c
     from scas4d_core.storage.history import History
 
     settings = named(preset, changes)
+    check_rig(given.full_rig, settings.scene, None if given.points is None else given.points.positions)
     capture = given.scaled(settings.scene.image_scale)
     count = min(frames or capture.frame_count, capture.frame_count)
     rig = capture.test_rig or capture.rig

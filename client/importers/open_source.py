@@ -7,13 +7,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 from client.importers.calibration import Calibration
-from client.importers.colmap import is_model, read_colmap
-from client.importers.nerfstudio import FILE, read_transforms
+from client.importers.formats.colmap import is_model, read_colmap
+from client.importers.formats.find import READ, found_in, is_calibration, only, read_found
+from client.importers.formats.nerfstudio import FILE, read_transforms
 from client.importers.pictures import PictureFiles, folders_of, named_files
 from client.importers.source import Encoding, ImportedPictures, RawReader, check_times, fitted
 from client.importers.videos import Videos, find_videos
 from scas4d_core.captures import Capture, CaptureError, Fit, open_capture
 from scas4d_core.captures.dynamic3dgs import TRAIN_META
+from scas4d_core.rig_checks import pose_warnings
 
 COLMAP_FOLDERS = ("sparse/0", "sparse", ".", "colmap/sparse/0", "colmap", "calibration")
 PicturesFrom = Literal["images", "videos", "named"]
@@ -65,7 +67,8 @@ def open_source(
 
     Args:
         folder: of the capture.
-        calibration: a transforms.json, or the folder of a COLMAP model; found in the folder where None.
+        calibration: a transforms.json, the folder of a COLMAP model, or a file of another tool
+            (`client/importers/formats/`); found in the folder where None.
         pictures: from where: folders `images/<camera>/`, `videos/<camera>.mp4`, or the files that the calibration
             names; where None, the latter if it names several a camera, else from what is there.
         fps: frames per second, where the files do not say.
@@ -96,6 +99,8 @@ def open_source(
     else:
         given = _imported(folder, read_calibration(folder, calibration), pictures, fps, encoding, use_masks, fit)
         given = given if use_points else replace(given, points=None)
+    suspicions = pose_warnings(given.full_rig, None if given.points is None else given.points.positions)
+    given = replace(given, remarks=(*given.remarks, *suspicions))
     return given.holding_out(test).scaled(image_scale)
 
 
@@ -127,40 +132,57 @@ def _imported(
         reader,
         fps=fps or raw.fps or found.fps or 30.0,
         points=found.points,
-        remarks=(*resized, *reader.remarks),
+        remarks=(*found.remarks, *resized, *reader.remarks),
     )
     check_times(capture.name, [capture.time(index) for index in range(capture.frame_count)])
     return capture
 
 
 def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
-    """Reads the given calibration, else transforms.json, else a COLMAP model in one of the usual places.
+    """Reads the given calibration, else transforms.json, else a COLMAP model in one of the usual places, else the one
+    file of another tool that is there.
 
     Raises:
-        CaptureError: there is none, or it cannot be read.
+        CaptureError: there is none, there are several, or it cannot be read.
+        MissingExtra: it needs a package of the extra `importers`.
     """
     if given is not None:
         if given.is_file() and given.suffix == ".json":
             return read_transforms(given)
         if given.is_dir() and is_model(given):
             return read_colmap(given)
-        raise CaptureError(f"{given}: is neither a transforms.json nor the folder of a COLMAP model")
+        if is_calibration(given):
+            return read_found(given, folder)
+        raise CaptureError(f"{given}: is neither a transforms.json, nor the folder of a COLMAP model, nor {READ}")
+    others = found_in(folder)
     if (folder / FILE).is_file():
-        return read_transforms(folder / FILE)
+        return _instead_of(others, folder, read_transforms(folder / FILE))
     for name in COLMAP_FOLDERS:
         if is_model(folder / name):
-            return read_colmap(folder / name)
+            return _instead_of(others, folder, read_colmap(folder / name))
+    if others:
+        return read_found(only(others, folder), folder)
     raise CaptureError(
-        f"{folder}: no known capture layout: no {TRAIN_META} (Dynamic3DGaussians), no {FILE} (nerfstudio), and no "
-        f"cameras.bin or cameras.txt (COLMAP) in {', '.join(COLMAP_FOLDERS)}; name the calibration with --calibration"
+        f"{folder}: no known capture layout: no {TRAIN_META} (Dynamic3DGaussians), no {FILE} (nerfstudio), no "
+        f"cameras.bin or cameras.txt (COLMAP) in {', '.join(COLMAP_FOLDERS)}, nor, here or in calibration/, {READ}; "
+        "name the calibration with --calibration"
     )
+
+
+def _instead_of(others: list[Path], folder: Path, found: Calibration) -> Calibration:
+    """The calibration, with a remark on others that are there and not read."""
+    if not others:
+        return found
+    listed = ", ".join(str(path.relative_to(folder)) for path in others)
+    remark = f"calibration: {found.source.relative_to(folder)}, not {listed}; --calibration FILE takes another"
+    return replace(found, remarks=(*found.remarks, remark))
 
 
 def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | None) -> RawReader:
     images, videos = folder / "images", folder / "videos"
     has_images = images.is_dir() and any(path.is_dir() for path in images.iterdir())
     if wanted == "named" or (wanted is None and min(len(views) for views in calibration.views.values()) > 1):
-        return PictureFiles(calibration, *named_files(folder, calibration))
+        return _named(folder, calibration)
     if wanted is None and has_images and videos.is_dir():
         raise CaptureError(
             f"{folder}: has pictures in images/ and in videos/; say which: --pictures images or --pictures videos"
@@ -173,4 +195,13 @@ def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | Non
         if not videos.is_dir():
             raise CaptureError(f"{videos}: no such folder; put each camera's video into videos/<camera>.mp4")
         return Videos(calibration, find_videos(videos, calibration))
+    return _named(folder, calibration)
+
+
+def _named(folder: Path, calibration: Calibration) -> PictureFiles:
+    if not any(calibration.views.values()):
+        raise CaptureError(
+            f"{folder}: there is neither images/ nor videos/, and {calibration.source.name} names no pictures; put "
+            f"each camera's into images/<camera>/ or videos/<camera>.mp4 (cameras: {', '.join(calibration.names)})"
+        )
     return PictureFiles(calibration, *named_files(folder, calibration))

@@ -200,7 +200,7 @@ def test_choices_that_cannot_be_are_named(straight):
         open_source(straight / "nowhere")
     with pytest.raises(CaptureError, match=r"videos: no such folder; put each camera's video into videos/<camera>.mp4"):
         open_source(straight, pictures="videos")
-    with pytest.raises(CaptureError, match=r"neither a transforms.json nor the folder of a COLMAP model"):
+    with pytest.raises(CaptureError, match=r"neither a transforms.json, nor the folder of a COLMAP model, nor cali"):
         open_source(straight, calibration=straight / "images")
     with pytest.raises(CaptureError, match="fps -1"):
         open_source(straight, fps=-1)
