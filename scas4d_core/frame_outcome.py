@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
@@ -59,6 +60,42 @@ class FrameOutcome(StrEnum):
     def learnt(self) -> bool:
         """True where the state was updated to the frame's pictures."""
         return not self.held and self is not self.STOOD
+
+
+class AlarmKind(StrEnum):
+    """What an alarm is about. The values are those on disk and on the wire; ``robust/alarms.py`` says when."""
+
+    CAMERA_LEFT_OUT = "camera_left_out"
+    """Nothing was learnt from the camera: no picture came, or it was not believed."""
+    CAMERA_MISFIT = "camera_misfit"
+    """The camera's picture fits worse than usual beside the others: moved, dirty, late."""
+    CAMERA_COLOURS = "camera_colours"
+    """The camera's colours are off against its own past and the other cameras: exposure, white balance."""
+    CAMERA_SHARPNESS = "camera_sharpness"
+    """The camera's picture is less sharp, or noisier, against its own past and the other cameras."""
+    CAMERA_FROZEN = "camera_frozen"
+    """The camera sends the same picture again, bit by bit, while the others go on."""
+    LIGHT = "light"
+    """All cameras see another light than the colours are in."""
+    FRAME_REPEATED = "frame_repeated"
+    """All cameras send the same pictures again, bit by bit."""
+    FRAME_IN_PART = "frame_in_part"
+    """The frame was committed in part, or after a longer search."""
+    FRAME_HELD = "frame_held"
+    """The frame was not believed, and the state of the frame before stays."""
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """What a person should look at; an entry of the report of a frame.
+
+    Attributes:
+        what: it is about. camera: that it is about, or None. evidence: for people, with figures.
+    """
+
+    what: AlarmKind
+    camera: str | None
+    evidence: str
 
 
 def degraded_text(outcome: FrameOutcome, reason: str) -> str | None:

@@ -14,9 +14,9 @@ import numpy as np
 
 from scas4d_core.captures.frame import Frame
 from scas4d_core.first_frame.static_scene import StaticResult
-from scas4d_core.frame_outcome import Candidate, FrameOutcome, degraded_text
+from scas4d_core.frame_outcome import Alarm, Candidate, FrameOutcome, degraded_text
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.robust.outliers import health
+from scas4d_core.robust.alarms import left_out_alarms
 from scas4d_core.update.best_state import mean_error
 from scas4d_core.update.result import REPORT, CameraFit, Stopwatch, UpdateResult
 
@@ -66,6 +66,7 @@ class FrameReport:
         psnr: dB, over the training views of the last iterations, each as it was rendered then; NaN where not measured.
         moving, gaussians: how many Gaussians move, and are there. born, retired, revived: how many were, in this frame.
         put_off: what the budget left no time for, in words; the next frame has some for it.
+        alarms: what a person should look at (``robust/alarms.py``).
         cameras: by name, how well each camera's picture was met when it was last rendered: a bumped camera shows.
         used: cameras whose pictures were learnt from; none of a frame that was held or stood. dropped: cameras left
             out, with the reason.
@@ -105,6 +106,7 @@ class FrameReport:
     retired: int = 0
     revived: int = 0
     put_off: list[str] = field(default_factory=list)
+    alarms: list[Alarm] = field(default_factory=list)
 
     def record(self) -> dict[str, Any]:
         """The report as JSON: numbers that are not finite are None."""
@@ -149,6 +151,7 @@ def report_of_first(
         cameras=result.cameras,
         used=[name for name in names if name in frame.images],
         dropped=dict(dropped or {}),
+        alarms=left_out_alarms(names, frame.images, dropped or {}),
     )
 
 
@@ -189,7 +192,7 @@ def report_of_update(
         moving=int(gaussians.moving.sum()),
         gaussians=int(gaussians.present.sum()),
         cameras={
-            name: CameraFit(psnr=fit["psnr"], colour_shift=fit["colour_shift"], health=health(result.offsets.get(name)))
+            name: CameraFit(psnr=fit["psnr"], colour_shift=fit["colour_shift"], health=result.health.get(name, 1.0))
             for name, fit in trace.cameras.items()
         },
         used=used if result.outcome.learnt else [],
@@ -208,6 +211,7 @@ def report_of_update(
         retired=int((gaussians.retired[: len(before)] & before.present).sum()),
         revived=int((gaussians.present[: len(before)] & before.retired).sum()),
         put_off=list(put_off),
+        alarms=[*left_out_alarms(names, frame.images, missing), *result.alarms],
     )
     stages[REPORT] = watch.seconds[REPORT] + trace.seconds.get(REPORT, 0.0) + perf_counter() - began
     return report

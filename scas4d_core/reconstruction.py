@@ -27,6 +27,7 @@ from scas4d_core.preparation import Preparation, room_for_births
 from scas4d_core.query.committed import CommittedScene, View
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.rig_checks import check_rig
+from scas4d_core.robust.alarms import first_watched, sharpness
 from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness, fingerprints, goes_on, lit, noted
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import FrameSolver, UpdateInput
@@ -136,7 +137,7 @@ class Reconstruction(CommittedScene):
         seconds = {**load, "fit": fitted - began, "prepare": perf_counter() - fitted}
         report = report_of_first(frame, result, self.rig.names, len(self._updater.hierarchy.rows), seconds, dropped)
         psnr, shown = {name: fit["psnr"] for name, fit in result.cameras.items()}, fingerprints(frame.images)
-        past = replace(Past.of_first(psnr, brightness(frame.images)), fitted=frame.time)
+        past = replace(first_watched(Past.of_first(psnr, brightness(frame.images)), frame.images), fitted=frame.time)
         carried = CarryOver(seen=seen, structure=structure, past=past, shown=shown, switches=switches, effects=effects)
         self._commit(report, result.gaussians, carried, {**self._fixed.record(), **(notes or {})})
         return self
@@ -233,7 +234,7 @@ class Reconstruction(CommittedScene):
         frame = replace(frame, images=dict(frame.images))  # decoded once: a capture's pictures are, whenever looked at
         views = self._views(frame)
         watch.lap("decode")
-        bright = brightness(frame.images)
+        bright, shown = brightness(frame.images), fingerprints(frame.images)
         judged = bright if self.settings.update.judge else {}  # of no picture nothing is found
         exposure, left_out, unusable = check_brightness(self._carried.past, judged)
         moves = exposure != 1.0 and goes_on(self._carried.past, judged)
@@ -250,15 +251,14 @@ class Reconstruction(CommittedScene):
             motion=carried.motion,
             seconds=frame.time - past.fitted if isfinite(past.fitted) else seconds,
             step=seconds,
-            views=believed,
-            suspects=[view for view in views if past.is_out(view.name)],
+            views=believed, suspects=[view for view in views if past.is_out(view.name)],
             brightness=bright, seed=frame.index, past=past, lengths=self._fixed.lengths, exposure=exposure,
             light_moves=moves, left_out=left_out, unusable=unusable, carried=carried.effects,
+            same=[name for name in shown if shown[name] == carried.shown.get(name)], sharp=sharpness(frame.images),
             end=self._budget.end(watch.began), each=self._budget.each,
         )  # fmt: skip
         solver = FrameSolver(updater, self._factory, self._picture, self._update)
-        shown = fingerprints(frame.images)
-        result, past = solver.run(given, repeated=shown == carried.shown and self._update.still > -1)
+        result, past = solver.run(given)
         watch.lap("update")
         watch.move("update", "judge", solver.judging)
         if result.outcome.held:  # motion that seemed to be in its pictures is as little believed as they are

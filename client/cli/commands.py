@@ -15,6 +15,7 @@ from client.cli.progress import Bars, console
 from client.importers.open_source import CaptureOptions
 from client.sdk import DEFAULT_URL, Client
 from client.wire import FINISHED, FrameReportModel, IngestSettings
+from scas4d_core.frame_outcome import AlarmKind
 
 PUSH_OUTAGE_S = 600.0
 """A rig goes on trying for so long: a restart of the service is no reason to end a day's capture."""
@@ -214,6 +215,10 @@ def import_(
     console.print(f"{out}: {count} cameras; try: scas4d push {out}", highlight=False, soft_wrap=True)
 
 
+TOLD = frozenset({AlarmKind.CAMERA_LEFT_OUT, AlarmKind.FRAME_HELD, AlarmKind.FRAME_IN_PART})
+"""Alarms that the line of a frame tells without."""
+
+
 def frame_line(report: FrameReportModel, missed: int = 0) -> str:
     """A finished frame's report as one line."""
     parts = [f"frame {report.index}: {report.state}"]
@@ -225,6 +230,9 @@ def frame_line(report: FrameReportModel, missed: int = 0) -> str:
         parts.append(report.degraded)
     if report.dropped_cameras:
         parts.append(f"without {', '.join(report.dropped_cameras)}")
+    for alarm in report.alarms:
+        if alarm.what not in TOLD:
+            parts.append(alarm.evidence if alarm.camera is None else f"camera {alarm.camera}: {alarm.evidence}")
     if report.error:
         parts.append(report.error)
     if missed:

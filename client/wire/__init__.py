@@ -4,6 +4,7 @@ from client.wire.base import MAX_CAMERAS, MAX_PIXELS_A_SIDE, CameraName, Model, 
 from client.wire.budgets import Budget, EffectiveBudget, SceneBudget
 from client.wire.frames import (
     FINISHED,
+    AlarmModel,
     CameraFitModel,
     CurvePointModel,
     EffectModel,
@@ -57,6 +58,7 @@ __all__ = [
     "FRAME_MEDIA_TYPE",
     "MAX_CAMERAS",
     "MAX_PIXELS_A_SIDE",
+    "AlarmModel",
     "Budget",
     "CameraFitModel",
     "CameraModel",

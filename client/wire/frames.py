@@ -9,7 +9,7 @@ from pydantic import Field
 
 from client.wire.base import Model
 from client.wire.budgets import Budget
-from scas4d_core.frame_outcome import FrameOutcome
+from scas4d_core.frame_outcome import AlarmKind, FrameOutcome
 
 
 class FrameReceipt(Model):
@@ -66,6 +66,19 @@ class CameraFitModel(Model):
         description="0…1: 1 where it fits as usual beside the other cameras, 0 where it would be left out; null where "
         "not judged.",
     )
+
+
+class AlarmModel(Model):
+    """What a person should look at."""
+
+    what: AlarmKind = Field(
+        description="camera_left_out: nothing was learnt from it. camera_misfit: it fits worse than usual beside the "
+        "others. camera_colours, camera_sharpness: off against its past and the others. camera_frozen: it sends the "
+        "same picture again. light: all see another light. frame_repeated: all send the same pictures again. "
+        "frame_in_part, frame_held: see `degraded`."
+    )
+    camera: str | None = Field(default=None, description="Null where it is about none.")
+    evidence: str = Field(description="For people, with figures.")
 
 
 class CurvePointModel(Model):
@@ -153,6 +166,9 @@ class FrameReportModel(Model):
     )
     psnr: float | None = Field(default=None, description="dB, training views of the last iterations.")
     cameras: dict[str, CameraFitModel] = Field(default_factory=dict, description="By camera that the update saw.")
+    alarms: list[AlarmModel] = Field(
+        default_factory=list, description="What a person should look at; frames of earlier versions have none."
+    )
     moving: int | None = None
     gaussians: int | None = Field(default=None, description="That are there; those retired are not counted.")
     born: int = Field(default=0, description="Gaussians that were born in this frame.")

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from math import isfinite, log2, log10, nan
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,8 @@ LAST_DB = -5.0
 """The same when last rendered: left out from the next frame on. Clean: -3.7; moved by one or two pixels: -6 to -15."""
 FITS_DB = -3.0
 """From which a camera that was left out is believed again."""
-NEW_DB = -4.0
-"""More is allowed for in the first update, when a camera's place is known from frame 0 alone."""
+NEW_DB = (-4.0, -2.0, -2.0)
+"""More is allowed for in the first updates: a camera's place is known from frame 0 alone, or from one update."""
 DROP_DB = 6.0
 """Of the cameras' median below its usual, from which an update has not met its frame."""
 DROPS_DB = (14.0, 9.0, 9.0)
@@ -46,6 +46,11 @@ OTHER_EFFORT = 1.5
 PLACE_RATE, LEVEL_RATE = 0.2, 0.3
 """How fast a camera's usual place and the usual level follow."""
 
+WATCHED = 9
+"""Figures of ``alarms.Watch`` by camera."""
+
+Fault = TypeVar("Fault")
+
 
 @dataclass(frozen=True)
 class Past:
@@ -64,6 +69,7 @@ class Past:
             that were brighter, or that were darker.
         last: by camera, mean of its picture in the last frame, in whatever light. step: times that the last frame was
             brighter than the one before it.
+        watch: by camera, what its alarms are told from, see ``alarms.Watch``.
     """
 
     places: Mapping[str, float] = field(default_factory=dict)
@@ -80,6 +86,7 @@ class Past:
     lit: int = 0
     last: Mapping[str, float] = field(default_factory=dict)
     step: float = 1.0
+    watch: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     @classmethod
     def of_first(cls, psnr: Mapping[str, float], bright: Mapping[str, float]) -> Past:
@@ -102,6 +109,8 @@ class Past:
             "error": np.array(list(self.error.values()), np.float64),
             "shown": np.array(list(self.last), np.str_),
             "last": np.array(list(self.last.values()), np.float64),
+            "watched": np.array(list(self.watch), np.str_),
+            "watch": np.array(list(self.watch.values()), np.float64).reshape(-1, WATCHED),
         }
 
     @classmethod
@@ -122,9 +131,12 @@ class Past:
         level, updates, held, fitted, behind, iterations, light, lit, step = scene
         error = dict(zip(arrays["witnesses"].tolist(), arrays["error"].tolist(), strict=True))
         last = dict(zip(arrays["shown"].tolist(), arrays["last"].tolist(), strict=True)) if "last" in arrays else {}
+        rows_of = zip(arrays["watched"].tolist(), arrays["watch"].tolist(), strict=True) if "watch" in arrays else ()
+        watch = {name: tuple(row) for name, row in rows_of}
         return cls(
             places, bright, outs, level,
             int(updates), int(held), fitted, int(behind), int(iterations), error, light, int(lit), last, step,
+            watch,
         )  # fmt: skip
 
     def place(self, name: str) -> float:
@@ -159,14 +171,18 @@ def misfits(past: Past, psnr: Mapping[str, float], limit: float) -> dict[str, st
     Args:
         psnr: dB by camera. limit: ``FIRST_DB`` or ``LAST_DB``.
     """
-    if past.updates == 0:
-        limit += NEW_DB
+    limit += allowed(past)
     found = {
         name: f"its picture fits {-off:.1f} dB worse than usual beside the others"
         for name, off in offsets(past, psnr).items()
         if off < limit
     }
     return few(found, len(psnr))
+
+
+def allowed(past: Past) -> float:
+    """DB that are allowed for beside every limit, by how well the cameras' places are known: ``NEW_DB``, or 0."""
+    return NEW_DB[past.updates] if past.updates < len(NEW_DB) else 0.0
 
 
 def unmet(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | None:
@@ -205,9 +221,9 @@ def level_of(past: Past, psnr: Mapping[str, float]) -> float:
     return float(np.median(values)) if values else nan
 
 
-def health(off: float | None) -> float:
-    """0…1: 1 where a camera fits as usual or better, 0 from ``LAST_DB`` on; ``off`` is its offset, None: not known."""
-    return 1.0 if off is None else float(np.clip(1 - off / LAST_DB, 0, 1))
+def health(past: Past, off: float) -> float:
+    """0…1: 1 where a camera fits as usual or better, 0 from where it will be left out; ``off`` is its offset, dB."""
+    return float(np.clip(1 - off / (LAST_DB + allowed(past)), 0, 1))
 
 
 def settle(
@@ -262,6 +278,6 @@ def _capped(psnr: Mapping[str, float]) -> dict[str, float]:
     return {name: CLEAN_DB if value > CLEAN_DB else value for name, value in psnr.items()}
 
 
-def few(found: dict[str, str], count: int) -> dict[str, str]:
+def few(found: dict[str, Fault], count: int) -> dict[str, Fault]:
     """The faults found of cameras, by name; none where most of ``count`` cameras have one."""
     return found if len(found) <= MOST_OUT * count else {}

@@ -6,7 +6,7 @@ Whatever fails, the next attempt starts from the committed state. Where no attem
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from math import nan
@@ -20,6 +20,7 @@ from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.rasterize.shading import features_seen
 from scas4d_core.robust import outliers
+from scas4d_core.robust.alarms import alarms_of, colours_by_camera
 from scas4d_core.robust.attempt_results import joined, met, retold, usual_errors
 from scas4d_core.robust.checks import EXPOSURE, evened, gain_of, relit, validated
 from scas4d_core.robust.outliers import Past
@@ -53,6 +54,7 @@ class UpdateInput:
         lengths: [N, 3] metres, of the axes in frame 0.
         exposure, left_out, unusable: by the brightness of the pictures, see ``checks.check_brightness``.
         light_moves: whether it goes on from frame to frame, see ``checks.goes_on``.
+        same: cameras whose picture is that of the last frame that was believed. sharp: ``alarms.sharpness`` of each.
         end: moment by which the last iteration has to be over. each: seconds of an iteration in the updates before.
     """
 
@@ -68,6 +70,8 @@ class UpdateInput:
     lengths: NDArray[np.float32]
     exposure: float = 1.0
     light_moves: bool = False
+    same: Collection[str] = ()
+    sharp: Mapping[str, float] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     unusable: str | None = None
     carried: Mapping[str, Arrays] = field(default_factory=dict)
@@ -98,13 +102,26 @@ class FrameSolver:
         self._settings = settings
         self.judging = 0.0
 
-    def run(self, given: UpdateInput, repeated: bool = False) -> Solved:
-        """Solve a frame; where it is held, the state and the motion are those given.
+    def run(self, given: UpdateInput) -> Solved:
+        """Solve a frame; where it is held, the state and the motion are those given."""
+        result, past = self._solved(given)
+        with self._timed():
+            return self._alarmed(given, result, past)
 
-        Args:
-            repeated: its pictures are those of the last frame that was believed.
-        """
-        if repeated and given.unusable is None:
+    def _alarmed(self, given: UpdateInput, result: UpdateResult, past: Past) -> Solved:
+        """With the health of the cameras, and the alarms."""
+        means = {view.name: view.mean for view in result.views or given.views}
+        alarms, past = alarms_of(
+            given.past, past, outcome=result.outcome, reason=result.reason, exposure=result.exposure, sharp=given.sharp,
+            offsets=result.offsets, colours=colours_by_camera(result.trace.cameras, means), same=given.same,
+            left_out={*given.left_out, *result.trace.left_out},
+        )  # fmt: skip
+        fits = {name: outliers.health(given.past, off) for name, off in result.offsets.items()}
+        return replace(result, health=fits, alarms=alarms if self._settings.judge else []), past
+
+    def _solved(self, given: UpdateInput) -> Solved:
+        repeated = given.same and len(given.same) == len(given.brightness)
+        if repeated and self._settings.still > -1 and given.unusable is None:
             return _standing(given, UpdateTrace(kept=Candidate.STILL), given.exposure, "the same pictures again")
         stays = given.light_moves or given.past.lit >= self._settings.patience
         if stays and (solved := self._relit(given)) is not None:
@@ -166,7 +183,7 @@ class FrameSolver:
         gain, light = (1.0, "the same light") if same else (gain, f"{gain:.2g} times the light")
         state, past = relit(given.state, gain), outliers.relit(given.past, gain)
         in_light = replace(given, state=state, past=past, exposure=1.0, light_moves=False, unusable=None)
-        result, past = self.run(in_light)
+        result, past = self._solved(in_light)
         if not result.outcome.held:
             return replace(result, attempts=[f"{light}, for good", *result.attempts]), past
         lost = replace(given.past, held=given.past.held + 1)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.effects.parts import Array, Arrays
-from scas4d_core.frame_outcome import Candidate, FrameOutcome
+from scas4d_core.frame_outcome import Alarm, Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView
 from scas4d_core.update.schedule import Stopping
@@ -199,6 +199,7 @@ class UpdateResult:
         attempts: each attempt at the frame, with what came of it.
         exposure: times that the frame is brighter than usual.
         offsets: dB by camera above (+) or below its usual place among the cameras; empty where nothing was rendered.
+        health: 0…1 by camera of ``offsets``. alarms: but for the cameras that were left out (``robust/alarms.py``).
         carried: arrays for the next update, by effect. views: that were learnt from, with the exposures of the end.
         joins: [B] int64 of the Gaussians born in this frame, which are the last rows: the row of the founder that each
             joins in the hierarchy and the graph, or −1 where it starts a structure of its own. None: none is born.
@@ -214,6 +215,8 @@ class UpdateResult:
     attempts: Sequence[str] = ()
     exposure: float = 1.0
     offsets: Mapping[str, float] = field(default_factory=dict)
+    health: Mapping[str, float] = field(default_factory=dict)
+    alarms: Sequence[Alarm] = ()
     carried: Mapping[str, Arrays] = field(default_factory=dict)
     views: Sequence[TrainingView] = ()
     joins: NDArray[np.int64] | None = None

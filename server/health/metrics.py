@@ -10,6 +10,7 @@ from prometheus_client import CollectorRegistry, Counter, Histogram
 from prometheus_client.core import GaugeMetricFamily, Metric
 
 from client.wire import SceneState, SceneStatus
+from scas4d_core.frame_outcome import AlarmKind
 from server.connections.refusals import Refusal
 from server.settings import ServerSettings
 from server.stream.hub import Hub
@@ -37,6 +38,14 @@ LEFT_OUT = Counter(
     "Cameras of committed frames that were not learnt from: nothing came, or it did not fit.",
     registry=registry,
 )
+ALARMS = Counter(
+    "scas4d_alarms",
+    "Alarms of committed frames, by what they are about.",
+    ["what"],
+    registry=registry,
+)
+for what in AlarmKind:
+    ALARMS.labels(what.value)
 UPDATE_SECONDS = Histogram(
     "scas4d_update_seconds", "A committed frame, by stage.", ["stage"], buckets=SECONDS, registry=registry
 )

@@ -103,6 +103,8 @@ class Updates:
             metrics.FRAMES.labels(report.state.value).inc()
             if report.state == FrameState.COMMITTED:
                 metrics.LEFT_OUT.inc(len(report.dropped_cameras))
+                for alarm in report.alarms:
+                    metrics.ALARMS.labels(alarm.what.value).inc()
                 if report.outcome is not None and report.outcome.degraded:
                     metrics.DEGRADED.labels("held" if report.outcome.held else "in_part").inc()
             for stage, seconds in report.seconds.items():

@@ -292,7 +292,7 @@ function showHealth() {
   const reports = inOrder().filter((one) => one.state === "committed");
   const index = page.frame ?? reports.at(-1)?.index;
   const measured = reports.filter((one) => Object.keys(one.cameras ?? {}).length && one.index <= index);
-  showCameras($("cameras"), $("camera-summary"), page.rig.cameras.map((camera) => camera.name), measured.at(-1), measured, lookFrom);
+  showCameras($("cameras"), $("camera-summary"), page.rig.cameras.map((camera) => camera.name), measured.at(-1), lookFrom);
 }
 
 function play() {

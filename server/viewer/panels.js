@@ -84,51 +84,27 @@ export function showQueue(box, words, status) {
   box.classList.toggle("full", full);
 }
 
-const median = (values) => {
-  const sorted = [...values].sort((a, b) => a - b);
-  return sorted.length ? (sorted[(sorted.length - 1) >> 1] + sorted[sorted.length >> 1]) / 2 : null;
-};
+/** Evidence of the alarms about a camera; they are made where the frame was reconstructed, and only shown here. */
+export const complaints = (name, report) => (report?.alarms ?? []).filter((one) => one.camera === name).map((one) => one.evidence);
 
-const BELOW_DB = 4;
-const SHIFT = 0.02;
-const UNWELL = 0.4;
+const TOLD = ["frame_held", "frame_in_part"];
 
-/** Lists faults of a camera, compared with the others and with itself before; empty if there are none. */
-export function complaints(name, report, reports) {
-  const fit = report.cameras?.[name];
-  const found = name in (report.dropped_cameras ?? {}) ? [`left out of this frame: ${report.dropped_cameras[name]}`] : [];
-  if (!fit || found.length) return found;
-  if (fit.health != null && fit.health < UNWELL) {
-    found.push(`its health is ${Math.round(100 * fit.health)} %: it fits worse than usual beside the others, and is left out at 0`);
-  }
-  const others = Object.entries(report.cameras).filter(([other]) => other !== name).map(([, one]) => one.psnr);
-  const middle = median(others.filter((value) => value !== null));
-  const before = reports.filter((one) => one.index < report.index).slice(-20).map((one) => one.cameras?.[name]);
-  const own = median(before.map((one) => one?.psnr).filter((value) => value != null));
-  // Some cameras always see more detail than others: a camera is held against itself where it has a past.
-  const usual = own ?? middle;
-  if (usual !== null && fit.psnr !== null && usual - fit.psnr > BELOW_DB) {
-    found.push(`its PSNR is ${(usual - fit.psnr).toFixed(1)} dB lower than ${own === null ? "that of the others" : "before"}: moved, dirty or out of focus?`);
-  }
-  if (fit.colour_shift) {
-    const past = before.filter((one) => one?.colour_shift);
-    const usually = [0, 1, 2].map((k) => median(past.map((one) => one.colour_shift[k])) ?? 0);
-    const moved = Math.max(...fit.colour_shift.map((value, k) => Math.abs(value - usually[k])));
-    if (moved > SHIFT) found.push(`its colours are off by ${(100 * moved).toFixed(1)} %: exposure or white balance?`);
-  }
-  return found;
+/** Alarms in sentences, but for those that the reason of the frame tells. */
+function sentences(report) {
+  return (report?.alarms ?? []).filter((one) => !TOLD.includes(one.what)).map((one) => {
+    const words = one.camera === null ? called(one.evidence) : `Camera ${one.camera}: ${one.evidence}`;
+    return words.endsWith("?") ? words : `${words}.`;
+  });
 }
 
 /** Fills a row for each camera: PSNR of its picture, shift of its colours, and faults. */
-export function showCameras(body, summary, names, report, reports, lookFrom) {
+export function showCameras(body, summary, names, report, lookFrom) {
   const fits = report?.cameras ?? {};
   const known = Object.values(fits).map((fit) => fit.psnr).filter((value) => value !== null);
   const [low, high] = [Math.min(...known, 20), Math.max(...known, 40)];
-  let troubled = 0;
   const rows = names.map((name, index) => {
     const fit = fits[name];
-    const found = report ? complaints(name, report, reports) : [];
-    troubled += found.length > 0;
+    const found = complaints(name, report);
     const meter = node("span", { class: "meter" }, node("span", {}));
     const share = fit && fit.psnr !== null ? Math.max(0.03, (fit.psnr - low) / (high - low)) : 0;
     meter.firstChild.style.width = `${100 * share}%`;
@@ -148,9 +124,9 @@ export function showCameras(body, summary, names, report, reports, lookFrom) {
           : found.length ? "look" : fit ? "good" : "no figures")));
   });
   body.replaceChildren(...rows);
-  const complaint = report && names.flatMap((name) => complaints(name, report, reports).map((one) => `Camera ${name}: ${one}${one.endsWith("?") ? "" : "."}`));
-  summary.textContent = !report || !known.length ? "Figures come with the first update."
-    : troubled ? complaint.slice(0, 3).join(" ") + (complaint.length > 3 ? ` … and ${complaint.length - 3} more.` : "")
+  const told = sentences(report);
+  summary.textContent = told.length ? told.slice(0, 3).join(" ") + (told.length > 3 ? ` … and ${told.length - 3} more.` : "")
+    : !report || !known.length ? "Figures come with the first update."
     : `All ${names.length} cameras look as they did before.`;
-  summary.classList.toggle("warning", troubled > 0);
+  summary.classList.toggle("warning", told.length > 0);
 }

@@ -21,7 +21,7 @@ from PIL import Image
 
 from client.wire import FRAME_MEDIA_TYPE, FrameState, frame_chunks
 from scas4d_core.captures.frame import Frame
-from scas4d_core.frame_outcome import FrameOutcome
+from scas4d_core.frame_outcome import Alarm, AlarmKind, FrameOutcome
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import psnr
@@ -150,7 +150,8 @@ class Pushed:
         """Of a frame, as it was committed."""
         record = self.committed.history.report(index)
         known = {item.name: record[item.name] for item in fields(FrameReport) if item.name in record}
-        return FrameReport(**{**known, "outcome": FrameOutcome(record["outcome"])})
+        alarms = [Alarm(AlarmKind(one["what"]), one["camera"], one["evidence"]) for one in known.pop("alarms", [])]
+        return FrameReport(**{**known, "outcome": FrameOutcome(record["outcome"]), "alarms": alarms})
 
     def psnr(self, footage: AnyFootage, index: int, truth: Pictures) -> float:
         """DB of the held-out cameras."""

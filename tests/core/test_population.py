@@ -217,10 +217,10 @@ def test_an_effect_that_breaks_the_rules_is_named(
 def test_births_have_their_time_in_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
     ends, asked = [], FrameSolver.run
 
-    def run(self: FrameSolver, given: UpdateInput, repeated: bool = False) -> Solved:
+    def run(self: FrameSolver, given: UpdateInput) -> Solved:
         assert given.end is not None
         ends.append(given.end)
-        return asked(self, given, repeated)
+        return asked(self, given)
 
     def populated(seen: Seen) -> UpdateResult:
         assert seen.time.end is not None

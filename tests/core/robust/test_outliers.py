@@ -90,7 +90,7 @@ def test_a_camera_that_fits_worse_than_usual_is_a_misfit_in_any_place() -> None:
 def test_more_is_allowed_for_before_the_first_update() -> None:
     psnr = {**USUAL, "c2": USUAL["c2"] + outliers.FIRST_DB - 1}
     assert outliers.misfits(replace(PAST, updates=0), psnr, outliers.FIRST_DB) == {}
-    psnr["c2"] += outliers.NEW_DB
+    psnr["c2"] += outliers.NEW_DB[0]
     assert list(outliers.misfits(replace(PAST, updates=0), psnr, outliers.FIRST_DB)) == ["c2"]
 
 
@@ -132,9 +132,18 @@ def test_above_clean_pictures_differences_are_no_sign_of_a_fault() -> None:
 
 
 def test_health_falls_from_one_to_nothing_where_a_camera_is_left_out() -> None:
-    assert [outliers.health(off) for off in (None, 2.0, 0.0, outliers.LAST_DB / 2, outliers.LAST_DB, -30.0)] == [
-        1.0, 1.0, 1.0, 0.5, 0.0, 0.0,
-    ]  # fmt: skip
+    offs = (2.0, 0.0, outliers.LAST_DB / 2, outliers.LAST_DB, -30.0)
+    assert [outliers.health(PAST, off) for off in offs] == [1.0, 1.0, 0.5, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("updates", range(len(outliers.NEW_DB)))
+def test_health_allows_for_places_that_are_hardly_known(updates: int) -> None:
+    new, limit = replace(PAST, updates=updates), outliers.LAST_DB + outliers.NEW_DB[updates]
+    for name in NAMES:
+        psnr = {**USUAL, name: USUAL[name] + limit - 0.1}
+        assert outliers.health(new, limit) == 0.0 < outliers.health(new, outliers.LAST_DB)
+        assert list(outliers.misfits(new, psnr, outliers.LAST_DB)) == [name]
+        assert outliers.misfits(new, {**USUAL, name: USUAL[name] + outliers.LAST_DB}, outliers.LAST_DB) == {}
 
 
 def test_a_camera_that_ends_badly_is_out_from_the_next_frame_and_comes_back_once_it_fits() -> None:
