@@ -90,7 +90,8 @@ class FrameCase:
     Attributes:
         name, what, source: of the case; where in the literature or in users' reports it comes from. sizes: in which it
             is tried. make: what is sent from a frame on, in a size; None where the footage cannot show it. holds: what
-            must hold beside what always must, of the faulty frames.
+            must hold beside what always must, of the faulty frames. alarms: whether they must raise an alarm, in a
+            size: what looks like a world that stands or moves faster cannot.
     """
 
     name: str
@@ -99,6 +100,7 @@ class FrameCase:
     sizes: tuple[Any, ...]
     make: Make
     holds: Holds
+    alarms: Callable[[Any], bool] = lambda size: True
 
 
 def violations(case: FrameCase, steps: Sequence[FrameStep], size: Any) -> list[str]:
@@ -106,8 +108,11 @@ def violations(case: FrameCase, steps: Sequence[FrameStep], size: Any) -> list[s
     found = [f"frame {step.report.index}: not finite, or a rotation is no unit" for step in steps if not step.sound]
     faulty = [step for step in steps if not step.sent.good]
     found += case.holds(faulty, size)
+    if case.alarms(size) and not any(step.report.alarms for step in faulty):
+        found.append("no alarm")
     last = steps[-1]
     if last.sent.good:
+        found += [f"{AFTER} good frames later an alarm: {alarm.evidence}" for alarm in last.report.alarms]
         if not last.psnr >= last.usual - WITHIN_DB:
             found.append(f"{AFTER} good frames later {last.psnr - last.usual:+.2f} dB against the undisturbed run")
         if last.report.degraded is not None:
@@ -367,7 +372,7 @@ def named(footage: Footage) -> tuple[FrameCase, ...]:
         FrameCase(
             "a camera is bumped", "shifted by so many pixels for good; one may pass unseen", FIELD,
             (1, 2, 4, 8), bumped,
-            left_out(lambda size: (one,) if size > 1 else (), first=1, may=(one,)),
+            left_out(lambda size: (one,) if size > 1 else (), first=1, may=(one,)), lambda size: bool(size > 1),
         ),
         FrameCase(
             "cameras show nothing", "so many are black, two frames", FIELD, (1, 3), capped,
@@ -377,7 +382,7 @@ def named(footage: Footage) -> tuple[FrameCase, ...]:
         FrameCase("a frame again", "the same pictures so many times, the world goes on", FIELD, (1, 2), stuck, stood),
         FrameCase(
             "a frame again, with noise", "the last pictures twice more, with noise of so many levels of 255", FIELD,
-            (1, 3), still_noisy, near,
+            (1, 3), still_noisy, near, lambda size: False,
         ),
         FrameCase(
             "cameras drop out one by one", "until so many are left, then all are back", FIELD, (4, 2), dropping,
@@ -385,7 +390,7 @@ def named(footage: Footage) -> tuple[FrameCase, ...]:
         ),
         FrameCase(
             "a frame of another time", "one frame shows what is so many frames later", FIELD, (2, 4), elsewhen,
-            lambda steps, size: [],
+            lambda steps, size: [], lambda size: False,
         ),
         FrameCase(
             "the object jumps", "by so many times its own size, and goes on from there", FIELD, (1.0, 2.0), teleported,

@@ -157,8 +157,10 @@ def _said(step: FrameStep) -> str:
     words = [] if report.degraded is None else [report.degraded]
     if report.dropped:
         words.append("without " + ", ".join(f"{name} ({why})" for name, why in report.dropped.items()))
-    if report.exposure != 1.0 and report.used:
-        words.append(f"{report.exposure:.2g} times as bright")
+    told = [
+        alarm for alarm in report.alarms if alarm.evidence != report.degraded and alarm.camera not in report.dropped
+    ]
+    words += [alarm.evidence if alarm.camera is None else f"{alarm.camera}: {alarm.evidence}" for alarm in told]
     return "; ".join(words or report.attempts)
 
 

@@ -172,7 +172,9 @@ def test_a_bumped_camera_shows(page, service, finished):
     row = page.locator("#cameras tr.bad")
     assert row.count() == 1
     assert row.locator("th").inner_text() == "c2"
-    assert "dB lower than before" in page.locator("#camera-summary").inner_text()
+    words = "Camera c2: its picture fits 11.0 dB worse: moved? The pictures are 1.3 times as bright."
+    assert page.locator("#camera-summary").inner_text() == words
+    assert row.locator("td.words").get_attribute("title") == "its picture fits 11.0 dB worse: moved?"
     page.locator("#time").fill("3")  # before it was bumped
     until(page, "document.querySelectorAll('#cameras tr.bad').length === 0")
     assert page.faults == []

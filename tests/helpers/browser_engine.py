@@ -46,10 +46,13 @@ class DrawnReconstruction(fakes.FakeReconstruction):
             name: {"psnr": 32.0 + number, "colour_shift": [0.001, 0, 0], "health": 0.95}
             for number, name in enumerate(frame.images)
         }
+        alarms = []
         if frame.index >= BUMPED_FROM:
             fits["c2"] = {"psnr": 21.0, "colour_shift": [0.06, 0.01, -0.02], "health": 0.2}
+            alarms = [{"what": "camera_misfit", "camera": "c2", "evidence": "its picture fits 11.0 dB worse: moved?"}]
+            alarms.append({"what": "light", "camera": None, "evidence": "the pictures are 1.3 times as bright"})
         seconds = {"total": (0.8 + 0.1 * (frame.index % 3)) * self.iterations / fakes.ITERATIONS}
-        more = {"cameras": fits, "psnr": 31.0 + np.sin(frame.index), "seconds": seconds}
+        more = {"cameras": fits, "psnr": 31.0 + np.sin(frame.index), "seconds": seconds, "alarms": alarms}
         return super().commit(frame, dropped, {**(notes or {}), **more})
 
 

@@ -137,6 +137,8 @@ class FakeReconstruction:
             record |= {"iterations": 0, "kept": "still", "used": []}
         if red == LEAVES_OUT:
             record["dropped"] = {**record["dropped"], "c1": "it shows nothing"}
+            out = {"what": "camera_left_out", "camera": "c1", "evidence": "left out of this frame: it shows nothing"}
+            record["alarms"] = [*record.get("alarms", []), out]
         first = self.iterations // 2
         record["curve"] = [
             {"iterations": first, "milliseconds": MS_EACH * first, "loss": 0.5},

@@ -13,10 +13,11 @@ from PIL import Image
 from running import HEIGHT, WIDTH, make_rig
 
 from client.cli.changes import parse_changes
+from client.cli.commands import frame_line
 from client.cli.pictures import coloured, comparison, psnr
 from client.rig import push
 from client.sdk import Client
-from client.wire import part_colour
+from client.wire import FrameReportModel, part_colour
 from scas4d_core.captures import open_capture
 
 FAKES = str(Path(__file__).parents[2] / "helpers")
@@ -219,3 +220,15 @@ def test_pictures():
     colours = coloured(np.array([[0, 1, 8]], np.uint8))
     assert colours[0, 0].tolist() == [0, 0, 0]
     assert [tuple(colour) for colour in colours[0, 1:].tolist()] == [part_colour(0), part_colour(7)]
+
+
+def test_the_line_of_a_frame_names_alarms_that_it_does_not_tell_already():
+    alarms = [
+        {"what": "camera_colours", "camera": "c1", "evidence": "its colours are off"},
+        {"what": "light", "evidence": "the pictures are brighter"},
+        {"what": "camera_left_out", "camera": "c2", "evidence": "left out of this frame: dark"},
+    ]
+    report = {"scene": "s", "index": 3, "time": 0.1, "state": "committed", "dropped_cameras": {"c2": "dark"}}
+    line = frame_line(FrameReportModel.model_validate({**report, "alarms": alarms}))
+    assert line == "frame 3: committed  without c2  camera c1: its colours are off  the pictures are brighter"
+    assert frame_line(FrameReportModel.model_validate(report)) == "frame 3: committed  without c2"

@@ -1,0 +1,192 @@
+"""Alarms: told from a camera's own past and the others of the frame, and not from what all see together."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from math import isnan, nan
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scas4d_core.captures.frame import Frame
+from scas4d_core.frame_outcome import Alarm, AlarmKind, FrameOutcome
+from scas4d_core.robust import alarms, outliers
+from scas4d_core.robust.alarms import GAIN, NEAR_DB, SHARPNESS, TINT, Numbers, Watch, alarms_of, left_out_alarms
+from scas4d_core.robust.outliers import LAST_DB, NEW_DB, Past
+from studies.hard_frames.footage import SyntheticFootage
+
+NAMES = [f"c{k}" for k in range(10)]
+SHARP = dict.fromkeys(NAMES, -0.3)
+GREY = {name: np.full(3, 0.01 * k) for k, name in enumerate(NAMES)}
+NONE = dict.fromkeys(NAMES, 0.0)
+
+
+def settled(past: Past, **changes: Any) -> tuple[list[Alarm], Past]:
+    given: dict[str, Any] = {
+        "outcome": FrameOutcome.UPDATED, "reason": "", "exposure": 1.0, "offsets": NONE, "colours": GREY,
+        "sharp": SHARP, "same": (), **changes,
+    }  # fmt: skip
+    return alarms_of(past, past, **given)
+
+
+@pytest.fixture
+def past() -> Past:
+    new = Past(dict.fromkeys(NAMES, 0.0), dict.fromkeys(NAMES, 0.3), dict.fromkeys(NAMES, 0), 33.0, 5)
+    found, known = settled(new)
+    assert found == []
+    return known
+
+
+def told(found: Collection[Alarm]) -> list[tuple[str, str | None]]:
+    return [(alarm.what.value, alarm.camera) for alarm in found]
+
+
+def in_a_row(past: Past, frames: int = 4, **changes: Any) -> list[list[tuple[str, str | None]]]:
+    rows = []
+    for _ in range(frames):
+        found, past = settled(past, **changes)
+        rows.append(told(found))
+    return rows
+
+
+def test_usual_figures_raise_no_alarm(past: Past) -> None:
+    assert in_a_row(past) == [[]] * 4
+
+
+def test_a_camera_that_will_be_left_out_raises_one_at_once_and_one_in_doubt_after_two_frames(past: Past) -> None:
+    misfit = [("camera_misfit", "c3")]
+    assert in_a_row(past, offsets={**NONE, "c3": LAST_DB - 0.1}) == [misfit] * 4
+    assert in_a_row(past, offsets={**NONE, "c3": NEAR_DB - 0.1}) == [[], misfit, misfit, misfit]
+    assert in_a_row(past, offsets={**NONE, "c3": NEAR_DB + 0.1}) == [[]] * 4
+
+
+def test_one_frame_of_doubt_between_good_ones_is_noise(past: Past) -> None:
+    for _ in range(3):
+        found, past = settled(past, offsets={**NONE, "c3": NEAR_DB - 0.5})
+        assert found == []
+        found, past = settled(past)
+        assert found == []
+
+
+def test_all_cameras_that_fall_together_raise_no_alarm(past: Past) -> None:
+    psnr = {name: 33.0 - 13.5 for name in NAMES}
+    assert in_a_row(past, offsets=outliers.offsets(past, psnr)) == [[]] * 4
+    assert in_a_row(past, offsets={name: 3 * LAST_DB for name in NAMES[:6]} | dict.fromkeys(NAMES[6:], 0.0)) == [[]] * 4
+
+
+@pytest.mark.parametrize("updates", range(len(NEW_DB)))
+def test_the_usual_spread_of_the_first_updates_raises_none(updates: int) -> None:
+    new = Past(dict.fromkeys(NAMES, 0.0), dict.fromkeys(NAMES, 0.3), dict.fromkeys(NAMES, 0), 33.0, updates)
+    off = LAST_DB + NEW_DB[updates]
+    assert told(settled(new, offsets={**NONE, "c3": LAST_DB})[0]) == []
+    assert told(settled(new, offsets={**NONE, "c3": off - 0.1})[0]) == [("camera_misfit", "c3")]
+
+
+def coloured(change: Mapping[str, tuple[float, float, float]]) -> dict[str, Numbers]:
+    return {name: grey + np.array(change.get(name, (0, 0, 0))) for name, grey in GREY.items()}
+
+
+def test_a_cast_of_one_camera_raises_an_alarm_and_a_light_that_all_see_none(past: Past) -> None:
+    cast = [("camera_colours", "c3")]
+    assert in_a_row(past, colours=coloured({"c3": (TINT[1] + 0.01, 0, 0)})) == [cast] * 4
+    assert in_a_row(past, colours=coloured({"c3": (0, TINT[0] + 0.02, 0)})) == [[], cast, cast, cast]
+    assert in_a_row(past, colours=coloured({"c3": (0, 0, TINT[0] - 0.02)})) == [[]] * 4
+    assert in_a_row(past, colours=coloured(dict.fromkeys(NAMES, (0.4, 0.1, -0.2)))) == [[]] * 4
+
+
+def test_more_is_allowed_for_where_all_colours_change_as_where_a_thing_is_seen_from_its_edge(past: Past) -> None:
+    assert in_a_row(past, colours=coloured({"c3": (GAIN[0] - 0.01,) * 3})) == [[]] * 4
+    found, after = settled(past, colours=coloured({"c3": (-GAIN[1] - 0.01,) * 3}))
+    assert told(found) == [("camera_colours", "c3")]
+    assert "darker" in found[0].evidence
+    assert told(settled(after)[0]) == []
+
+
+def test_colours_that_drift_slowly_are_followed(past: Past) -> None:
+    for k in range(40):
+        found, past = settled(past, colours=coloured({"c3": (0.005 * k, 0, 0)}))
+        assert found == []
+
+
+@pytest.mark.parametrize(("sign", "word"), [(-1, "less sharp"), (1, "sharper")])
+def test_a_camera_that_loses_its_focus_or_gets_noisy_raises_an_alarm(past: Past, sign: int, word: str) -> None:
+    kind = [("camera_sharpness", "c3")]
+    found, _ = settled(past, sharp={**SHARP, "c3": -0.3 + sign * (SHARPNESS[1] + 0.01)})
+    assert told(found) == kind
+    assert word in found[0].evidence
+    assert in_a_row(past, sharp={**SHARP, "c3": -0.3 + sign * (SHARPNESS[0] + 0.01)}) == [[], kind, kind, kind]
+    assert in_a_row(past, sharp={name: value + sign for name, value in SHARP.items()}) == [[]] * 4
+    assert in_a_row(past, sharp={**SHARP, "c3": nan}) == [[]] * 4
+
+
+def test_a_camera_that_sends_its_picture_again_while_the_others_go_on(past: Past) -> None:
+    assert in_a_row(past, same=["c3"]) == [[], *[[("camera_frozen", "c3")]] * 3]
+    assert in_a_row(past, same=NAMES[:6]) == [[]] * 4
+    assert in_a_row(past, same=NAMES, offsets={}) == [[("frame_repeated", None)]] * 4
+
+
+def test_alarms_of_the_frame_are_no_cameras(past: Past) -> None:
+    wild = {"offsets": {**NONE, "c3": -20.0}, "reason": "too dark"}
+    found, after = settled(past, outcome=FrameOutcome.HELD_UNUSABLE, **wild)
+    assert told(found) == [("frame_held", None)]
+    assert found[0].evidence == "held as it was: too dark"
+    assert after == past
+    assert told(settled(past, outcome=FrameOutcome.RELOCATED, reason="far")[0]) == [("frame_in_part", None)]
+    assert told(settled(past, exposure=1.3)[0]) == [("light", None)]
+    assert told(settled(past, outcome=FrameOutcome.STOOD, offsets={})[0]) == []
+
+
+def test_a_camera_that_was_left_out_has_that_alarm_alone(past: Past) -> None:
+    assert settled(past, offsets={**NONE, "c3": -20.0}, left_out=["c3"])[0] == []
+    found = left_out_alarms(["a", "b", "c"], ["a", "b"], {"b": "it shows nothing"})
+    assert [(alarm.what, alarm.camera) for alarm in found] == [
+        (AlarmKind.CAMERA_LEFT_OUT, "b"), (AlarmKind.CAMERA_LEFT_OUT, "c"),
+    ]  # fmt: skip
+    assert "it shows nothing" in found[0].evidence
+    assert "no picture came" in found[1].evidence
+
+
+def test_what_alarms_are_told_from_goes_through_arrays(past: Past) -> None:
+    _, past = settled(past, same=["c1"], offsets={**NONE, "c3": NEAR_DB - 1}, sharp={**SHARP, "c4": nan})
+    back = Past.of_arrays(past.arrays())
+    assert {name: Watch.of(back, name) for name in NAMES} == {name: Watch.of(past, name) for name in NAMES}
+    assert (Watch.of(back, "c1").same, Watch.of(back, "c3").misfit) == (1, 1)
+    older = {name: array for name, array in past.arrays().items() if name not in ("watched", "watch")}
+    assert Past.of_arrays(older).watch == {}
+    assert len(Watch().row()) == outliers.WATCHED
+
+
+def test_sharpness_does_not_hang_on_how_much_is_seen() -> None:
+    rng = np.random.default_rng(0)
+    half = rng.integers(0, 255, (64, 64, 3)).astype(np.uint8)
+    less = half.copy()
+    less[:, 32:] = 0
+    soft = ((half[:, :-1].astype(int) + half[:, 1:]) // 2).astype(np.uint8)
+    assert abs(alarms.sharpness_of(half) - alarms.sharpness_of(less)) < 0.05
+    assert alarms.sharpness_of(soft) < alarms.sharpness_of(half) - SHARPNESS[1]
+    assert isnan(alarms.sharpness_of(np.zeros((64, 64, 3), np.uint8)))
+    assert isnan(alarms.sharpness_of(np.zeros((1, 1, 3), np.uint8)))
+
+
+def test_a_scene_raises_none_and_of_one_camera_in_another_colour_one(tmp_path: Path) -> None:
+    footage = SyntheticFootage()
+    scene = footage.start(tmp_path)
+    for index in range(1, 5):
+        report = scene.step(footage.frame(index))
+        assert report.alarms == []
+        assert all(fit["health"] > 0.3 for fit in report.cameras.values())
+    frame = footage.frame(5)
+    red = (frame.images["c3"] * np.array([1.2, 1.0, 1.0])).clip(0, 255).astype(np.uint8)
+    report = scene.step(Frame(5, frame.time, {**frame.images, "c3": red}, frame.masks))
+    assert ("camera_colours", "c3") in told(report.alarms)
+    assert {alarm.camera for alarm in report.alarms} == {"c3"}
+    record = report.record()["alarms"]
+    assert {"what": "camera_colours", "camera": "c3"}.items() <= record[-1].items()
+    brighter = footage.frame(6)
+    images = {name: (1.3 * np.asarray(image)).clip(0, 255).astype(np.uint8) for name, image in brighter.images.items()}
+    report = scene.step(replace(brighter, images=images))
+    assert ("light", None) in told(report.alarms)
+    assert {alarm.camera for alarm in report.alarms} <= {None, "c3"}
