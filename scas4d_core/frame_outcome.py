@@ -63,7 +63,7 @@ class FrameOutcome(StrEnum):
 
 
 class AlarmKind(StrEnum):
-    """What an alarm is about. The values are those on disk and on the wire; ``robust/alarms.py`` says when."""
+    """Subject of an alarm. The values are those on disk and on the wire; ``robust/alarms.py`` says when."""
 
     CAMERA_LEFT_OUT = "camera_left_out"
     """Nothing was learnt from the camera: no picture came, or it was not believed."""
@@ -87,7 +87,7 @@ class AlarmKind(StrEnum):
 
 @dataclass(frozen=True)
 class Alarm:
-    """What a person should look at; an entry of the report of a frame.
+    """Something that a person should look at; an entry of the report of a frame.
 
     Attributes:
         what: it is about. camera: that it is about, or None. evidence: for people, with figures.

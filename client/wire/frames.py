@@ -69,7 +69,7 @@ class CameraFitModel(Model):
 
 
 class AlarmModel(Model):
-    """What a person should look at."""
+    """Something that a person should look at."""
 
     what: AlarmKind = Field(
         description="camera_left_out: nothing was learnt from it. camera_misfit: it fits worse than usual beside the "

@@ -1,4 +1,4 @@
-"""Alarms: what a person should look at after a frame. They are made here alone, and only shown everywhere else.
+"""Alarms tell a person what to look at after a frame. They are made here alone, and only shown everywhere else.
 
 They are told from the figures that an update has anyway. A camera is compared with its own past and with the other
 cameras of the frame, so what all see together is no camera's fault. One frame may be noise: what is not far off has to
@@ -7,7 +7,7 @@ stay so for two. The thresholds were read off the captures: docs/stability.md ha
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import log, nan
 
@@ -26,6 +26,9 @@ TINT = (0.05, 0.1)
 its two other colours: two frames in a row, and one. Clean: 0.03."""
 GAIN = (0.15, 0.25)
 """The same of all its colours together. Clean: 0.09, where a sheet is seen from its edge."""
+SPREAD = 4.0
+"""Times what half of the cameras differ by in this frame, up to which ``TINT`` and ``GAIN`` are widened: where all are
+met badly, as in a few pixels, colours say little."""
 SHARPNESS = (0.12, 0.2)
 """The same of the logarithm of a picture's sharpness. Clean: 0.07; blurred by a pixel: 0.42."""
 FOLLOWS = 0.2
@@ -45,7 +48,7 @@ Numbers = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Watch:
-    """What the alarms of one camera are told from.
+    """Figures that the alarms of one camera are told from.
 
     Attributes:
         colours: [3] usual ``colours_of``, less the median over the cameras; NaN where not known. sharp: usual
@@ -105,10 +108,12 @@ def alarms_of(
     changes = {name: value - told[name].sharp for name, value in sharp.items()}
     common = float(np.nanmedian(list(changes.values()))) if not np.isnan(list(changes.values())).all() else 0.0
     few_same = len(same) <= MOST_OUT * count
+    moved = {name: colour - _known(told[name].colours, colour) for name, colour in beside.items() if name in told}
+    spread = _half(tint_of(change) for change in moved.values()), _half(gain_of(change) for change in moved.values())
     for name, before in told.items():
         now, alarms = _judged(
             name, before, allowed(past), offsets.get(name), beside.get(name), sharp[name], changes[name] - common,
-            few_same and name in same,
+            few_same and name in same, spread,
         )  # fmt: skip
         watch[name] = now.row()
         if name not in left_out:
@@ -127,12 +132,14 @@ def _judged(
     sharp: float,
     sharper: float,
     same: bool,
+    spread: tuple[float, float],
 ) -> tuple[Watch, list[Alarm]]:
     """A camera's figures for the next frame, and its alarms.
 
     Args:
         before: its figures. new: ``outliers.allowed``. offset: dB; None: not rendered. colours: beside the others'.
         sharp: of its picture; ``sharper``: than usual, beside the others. same: as in the frame before, and others not.
+        spread: tint and gain that half of the cameras differ by.
     """
     now, alarms = replace(before, same=before.same + 1 if same else 0), list[Alarm]()
     if now.same >= ROW:
@@ -144,17 +151,17 @@ def _judged(
             text = f"its picture fits {-offset:.1f} dB worse than usual beside the others: moved, dirty or late?"
             alarms.append(Alarm(AlarmKind.CAMERA_MISFIT, name, text))
     if colours is not None:
-        usual = np.where(np.isnan(before.colours), colours, before.colours)
+        usual = _known(before.colours, colours)
         change = colours - usual
-        gain = float(np.median(change))
-        tint = float(np.abs(change - gain).max())
-        now = replace(now, tint=before.tint + 1 if tint > TINT[0] else 0)
-        now = replace(now, gain=before.gain + 1 if abs(gain) > GAIN[0] else 0)
-        if tint > TINT[1] or now.tint >= ROW:
+        tint, gain = tint_of(change), gain_of(change)
+        tints, gains = np.maximum(TINT, SPREAD * spread[0]), np.maximum(GAIN, SPREAD * spread[1])
+        now = replace(now, tint=before.tint + 1 if tint > tints[0] else 0)
+        now = replace(now, gain=before.gain + 1 if abs(gain) > gains[0] else 0)
+        if tint > tints[1] or now.tint >= ROW:
             parts = ", ".join(f"{colour} {100 * part:+.0f} %" for colour, part in zip(COLOURS, change, strict=True))
             text = f"its colours are off, against its past and the others: {parts}; white balance?"
             alarms.append(Alarm(AlarmKind.CAMERA_COLOURS, name, text))
-        elif abs(gain) > GAIN[1] or now.gain >= ROW:
+        elif abs(gain) > gains[1] or now.gain >= ROW:
             size = f"{100 * abs(gain):.0f} % {'brighter' if gain > 0 else 'darker'}"
             text = f"its picture is {size} than it should be, against its past and the others: exposure?"
             alarms.append(Alarm(AlarmKind.CAMERA_COLOURS, name, text))
@@ -175,6 +182,28 @@ def _judged(
     elif not now.blur and not np.isnan(sharp):
         now = replace(now, sharp=before.sharp + FOLLOWS * (sharp - before.sharp))
     return now, alarms
+
+
+def tint_of(change: Numbers) -> float:
+    """By how much one of three colours changed beside the two others."""
+    return float(np.abs(change - np.median(change)).max())
+
+
+def gain_of(change: Numbers) -> float:
+    """By how much three colours changed together."""
+    return float(np.median(change))
+
+
+def _known(usual: tuple[float, float, float], now: Numbers) -> Numbers:
+    """[3] the usual colours, where they are not known those of now."""
+    known: Numbers = np.where(np.isnan(usual), now, usual)
+    return known
+
+
+def _half(sizes: Iterable[float]) -> float:
+    """The size that half of them, rounded up, do not exceed; 0 of none."""
+    ordered = sorted(abs(size) for size in sizes)
+    return ordered[(len(ordered) - 1) // 2] if ordered else 0.0
 
 
 def left_out_alarms(names: Sequence[str], shown: Collection[str], dropped: Mapping[str, str]) -> list[Alarm]:

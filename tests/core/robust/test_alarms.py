@@ -105,6 +105,14 @@ def test_more_is_allowed_for_where_all_colours_change_as_where_a_thing_is_seen_f
     assert told(settled(after)[0]) == []
 
 
+def test_where_all_colours_are_met_badly_one_cameras_say_little(past: Past) -> None:
+    rough = {name: (0.06 * (-1) ** k, 0, -0.06 * (-1) ** k) for k, name in enumerate(NAMES)}
+    cast = {"c3": (0.2, 0, 0)}
+    assert told(settled(past, colours=coloured({**rough, **cast}))[0]) == []
+    assert told(settled(past, colours=coloured(cast))[0]) == [("camera_colours", "c3")]
+    assert told(settled(past, colours=coloured({**rough, "c3": (0.9, 0, 0)}))[0]) == [("camera_colours", "c3")]
+
+
 def test_colours_that_drift_slowly_are_followed(past: Past) -> None:
     for k in range(40):
         found, past = settled(past, colours=coloured({"c3": (0.005 * k, 0, 0)}))
