@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.first_frame.initial_points import initial_points
-from scas4d_core.first_frame.posed_pictures import (
+from scas4d_core.first_frame.points.posed_pictures import (
     InitialPointsError,
     PosedPicture,
     collect_views,
@@ -14,8 +14,8 @@ from scas4d_core.first_frame.posed_pictures import (
     observe,
     visible_from,
 )
-from scas4d_core.first_frame.stereo import DepthMap, fused_points, halved, looked_through
-from scas4d_core.first_frame.triangulation import fundamental_matrix, triangulate
+from scas4d_core.first_frame.points.stereo import DepthMap, fused_points, halved, looked_through
+from scas4d_core.first_frame.points.triangulation import fundamental_matrix, triangulate
 
 HALF = np.array([0.5, 0.35, 0.4])
 PIXEL = 2.6 / 190.0
