@@ -77,7 +77,15 @@ class Camera:
             raise CameraError(
                 f"camera {self.name!r}: intrinsics must be [[fx,0,cx],[0,fy,cy],[0,0,1]]", "undo skew first"
             )
-        if not np.abs(r @ r.T - np.eye(3)).max() <= ROTATION_TOLERANCE or np.linalg.det(r) < 0:
+        turns = np.abs(r @ r.T - np.eye(3)).max() <= ROTATION_TOLERANCE
+        if turns and np.linalg.det(r) < 0:
+            raise CameraError(
+                f"camera {self.name!r}: the rotation world_to_camera[:3,:3] has determinant -1: a left-handed frame",
+                "mirror one axis: if the world is left-handed, negate one of its axes for all cameras (that column of "
+                "every rotation) and in the points; if the camera's axes are, negate the wrong row of the rotation and "
+                "of the translation",
+            )
+        if not turns:
             raise CameraError(
                 f"camera {self.name!r}: world_to_camera[:3,:3] is no rotation (determinant {np.linalg.det(r):.4g})",
                 "give the rotation of world-to-camera with OpenCV axes",

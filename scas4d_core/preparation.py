@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures.frame import Frame
 from scas4d_core.effects.appearance.camera_gain import known_gains
+from scas4d_core.effects.cameras.pose_drift import posed
 from scas4d_core.effects.coherence.floor import floor_inside
 from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
 from scas4d_core.effects.effect import Effect, effect
@@ -31,6 +32,7 @@ from scas4d_core.effects.switches import (
     first_switches,
     joined,
     names_on,
+    noted,
     refusal,
     switched_by,
 )
@@ -93,9 +95,20 @@ class Preparation:
         arrays = began(switches, self._settings, seen)
         return switched_by(arrays, switches, seen), arrays
 
-    def exposures(self, fixed: dict[str, NDArray[np.float32]], carried: CarryOver) -> dict[str, NDArray[np.float32]]:
-        """[3, 2] gain and offset of each camera: those that frame 0 found, or as they are known by now."""
-        return known_gains(fixed, carried.effects, self._factory.rig.names)
+    def views(self, frame: Frame, fixed: dict[str, NDArray[np.float32]], carried: CarryOver) -> list[TrainingView]:
+        """The views of a frame, with the poses and exposures of the cameras as they are known by now.
+
+        Without masks where no term asks for them: they are not even read.
+
+        Args:
+            fixed: [3, 2] gain and offset of each camera, that frame 0 found.
+
+        Raises:
+            ValueError: see ``ViewFactory.views``.
+        """
+        self._factory.posed = posed(self._factory.rig, carried.effects)
+        exposures = known_gains(fixed, carried.effects, self._factory.rig.names)
+        return self._factory.views(self._factory.scaled(frame), exposures, self.parts.mask > 0)
 
     def updater(self, first: Gaussians, switches: Switches) -> tuple[Updater, int]:
         """The updater of ``settings.device``, and the digest of its clusters and neighbours.
@@ -185,7 +198,8 @@ class Preparation:
         Args:
             seen: the frame. first: the roots before. populates: whether Gaussians may come and go.
         """
-        on = names_on(carried.switches)
+        on, seen = names_on(carried.switches), noted(carried.switches, self._settings, seen)
+        carried = replace(carried, effects=seen.result.carried)
         updater, carried = self.switched(updater, carried, seen, first)
         if not populates:
             return seen.result, updater, carried, first

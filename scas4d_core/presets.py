@@ -17,7 +17,7 @@ TIES = ("rigidity", "isometry", "rotation")
 """Effects that tie neighbours together."""
 
 
-OURS = ("bending", "shadows", "camera_gain", "light", "direction", "uncovered", "entering", "leaving")
+OURS = ("bending", "shadows", "camera_gain", "pose_drift", "light", "direction", "uncovered", "entering", "leaving")
 """Effects that Dynamic3DGaussians does not have."""
 
 
@@ -139,7 +139,7 @@ def _setting_error(error: ValidationError) -> SettingError:
     """The first error of a validation, with the nearest known name as the remedy for an unknown one."""
     found = error.errors(include_url=False)
     first = found[0]
-    setting = ".".join(str(part) for part in first["loc"])
+    setting = ".".join(str(part) for part in first["loc"] if not _of_union(part))
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
     remedy = "docs/settings.md lists all settings"
     if first["type"] == "extra_forbidden":
@@ -154,6 +154,11 @@ def _setting_error(error: ValidationError) -> SettingError:
     else:
         fault = first["msg"]
     return SettingError(setting, first["input"], f"{fault}{more}", remedy, error)
+
+
+def _of_union(part: int | str) -> bool:
+    """True where a part of a place names a member of a union, as ``literal['auto']``, and no setting."""
+    return isinstance(part, str) and (not part.isidentifier() or part in ("bool", "float", "int", "str"))
 
 
 def _names(values: Mapping[str, Any], under: str = "") -> Iterator[str]:

@@ -26,13 +26,14 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import Preparation, room_for_births
 from scas4d_core.query.committed import CommittedScene, View
 from scas4d_core.rasterize.limits import scene_limits
+from scas4d_core.rig_checks import check_rig
 from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness, fingerprints, goes_on, lit, noted
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import FrameSolver, UpdateInput
 from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.storage.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, cold_start, find_commit
 from scas4d_core.storage.history import History, HistoryError
-from scas4d_core.structure.motion_mask import labelled, with_reliable_labels
+from scas4d_core.structure.motion_mask import first_labels, labelled
 from scas4d_core.torch_backend.device import require_device
 from scas4d_core.update.frame_update import Updater
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
@@ -107,23 +108,23 @@ class Reconstruction(CommittedScene):
         Args:
             rig: training cameras, user's world and units, at the size of the frame's pictures.
             frame: with a picture of every camera, or of most; masks where there are.
-            points: a first cloud in the user's world; without it one is made from the pictures.
-            progress: told of each stage.
-            history: to commit to; None: in memory.
-            static: a frame 0 that was fitted before, taken as it is.
+            points: a first cloud in the user's world; without it one is made from the pictures. progress: told of each
+                stage. history: to commit to; None: in memory. static: a frame 0 that was fitted before, taken as it is.
             dropped, notes, started: see ``step``; the stage "load" has the time before: decoding, loading the kernels.
 
         Raises:
-            DeviceError: the settings' device cannot be had here.
+            DeviceError: the settings' device cannot be had here. RigError: the rig cannot work with these settings.
             ValueError: a time that is not finite, or pictures of another size.
         """
         if not isfinite(frame.time):
             raise ValueError(f"frame {frame.index}: time {frame.time} s must be finite")
+        if static is None:
+            check_rig(rig, settings.scene, None if points is None else points.positions)
         self = cls(rig, with_background(settings, frame.images), History() if history is None else history)
         began, scaled = perf_counter(), self._factory.scaled(frame)
         told = progress or (lambda _: None)
         result = static or fit_first(scaled, points, self._factory, self.settings, self.world, told)
-        self.static = result = replace(result, gaussians=with_reliable_labels(result.gaussians))
+        self.static = result = replace(result, gaussians=first_labels(result.gaussians, self.rig, scaled.masks))
         fitted = perf_counter()
         lengths = axis_lengths(result.gaussians)
         self._fixed = FirstFrame(len(frame.masks) > 0, result.exposures, lengths, self.settings.scene.behind)
@@ -134,9 +135,8 @@ class Reconstruction(CommittedScene):
         load = {} if started is None else {"load": began - started}
         seconds = {**load, "fit": fitted - began, "prepare": perf_counter() - fitted}
         report = report_of_first(frame, result, self.rig.names, len(self._updater.hierarchy.rows), seconds, dropped)
-        psnr = {name: fit["psnr"] for name, fit in result.cameras.items()}
+        psnr, shown = {name: fit["psnr"] for name, fit in result.cameras.items()}, fingerprints(frame.images)
         past = replace(Past.of_first(psnr, brightness(frame.images)), fitted=frame.time)
-        shown = fingerprints(frame.images)
         carried = CarryOver(seen=seen, structure=structure, past=past, shown=shown, switches=switches, effects=effects)
         self._commit(report, result.gaussians, carried, {**self._fixed.record(), **(notes or {})})
         return self
@@ -269,10 +269,11 @@ class Reconstruction(CommittedScene):
         roots, fits = self._roots, FitTime(self._budget.end_of_births(watch.began))
         if result.outcome.learnt and result.exposure == 1.0:  # in a light that is taken out again much looks new
             learnt = [view for view in result.views or believed if view.name not in result.trace.left_out]
+            aside = [view for view in views if view.name not in {view.name for view in learnt}]
             room = room_for_births(len(self.history.first), len(result.gaussians))
-            seen = Seen(frame.index, given.state, result, self.rig, learnt, self._picture, room, fits)
-            populates, follow = self.populates and exposure == 1.0, self._preparation.followed
-            result, updater, carried, roots = follow(updater, carried, seen, roots, populates)
+            looked_at = (result, self._factory.posed, learnt, self._picture, room, fits, aside)
+            seen, populates = Seen(frame.index, given.state, *looked_at), self.populates and exposure == 1.0
+            result, updater, carried, roots = self._preparation.followed(updater, carried, seen, roots, populates)
             tried = self._budget.births  # time that was kept and not enough is not kept again
             self._budget.births = bool(fits.spent or fits.put_off) and not (tried and fits.put_off)
             watch.lap("presence")
@@ -303,10 +304,9 @@ class Reconstruction(CommittedScene):
         return seconds
 
     def _views(self, frame: Frame) -> list[TrainingView]:
-        """The views of a frame; without masks where no term asks for them: they are not even read."""
+        """The views of a frame, as the scene knows its cameras by now."""
         try:
-            exposures = self._preparation.exposures(self._fixed.exposures, self._carried)
-            return self._factory.views(self._factory.scaled(frame), exposures, self._preparation.parts.mask > 0)
+            return self._preparation.views(frame, self._fixed.exposures, self._carried)
         except ValueError as error:
             raise StepError(str(error)) from error
 

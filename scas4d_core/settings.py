@@ -19,6 +19,7 @@ from scas4d_core.errors import InputError
 Positive = Annotated[float, Field(gt=0)]
 Unit = Annotated[float, Field(ge=0, le=1)]
 NotNegative = Annotated[float, Field(ge=0)]
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
 
 
 class Constant(NamedTuple):
@@ -135,7 +136,7 @@ class StaticSettings(SettingsModel):
         "rate_exposure": Constant(1e-3, "scas4d_core.first_frame.static_scene.RATE_EXPOSURE"),
         "weight_mask": Constant(3.0, "scas4d_core.first_frame.static_scene.WEIGHT_MASK"),
     }
-    iterations: int = Field(3000, ge=1, description="Iterations of frame 0, one training view each.")
+    iterations: int = Field(3000, ge=1, le=1_000_000, description="Iterations of frame 0, one training view each.")
     stop_gain: float = Field(
         0.0,
         ge=0,
@@ -144,9 +145,8 @@ class StaticSettings(SettingsModel):
         "rounds over all views lower the mean training loss by less than this share. 0: never; 0.01 saves a simple "
         "scene a part of its wait.",
     )
-    max_gaussians: int | None = Field(
+    max_gaussians: Annotated[int, Field(ge=1, le=10_000_000)] | None = Field(
         None,
-        ge=1,
         description="Budget of Gaussians; densification stops there. None: 0.34 for each pixel of a training picture "
         "and 0.27 more for each that is not background, at most 100,000: 25,000 for an object at 256x256, 40,000 for "
         "a room.",
@@ -213,7 +213,7 @@ class UpdateSettings(SettingsModel):
         "max_scale": Constant(0.02, "scas4d_core.update.deformation.MAX_SCALE"),
     }
 
-    iterations: int = Field(100, ge=1, description="Iterations a frame, each a step down the gradient.")
+    iterations: int = Field(100, ge=1, le=100_000, description="Iterations a frame, each a step down the gradient.")
     views: int = Field(
         1,
         ge=1,
@@ -221,7 +221,7 @@ class UpdateSettings(SettingsModel):
         description="Training views that an iteration renders forward and backward; losses and gradients are their "
         "mean. The paper does not say how many; its code base, Dynamic3DGaussians, takes one.",
     )
-    budget_ms: Positive | None = Field(
+    budget_ms: Annotated[float, Field(gt=0, le=3_600_000)] | None = Field(
         None,
         description="Milliseconds that a frame may take, decoding and commit included; then there are as many "
         "iterations as fit, whatever `iterations` says. None: no limit.",
@@ -247,11 +247,14 @@ class UpdateSettings(SettingsModel):
     patience: int = Field(
         10,
         ge=1,
+        le=1_000_000,
         description="Frames in a row that are held because they cannot be met, before the scene is another; dark ones "
         "do not count. A light that stays for so many is the scene's own.",
     )
-    clusters: tuple[int, ...] = Field(
-        (64, 320, 1280), description="Clusters per layer, coarse to fine (the paper's); empty: each Gaussian alone."
+    clusters: tuple[Count, ...] = Field(
+        (64, 320, 1280),
+        max_length=16,
+        description="Clusters per layer, coarse to fine (the paper's); empty: each Gaussian alone.",
     )
     cluster_map: Literal["centred", "published"] = Field(
         "centred", description="Scaling about the pivot (translation-equivariant) or about the world origin (paper)."
@@ -308,11 +311,8 @@ class UpdateSettings(SettingsModel):
     @field_validator("clusters")
     @classmethod
     def _ascend(cls, clusters: tuple[int, ...]) -> tuple[int, ...]:
-        if any(size < 1 for size in clusters) or list(clusters) != sorted(set(clusters)):
-            raise InputError(
-                f"clusters {clusters} do not ascend",
-                "give numbers from 1, the coarsest layer's first, the finest's last",
-            )
+        if list(clusters) != sorted(set(clusters)):
+            raise InputError(f"clusters {clusters} do not ascend", "give the coarsest layer's first, the finest's last")
         return clusters
 
 

@@ -13,6 +13,7 @@ from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
 from client.wire import ProblemDetails
+from scas4d_core.rig_checks import RigError
 
 MEDIA_TYPE = "application/problem+json"
 VALUE_LENGTH = 200
@@ -55,6 +56,11 @@ class Problem(HTTPException):
             remedy=remedy,
             **more,
         )
+
+
+def of_rig(error: RigError) -> Problem:
+    """Makes the problem of a rig, or of settings for it, that cannot work."""
+    return Problem(422, error.fault, field=error.field, value=error.value, remedy=error.remedy)
 
 
 def counted(count: int, noun: str) -> str:

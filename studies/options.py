@@ -16,7 +16,7 @@ FRONTIER = Path("out/frontier")
 """Folder of the study of accuracy against time, which the paper's and the effort's studies share."""
 
 Capture = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture.")]
-Captures = Annotated[list[Path], typer.Argument(metavar="CAPTURE...", help="Folders of captures with test cameras.")]
+Captures = Annotated[list[Path], typer.Argument(metavar="CAPTURE...", help="Folders of captures.")]
 Page = Annotated[Path | None, typer.Option(help="Also write the result to this file, as Markdown.")]
 Changes = Annotated[
     list[str] | None,

@@ -17,10 +17,17 @@ LIGHT_ROOMS = (
     "scas4d_core.captures",
     "scas4d_core.settings",
     "scas4d_core.presets",
+    "scas4d_core.rig_checks",
 )
 """What the client may import when it is imported; its heavy commands import the rest when they run."""
 
-NUMPY_ONLY = ("scas4d_core.cameras", "scas4d_core.gaussians", "scas4d_core.captures", "scas4d_core.settings")
+NUMPY_ONLY = (
+    "scas4d_core.cameras",
+    "scas4d_core.gaussians",
+    "scas4d_core.captures",
+    "scas4d_core.settings",
+    "scas4d_core.rig_checks",
+)
 
 
 def test_the_tree_was_read() -> None:

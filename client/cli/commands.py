@@ -9,23 +9,15 @@ from typing import Annotated
 import typer
 
 from client import rig
+from client.cli.capture_options import opened, takes_capture
 from client.cli.changes import parse_changes
 from client.cli.progress import Bars, console
-from client.importers.open_source import open_source
-from client.importers.source import Source
+from client.importers.open_source import CaptureOptions
 from client.sdk import DEFAULT_URL, Client
 from client.wire import FINISHED, FrameReportModel, IngestSettings
 
 PUSH_OUTAGE_S = 600.0
 """A rig goes on trying for so long: a restart of the service is no reason to end a day's capture."""
-
-
-class PicturesFrom(StrEnum):
-    """The kind of files that hold a capture's pictures."""
-
-    IMAGES = "images"
-    VIDEOS = "videos"
-    NAMED = "named"
 
 
 class Encoding(StrEnum):
@@ -48,23 +40,15 @@ Token = Annotated[
     str | None, typer.Option(envvar="SCAS4D_TOKEN", help="Token of the service; better given in SCAS4D_TOKEN.")
 ]
 Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene.")]
-Calibration = Annotated[
-    Path | None, typer.Option(help="A transforms.json or the folder of a COLMAP model, if not in CAPTURE.")
-]
-From = Annotated[
-    PicturesFrom | None, typer.Option("--pictures", help="Kind of pictures to take, where a capture has several.")
-]
-CaptureFps = Annotated[
-    float | None, typer.Option(min=0.001, help="Frames a second of the capture, where its files do not say.")
-]
-Masks = Annotated[bool, typer.Option(help="Use the capture's masks.")]
 Encode = Annotated[
     Encoding, typer.Option(help="Encoding of undistorted pictures and frames of video; jpeg has quality 95.")
 ]
 
 
+@takes_capture
 def push(
     capture: CaptureFolder,
+    options: CaptureOptions,
     url: Url = DEFAULT_URL,
     token: Token = None,
     scene: Annotated[
@@ -91,10 +75,6 @@ def push(
         WhenFull, typer.Option(help="refuse: wait for a full queue; skip: the newest frame takes its place.")
     ] = WhenFull.REFUSE,
     outage: Annotated[float, typer.Option(min=0, help="Seconds to wait for a service that is away.")] = PUSH_OUTAGE_S,
-    calibration: Calibration = None,
-    pictures: From = None,
-    capture_fps: CaptureFps = None,
-    masks: Masks = True,
     encoding: Encode = Encoding.JPEG,
     preset: Annotated[str, typer.Option(help="Preset of settings, as scas4d, adaptive or cloth.")] = "scas4d",
     changes: Annotated[
@@ -106,7 +86,7 @@ def push(
 ) -> None:
     """Sends a capture to a running service as its rig would, and waits for the last frame."""
     settings = parse_changes(changes)
-    source = _opened(capture, calibration, pictures, capture_fps, masks, encoding)
+    source = opened(capture, options, encoding=encoding.value)
     with Client(url, token=token, outage=0) as client:
         client.live()  # a wrong address is said at once, an outage later is waited for
     with Client(url, token=token, outage=outage) as client, Bars() as bars:
@@ -216,24 +196,22 @@ def budget(
     console.print(f"{many} a frame{stops}; still {now.still:g}; from frame {found.since} on", highlight=False)
 
 
+@takes_capture
 def import_(
     capture: CaptureFolder,
+    options: CaptureOptions,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="New folder for the undistorted capture.")],
     frames: Annotated[int | None, typer.Option(min=1, help="Import only so many frames.")] = None,
-    test: Annotated[list[str] | None, typer.Option(help="Hold out a camera, for measuring. May be repeated.")] = None,
-    calibration: Calibration = None,
-    pictures: From = None,
-    capture_fps: CaptureFps = None,
-    masks: Masks = True,
     encoding: Encode = Encoding.JPEG,
 ) -> None:
-    """Undistorts a capture once and for all, into a folder that every command reads without OpenCV or PyAV."""
+    """Undistorts a capture once and for all: read without OpenCV or PyAV, and fast enough for a rig's full rate."""
     from client.importers.write import write_dynamic3dgs
 
-    source = _opened(capture, calibration, pictures, capture_fps, masks, encoding)
+    source = opened(capture, options, encoding=encoding.value)
     with Bars() as bars:
-        write_dynamic3dgs(source, out, frames=frames, test=test or (), on_progress=bars)
-    console.print(f"{out}: {len(source.rig)} cameras; try: scas4d push {out}", highlight=False, soft_wrap=True)
+        write_dynamic3dgs(source, out, frames=frames, on_progress=bars)
+    count = len(source.rig) + (0 if source.test_rig is None else len(source.test_rig))
+    console.print(f"{out}: {count} cameras; try: scas4d push {out}", highlight=False, soft_wrap=True)
 
 
 def frame_line(report: FrameReportModel, missed: int = 0) -> str:
@@ -252,27 +230,6 @@ def frame_line(report: FrameReportModel, missed: int = 0) -> str:
     if missed:
         parts.append(f"({missed} before it not shown)")
     return "  ".join(parts)
-
-
-def _opened(
-    capture: Path,
-    calibration: Path | None,
-    pictures: PicturesFrom | None,
-    fps: float | None,
-    masks: bool,
-    encoding: Encoding,
-) -> Source:
-    source = open_source(
-        capture,
-        calibration=calibration,
-        pictures=None if pictures is None else pictures.value,
-        fps=fps,
-        encoding=encoding.value,
-        use_masks=masks,
-    )
-    for remark in source.remarks:
-        console.print(f"[yellow]{remark}")
-    return source
 
 
 def register(app: typer.Typer) -> None:

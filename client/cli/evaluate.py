@@ -17,7 +17,8 @@ from client.cli import pictures
 from client.cli.progress import Bars
 from client.cli.reconstruct import compile_kernels, reconstruct_frames
 from client.cli.scores import Row, Store, digest, markdown, stage_table
-from scas4d_core.captures import Capture, CaptureError, open_capture
+from client.importers.open_source import CaptureOptions
+from scas4d_core.captures import Capture
 from scas4d_core.presets import preset
 from scas4d_core.settings import Settings
 
@@ -27,6 +28,12 @@ if TYPE_CHECKING:
 
 Report = Callable[[str], None]
 """Takes each line that is printed."""
+
+
+DEFAULT_OPTIONS = CaptureOptions()
+
+TRAINING = "training cameras"
+"""The mark of a row that tells how well seen pictures are met, for want of test cameras."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +50,7 @@ class Job:
         pictures: frames whose comparison pictures are saved; negative ones count from the end.
         lpips: also LPIPS; loads torch.
         constants: of the method, by dotted name, to which a study gives another value; recorded with the row.
+        options: how the capture is read.
     """
 
     capture: Path
@@ -54,6 +62,17 @@ class Job:
     pictures: tuple[int, ...] = (0, 1, -1)
     lpips: bool = False
     constants: tuple[tuple[str, Any], ...] = ()
+    options: CaptureOptions = DEFAULT_OPTIONS
+
+    def open_given(self) -> Capture:
+        """The capture as the method gets it: at full size, without what is withheld."""
+        use_masks = self.masks and self.options.use_masks
+        return self.options.open(self.capture, use_masks=use_masks, use_points=self.points)
+
+    def open_truth(self) -> Capture:
+        """The capture as it is measured: scaled as rendered, and with test cameras, if they are those it trains on."""
+        truth = self.options.open(self.capture, image_scale=self.settings.scene.image_scale)
+        return truth if truth.full_test_rig is not None else truth.measured_on_training()
 
     @property
     def record(self) -> Row:
@@ -67,6 +86,7 @@ class Job:
         given: Row = {"frames": self.frames, "masks": self.masks, "points": self.points}
         if self.lpips:
             given["lpips"] = True
+        given |= self.options.changed
         return f"{self.preset}-{update.iterations}-s{update.seed}-{digest(self.record, given)}"
 
     @property
@@ -78,7 +98,10 @@ class Job:
             for name, value in _flat(own)
             if name not in ("update.iterations", "update.seed", "static.seed") and dict(_flat(usual)).get(name) != value
         ]
-        return ", ".join(words + ["no masks"] * (not self.masks) + ["no points"] * (not self.points))
+        words += ["no masks"] * (not self.masks) + ["no points"] * (not self.points)
+        words += [f"held out {', '.join(self.options.test)}"] if self.options.test else []
+        words += [f"{name}={value}" for name, value in self.options.changed.items() if name != "test"]
+        return ", ".join(words)
 
     @property
     def key(self) -> str:
@@ -95,6 +118,7 @@ def evaluate(
     folder: Path,
     out: Path,
     *,
+    options: CaptureOptions = DEFAULT_OPTIONS,
     frames: int | None = None,
     preset_name: str = "scas4d",
     changes: Mapping[str, Any],
@@ -104,8 +128,9 @@ def evaluate(
     """Scores of a capture, printed as a table; `out` gets the row, a line a frame, pictures and table.md.
 
     Args:
-        folder: of the capture, with test cameras.
+        folder: of the capture; without test cameras its training cameras are measured, and the row says so.
         out: folder; scores that it holds are printed without another reconstruction.
+        options: how the capture is read.
         frames: only so many; all where None.
         preset_name: named settings.
         changes: what differs from the preset, nested.
@@ -113,10 +138,11 @@ def evaluate(
         report: takes the printed lines.
 
     Raises:
-        CaptureError: the capture cannot be read, or has no test cameras.
+        CaptureError: the capture cannot be read.
     """
-    job = Job(folder, preset_name, preset(preset_name, changes), frames)
-    check_test_cameras(open_capture(folder), folder)
+    job = Job(folder, preset_name, preset(preset_name, changes), frames, options=options)
+    for remark in options.open(folder).remarks:
+        report(remark)
     store = Store(out)
     row = None if again else store.row(job.key)
     if row is None:
@@ -130,16 +156,6 @@ def evaluate(
     (out / "table.md").write_text(table + "\n")
     report(table)
     return row
-
-
-def check_test_cameras(capture: Capture, folder: Path) -> None:
-    """Refuses a capture that cannot be measured.
-
-    Raises:
-        CaptureError: it has no test cameras.
-    """
-    if capture.full_test_rig is None:
-        raise CaptureError(f"{folder}: no test cameras (test_meta.json) to measure on; `scas4d reconstruct` needs none")
 
 
 def page(rows: Sequence[Row], stages_of: Sequence[Row] | None = None) -> str:
@@ -169,9 +185,10 @@ def measure(
         static: a frame 0 that was fitted before, and the seconds that it took.
         fitted: called with frame 0 and its seconds once it is fitted here.
     """
-    truth = open_capture(job.capture, image_scale=job.settings.scene.image_scale)
-    check_test_cameras(truth, job.capture)
-    given = open_capture(job.capture, use_masks=job.masks, use_points=job.points)
+    truth, given = job.open_truth(), job.open_given()
+    unseen = given.full_test_rig is not None
+    if not unseen:
+        report("    no test cameras: the scores are those of the training cameras (--test holds some out)")
     # These bring the kernels; the table and the command do not.
     from scas4d_core.metrics.evaluation import measure_flicker, measure_parts, measure_pictures, measure_tracks
 
@@ -205,7 +222,8 @@ def measure(
         "preset": job.preset,
         "iterations": job.settings.update.iterations,
         "seed": job.settings.update.seed,
-        "changes": job.changes,
+        "changes": ", ".join([word for word in (job.changes, "" if unseen else TRAINING) if word]),
+        "measured_on": "test cameras" if unseen else TRAINING,
         "settings": job.record,
         "given": {"frames": count, "masks": job.masks, "points": job.points},
         "capture_frames": given.frame_count,

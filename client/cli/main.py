@@ -13,10 +13,11 @@ import typer
 
 from client import __version__
 from client.cli import commands, extras
+from client.cli.capture_options import opened, takes_capture
 from client.cli.changes import parse_changes
 from client.cli.progress import console
 from client.errors import ServiceError, ServiceUnreachable
-from client.importers.open_source import open_prepared
+from client.importers.open_source import CaptureOptions
 from client.sdk import DEFAULT_URL
 from scas4d_core.captures import CaptureError, ImageError
 
@@ -54,7 +55,9 @@ def serve(
 
 
 @app.command()
+@takes_capture
 def demo(
+    options: CaptureOptions,
     capture: Annotated[Path, typer.Option(help="Folder of a capture.")] = Path("samples/robot"),
     out: Out = Path("out/demo"),
     port: Annotated[int, typer.Option(min=1, max=65535, help="Another is taken where this is in use.")] = 8000,
@@ -69,12 +72,12 @@ def demo(
     """Starts a service, streams the sample capture through it, and leaves renders beside the truth."""
     from client.cli import demo as main_job
 
-    opened, settings = open_prepared(capture), parse_changes(changes)
+    given, settings = opened(capture, options), parse_changes(changes)
     stays = sys.stdout.isatty() if stay is None else stay
     data, log = out / "data", out / "service.log"
     with main_job.running_service(data, log, port) as url:
         console.print(f"service at {url}, its log in {log}", soft_wrap=True)
-        id = main_job.run(opened, url, out, frames=frames, preset=preset, settings=settings)
+        id = main_job.run(given, url, out, frames=frames, preset=preset, settings=settings)
         console.print(f"pictures (truth | render | difference x4): {out}", soft_wrap=True)
         if stays:
             console.print(f"open {url}/#scene={id} (the API: {url}/docs); Ctrl-C ends the service", soft_wrap=True)
@@ -88,8 +91,10 @@ def demo(
 
 
 @app.command()
+@takes_capture
 def reconstruct(
     capture: CaptureFolder,
+    options: CaptureOptions,
     out: Out = Path("out/reconstruct"),
     frames: Frames = None,
     preset: Preset = "scas4d",
@@ -100,12 +105,14 @@ def reconstruct(
     from client.cli.reconstruct import reconstruct as run
 
     given = parse_changes([*(changes or []), *([f"device={device}"] if device else [])])
-    run(capture, out, frames=frames, preset=preset, changes=given)
+    run(opened(capture, options), out, frames=frames, preset=preset, changes=given)
 
 
 @app.command()
+@takes_capture
 def evaluate(
     capture: CaptureFolder,
+    options: CaptureOptions,
     out: Out = Path("out/evaluate"),
     frames: Frames = None,
     preset: Preset = "scas4d",
@@ -114,11 +121,14 @@ def evaluate(
         bool, typer.Option("--again", help="Measure anew, even where the folder holds the scores.")
     ] = False,
 ) -> None:
-    """Prints a capture's scores on its test cameras and ground truth; reconstructs it unless `out` has them already."""
+    """Prints a capture's scores on its test cameras and ground truth; reconstructs it unless `out` has them already.
+
+    Without test cameras (--test holds some out) the scores are those of the training cameras, and the table says so.
+    """
     from client.cli.evaluate import evaluate as run
 
-    open_prepared(capture)  # says which command prepares a capture that is not
-    run(capture, out, frames=frames, preset_name=preset, changes=parse_changes(changes), again=again)
+    given = parse_changes(changes)
+    run(capture, out, options=options, frames=frames, preset_name=preset, changes=given, again=again)
 
 
 def _version(wanted: bool) -> None:

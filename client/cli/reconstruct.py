@@ -13,9 +13,9 @@ import numpy as np
 
 from client.cli import pictures
 from client.cli.progress import Bars, console
-from client.importers.open_source import open_prepared
-from scas4d_core.captures import Capture, open_capture
+from scas4d_core.captures import Capture
 from scas4d_core.presets import preset as named
+from scas4d_core.rig_checks import check_rig
 from scas4d_core.settings import Settings
 
 if TYPE_CHECKING:
@@ -82,23 +82,24 @@ def reconstruct_frames(
         yield reconstruction, done
 
 
-def reconstruct(folder: Path, out: Path, *, frames: int | None, preset: str, changes: Mapping[str, Any]) -> None:
+def reconstruct(given: Capture, out: Path, *, frames: int | None, preset: str, changes: Mapping[str, Any]) -> None:
     """Reconstructs every frame; `out` gets pictures beside the truth, `states/` and `last.ply`.
 
+    The truth is that of the test cameras or, where there are none, of one training camera, and the last line says so.
+
     Args:
-        folder: of the capture.
+        given: the capture, at full size: the reconstruction resizes its pictures.
         out: folder; made when missing.
         frames: how many; all where None.
         preset: named settings.
         changes: what differs from the preset, nested.
     """
-    given = open_prepared(folder)  # the reconstruction resizes what it is given
-
     from scas4d_core.query.ply import write_ply
     from scas4d_core.storage.history import History
 
     settings = named(preset, changes)
-    capture = open_capture(folder, image_scale=settings.scene.image_scale)
+    check_rig(given.full_rig, settings.scene, None if given.points is None else given.points.positions)
+    capture = given.scaled(settings.scene.image_scale)
     count = min(frames or capture.frame_count, capture.frame_count)
     rig = capture.test_rig or capture.rig
     cameras = rig.cameras if capture.test_rig is not None else rig.cameras[:1]
@@ -120,7 +121,10 @@ def reconstruct(folder: Path, out: Path, *, frames: int | None, preset: str, cha
                 pictures.save(out / f"camera_{camera.name}" / f"{index:06d}.png", pictures.comparison(true, render))
             console.print(f"frame {index}: {np.mean(scores):.2f} dB")
     write_ply(out / "last.ply", history.gaussians(history.indices[-1]), reconstruction.world)
-    console.print(f"pictures, states and last.ply: {out}")
+    seen = (
+        "" if capture.test_rig is not None else f" (dB of training camera {cameras[0].name}; --test holds out others)"
+    )
+    console.print(f"pictures, states and last.ply: {out}{seen}")
 
 
 def compile_kernels(settings: Settings) -> None:

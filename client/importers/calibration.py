@@ -17,6 +17,9 @@ STILL_TOLERANCE = 1e-6
 """Largest change of an entry of a pose or of the intrinsics that still counts as a camera standing still."""
 
 
+NAMES = "a camera's name has letters, digits, dots, dashes and underscores, at most 64, and is not `time`"
+
+
 @dataclass(frozen=True, eq=False)
 class CalibratedImage:
     """One picture that a calibration names, with its camera.
@@ -42,6 +45,7 @@ class Calibration:
         views: by camera name the pictures that the calibration speaks of, in order of time.
         points: a cloud that came with it, or None.
         fps: frames per second, where the file says.
+        remarks: what a person should know of the reading.
     """
 
     source: Path
@@ -49,6 +53,7 @@ class Calibration:
     views: Mapping[str, tuple[CalibratedImage, ...]]
     points: InitialPoints | None = None
     fps: float | None = None
+    remarks: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -78,14 +83,35 @@ def calibration(
         by_name.setdefault(view.path.stem if one_folder else view.path.parent.name, []).append(view)
     cameras = []
     for name in sorted(by_name, key=natural):
-        if not re.match(CAMERA_NAME, name) or name == "time" or name.startswith("mask."):
+        if not _can_be_named(name):
             raise CaptureError(
-                f"{source}: camera {name!r} (of {by_name[name][0].path}): a camera's name has letters, digits, dots, "
-                "dashes and underscores, at most 64, and is not `time`; rename its pictures or their folder"
+                f"{source}: camera {name!r} (of {by_name[name][0].path}): {NAMES}; rename its pictures or their folder"
             )
         by_name[name].sort(key=lambda view: (view.time is not None, view.time or 0.0, natural(str(view.path))))
         cameras.append(_still(source, name, by_name[name]))
     return Calibration(source, tuple(cameras), {name: tuple(found) for name, found in by_name.items()}, points, fps)
+
+
+def calibration_of_cameras(source: Path, cameras: Sequence[LensCamera], remarks: Sequence[str] = ()) -> Calibration:
+    """A calibration that names its cameras and no pictures: these lie in `images/<camera>/` or `videos/<camera>.mp4`.
+
+    Raises:
+        CaptureError: no cameras, one name twice, or a name that cannot be.
+    """
+    if not cameras:
+        raise CaptureError(f"{source}: lists no camera with a pose; calibrate the rig's poses (extrinsics) too")
+    names = [camera.name for camera in cameras]
+    for name in names:
+        if not _can_be_named(name):
+            raise CaptureError(f"{source}: camera {name!r}: {NAMES}; rename it there and its pictures")
+        if names.count(name) > 1:
+            raise CaptureError(f"{source}: two cameras are called {name!r}; rename one, and its pictures")
+    ordered = tuple(sorted(cameras, key=lambda camera: natural(camera.name)))
+    return Calibration(source, ordered, {camera.name: () for camera in ordered}, remarks=tuple(remarks))
+
+
+def _can_be_named(name: str) -> bool:
+    return bool(re.match(CAMERA_NAME, name)) and name != "time" and not name.startswith("mask.")
 
 
 def _still(source: Path, name: str, views: Sequence[CalibratedImage]) -> LensCamera:

@@ -12,7 +12,7 @@ from pathlib import Path
 from client.importers.calibration import Calibration, natural
 from client.importers.source import Picture
 from scas4d_core.captures import CaptureError, ImageError, decode_image
-from scas4d_core.captures.images import picture_size
+from scas4d_core.captures.images import describe_pictures, picture_size
 
 SENT = (".jpg", ".jpeg", ".png", ".webp")
 """What the service takes as it is."""
@@ -22,26 +22,32 @@ SHOWN = 3
 
 
 class PictureFiles:
-    """Picture files of T frames by camera.
+    """Picture files of T frames by camera; all of a camera have the size of its first.
 
     Raises:
-        CaptureError: the first picture of a camera cannot be read, or is not of the calibrated size.
+        CaptureError: the first picture of a camera cannot be read.
     """
 
     fps: float | None = None
-    remarks: Sequence[str] = ()
 
     def __init__(self, calibration: Calibration, files: Sequence[Mapping[str, Path]], times: Sequence[float] = ()):
         self._files = files
         self._times = times
-        self._sizes = {lens.name: (lens.width, lens.height) for lens in calibration.cameras}
         self.frame_count = len(files)
-        for camera, size in self._sizes.items():
-            check_size(files[0][camera], camera, size)
+        first = {camera: files[0][camera] for camera in calibration.names}
+        try:
+            self.sizes = {camera: picture_size(path) for camera, path in first.items()}
+            self.remarks = describe_pictures(first)
+        except ImageError as fault:
+            raise CaptureError(str(fault)) from fault
 
     def time(self, index: int) -> float | None:
         """Seconds, where the calibration says."""
         return self._times[index] if self._times else None
+
+    def path(self, camera: str) -> Path:
+        """The camera's first file."""
+        return self._files[0][camera]
 
     def file(self, index: int, camera: str) -> Path | None:
         """The file, if the service takes its kind."""
@@ -50,7 +56,7 @@ class PictureFiles:
 
     def decoded(self, index: int, camera: str) -> Picture:
         """Decodes a picture, [H, W, 3]."""
-        return decode_image(self._files[index][camera], size=self._sizes[camera])
+        return decode_image(self._files[index][camera], size=self.sizes[camera])
 
     def check_same_frames(self, masks: Sequence[Mapping[str, Path]]) -> None:
         """Refuses masks that are not named like the pictures.
@@ -66,19 +72,6 @@ class PictureFiles:
                     f"frame {index}: its picture is {picture} and its mask {mask}; call masks like the pictures and "
                     "give one of every picture, or none (--no-masks)"
                 )
-
-
-def check_size(path: Path, camera: str, size: tuple[int, int]) -> None:
-    """Refuses a picture of another size than its camera was calibrated for."""
-    try:
-        found = picture_size(path)
-    except ImageError as fault:
-        raise CaptureError(str(fault)) from fault
-    if found != size:
-        raise CaptureError(
-            f"{path}: is {found[0]}x{found[1]} pixels, but camera {camera!r} was calibrated for {size[0]}x{size[1]}; "
-            "give the pictures at that size, or calibrate with these"
-        )
 
 
 def folders_of(root: Path, calibration: Calibration, *, what: str = "pictures") -> list[dict[str, Path]]:

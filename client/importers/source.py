@@ -1,10 +1,12 @@
-"""`Source`: a capture to be sent: a rig of pinhole cameras and an encoded picture by frame and camera."""
+"""Pictures of a calibrated rig as its pinhole cameras would have taken them: the reader behind an imported capture."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -15,7 +17,10 @@ from PIL import Image
 from client.importers.calibration import Calibration
 from client.importers.undistort import Undistorter
 from scas4d_core.cameras import Rig
-from scas4d_core.captures import Capture, CaptureError, InitialPoints, decode_mask
+from scas4d_core.captures import CaptureError, Fit, decode_mask
+from scas4d_core.captures.fit import fitted_intrinsics
+from scas4d_core.captures.images import Size, eight_bit_file
+from scas4d_core.captures.reader import read_bytes
 
 Picture = NDArray[np.uint8]
 Encoding = Literal["jpeg", "png"]
@@ -23,69 +28,7 @@ Encoding = Literal["jpeg", "png"]
 JPEG_QUALITY = 95
 
 
-class Source(Protocol):
-    """A capture as a rig would send it: files of pinhole cameras."""
-
-    @property
-    def name(self) -> str:
-        """Name of the capture, for people."""
-
-    @property
-    def rig(self) -> Rig:
-        """The cameras, as large as the pictures."""
-
-    @property
-    def frame_count(self) -> int:
-        """Number of frames T."""
-
-    @property
-    def fps(self) -> float:
-        """Frames per second."""
-
-    @property
-    def points(self) -> InitialPoints | None:
-        """A cloud of frame 0, or None."""
-
-    @property
-    def remarks(self) -> Sequence[str]:
-        """Remarks on the reading, for a person."""
-
-    def time(self, index: int) -> float:
-        """Seconds of a frame, rising."""
-
-    def encoded(self, index: int, camera: str) -> bytes:
-        """A picture as JPEG, PNG or WebP."""
-
-    def encoded_mask(self, index: int, camera: str) -> bytes | None:
-        """A mask as PNG; None where there is none."""
-
-
-class CaptureSource:
-    """A capture that the core reads: its files go as they are."""
-
-    def __init__(self, capture: Capture) -> None:
-        self._capture = capture
-        self.name = capture.name
-        self.rig = capture.full_rig
-        self.frame_count = capture.frame_count
-        self.fps = capture.fps
-        self.points = capture.points
-        self.remarks: list[str] = []
-
-    def time(self, index: int) -> float:
-        """Seconds since frame 0."""
-        return index / self.fps
-
-    def encoded(self, index: int, camera: str) -> bytes:
-        """The file."""
-        return self._capture.encoded(index, camera)
-
-    def encoded_mask(self, index: int, camera: str) -> bytes | None:
-        """The file; None where there is none."""
-        return self._capture.encoded_mask(index, camera)
-
-
-class PictureReader(Protocol):
+class RawReader(Protocol):
     """Reads the pictures as the cameras took them, from files or videos."""
 
     @property
@@ -100,27 +43,32 @@ class PictureReader(Protocol):
     def remarks(self) -> Sequence[str]:
         """Remarks on the reading, for a person."""
 
+    @property
+    def sizes(self) -> Mapping[str, Size]:
+        """(width, height) of each camera's pictures."""
+
     def time(self, index: int) -> float | None:
         """Seconds, where the pictures say."""
 
+    def path(self, camera: str) -> Path:
+        """The camera's first file, for messages."""
+
     def file(self, index: int, camera: str) -> Path | None:
-        """The picture's own file, if it has one that the service takes."""
+        """The picture's own file, if it has one of a kind that the service takes."""
 
     def decoded(self, index: int, camera: str) -> Picture:
         """Decodes a picture, [H, W, 3]."""
 
 
-class ImportedSource:
-    """Pictures of a calibrated rig, their lenses undone.
+class ImportedPictures:
+    """Pictures of a calibrated rig, their lenses undone: a `PictureReader`.
 
-    A picture of a straight lens that is a file already goes as it is; every other is encoded anew.
+    In a file, a picture of a straight lens goes as it is; every other is encoded anew.
 
     Args:
-        name: for people.
-        calibration: of the rig.
-        pictures: of all its cameras.
+        calibration: of the rig, for pictures of the size that `raw` has (`fitted`).
+        raw: pictures of all its cameras.
         masks: [T] files by camera, or none.
-        fps: frames per second where neither pictures nor calibration say.
         encoding: of pictures that are encoded anew; JPEG has quality 95 and no subsampling.
 
     Raises:
@@ -130,69 +78,91 @@ class ImportedSource:
 
     def __init__(
         self,
-        name: str,
         calibration: Calibration,
-        pictures: PictureReader,
+        raw: RawReader,
         *,
-        masks: tuple[Mapping[str, Path], ...] = (),
-        fps: float | None = None,
+        masks: Sequence[Mapping[str, Path]] = (),
         encoding: Encoding = "jpeg",
     ) -> None:
-        self.name = name
-        self.points = calibration.points
-        self.frame_count = pictures.frame_count
-        self.fps = fps or pictures.fps or calibration.fps or 30.0
-        self.remarks = list(pictures.remarks)
-        self._pictures = pictures
+        self.frame_count = raw.frame_count
+        self._raw = raw
         self._masks = masks
         self._encoding = encoding
         self._undistorters = {lens.name: Undistorter(lens) for lens in calibration.cameras}
-        self._check_times()
 
     @cached_property
     def rig(self) -> Rig:
         """Pinhole cameras, as large as the pictures."""
         return Rig(tuple(undistorter.camera for undistorter in self._undistorters.values()))
 
-    def undistorter(self, camera: str) -> Undistorter:
-        """The undistorter of a camera's lens."""
-        return self._undistorters[camera]
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Remarks on the files and the lenses, for a person."""
+        lenses = (undistorter.remark for undistorter in self._undistorters.values())
+        return (*self._raw.remarks, *(remark for remark in lenses if remark is not None))
 
-    def time(self, index: int) -> float:
-        """Seconds: those of the pictures, else by the frame rate."""
-        given = self._pictures.time(index)
-        return index / self.fps if given is None else given
+    def time(self, index: int) -> float | None:
+        """Seconds, where the pictures say."""
+        return self._raw.time(index)
 
-    def picture(self, index: int, camera: str) -> Picture:
+    def image(self, index: int, camera: str) -> Picture:
         """[H, W, 3] as the pinhole camera of the rig would have seen it."""
-        return self._undistorters[camera].picture(self._pictures.decoded(index, camera))
+        return self._undistorters[camera].picture(self._raw.decoded(index, camera))
+
+    def has_mask(self, index: int, camera: str) -> bool:
+        """True where there is a file."""
+        return bool(self._masks) and camera in self._masks[index]
+
+    def mask(self, index: int, camera: str) -> Picture:
+        """The undistorted mask, [H, W]."""
+        undistorter = self._undistorters[camera]
+        size = (undistorter.lens.width, undistorter.lens.height)
+        return undistorter.mask(decode_mask(self._masks[index][camera], size=size))
 
     def encoded(self, index: int, camera: str) -> bytes:
-        """The file as it is, or the undistorted picture encoded."""
+        """The file as it is, or the undistorted picture encoded; 16 bits are rounded to 8."""
         if self._undistorters[camera].lens.straight:
-            file = self._pictures.file(index, camera)
+            file = self._raw.file(index, camera)
             if file is not None:
-                return file.read_bytes()
-        return encode(self.picture(index, camera), self._encoding)
+                return eight_bit_file(read_bytes(file), str(file))
+        return encode(self.image(index, camera), self._encoding)
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
         """The undistorted mask, as PNG."""
-        if not self._masks:
-            return None
-        undistorter = self._undistorters[camera]
-        size = (undistorter.lens.width, undistorter.lens.height)
-        mask = 255 * decode_mask(self._masks[index][camera], size=size)
-        return encode(undistorter.mask(mask), "png")
+        return encode(255 * self.mask(index, camera), "png") if self.has_mask(index, camera) else None
 
-    def _check_times(self) -> None:
-        before = -np.inf
-        for index in range(self.frame_count):
-            now = self.time(index)
-            if now <= before:
-                raise CaptureError(
-                    f"{self.name}: frame {index} is at {now:g} s, not after the one before, {before:g} s"
-                )
-            before = now
+
+def fitted(calibration: Calibration, raw: RawReader, fit: Fit | None) -> tuple[Calibration, list[str]]:
+    """The calibration for pictures of the size that they have, and remarks on cameras where that is another.
+
+    Raises:
+        CaptureError: pictures of another shape than calibrated, and `fit` does not say how they came about.
+    """
+    cameras, remarks = [], []
+    for lens in calibration.cameras:
+        size = raw.sizes[lens.name]
+        k, remark = fitted_intrinsics(
+            lens.intrinsics,
+            (lens.width, lens.height),
+            size,
+            camera=lens.name,
+            where=str(raw.path(lens.name)),
+            fit=fit,
+        )
+        cameras.append(replace(lens, intrinsics=k, width=size[0], height=size[1]))
+        remarks += [] if remark is None else [remark]
+    return replace(calibration, cameras=tuple(cameras)), remarks
+
+
+def check_times(name: str, times: Sequence[float]) -> None:
+    """Refuses times [T] of frames that do not rise.
+
+    Raises:
+        CaptureError: names the frame.
+    """
+    for index, (before, now) in enumerate(pairwise(times), 1):
+        if now <= before:
+            raise CaptureError(f"{name}: frame {index} is at {now:g} s, not after the one before, {before:g} s")
 
 
 def encode(picture: Picture, encoding: Encoding) -> bytes:

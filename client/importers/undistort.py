@@ -1,7 +1,8 @@
 """Undoes distortion and fisheye with OpenCV: from a lens to a pinhole camera of the same place and picture size.
 
 The pinhole looks at the largest part of the picture, of the picture's own shape, in which every pixel was seen: no
-black corners. Its pixels are as square as the lens's, its principal point follows.
+black corners. Its pixels are as square as the lens's, its principal point follows. Where the lens's polynomial turns
+back before a corner, the pinhole is narrowed to the rays on which it still rises.
 
 OpenCV puts the centre of the first pixel at (0, 0), we and COLMAP at (0.5, 0.5): principal points lose half a pixel on
 their way to it. Left out, the picture would lie half a pixel beside its camera.
@@ -11,11 +12,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from client.importers.curve import Curve
 from client.importers.extras import opencv
 from client.importers.lens import LensCamera
 from scas4d_core.cameras import Camera
@@ -28,7 +29,13 @@ WIDEST_DEGREES = 120.0
 """A pinhole's field at most: beyond, a fisheye's picture is stretched over pixels that hold nothing."""
 BORDER_POINTS = 64
 TOLERANCE_PIXELS = 0.01
-"""Farthest that a point of the border may come back from where it was: beyond, the lens cannot be undone there."""
+"""Farthest that a pinhole's border may lie outside of the picture: less than is interpolated over."""
+NARROWING = 1.005
+"""Step of the focal length by which a lens that turns back is cut: half a per cent of the picture's side."""
+MOST_NARROWED = 50.0
+"""Times the lens's focal length at which the search for a pinhole ends."""
+LEAST_KEPT = 0.25
+"""Share of its picture below which a lens that turns back is refused: its calibration is wrong, not imprecise."""
 HALF = 0.5
 
 
@@ -40,7 +47,7 @@ class Undistorter:
         lens: as calibrated.
 
     Raises:
-        CaptureError: the distortion cannot be undone within the picture.
+        CaptureError: the distortion cannot be undone in a quarter of the picture or more.
         MissingExtra: OpenCV is needed and not there.
     """
 
@@ -49,9 +56,21 @@ class Undistorter:
     @cached_property
     def camera(self) -> Camera:
         """The pinhole camera that the undistorted picture belongs to."""
-        if self.lens.straight:
-            return self.lens.pinhole()
-        return self.lens.pinhole(_inscribed(self.lens))
+        return self.lens.pinhole() if self.lens.straight else self.lens.pinhole(self._view.intrinsics)
+
+    @cached_property
+    def remark(self) -> str | None:
+        """A sentence on a lens that is cut, because its polynomial turns back; None for others."""
+        if self.lens.straight or self._view.kept is None:
+            return None
+        return (
+            f"camera {self.lens.name!r}: its distortion turns back towards the corners, where its calibration had no "
+            f"points; {1 - self._view.kept:.0%} of its picture is cut off"
+        )
+
+    @cached_property
+    def _view(self) -> _View:
+        return _inscribed(self.lens)
 
     @cached_property
     def _maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -105,97 +124,97 @@ def _shifted(intrinsics: Float) -> Float:
     return shifted
 
 
-def _inscribed(lens: LensCamera) -> Float:
-    """Intrinsics of the pinhole whose whole picture the lens saw."""
-    left, top, right, bottom = _seen_rectangle(lens)
+@dataclass(frozen=True, eq=False)
+class _View:
+    """The pinhole of a lens.
+
+    Attributes:
+        intrinsics: [3, 3] in pixels.
+        kept: share of the lens's picture that it shows, where the lens is cut because its polynomial turns back.
+    """
+
+    intrinsics: Float
+    kept: float | None = None
+
+
+def _inscribed(lens: LensCamera) -> _View:
+    """The pinhole whose whole picture the lens saw; its pixels have the shape of the lens's."""
+    curve = Curve.of(lens)
+    left, top, right, bottom = _seen_rectangle(lens, curve)
     fx, fy = lens.intrinsics[0, 0], lens.intrinsics[1, 1]
     # One factor for both focal lengths keeps the pixels' shape.
     factor = max(lens.width / ((right - left) * fx), lens.height / ((bottom - top) * fy))
     k = np.diag([factor * fx, factor * fy, 1.0])
     k[0, 2] = lens.width / 2 - k[0, 0] * (left + right) / 2
     k[1, 2] = lens.height / 2 - k[1, 1] * (top + bottom) / 2
-    return k
+    return _within(lens, curve, k) if curve.turns else _View(k)
 
 
-def _seen_rectangle(lens: LensCamera) -> tuple[float, float, float, float]:
-    """Left, top, right, bottom at distance 1 of a rectangle that lies within what the lens saw.
+def _within(lens: LensCamera, curve: Curve, k: Float) -> _View:
+    """Narrows a pinhole about the lens's axis until all that it shows lies where the lens's polynomial rises.
 
-    No edge of the picture, bent as it is, comes into the rectangle: it ends where each edge's innermost point lies.
+    Raises:
+        CaptureError: too little of the picture is left.
     """
+    border, size = np.concatenate(list(_edges(lens).values())), np.array([lens.width, lens.height])
+    kept = 0.0
+    while k[0, 0] < MOST_NARROWED * lens.intrinsics[0, 0]:
+        rays = (border - k[:2, 2]) / k.diagonal()[:2]
+        at = curve.bent(rays) * lens.intrinsics.diagonal()[:2] + lens.intrinsics[:2, 2]
+        inside = (at > -TOLERANCE_PIXELS) & (at < size + TOLERANCE_PIXELS)
+        if inside.all() and np.linalg.norm(rays, axis=-1).max() <= curve.widest:
+            x, y = at.T
+            kept = float(abs(x @ np.roll(y, 1) - y @ np.roll(x, 1))) / 2 / (lens.width * lens.height)
+            break
+        k[0, 0], k[1, 1] = NARROWING * k[0, 0], NARROWING * k[1, 1]
+    if kept < LEAST_KEPT:
+        raise CaptureError(
+            f"camera {lens.name!r}: its distortion ({_listed(lens)}) turns back within the picture, and no more than "
+            f"{kept:.0%} of the picture could be undone; calibrate with points out to the corners, or with another "
+            "model"
+        )
+    return _View(k, kept)
+
+
+def _edges(lens: LensCamera) -> dict[str, Float]:
+    """Pixels [P, 2] along each edge of the lens's picture, once around it."""
     x, y = (np.linspace(0, length, BORDER_POINTS) for length in (lens.width, lens.height))
-    edges = {
-        "left": np.stack([np.zeros_like(y), y], axis=-1),
+    return {
         "top": np.stack([x, np.zeros_like(x)], axis=-1),
         "right": np.stack([np.full_like(y, lens.width), y], axis=-1),
-        "bottom": np.stack([x, np.full_like(x, lens.height)], axis=-1),
+        "bottom": np.stack([x[::-1], np.full_like(x, lens.height)], axis=-1),
+        "left": np.stack([np.zeros_like(y), y[::-1]], axis=-1),
     }
-    rays = {side: straightened(lens, pixels, f"its {side} edge") for side, pixels in edges.items()}
-    limit = np.tan(np.radians(WIDEST_DEGREES / 2))
-    left, top = max(rays["left"][:, 0].max(), -limit), max(rays["top"][:, 1].max(), -limit)
-    right, bottom = min(rays["right"][:, 0].min(), limit), min(rays["bottom"][:, 1].min(), limit)
+
+
+def _seen_rectangle(lens: LensCamera, curve: Curve) -> tuple[float, float, float, float]:
+    """Left, top, right, bottom at distance 1 of a rectangle that lies within what the lens saw.
+
+    No edge of the picture, bent as it is, comes into the rectangle: it ends where each edge's innermost point lies. Of
+    a lens that turns back, `_within` cuts the corners.
+    """
+    limit = min(np.tan(np.radians(WIDEST_DEGREES / 2)), curve.widest)
+    rays = {side: straightened(lens, pixels, curve) for side, pixels in _edges(lens).items()}
+    seen = {side: found[~np.isnan(found).any(axis=-1)] for side, found in rays.items()}
+    left, top = (seen[side][:, axis].max(initial=-limit) for axis, side in enumerate(("left", "top")))
+    right, bottom = (seen[side][:, axis].min(initial=limit) for axis, side in enumerate(("right", "bottom")))
     if not (left < right and top < bottom):
         raise CaptureError(
             f"camera {lens.name!r}: undistorted, nothing is left of its picture (from {left:.3g}, {top:.3g} to "
             f"{right:.3g}, {bottom:.3g} at distance 1); check its principal point and coefficients"
         )
-    return left, top, right, bottom
+    return float(left), float(top), float(right), float(bottom)
 
 
-def straightened(lens: LensCamera, pixels: Float, where: str) -> Float:
-    """[P, 2] pixels of the lens to rays (x/z, y/z) [P, 2]; ±infinity beyond 89° from the axis of a fisheye.
+def straightened(lens: LensCamera, pixels: Float, curve: Curve | None = None) -> Float:
+    """[P, 2] pixels of the lens to rays (x/z, y/z) [P, 2].
 
-    Raises:
-        CaptureError: a pixel has no ray: the polynomial turns back before it.
+    Rays are ±infinity beyond 89° from the axis of a fisheye, and NaN where the lens has none: its polynomial turns back
+    before the pixel.
     """
-    distorted = (pixels - lens.intrinsics[:2, 2]) / lens.intrinsics.diagonal()[:2]
-    if lens.fisheye:
-        return _from_angles(lens, distorted, where)
-    cv2 = opencv()
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-12)
-    arguments: tuple[Any, ...] = (np.eye(3), lens.distortion)
-    rays: Float = cv2.undistortPoints(distorted[:, None], *arguments, criteria=criteria)[:, 0]
-    points = np.concatenate([rays, np.ones((len(rays), 1))], axis=-1)
-    again = cv2.projectPoints(points[:, None], np.zeros(3), np.zeros(3), *arguments)[0][:, 0]
-    missed = np.abs(again - distorted) @ lens.intrinsics.diagonal()[:2]
-    _reached(lens, missed, where)
-    _rising(lens, rays, where)
-    return rays
+    curve = curve or Curve.of(lens)
+    return curve.straight((pixels - lens.intrinsics[:2, 2]) / lens.intrinsics.diagonal()[:2])
 
 
-def _from_angles(lens: LensCamera, distorted: Float, where: str) -> Float:
-    radius = np.linalg.norm(distorted, axis=-1)
-    powers = np.arange(3, 11, 2)
-    angle = np.minimum(radius, np.pi)
-    for _ in range(50):  # Newton
-        value = angle + angle[:, None] ** powers @ lens.distortion
-        slope = 1 + angle[:, None] ** (powers - 1) @ (powers * lens.distortion)
-        angle = np.clip(angle - (value - radius) / np.where(np.abs(slope) > 1e-9, slope, 1e-9), 0, np.pi)
-    missed = np.abs(angle + angle[:, None] ** powers @ lens.distortion - radius) * lens.intrinsics[0, 0]
-    _reached(lens, missed, where)
-    to_there = np.linspace(0, angle.max(), 256)[:, None]
-    if (1 + to_there ** (powers - 1) @ (powers * lens.distortion)).min() <= 0:
-        _reached(lens, np.array([np.inf]), where)
-    direction = distorted / np.maximum(radius, 1e-12)[:, None]
-    flat = angle < np.radians(89)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        endless = np.where(np.abs(direction) > 1e-9, np.sign(direction) * np.inf, 0.0)
-    return np.where(flat[:, None], direction * np.tan(np.where(flat, angle, 0.0))[:, None], endless)
-
-
-def _rising(lens: LensCamera, rays: Float, where: str) -> None:
-    """Refuses a radial factor that turns back between the axis and the border: there, two rays share a pixel."""
-    k1, k2, _, _, k3, k4, k5, k6 = lens.distortion
-    r = np.linspace(0, np.linalg.norm(rays, axis=-1).max(), 1024)
-    s = r * r
-    radial = r * (1 + s * (k1 + s * (k2 + s * k3))) / (1 + s * (k4 + s * (k5 + s * k6)))
-    if np.diff(radial).min() <= 0:
-        _reached(lens, np.array([np.inf]), where)
-
-
-def _reached(lens: LensCamera, missed: Float, where: str) -> None:
-    if not (missed <= TOLERANCE_PIXELS).all():
-        listed = ", ".join(f"{value:g}" for value in lens.distortion)
-        raise CaptureError(
-            f"camera {lens.name!r}: its distortion ({lens.model} {listed}) cannot be undone at {where}: the polynomial "
-            "turns back before it; calibrate with points out to the corners, or with another model"
-        )
+def _listed(lens: LensCamera) -> str:
+    return " ".join([lens.model, *(f"{value:g}" for value in lens.distortion)])

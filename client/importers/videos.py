@@ -18,10 +18,13 @@ from client.importers.calibration import Calibration
 from client.importers.extras import pyav
 from client.importers.source import Picture
 from scas4d_core.captures import CaptureError
+from scas4d_core.captures.images import mixed_colours
 
 ENDS = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".mts", ".ts")
 RATE_TOLERANCE = 1e-3
 """Largest relative difference of two cameras' rates: 29.97 and 30 differ by it."""
+NEAR = 8
+"""Frames ahead that are decoded on to; farther ahead there may be a key frame to begin with."""
 ALIKE = 0.05
 """Intervals between frames that differ by less are meant to be the same: stamps are rounded."""
 
@@ -33,6 +36,7 @@ class Video:
         times: [T] seconds of each frame since the first.
         fps: mean frames per second.
         size: (width, height) in pixels.
+        grey: true where it has no colours.
 
     Raises:
         CaptureError: no video, damaged, turned by its metadata, or fewer than one frame.
@@ -45,6 +49,8 @@ class Video:
         self._lock = threading.Lock()
         self._decoding: Iterator[Any] = iter(())
         self._next = -1
+        self._last: tuple[int, Picture] | None = None
+        self._kept: tuple[int, Picture] | None = None
         try:
             self._container = self._av.open(str(path))
             if not self._container.streams.video:
@@ -60,6 +66,7 @@ class Video:
         base = float(self._stream.time_base)
         self.times: NDArray[np.float64] = (np.array(self._stamps) - self._stamps[0]) * base
         self.size = (int(self._stream.codec_context.width), int(self._stream.codec_context.height))
+        self.grey = (self._stream.codec_context.pix_fmt or "").startswith("gray")
         rate = self._stream.average_rate or 0
         self.fps = (len(self) - 1) / self.times[-1] if len(self) > 1 else float(rate)
 
@@ -72,28 +79,43 @@ class Video:
         return float(np.median(np.diff(self.times))) if len(self) > 1 else 0.0
 
     def frame(self, index: int) -> Picture:
-        """Decodes frame `index`: [H, W, 3] sRGB values.
+        """Decodes frame `index`: [H, W, 3] sRGB values, read-only.
+
+        The last frame is kept, and one that was asked for again after others: scores compare every frame with frame 0,
+        and going back to it would cost all frames since the last key frame each time.
 
         Raises:
             CaptureError: it cannot be decoded.
         """
         with self._lock:
-            wanted = self._stamps[index]
-            try:
-                if index != self._next:
-                    self._container.seek(wanted, stream=self._stream, backward=True)
-                    self._decoding = self._container.decode(self._stream)
-                for frame in self._decoding:
-                    if frame.pts == wanted:
-                        self._next = index + 1
-                        return self._pixels(frame)
-                    if frame.pts is not None and frame.pts > wanted:
-                        break
-            except self._av.FFmpegError as fault:
-                self._next = -1
-                raise CaptureError(f"{self.path}: frame {index} cannot be decoded ({fault})") from fault
+            for found in (self._last, self._kept):
+                if found is not None and found[0] == index:
+                    return found[1]
+            again = self._last is not None and index < self._last[0]
+            picture = self._decoded(index)
+            picture.setflags(write=False)
+            if again:
+                self._kept = (index, picture)
+            self._last = (index, picture)
+            return picture
+
+    def _decoded(self, index: int) -> Picture:
+        wanted = self._stamps[index]
+        try:
+            if not 0 <= self._next <= index <= self._next + NEAR:
+                self._container.seek(wanted, stream=self._stream, backward=True)
+                self._decoding = self._container.decode(self._stream)
+            for frame in self._decoding:
+                if frame.pts == wanted:
+                    self._next = index + 1
+                    return self._pixels(frame)
+                if frame.pts is not None and frame.pts > wanted:
+                    break
+        except self._av.FFmpegError as fault:
             self._next = -1
-            raise CaptureError(f"{self.path}: frame {index}, at {self.times[index]:.3f} s, cannot be decoded")
+            raise CaptureError(f"{self.path}: frame {index} cannot be decoded ({fault})") from fault
+        self._next = -1
+        raise CaptureError(f"{self.path}: frame {index}, at {self.times[index]:.3f} s, cannot be decoded")
 
     def _pixels(self, frame: Any) -> Picture:
         if frame.rotation:
@@ -113,7 +135,7 @@ class Videos:
     """One video a camera, of one rate, begun at one moment. The shortest gives the number of frames.
 
     Raises:
-        CaptureError: a camera without a video, sizes or rates that differ from the calibration's or each other's.
+        CaptureError: a camera without a video, or rates that differ.
     """
 
     def __init__(self, calibration: Calibration, files: Mapping[str, Path]) -> None:
@@ -121,13 +143,7 @@ class Videos:
         self.frame_count = min(len(video) for video in self._videos.values())
         first = self._videos[calibration.names[0]]
         self.fps: float | None = first.fps or None
-        for lens in calibration.cameras:
-            video = self._videos[lens.name]
-            if video.size != (lens.width, lens.height):
-                raise CaptureError(
-                    f"{video.path}: is {video.size[0]}x{video.size[1]} pixels, but camera {lens.name!r} was calibrated "
-                    f"for {lens.width}x{lens.height}; give the video at that size, or calibrate with it"
-                )
+        self.sizes = {camera: video.size for camera, video in self._videos.items()}
         self._times = first.times
         for video in self._videos.values():
             self._check_together(video, first)
@@ -135,7 +151,7 @@ class Videos:
             f"{video.path.name} has {len(video) - self.frame_count} frames more than the shortest; they are left out"
             for video in self._videos.values()
             if len(video) > self.frame_count
-        ]
+        ] + mixed_colours({camera: video.grey for camera, video in self._videos.items()})
 
     def _check_together(self, video: Video, first: Video) -> None:
         count = self.frame_count
@@ -157,6 +173,10 @@ class Videos:
     def time(self, index: int) -> float | None:
         """Seconds since the first frame."""
         return float(self._times[index])
+
+    def path(self, camera: str) -> Path:
+        """The camera's video."""
+        return self._videos[camera].path
 
     def file(self, index: int, camera: str) -> Path | None:
         """None: a frame of a video has no file."""

@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from client.importers.source import Source
 from scas4d_core.cameras import Camera
-from scas4d_core.captures import CaptureError
+from scas4d_core.captures import Capture, CaptureError
 
 OnProgress = Callable[[str, int, int], None]
 
 
 def write_dynamic3dgs(
-    source: Source,
+    source: Capture,
     out: Path,
     *,
     frames: int | None = None,
-    test: Collection[str] = (),
     on_progress: OnProgress | None = None,
 ) -> None:
     """Writes a capture: pictures under `ims/`, masks under `seg/`, cameras in `train_meta.json` and `test_meta.json`.
@@ -31,33 +29,23 @@ def write_dynamic3dgs(
     The cameras' files come last: a folder that was not finished is no capture.
 
     Args:
-        source: what is written.
+        source: what is written; its test cameras go into `test_meta.json`.
         out: folder, new or empty.
         frames: how many; all where None.
-        test: cameras to hold out, for measuring.
         on_progress: hears ("frames", done, total).
 
     Raises:
-        CaptureError: the folder is not empty, cameras differ in size, or a test camera is unknown or the last.
+        CaptureError: the folder is not empty.
 
     >>> from client.importers.open_source import open_source
-    >>> write_dynamic3dgs(open_source(folder), out, frames=2, test=["1"])
+    >>> write_dynamic3dgs(open_source(folder, test=("1",)), out, frames=2)
     >>> sorted(path.name for path in out.iterdir())
     ['ims', 'init_pt_cld.npz', 'seg', 'test_meta.json', 'train_meta.json']
     """
-    cameras = source.rig.cameras
     if out.exists() and any(out.iterdir()):
         raise CaptureError(f"{out}: is not empty; name a new folder")
-    unknown = sorted(set(test) - set(source.rig.names))
-    if unknown:
-        raise CaptureError(f"test camera {unknown[0]!r} is not one of {', '.join(source.rig.names)}")
-    train = [camera for camera in cameras if camera.name not in test]
-    if not train:
-        raise CaptureError("every camera is a test camera; leave some to reconstruct from")
-    sizes = {camera.name: (camera.width, camera.height) for camera in cameras}
-    if len(set(sizes.values())) > 1:
-        listed = ", ".join(f"{name} {width}x{height}" for name, (width, height) in list(sizes.items())[:4])
-        raise CaptureError(f"the cameras differ in size ({listed}), and this layout has one for all; push them instead")
+    held_out = () if source.full_test_rig is None else source.full_test_rig.cameras
+    cameras = [*source.full_rig.cameras, *held_out]
     count = min(frames or source.frame_count, source.frame_count)
     ends: dict[str, str] = {}
 
@@ -70,23 +58,22 @@ def write_dynamic3dgs(
 
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
         for index in range(count):
-            list(pool.map(write, [index] * len(cameras), source.rig.names))
+            list(pool.map(write, [index] * len(cameras), [camera.name for camera in cameras]))
             if on_progress is not None:
                 on_progress("frames", index + 1, count)
     points = source.points
     if points is not None:
         foreground = () if points.foreground is None else (points.foreground[:, None],)
         np.savez(out / "init_pt_cld.npz", data=np.concatenate([points.positions, points.colours, *foreground], axis=1))
-    held_out = [camera for camera in cameras if camera.name in test]
     if held_out:
         _write_meta(out / "test_meta.json", held_out, count, ends, source.fps)
-    _write_meta(out / "train_meta.json", train, count, ends, source.fps)
+    _write_meta(out / "train_meta.json", source.full_rig.cameras, count, ends, source.fps)
 
 
-def _write_meta(path: Path, cameras: list[Camera], count: int, ends: dict[str, str], fps: float) -> None:
+def _write_meta(path: Path, cameras: Sequence[Camera], count: int, ends: dict[str, str], fps: float) -> None:
     meta: dict[str, Any] = {
-        "w": cameras[0].width,
-        "h": cameras[0].height,
+        "w": _one_or_all([camera.width for camera in cameras]),
+        "h": _one_or_all([camera.height for camera in cameras]),
         "fps": fps,
         "k": [[camera.intrinsics.tolist() for camera in cameras]] * count,
         "w2c": [[camera.world_to_camera.tolist() for camera in cameras]] * count,
@@ -94,6 +81,11 @@ def _write_meta(path: Path, cameras: list[Camera], count: int, ends: dict[str, s
         "fn": [[f"{camera.name}/{t:06d}{ends[camera.name]}" for camera in cameras] for t in range(count)],
     }
     path.write_text(json.dumps(meta))
+
+
+def _one_or_all(sizes: list[int]) -> int | list[int]:
+    """The size that all cameras have, as the layout has it; else one each, which is this project's extension."""
+    return sizes[0] if len(set(sizes)) == 1 else sizes
 
 
 def _end_of(picture: bytes) -> str:

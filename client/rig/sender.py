@@ -83,7 +83,7 @@ class Sender:
         self._pace = pace
         self._delivery = delivery
         self._on_message = on_message
-        names = sequence.source.rig.names
+        names = sequence.source.full_rig.names
         self._cameras = ThreadPoolExecutor(max_workers=len(names), thread_name_prefix="camera") if per_camera else None
         self.start_clock()
 

@@ -6,7 +6,7 @@ import os
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
-from client.importers.source import Source
+from scas4d_core.captures import Capture
 
 FOREVER = 10**9
 
@@ -26,7 +26,7 @@ class Sequence:
     Back and forth, because a jump from the last frame to the first is a motion that no scene makes.
     """
 
-    def __init__(self, source: Source, *, start: int = 0, loop: bool = False) -> None:
+    def __init__(self, source: Capture, *, start: int = 0, loop: bool = False) -> None:
         if not 0 <= start < source.frame_count:
             raise ValueError(f"start {start} is not one of the frames 0…{source.frame_count - 1} of {source.name}")
         self.source = source
@@ -64,7 +64,7 @@ class Sequence:
         return found
 
     def _files(self, index: int) -> Files:
-        place, names = self.place(index), self.source.rig.names
+        place, names = self.place(index), self.source.full_rig.names
         images = dict(zip(names, self._pool.map(lambda name: self.source.encoded(place, name), names), strict=True))
         found = dict(zip(names, self._pool.map(lambda name: self.source.encoded_mask(place, name), names), strict=True))
         masks = {name: mask for name, mask in found.items() if mask is not None}

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from typing import Any
 
-from client.importers.source import CaptureSource, Source
 from client.retries import Retry
 from client.rig.delivery import Delivery, Lateness
 from client.rig.pace import Pace
@@ -23,7 +22,7 @@ OnProgress = Callable[[str, int, int], None]
 
 
 def push(
-    source: Source | Capture,
+    source: Capture,
     client: Client,
     *,
     scene: str | None = None,
@@ -46,7 +45,7 @@ def push(
     client waits for an outage, and what it says comes next is sent next.
 
     Args:
-        source: what is sent, at the size of the files. The service scales, if `settings` say so.
+        source: its training cameras are sent, at the size of the files. The service scales, if `settings` say so.
         client: of the service.
         scene: id of a scene to go on with, from its next frame; a new one where None.
         name: of a new scene; that of the source where None.
@@ -73,7 +72,6 @@ def push(
     2
     >>> client.delete_scene(delivery.scene)
     """
-    source = CaptureSource(source) if isinstance(source, Capture) else source
     on_progress = on_progress or (lambda stage, done, total: None)
     on_message = on_message or (lambda sentence: None)
     sequence = Sequence(source, start=start, loop=loop)
@@ -82,7 +80,7 @@ def push(
         count = min(frames or len(sequence), len(sequence))
         if scene is None:
             status = client.create_scene(
-                source.rig,
+                source.full_rig,
                 name=source.name if name is None else name,
                 preset=preset,
                 settings=settings,
@@ -152,11 +150,11 @@ class _listening:
             self._before(retry)
 
 
-def _check_cameras(status: SceneStatus, source: Source) -> None:
-    if set(status.cameras) != set(source.rig.names):
+def _check_cameras(status: SceneStatus, source: Capture) -> None:
+    if set(status.cameras) != set(source.full_rig.names):
         raise RuntimeError(
             f"scene {status.id} has the cameras {', '.join(status.cameras)}, {source.name} has "
-            f"{', '.join(source.rig.names)}; go on with the capture that the scene began with"
+            f"{', '.join(source.full_rig.names)}; go on with the capture that the scene began with"
         )
 
 

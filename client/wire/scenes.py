@@ -153,6 +153,11 @@ class SceneStatus(Model):
         description="What was found damaged on disk, and what came of it, a sentence each: at the start of the service "
         "and since. The newest 100.",
     )
+    warnings: list[str] = Field(
+        default_factory=list,
+        description="What looks wrong with the rig and may be right, a sentence each: poses that seem to be the wrong "
+        "way round.",
+    )
     created: str = Field(description="UTC, ISO 8601.")
     ingest: IngestSettings = IngestSettings()
     settings: dict[str, Any]

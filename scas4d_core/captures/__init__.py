@@ -8,18 +8,22 @@ from typing import Any
 from scas4d_core.captures.capture import Capture
 from scas4d_core.captures.dynamic3dgs import TRAIN_META, read_dynamic3dgs
 from scas4d_core.captures.files import CaptureError
+from scas4d_core.captures.fit import Fit
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.captures.ground_truth import GroundTruth, Part
 from scas4d_core.captures.images import ImageError, decode_image, decode_mask, resize_area
+from scas4d_core.captures.reader import PictureReader
 
 __all__ = [
     "Capture",
     "CaptureError",
+    "Fit",
     "Frame",
     "GroundTruth",
     "ImageError",
     "InitialPoints",
     "Part",
+    "PictureReader",
     "decode_image",
     "decode_mask",
     "open_capture",
@@ -33,7 +37,7 @@ def open_capture(folder: Path | str, **options: Any) -> Capture:
 
     Args:
         folder: of the capture.
-        options: of the reader, `read_dynamic3dgs`: image_scale, fps, use_masks, use_points.
+        options: of the reader, `read_dynamic3dgs`: image_scale, fps, use_masks, use_points, fit.
 
     Raises:
         CaptureError: no such folder, no known layout, or a fault in one of the files.

@@ -1,10 +1,9 @@
-"""A capture: pictures of a rig over time, on disk. Pictures are decoded when they are read."""
+"""A capture: pictures of a rig over time. Pictures are decoded when they are read."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,26 +12,27 @@ from scas4d_core.cameras import Rig
 from scas4d_core.captures.files import CaptureError
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.captures.ground_truth import GroundTruth
-from scas4d_core.captures.images import decode_image, decode_mask
-
-Files = Mapping[str, Path]
+from scas4d_core.captures.images import resize_area, resize_mask, scaled_size
+from scas4d_core.captures.reader import PictureReader
 
 
 class LazyPictures(Mapping[str, NDArray[np.uint8]]):
     """Pictures by camera name, decoded anew at every access and not kept: a long capture stays out of memory."""
 
-    def __init__(self, files: Files, decode: Callable[[str, Path], NDArray[np.uint8]]) -> None:
-        self._files = files
+    def __init__(self, cameras: Collection[str], decode: Callable[[str], NDArray[np.uint8]]) -> None:
+        self._cameras = cameras
         self._decode = decode
 
     def __getitem__(self, camera: str) -> NDArray[np.uint8]:
-        return self._decode(camera, self._files[camera])
+        if camera not in self._cameras:
+            raise KeyError(camera)
+        return self._decode(camera)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._files)
+        return iter(self._cameras)
 
     def __len__(self) -> int:
-        return len(self._files)
+        return len(self._cameras)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,17 +41,15 @@ class Capture:
 
     Attributes:
         name: of the capture's folder.
-        full_rig: the training cameras at the size of the files.
-        full_test_rig: the test cameras at the size of the files; None where there are none.
+        full_rig: the training cameras at the size of the pictures.
+        full_test_rig: the test cameras at the size of the pictures; None where there are none.
+        pictures: reads pictures and masks of all these cameras.
         image_scale: pictures, masks, labels and the cameras of ``rig`` are resized by this.
-        image_files: [T] training pictures by camera name.
-        mask_files: [T] training masks by camera name; empty mappings where there are none.
-        test_image_files: [T] test pictures by camera name.
-        test_mask_files: [T] test masks by camera name, of the test cameras that have any.
-        fps: frames per second; the time of frame i is i / fps.
+        fps: frames per second; the time of frame i is i / fps where the pictures have no times of their own.
         points: a cloud of frame 0, or None.
         ground_truth: tracks and parts, or None.
         extent: longest side of the box of the foreground over the sequence, user's units, or None.
+        remarks: sentences for a person, on how the files were read.
 
     >>> from scas4d_core.captures import open_capture
     >>> capture = open_capture("samples/robot")
@@ -62,20 +60,20 @@ class Capture:
     b'\x89PNG'
     >>> capture.test_rig.names
     ('4', '11')
+    >>> capture.holding_out(["3"]).test_rig.names
+    ('3', '4', '11')
     """
 
     name: str
     full_rig: Rig
     full_test_rig: Rig | None
-    image_scale: float
-    image_files: tuple[Files, ...]
-    mask_files: tuple[Files, ...]
-    test_image_files: tuple[Files, ...]
-    test_mask_files: tuple[Files, ...]
+    pictures: PictureReader
+    image_scale: float = 1.0
     fps: float = 30.0
     points: InitialPoints | None = None
     ground_truth: GroundTruth | None = None
     extent: float | None = None
+    remarks: tuple[str, ...] = ()
 
     @property
     def rig(self) -> Rig:
@@ -90,7 +88,12 @@ class Capture:
     @property
     def frame_count(self) -> int:
         """T, the number of frames."""
-        return len(self.image_files)
+        return self.pictures.frame_count
+
+    def time(self, index: int) -> float:
+        """Seconds of a frame: those of its pictures, else by the frame rate."""
+        given = self.pictures.time(index)
+        return index / self.fps if given is None else given
 
     def frame(self, index: int) -> Frame:
         """The training pictures and masks of one moment.
@@ -98,7 +101,7 @@ class Capture:
         Raises:
             IndexError: no such frame. Reading a picture may raise ImageError.
         """
-        return self._frame(index, self.full_rig, self.image_files, self.mask_files)
+        return self._frame(index, self.full_rig)
 
     def test_frame(self, index: int) -> Frame:
         """The test pictures of one moment, and masks where there are any: to measure with, never to train on.
@@ -108,8 +111,8 @@ class Capture:
             CaptureError: the capture has no test cameras. Reading a picture may raise ImageError.
         """
         if self.full_test_rig is None:
-            raise CaptureError(f"capture {self.name}: has no test cameras (no test_meta.json)")
-        return self._frame(index, self.full_test_rig, self.test_image_files, self.test_mask_files)
+            raise CaptureError(f"capture {self.name}: has no test cameras; hold some out (--test)")
+        return self._frame(index, self.full_test_rig)
 
     def encoded(self, index: int, camera: str) -> bytes:
         """Bytes of a picture's file, at full size whatever ``image_scale``, of a training or test camera.
@@ -119,7 +122,8 @@ class Capture:
             KeyError: no such camera.
             CaptureError: the file cannot be read.
         """
-        return _read(self._file(index, camera, self.image_files, self.test_image_files))
+        self._check(index)
+        return self.pictures.encoded(index, camera)
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
         """Bytes of a mask's file, at full size whatever ``image_scale``; None where there is none.
@@ -128,39 +132,54 @@ class Capture:
             IndexError: no such frame.
             CaptureError: the file cannot be read.
         """
-        try:
-            path = self._file(index, camera, self.mask_files, self.test_mask_files)
-        except KeyError:
-            return None
-        return _read(path)
-
-    def _file(self, index: int, camera: str, *sequences: tuple[Files, ...]) -> Path:
         self._check(index)
-        for files in sequences:
-            if files and camera in files[index]:
-                return files[index][camera]
-        raise KeyError(camera)
+        return self.pictures.encoded_mask(index, camera)
+
+    def scaled(self, image_scale: float) -> Capture:
+        """The same capture at another ``image_scale``; pictures come from the same reader."""
+        truth = self.ground_truth
+        if truth is not None:
+            sizes = {name: (full, scaled_size(full, image_scale)) for name, (full, _) in truth.image_size.items()}
+            truth = replace(truth, image_size=sizes)
+        return replace(self, image_scale=image_scale, ground_truth=truth)
+
+    def holding_out(self, names: Collection[str]) -> Capture:
+        """The same capture with these cameras among the test cameras: measured on, never trained on.
+
+        Raises:
+            CaptureError: no such camera, or none is left to train on.
+        """
+        if not names:
+            return self
+        others = () if self.full_test_rig is None else self.full_test_rig.cameras
+        known = [*self.full_rig.names, *(camera.name for camera in others)]
+        unknown = sorted(set(names) - set(known))
+        if unknown:
+            raise CaptureError(f"test camera {unknown[0]!r} is not one of {', '.join(known)}")
+        train = tuple(camera for camera in self.full_rig.cameras if camera.name not in names)
+        if not train:
+            raise CaptureError("every camera is a test camera; leave some to reconstruct from")
+        held = tuple(camera for camera in self.full_rig.cameras if camera.name in names)
+        return replace(self, full_rig=Rig(train), full_test_rig=Rig(held + others))
+
+    def measured_on_training(self) -> Capture:
+        """The same capture with its training cameras for test cameras: tells how well seen pictures are met."""
+        return replace(self, full_test_rig=self.full_rig)
 
     def _check(self, index: int) -> None:
         if not 0 <= index < self.frame_count:
             raise IndexError(f"capture {self.name}: frame {index} is not one of 0…{self.frame_count - 1}")
 
-    def _frame(self, index: int, rig: Rig, images: tuple[Files, ...], masks: tuple[Files, ...]) -> Frame:
+    def _frame(self, index: int, rig: Rig) -> Frame:
         self._check(index)
-        sizes = {camera.name: (camera.width, camera.height) for camera in rig.cameras}
-        scale = self.image_scale
+        scaled, pictures = rig.scaled(self.image_scale), self.pictures
+        sizes = {camera.name: (camera.width, camera.height) for camera in scaled.cameras}
         return Frame(
             index=index,
-            time=index / self.fps,
-            images=LazyPictures(
-                images[index], lambda name, path: decode_image(path, size=sizes[name], image_scale=scale)
+            time=self.time(index),
+            images=LazyPictures(rig.names, lambda name: resize_area(pictures.image(index, name), sizes[name])),
+            masks=LazyPictures(
+                [name for name in rig.names if pictures.has_mask(index, name)],
+                lambda name: resize_mask(pictures.mask(index, name), sizes[name]),
             ),
-            masks=LazyPictures(masks[index], lambda name, path: decode_mask(path, size=sizes[name], image_scale=scale)),
         )
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as fault:
-        raise CaptureError(f"{path}: cannot be read ({fault.strerror})") from fault

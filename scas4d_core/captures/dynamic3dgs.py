@@ -3,13 +3,14 @@
 ``train_meta.json`` and ``test_meta.json`` hold ``w``, ``h``, ``k[t][c]`` (3×3, pixels), ``w2c[t][c]`` (4×4, OpenCV
 axes), ``fn[t][c]`` (path under ``ims/``) and ``cam_id[t][c]``. Masks lie under ``seg/`` with the same path, ending in
 ``.png``. ``init_pt_cld.npz`` holds ``data`` [P, 7]: x y z, r g b (0…1), foreground (0…1). Beyond that layout,
-``train_meta.json`` may hold ``fps``, and a cloud without known foreground has six columns.
+``train_meta.json`` may hold ``fps``; ``w`` and ``h`` may be lists of one number a camera, where sizes differ; and a
+cloud without known foreground has six columns.
 (JonathonLuiten/Dynamic3DGaussians, ``train.py``.)
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -17,11 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera, CameraError, Rig
-from scas4d_core.captures.capture import Capture, Files
+from scas4d_core.captures.capture import Capture
 from scas4d_core.captures.files import CaptureError, read_json, read_npz
+from scas4d_core.captures.fit import Fit, fitted_intrinsics
 from scas4d_core.captures.frame import InitialPoints
 from scas4d_core.captures.ground_truth import read_extent, read_ground_truth
-from scas4d_core.captures.images import ImageError, picture_size, scaled_size
+from scas4d_core.captures.images import ImageError, describe_pictures, picture_size, scaled_size
+from scas4d_core.captures.reader import FileReader, Files
 
 TRAIN_META = "train_meta.json"
 STILL_TOLERANCE = 1e-6
@@ -35,6 +38,7 @@ def read_dynamic3dgs(
     fps: float | None = None,
     use_masks: bool = True,
     use_points: bool = True,
+    fit: Fit | None = None,
 ) -> Capture:
     """Opens a capture. Cameras are named ``str(cam_id)``; test cameras are those of ``test_meta.json``.
 
@@ -46,16 +50,17 @@ def read_dynamic3dgs(
         fps: frames per second; where None, those of ``train_meta.json`` (``scas4d import`` writes them), else 30.
         use_masks: False to leave ``seg/`` alone.
         use_points: False to leave ``init_pt_cld.npz`` alone.
+        fit: how pictures of another shape than ``w`` and ``h`` came about (`fitted_intrinsics`); None refuses them.
 
     Raises:
         CaptureError: a file is missing, broken, or does not fit the others; or a camera moves.
     """
     folder = Path(folder)
-    train = _read_cameras(folder, TRAIN_META)
+    train = _read_cameras(folder, TRAIN_META, fit)
     rate = train.fps if fps is None else fps
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not (np.isfinite(rate) and rate > 0):
         raise CaptureError(f"{folder}: fps {rate!r} must be a positive number of frames per second")
-    test = _read_cameras(folder, "test_meta.json") if (folder / "test_meta.json").exists() else None
+    test = _read_cameras(folder, "test_meta.json", fit) if (folder / "test_meta.json").exists() else None
     if test is not None:
         both = sorted(set(train.rig.names) & set(test.rig.names))
         if both:
@@ -64,28 +69,29 @@ def read_dynamic3dgs(
             raise CaptureError(
                 f"{folder / 'test_meta.json'}: has {len(test.images)} frames, {TRAIN_META} {len(train.images)}"
             )
-    sizes = {
-        camera.name: ((camera.width, camera.height), scaled_size((camera.width, camera.height), image_scale))
-        for rig in ([train.rig, test.rig] if test else [train.rig])
-        for camera in rig.cameras
-    }
-    with_masks = use_masks and (folder / "seg").is_dir()
+    given = [train] if test is None else [train, test]
+    sizes = {camera.name: (camera.width, camera.height) for one in given for camera in one.rig.cameras}
+    scaled = {name: (size, scaled_size(size, image_scale)) for name, size in sizes.items()}
+    masks: list[tuple[Files, ...]] = [({},) * len(train.images)]
+    if use_masks and (folder / "seg").is_dir():
+        masks = [_masks(folder, one, required=one is train) for one in given]
     return Capture(
         name=folder.resolve().name,
         full_rig=train.rig,
         full_test_rig=test.rig if test else None,
+        pictures=FileReader(_joined([one.images for one in given]), _joined(masks), sizes),
         image_scale=image_scale,
-        image_files=train.images,
-        mask_files=_masks(folder, train, required=True) if with_masks else tuple({} for _ in train.images),
-        test_image_files=test.images if test else (),
-        test_mask_files=_masks(folder, test, required=False)
-        if test and with_masks
-        else tuple({} for _ in train.images),
         fps=float(rate),
         points=_read_points(folder / "init_pt_cld.npz") if use_points else None,
-        ground_truth=read_ground_truth(folder, len(train.images), sizes),
+        ground_truth=read_ground_truth(folder, len(train.images), scaled),
         extent=read_extent(folder),
+        remarks=tuple(_remarks(given)),
     )
+
+
+def _joined(of: list[tuple[Files, ...]]) -> list[Files]:
+    """The files of training and test cameras, frame by frame."""
+    return [{name: file for files in frame for name, file in files.items()} for frame in zip(*of, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,21 +99,30 @@ class _Cameras:
     rig: Rig
     images: tuple[Files, ...]
     relative: tuple[dict[str, PurePosixPath], ...]
-    fps: Any = 30.0
+    fps: Any
+    remarks: list[str]
 
 
-def _read_cameras(folder: Path, file: str) -> _Cameras:
+def _remarks(given: list[_Cameras]) -> list[str]:
+    try:
+        described = describe_pictures({name: file for one in given for name, file in one.images[0].items()})
+    except ImageError as fault:
+        raise CaptureError(str(fault)) from fault
+    return [remark for one in given for remark in one.remarks] + described
+
+
+def _read_cameras(folder: Path, file: str, fit: Fit | None) -> _Cameras:
     path = folder / file
     meta = read_json(path)
     missing = [key for key in ("w", "h", "k", "w2c", "fn", "cam_id") if key not in meta]
     if missing:
         raise CaptureError(f"{path}: has no {', '.join(missing)}")
-    width, height = (_whole(path, key, meta[key]) for key in ("w", "h"))
     names = _names(path, meta["cam_id"])
+    widths, heights = (_sizes(path, key, meta[key], len(names)) for key in ("w", "h"))
     intrinsics = _still(path, "k", meta["k"], (len(meta["cam_id"]), len(names), 3, 3))
     poses = _still(path, "w2c", meta["w2c"], (len(meta["cam_id"]), len(names), 4, 4))
     try:
-        rig = Rig(tuple(Camera(n, k, p, width, height) for n, k, p in zip(names, intrinsics, poses, strict=True)))
+        rig = Rig(tuple(map(Camera, names, intrinsics, poses, widths, heights)))
     except CameraError as fault:
         raise CaptureError(f"{path}: {fault}") from fault
     relative = _relative_paths(path, meta["fn"], len(meta["cam_id"]), names)
@@ -116,17 +131,28 @@ def _read_cameras(folder: Path, file: str) -> _Cameras:
         absent = next((file for file in frame.values() if not file.is_file()), None)
         if absent:
             raise CaptureError(f"{absent}: no such file, but {file} names it")
-    for name, picture in images[0].items():
-        try:
-            size = picture_size(picture)
-        except ImageError as fault:
-            raise CaptureError(str(fault)) from fault
-        if size != (width, height):
-            raise CaptureError(
-                f"{picture}: is {size[0]}x{size[1]} pixels, but {file} says {width}x{height} (camera {name}); "
-                "give pictures at the size the cameras were calibrated for (image_scale resizes both)"
-            )
-    return _Cameras(rig, images, relative, meta.get("fps", 30.0))
+    fitted = [_fitted(camera, images[0][camera.name], fit) for camera in rig.cameras]
+    remarks = [remark for _, remark in fitted if remark is not None]
+    return _Cameras(Rig(tuple(camera for camera, _ in fitted)), images, relative, meta.get("fps", 30.0), remarks)
+
+
+def _fitted(camera: Camera, picture: Path, fit: Fit | None) -> tuple[Camera, str | None]:
+    try:
+        size = picture_size(picture)
+    except ImageError as fault:
+        raise CaptureError(str(fault)) from fault
+    calibrated = (camera.width, camera.height)
+    k, remark = fitted_intrinsics(camera.intrinsics, calibrated, size, camera=camera.name, where=str(picture), fit=fit)
+    return replace(camera, intrinsics=k, width=size[0], height=size[1]), remark
+
+
+def _sizes(path: Path, key: str, value: Any, cameras: int) -> list[int]:
+    """Widths or heights by camera; one number stands for all."""
+    if not isinstance(value, list):
+        return [_whole(path, key, value)] * cameras
+    if len(value) != cameras:
+        raise CaptureError(f"{path}: {key} lists {len(value)} sizes and cam_id {cameras} cameras; give one a camera")
+    return [_whole(path, f"{key}[{number}]", one) for number, one in enumerate(value)]
 
 
 def _whole(path: Path, key: str, value: Any) -> int:

@@ -21,6 +21,7 @@ A mask is 1 where the stored value of any channel is not zero; alpha in a mask a
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -100,12 +101,7 @@ def decode_mask(
     foreground = values != 0
     if foreground.ndim == 3:
         foreground = foreground.any(axis=-1)
-    target = scaled_size(picture.size, image_scale)
-    if target == picture.size:
-        return np.array(foreground, dtype=np.uint8)
-    share = area_average(foreground.astype(np.float64), target)
-    mask: NDArray[np.uint8] = (share >= 0.5 - 1e-9).astype(np.uint8)
-    return mask
+    return resize_mask(np.array(foreground, dtype=np.uint8), scaled_size(picture.size, image_scale))
 
 
 def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str | None = None) -> NDArray[np.uint8]:
@@ -168,6 +164,75 @@ def resize_area(picture: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
     if size == (picture.shape[1], picture.shape[0]):
         return picture
     return np.rint(area_average(picture.astype(np.float64), size)).astype(np.uint8)
+
+
+def resize_mask(mask: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
+    """Resizes a mask [H, W] of 0 and 1 to (width, height): 1 where at least half of the new pixel's area is.
+
+    >>> resize_mask(np.array([[1, 1, 1, 0]], np.uint8), size=(2, 1))
+    array([[1, 1]], dtype=uint8)
+    """
+    if size == (mask.shape[1], mask.shape[0]):
+        return mask
+    resized: NDArray[np.uint8] = (area_average(mask.astype(np.float64), size) >= 0.5 - 1e-9).astype(np.uint8)
+    return resized
+
+
+def eight_bit_file(data: bytes, name: str = "picture") -> bytes:
+    """The bytes of a picture file as they are; a PNG of 16 bits is rounded to 8, as `decode_image` rounds.
+
+    Raises:
+        ImageError: a PNG of 16 bits that cannot be decoded.
+
+    >>> file = io.BytesIO()
+    >>> Image.fromarray(np.full((2, 4), 25700, np.uint16)).save(file, "PNG")
+    >>> decode_image(eight_bit_file(file.getvalue()))[0, 0].tolist()
+    [100, 100, 100]
+    """
+    if not is_sixteen_bit(data):
+        return data
+    file = io.BytesIO()
+    Image.fromarray(decode_image(data, name=name)).save(file, "PNG", compress_level=1)
+    return file.getvalue()
+
+
+def is_sixteen_bit(head: bytes) -> bool:
+    """True where the first 25 bytes of a file are those of a PNG of 16 bits a channel."""
+    return head.startswith(b"\x89PNG") and head[24:25] == b"\x10"
+
+
+def describe_pictures(files: Mapping[str, Path]) -> list[str]:
+    """Remarks on the first pictures of the cameras, by their heads: 16 bits, and grey cameras beside colour ones.
+
+    Args:
+        files: one picture by camera name.
+
+    Raises:
+        ImageError: one cannot be read.
+    """
+    remarks, grey = [], {}
+    for camera, path in files.items():
+        try:
+            with path.open("rb") as file:
+                deep = is_sixteen_bit(file.read(25))
+            with Image.open(path, formats=PICTURE_FORMATS) as picture:
+                grey[camera] = picture.mode in ("1", "L", "LA", "I;16", "I;16B", "I;16L", "I")
+        except Exception as fault:
+            raise _unreadable(str(path), fault) from fault
+        if deep:
+            remarks.append(f"camera {camera!r}: its pictures have 16 bits; they are rounded to 8, value / 257")
+    return remarks + mixed_colours(grey)
+
+
+def mixed_colours(grey: Mapping[str, bool]) -> list[str]:
+    """The remark on a rig of grey and colour cameras, by camera name; none where all are alike."""
+    if len(set(grey.values())) < 2:
+        return []
+    listed = ", ".join(name for name, is_grey in grey.items() if is_grey)
+    return [
+        f"grey cameras beside colour ones: {listed}; their grey stands for all three channels, which dulls colours; "
+        "hold them out (--test) where the others are enough"
+    ]
 
 
 def area_average(picture: NDArray[np.float64], size: Size) -> NDArray[np.float64]:

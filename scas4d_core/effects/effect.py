@@ -81,6 +81,16 @@ class Effect:
         """The evidence of a frame that calls for it; None: the frame says nothing, and the switch stays."""
         return None
 
+    def noted(self, seen: Seen, on: bool) -> Arrays | None:
+        """Its arrays for the frames after, beside what its part leaves; None: those that it has stay.
+
+        Called after each frame that was learnt, before evidence is taken, and also where it is off and not pinned so.
+
+        Args:
+            on: whether it took part in the frame.
+        """
+        return None
+
     def populated(self, seen: Seen) -> UpdateResult:
         """The result of a frame with the Gaussians that are born, retired or revived in it.
 

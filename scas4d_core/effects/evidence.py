@@ -47,8 +47,9 @@ class Seen:
 
     Attributes:
         index: of the frame. before: Θ_{t−1}. result: Θ_t, the trace of its update, arrays of the effects.
-        rig: the cameras inside. views: that were learnt from. picture: renders them.
+        rig: the cameras inside, as they were posed. views: that were learnt from. picture: renders them.
         room: Gaussians that may still be born in the scene. time: for fitting them.
+        suspects: views that were not learnt from, of cameras that are set aside.
     """
 
     index: int
@@ -59,3 +60,4 @@ class Seen:
     picture: PictureLoss
     room: int = 1_000_000
     time: FitTime = field(default_factory=FitTime)
+    suspects: Sequence[TrainingView] = ()

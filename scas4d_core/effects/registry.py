@@ -32,6 +32,7 @@ EFFECTS = {
     "shadows": "scas4d_core.effects.appearance.shadows",
     "camera_gain": "scas4d_core.effects.appearance.camera_gain",
     "light": "scas4d_core.effects.appearance.light",
+    "pose_drift": "scas4d_core.effects.cameras.pose_drift",
     "uncovered": "scas4d_core.effects.presence.uncovered",
     "entering": "scas4d_core.effects.presence.entering",
     "leaving": "scas4d_core.effects.presence.leaving",

@@ -12,7 +12,7 @@ from importlib import import_module
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from scas4d_core.effects.effect import effect
+from scas4d_core.effects.effect import Effect, effect
 from scas4d_core.effects.parts import Part, not_on_devices
 from scas4d_core.effects.registry import EFFECTS, Mode
 from scas4d_core.errors import InputError
@@ -153,6 +153,25 @@ def began(switches: Switches, settings: Settings, seen: Seen) -> dict[str, Array
             if arrays is not None:
                 found[name] = arrays
     return found
+
+
+def noted(switches: Switches, settings: Settings, seen: Seen) -> Seen:
+    """A frame that was learnt, with the arrays that effects note of it.
+
+    Args:
+        switches: with which it was updated. settings: of the scene. seen: the frame.
+    """
+    found = {}
+    for name, switch in switches.items():
+        one = effect(name)
+        asked = type(one).noted is not Effect.noted and (switch.on or not switch.pinned)
+        if asked and refusal(name, settings) is None:
+            arrays = one.noted(seen, switch.on)
+            if arrays is not None:
+                found[name] = arrays
+    if not found:
+        return seen
+    return replace(seen, result=replace(seen.result, carried={**seen.result.carried, **found}))
 
 
 def kept_of(carried: Mapping[str, Arrays]) -> dict[str, Arrays]:

@@ -281,7 +281,7 @@ class StaticTrainer:
         activation.activate(self.parameters, self._means, self._factors, self._opacities, self._features)
         counts = np.zeros(len(self.parameters), np.int64)
         for view in self.views:
-            seen = self.loss.coverage(self._means, self._factors, self._opacities, self._features, view)
+            (seen,) = self.loss.coverage(self._means, self._factors, self._opacities, self._features, view)
             counts += seen > SEEN_PIXELS
         keep = counts >= min(MIN_VIEWS, len(self.views))
         if keep.any():

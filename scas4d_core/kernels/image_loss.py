@@ -4,13 +4,15 @@ SSIM is that of 3D Gaussian Splatting: 11×11 Gaussian window, sigma 1.5, zero p
 window is separable; passes go along a row, sixteen pixels at a time, and read across rows.
 
 Most of many pictures is black, in the target and in the render. A window that is 0 in both has an SSIM of 1 and no
-gradient: only the columns of each row near other pixels are computed.
+gradient: only the columns of each row near other pixels are computed. Where a part of the picture alone is asked for
+(``near``), what is far from it is left out as well, sixteen columns of a row at a time.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numba import prange
+from numpy.typing import NDArray
 
 from scas4d_core.guards import SSIM_C1, SSIM_C2
 from scas4d_core.kernels import lanes
@@ -35,6 +37,38 @@ PAD = lanes.COUNT
 
 BAND = 16
 """Rows a task."""
+
+WINDOWS, LOSS, SPREAD, GRADIENT = np.uint8(1), np.uint8(2), np.uint8(4), np.uint8(8)
+"""Bits of that which is computed of sixteen columns of a row: windowed quantities, the loss, its gradients filtered
+along the row, and those across rows, which are the gradient of the picture."""
+EVERYWHERE = np.full((1, 1), WINDOWS | LOSS | SPREAD | GRADIENT)
+LOSS_ALONE = np.full((1, 1), WINDOWS | LOSS)
+"""Of the whole picture."""
+
+
+def near(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """[H, columns] what has to be computed where the gradient of some pixels is asked for, and the loss they change.
+
+    Args:
+        shown: [H, W] these pixels.
+
+    >>> shown = np.zeros((20, 48), bool)
+    >>> shown[10, 20] = True
+    >>> near(shown)[[0, 5, 10]].tolist()  # the pixel is less than a window from the first sixteen columns
+    [[1, 1, 0], [7, 7, 0], [7, 15, 0]]
+    """
+    height, width = shown.shape
+    sums = np.zeros((height + 1, width + 1), np.int32)
+    sums[1:, 1:] = shown.cumsum(axis=0, dtype=np.int32).cumsum(axis=1)
+    rows, columns = np.arange(height)[:, None], np.arange(0, width, lanes.COUNT)
+    result = np.zeros((height, len(columns)), np.uint8)
+    for what, up, across in ((WINDOWS, 2, 1), (LOSS, 1, 1), (SPREAD, 1, 1), (GRADIENT, 0, 0)):
+        top, bottom = np.maximum(rows - up * REACH, 0), np.minimum(rows + 1 + up * REACH, height)
+        left = np.maximum(columns - across * REACH, 0)
+        right = np.minimum(columns + lanes.COUNT + across * REACH, width)
+        count = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+        result |= np.where(count > 0, what, np.uint8(0))
+    return result
 
 
 def stride(width: int) -> int:
@@ -74,13 +108,20 @@ def exposed(value, gain, offset):
     return gain * value + offset
 
 
+@inline
+def asked(what, wanted, y, x):
+    """True where something is computed of the sixteen columns from x on."""
+    return (wanted[0, 0] if wanted.shape[0] == 1 else wanted[y, x // lanes.COUNT]) & what != 0
+
+
 @kernel
-def filter_rows(rows, quantities, scratch, kind, channel, y, span, cleared):
+def filter_rows(rows, quantities, scratch, kind, channel, y, span, cleared, what, wanted):
     """Filters padded rows along themselves, into a row of scratch.
 
     Args:
         rows: [quantities or more, pitch + 2 PAD]. kind, channel, y: of the first quantity in ``scratch``.
         span: first column and last but one that are filtered, whole ``Lanes``. cleared: the same around it, set to 0.
+        what, wanted: where it is ``asked``; elsewhere scratch stays as it is.
     """
     _, channels, height, pitch = scratch.shape
     for k in range(quantities):
@@ -88,7 +129,8 @@ def filter_rows(rows, quantities, scratch, kind, channel, y, span, cleared):
         for x in range(cleared[0], min(span[0], cleared[1]), lanes.COUNT):
             lanes.store(scratch, place + x, lanes.fill(ZERO))
         for x in range(span[0], span[1], lanes.COUNT):
-            lanes.store(scratch, place + x, along(rows, k * (pitch + 2 * PAD) + PAD + x))
+            if asked(what, wanted, y, x):
+                lanes.store(scratch, place + x, along(rows, k * (pitch + 2 * PAD) + PAD + x))
         for x in range(max(span[1], cleared[0]), cleared[1], lanes.COUNT):
             lanes.store(scratch, place + x, lanes.fill(ZERO))
 
@@ -153,7 +195,7 @@ def target_moments(target, scratch, means, squares):
             value = target[channel, y, x]
             rows[0, PAD + x] = value
             rows[1, PAD + x] = value * value
-        filter_rows(rows, 2, scratch, 0, channel, y, (0, pitch), (0, 0))
+        filter_rows(rows, 2, scratch, 0, channel, y, (0, pitch), (0, 0), WINDOWS, EVERYWHERE)
     for task in prange(channels * height):
         channel, y = task // height, task % height
         row = np.empty((2, pitch), np.float32)
@@ -167,7 +209,7 @@ def target_moments(target, scratch, means, squares):
 
 
 @kernel
-def windows_of_row(image, exposure, target, scratch, spans, rows, channel, y):
+def windows_of_row(image, exposure, target, scratch, spans, rows, channel, y, wanted):
     """First pass of ``image_loss`` over a row: the windowed quantities, filtered along the row."""
     width, pitch = target.shape[2], scratch.shape[3]
     gain, offset = exposure[channel, 0], exposure[channel, 1]
@@ -179,7 +221,8 @@ def windows_of_row(image, exposure, target, scratch, spans, rows, channel, y):
         lanes.store(rows, PAD + x, value)
         lanes.store(rows, pitch + 3 * PAD + x, value * value)
         lanes.store(rows, 2 * pitch + 5 * PAD + x, value * lanes.load_first(target, there + x, width - x))
-    filter_rows(rows, 3, scratch, 0, channel, y, (first, last), hull(spans[channel], 0, y, 2 * REACH))
+    cleared = hull(spans[channel], 0, y, 2 * REACH)
+    filter_rows(rows, 3, scratch, 0, channel, y, (first, last), cleared, WINDOWS, wanted)
 
 
 @kernel
@@ -191,8 +234,9 @@ def clear(rows):
 
 @kernel
 def loss_of_row(
-    image, exposure, target, target_means, target_squares, weights, pixels, scratch, spans, rows, losses, channel, y
-):
+    image, exposure, target, target_means, target_squares, weights, pixels, scratch, spans, rows, losses, channel, y,
+    wanted,
+):  # fmt: skip
     """Second pass: the loss of a row, and its gradients by the windowed quantities, filtered along the row."""
     channels, height, width = target.shape
     pitch = scratch.shape[3]
@@ -204,6 +248,8 @@ def loss_of_row(
     place = (channel * (height + 2 * REACH) + y) * pitch
     kind = channels * (height + 2 * REACH) * pitch
     for x in range(first, last, lanes.COUNT):
+        if not asked(LOSS, wanted, y, x):
+            continue
         m1 = across(scratch, place + x, pitch)
         square = across(scratch, place + kind + x, pitch)
         cross = across(scratch, place + 2 * kind + x, pitch)
@@ -227,11 +273,11 @@ def loss_of_row(
     losses[channel, y, 0] = lanes.sum_of(loss) * (weights[channel] / np.float32(pixels))
     losses[channel, y, 1] = lanes.sum_of(squared)
     filtered, cleared = hull(spans[channel], 2, y, REACH), hull(spans[channel], 2, y, 3 * REACH)
-    filter_rows(rows, 3, scratch, 3, channel, y, filtered, cleared)
+    filter_rows(rows, 3, scratch, 3, channel, y, filtered, cleared, SPREAD, wanted)
 
 
 @kernel
-def gradient_of_row(image, exposure, target, weights, pixels, scratch, spans, g_image, g_exposure, channel, y):
+def gradient_of_row(image, exposure, target, weights, pixels, scratch, spans, g_image, g_exposure, channel, y, wanted):
     """Third pass: the gradient of a row."""
     channels, height, width = target.shape
     pitch = scratch.shape[3]
@@ -244,8 +290,11 @@ def gradient_of_row(image, exposure, target, weights, pixels, scratch, spans, g_
     nothing = lanes.fill(ZERO)
     g_gain = g_offset = nothing
     for x in range(0, min(first, width), lanes.COUNT):
-        lanes.store_first(g_image, out + x, width - x, nothing)
+        if asked(GRADIENT, wanted, y, x):
+            lanes.store_first(g_image, out + x, width - x, nothing)
     for x in range(first, last, lanes.COUNT):
+        if not asked(GRADIENT, wanted, y, x):
+            continue
         by_mean = across(scratch, place + x, pitch)
         by_square = across(scratch, place + kind + x, pitch)
         by_cross = across(scratch, place + 2 * kind + x, pitch)
@@ -259,14 +308,15 @@ def gradient_of_row(image, exposure, target, weights, pixels, scratch, spans, g_
         g_offset += g
         lanes.store_first(g_image, out + x, width - x, g * gain)
     for x in range(max(min(first, width), last), width, lanes.COUNT):
-        lanes.store_first(g_image, out + x, width - x, nothing)
+        if asked(GRADIENT, wanted, y, x):
+            lanes.store_first(g_image, out + x, width - x, nothing)
     g_exposure[channel, y, 0] = lanes.sum_of(g_gain)
     g_exposure[channel, y, 1] = lanes.sum_of(g_offset)
 
 
 @parallel_kernel
 def image_loss(
-    image, exposure, target, target_means, target_squares, weights, pixels, scratch, g_image, losses, g_exposure
+    image, exposure, target, target_means, target_squares, weights, pixels, scratch, wanted, g_image, losses, g_exposure
 ):
     """Loss of a rendered picture, or of a part of one, and its gradient.
 
@@ -275,8 +325,9 @@ def image_loss(
         target, target_means, target_squares: [C, H, W]. weights: [C] weight of each channel's mean.
         pixels: that the mean is taken over; H W for a whole picture.
         scratch: [6, C, H + 10, stride(W)], its upper and lower 5 rows 0: three windowed quantities, their gradients.
-        g_image: out [>= C, >= H, >= W] dL/dimage. losses: out [C, H, 2], each row's share of the loss and its sum
-            of squared differences.
+        wanted: see ``near``, ``EVERYWHERE``, ``LOSS_ALONE``.
+        g_image: out [>= C, >= H, >= W] dL/dimage, where it is wanted; elsewhere anything. losses: out [C, H, 2], each
+            row's share of the loss and its sum of squared differences.
         g_exposure: out [C, H, 2], each row's share of the gradient of gain and offset.
     """
     channels, height, _ = target.shape
@@ -292,16 +343,18 @@ def image_loss(
         channel, first = task // bands, task % bands * BAND
         rows = np.empty((3, pitch + 2 * PAD), np.float32)
         for y in range(first, min(height, first + BAND)):
-            windows_of_row(image, exposure, target, scratch, spans, rows, channel, y)
+            windows_of_row(image, exposure, target, scratch, spans, rows, channel, y, wanted)
     for task in prange(channels * bands):
         channel, first = task // bands, task % bands * BAND
         rows = np.empty((3, pitch + 2 * PAD), np.float32)
         for y in range(first, min(height, first + BAND)):
             loss_of_row(
                 image, exposure, target, target_means, target_squares, weights, pixels, scratch, spans, rows, losses,
-                channel, y,
+                channel, y, wanted,
             )  # fmt: skip
     for task in prange(channels * bands):
         channel, first = task // bands, task % bands * BAND
         for y in range(first, min(height, first + BAND)):
-            gradient_of_row(image, exposure, target, weights, pixels, scratch, spans, g_image, g_exposure, channel, y)
+            gradient_of_row(
+                image, exposure, target, weights, pixels, scratch, spans, g_image, g_exposure, channel, y, wanted
+            )

@@ -25,6 +25,12 @@ WIDER = np.float32(1.0 + COVER_SLACK)
 RADIX_BITS = 12
 DIGITS = 1 << RADIX_BITS
 
+BLOCK = lanes.ACROSS
+"""Pixels of a block's side."""
+
+SOME = 4096
+"""Rows a task."""
+
 AHEAD = 8
 """Gaussians by which numbers are prefetched: in depth order they lie anywhere in memory."""
 
@@ -170,13 +176,16 @@ def cover_tiles(
 
 
 @kernel
-def mark_blocks(splats, rects, tiles_x, marks):
+def mark_blocks(splats, rects, chosen, tiles_x, marks):
     """Marks the blocks that the supports of Gaussians meet.
 
     Args:
-        splats, rects: of ``projection.project``. marks: [tiles] uint64, added to.
+        splats, rects: of ``projection.project``. chosen: [N] uint8, 0 for Gaussians that mark nothing.
+        marks: [tiles] uint64, added to.
     """
     for i in range(rects.shape[0]):
+        if chosen[i] == 0:
+            continue
         for tile_y in range(rects[i, 1], rects[i, 3]):
             for tile_x in range(rects[i, 0], rects[i, 2]):
                 marks[tile_y * tiles_x + tile_x] |= cover(splats[i], tile_x, tile_y)
@@ -196,6 +205,66 @@ def find_meeting(splats, rects, tiles_x, drawn, meets):
                 tile = tile_y * tiles_x + tile_x
                 if drawn[tile] != 0 and (cover(splats[i], tile_x, tile_y) & drawn[tile]) != 0:
                     meets[i] = True
+
+
+@parallel_kernel
+def put_rows(rows, places, part, whole):
+    """Copies rows of an array to places of another.
+
+    Args:
+        rows, places: [M] int64. part: [P, K], whole: out [W, K] float32.
+    """
+    for task in prange((rows.shape[0] + SOME - 1) // SOME):
+        for k in range(task * SOME, min(rows.shape[0], (task + 1) * SOME)):
+            for column in range(part.shape[1]):
+                whole[places[k], column] = part[rows[k], column]
+
+
+@inline
+def holds(blocks, tiles_x, y, x):
+    """True where the block of a pixel is among the marked ones."""
+    number = x % TILE // BLOCK * (TILE // BLOCK) + y % TILE // BLOCK
+    return (blocks[y // TILE * tiles_x + x // TILE] >> np.uint64(number)) & np.uint64(1) != 0
+
+
+@kernel
+def take_blocks(planes, base, blocks, tiles_x, box, part, shifts):
+    """Composes a box of a picture: the blocks that were drawn, and what is known of all others.
+
+    Args:
+        planes: [C, rows, stride] float32, as drawn. base: [C, H, W] float32, all that is not.
+        blocks: [tiles] uint64. box: first row, last but one, first column, last but one.
+        part: out [C, h, w] float32, the box. shifts: out [C] float64, sums over the box of how much it differs from the
+            base.
+    """
+    top, bottom, left, right = box
+    for channel in range(part.shape[0]):
+        shifts[channel] = 0.0
+        for y in range(top, bottom):
+            part[channel, y - top] = base[channel, y, left:right]
+            shift = 0.0
+            for x in range(left // BLOCK * BLOCK, right, BLOCK):
+                if holds(blocks, tiles_x, y, x):
+                    for k in range(max(x, left), min(x + BLOCK, right)):
+                        shift += np.float64(planes[channel, y, k] - base[channel, y, k])
+                        part[channel, y - top, k - left] = planes[channel, y, k]
+            shifts[channel] += shift
+
+
+@kernel
+def put_blocks(part, blocks, tiles_x, box, planes):
+    """Copies the blocks that were drawn from a box to a picture, as ``take_blocks`` has them; others stay as they are.
+
+    Args:
+        part: [C, h, w] float32. planes: out [C, rows, stride] float32.
+    """
+    top, bottom, left, right = box
+    for channel in range(part.shape[0]):
+        for y in range(top, bottom):
+            for x in range(left // BLOCK * BLOCK, right, BLOCK):
+                if holds(blocks, tiles_x, y, x):
+                    for k in range(max(x, left), min(x + BLOCK, right)):
+                        planes[channel, y, k] = part[channel, y - top, k - left]
 
 
 @kernel

@@ -129,9 +129,10 @@ def measure_parts(reconstruction: Reconstruction, capture: Capture, indices: Seq
     rendered, true = [], []
     for camera in cameras:
         for index in indices:
-            rendered.append(render_parts(reconstruction, camera, index, labels))
-            true.append(truth.labels(camera.name, index))
-    return {"parts_ari": metrics.adjusted_rand_index(np.stack(rendered), np.stack(true)), "parts_count": float(count)}
+            rendered.append(render_parts(reconstruction, camera, index, labels).ravel())  # cameras differ in size
+            true.append(truth.labels(camera.name, index).ravel())
+    index_of_all = metrics.adjusted_rand_index(np.concatenate(rendered), np.concatenate(true))
+    return {"parts_ari": index_of_all, "parts_count": float(count)}
 
 
 def measure_flicker(reconstruction: Reconstruction, capture: Capture, indices: Sequence[int]) -> Scores:
@@ -140,11 +141,19 @@ def measure_flicker(reconstruction: Reconstruction, capture: Capture, indices: S
     assert rig is not None
     deviations: list[NDArray[Any]] = []
     for camera in rig.cameras:
-        true = np.stack([capture.test_frame(index).images[camera.name] for index in indices])
-        lowest, highest = true.min(axis=0).astype(np.int16), true.max(axis=0).astype(np.int16)
+        # Frame by frame: a long capture does not fit into memory.
+        lowest = highest = capture.test_frame(indices[0]).images[camera.name]
+        for index in indices[1:]:
+            true = capture.test_frame(index).images[camera.name]
+            lowest, highest = np.minimum(lowest, true), np.maximum(highest, true)
         still = ((highest - lowest).max(axis=-1) <= STILL_LEVELS) & (highest.max(axis=-1) > 0)
-        shown = np.stack([np.clip(reconstruction.render(camera, index).colour[still], 0, 1) for index in indices])
-        deviations.append(255 * shown.std(axis=0, dtype=np.float64))
+        mean, squares = np.float64(0), np.float64(0)
+        for count, index in enumerate(indices, 1):
+            shown = np.clip(reconstruction.render(camera, index).colour[still], 0, 1).astype(np.float64)
+            before = shown - mean
+            mean = mean + before / count
+            squares = squares + before * (shown - mean)
+        deviations.append(255 * np.sqrt(squares / len(indices)))
     found = np.concatenate(deviations)
     return {"still_pixels": float(len(found)), "flicker": float(found.mean()) if len(found) >= FEWEST_STILL else None}
 

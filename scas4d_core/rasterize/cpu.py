@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import Camera
 from scas4d_core.guards import GuardCounts
 from scas4d_core.kernels import blend as blend_kernels
-from scas4d_core.kernels import projection, tiles
+from scas4d_core.kernels import feature_gradients, projection, tiles
 from scas4d_core.kernels.jit import threads
 from scas4d_core.rasterize.limits import DEFAULT, Limits
 
@@ -73,10 +73,12 @@ class Drawing(NamedTuple):
     Attributes:
         blocks: [tiles] uint64, bits as of ``tiles.cover``. learnt: [N] uint8, 1 for the Gaussians that change: they
             have to stay within (``CpuRasterizer.escaped`` tells whether one did not), and they alone get gradients.
+        narrow: whether only those of the blocks are drawn that these Gaussians reach: ``CpuRasterizer.drawn``.
     """
 
     blocks: NDArray[np.uint64]
     learnt: NDArray[np.uint8]
+    narrow: bool = False
 
 
 class ForwardPass(NamedTuple):
@@ -107,6 +109,7 @@ class CpuRasterizer:
     Attributes:
         guards: number of times that each guard acted since the last ``reset`` of the counts.
         escaped: whether a Gaussian that is learnt reached a block that the last forward pass did not draw.
+        drawn: [tiles] uint64, the blocks that it drew.
 
     >>> from scas4d_core.gaussians import Gaussians
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
@@ -128,6 +131,7 @@ class CpuRasterizer:
         self.guards = GuardCounts(*projection.ACTED, *projection.ACTED_BACKWARD)
         self.limits = np.array(limits, dtype=np.float32)
         self.escaped = False
+        self.drawn = np.zeros(0, np.uint64)
         self._last: ForwardPass
         self._buffers: dict[str, NDArray[Any]] = {}
         self._views: dict[str, NDArray[Any]] = {}
@@ -199,15 +203,16 @@ class CpuRasterizer:
         if depth_channel >= 0:
             features[:, depth_channel] = splats[:, projection.DEPTH]
         drawing = drawing or self._whole(tiles_x * tiles_y, count)
+        self.escaped, self.drawn, learnt = False, drawing.blocks, drawing.learnt
+        if drawing.narrow:
+            marks = np.zeros(tiles_x * tiles_y, np.uint64)
+            tiles.mark_blocks(splats, rects, learnt, tiles_x, marks)
+            self.escaped, self.drawn = bool((marks & ~drawing.blocks).any()), marks & drawing.blocks
         visible, order = tiles.depth_order(
-            splats,
-            counts,
-            self._buffer("keys", (count,), np.uint32),
-            self._buffer("order", (count,), np.int32),
-            self._buffer("keys_too", (count,), np.uint32),
-            self._buffer("order_too", (count,), np.int32),
+            splats, counts, self._buffer("keys", (count,), np.uint32), self._buffer("order", (count,), np.int32),
+            self._buffer("keys_too", (count,), np.uint32), self._buffer("order_too", (count,), np.int32),
             self._histogram,
-        )
+        )  # fmt: skip
         tasks = threads()
         begins, ends = self._buffer("begins", (2, tasks), np.int64)
         # One more: a pair that is not reached is written and then overwritten.
@@ -217,10 +222,10 @@ class CpuRasterizer:
         pair_covers = self._buffer("pair_covers", (most,), np.uint64)
         tile_counts = self._buffer("tile_counts", (tasks, tiles_x * tiles_y), np.int32)
         left = tiles.cover_tiles(
-            splats, rects, order, visible, tiles_x, *drawing, begins, ends, counts, firsts, pairs, pair_covers,
-            tile_counts,
+            splats, rects, order, visible, tiles_x, self.drawn, learnt, begins, ends, counts, firsts, pairs,
+            pair_covers, tile_counts,
         )  # fmt: skip
-        self.escaped = left > 0
+        self.escaped |= left > 0
         starts = self._buffer("starts", (tiles_x * tiles_y + 1,), np.int64)
         cursors = self._buffer("cursors", (tasks, tiles_x * tiles_y), np.int64)
         entries = tiles.tile_offsets(tile_counts, starts, cursors)
@@ -230,16 +235,16 @@ class CpuRasterizer:
         tiles.fill_tiles(begins, ends, pairs, pair_covers, cursors, items, slots, covers)
         # Heavy tiles first, dealt out in turn: the tasks end together.
         tile_order = np.argsort(starts[:-1] - starts[1:], kind="stable")
-        tile_order = tile_order[drawing.blocks[tile_order] != 0]
+        tile_order = tile_order[self.drawn[tile_order] != 0]
         image = self._buffer("image", (channels, tiles_y * TILE, tiles_x * TILE))
         rest = self._buffer("rest", (tiles_y * TILE, tiles_x * TILE))
         blend_kernels.blend(
-            splats, features, (0,) * (channels // blend_kernels.GROUP), starts, items, covers, drawing.blocks,
+            splats, features, (0,) * (channels // blend_kernels.GROUP), starts, items, covers, self.drawn,
             tile_order, tasks, (width, height), background, self.limits, image, rest,
         )  # fmt: skip
         self._last = ForwardPass(
             means, factors, features, camera, depth_channel, splats, counts, firsts, starts, items, slots, covers,
-            drawing.learnt, tile_order, image, rest, most,
+            learnt, tile_order, image, rest, most,
         )  # fmt: skip
         return self.picture
 
@@ -298,21 +303,26 @@ class CpuRasterizer:
         shape = (-(-count // projection.CHUNK), len(projection.ACTED_BACKWARD))
         acted = self._buffer("acted_backward", shape, np.int64)
         projection.project_backward(
-            last.means,
-            last.factors,
-            last.camera.pose,
-            last.camera.lens,
-            self.limits,
-            last.splats,
-            last.counts * last.learnt,
-            last.firsts,
-            records,
-            last.depth_channel,
-            *gradients,
-            acted,
-        )
+            last.means, last.factors, last.camera.pose, last.camera.lens, self.limits, last.splats,
+            last.counts * last.learnt, last.firsts, records, last.depth_channel, *gradients, acted,
+        )  # fmt: skip
         self.guards.add(projection.ACTED_BACKWARD, acted)
         return gradients
+
+    def feature_gradients(self, g_image: Array) -> Array:
+        """[N, 4] the gradients of features that ``backward`` finds, alone; of pictures of four channels."""
+        last, count = self._last, len(self._last.features)
+        records = self._buffer("records", (last.pairs, blend_kernels.record_columns(blend_kernels.GROUP)))
+        feature_gradients.blend_features(
+            last.splats, last.starts, last.items, last.slots, last.covers, last.learnt, last.tile_order, threads(),
+            (last.camera.width, last.camera.height), self.limits, g_image, records,
+        )  # fmt: skip
+        found = self._buffer("g_features", (count, blend_kernels.GROUP))
+        shape = (-(-count // projection.CHUNK), len(projection.ACTED_BACKWARD))
+        acted = self._buffer("acted_backward", shape, np.int64)
+        feature_gradients.sum_features(last.counts * last.learnt, last.firsts, records, found, acted)
+        self.guards.add(projection.ACTED_BACKWARD, acted)
+        return found
 
     @property
     def planes(self) -> Array:

@@ -20,6 +20,7 @@ from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.rasterize.shading import features_seen
 from scas4d_core.robust import outliers
+from scas4d_core.robust.attempt_results import joined, met, retold, usual_errors
 from scas4d_core.robust.checks import EXPOSURE, evened, gain_of, relit, validated
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.relocation import find_jump, shifted
@@ -39,9 +40,6 @@ LADDER = (
 SEARCH = AttemptOptions("sought again", cold=True, longer=5.0)
 """From where the silhouettes say that the object is, or from where an update ended. Two of three frames of robot lost,
 the next is met at 33.5 dB with five times the iterations, at 32.1 dB with twice."""
-
-ERROR_RISE = 1.02
-"""Times that the usual error of a probe view rises at most in an update."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +94,7 @@ class FrameSolver:
     def __init__(self, updater: Updater, factory: ViewFactory, picture: PictureLoss, settings: UpdateSettings) -> None:
         self._updater = updater
         self._picture = picture
-        self._factory, self._rig = factory, factory.rig
+        self._factory, self._rig = factory, factory.posed
         self._settings = settings
         self.judging = 0.0
 
@@ -150,6 +148,9 @@ class FrameSolver:
         elif outcome is FrameOutcome.UPDATED and (why := self._behind(given, result)) is not None:
             attempts[-1] += f": {why}"
             result = self._go_on(given, result, attempts)
+        elif outcome is FrameOutcome.UPDATED and self._far(given):
+            other = replace(given, seed=given.seed + 1)  # another order of the views
+            result = self._go_on(other, result, attempts, longer=1.0)
         result = replace(result, outcome=outcome, reason=reason, attempts=attempts, exposure=exposure)
         return self._committed(given, result)
 
@@ -185,7 +186,7 @@ class FrameSolver:
 
     def _validated(self, given: UpdateInput, start: Gaussians, result: UpdateResult) -> Validated:
         with self._timed():
-            return validated(start, result, self._updater.hierarchy.rows, self._rig.radius, given.lengths)
+            return validated(start, result, self._updater.hierarchy.rows, self._factory.rig.radius, given.lengths)
 
     @contextmanager
     def _timed(self) -> Iterator[None]:
@@ -220,12 +221,12 @@ class FrameSolver:
         if not self._settings.judge:
             return None
         with self._timed():
-            return outliers.unmet(given.past, _met(result), len(result.trace.losses))
+            return outliers.unmet(given.past, met(result), len(result.trace.losses))
 
     def _behind(self, given: UpdateInput, result: UpdateResult) -> str | None:
         if not self._settings.judge or self._spent(given):
             return None
-        return outliers.behind(given.past, _met(result), len(result.trace.losses))
+        return outliers.behind(given.past, met(result), len(result.trace.losses))
 
     def _spent(self, given: UpdateInput, more: int = 0) -> bool:
         """True where the budget has no time left for another attempt, with ``more`` iterations before it."""
@@ -254,20 +255,30 @@ class FrameSolver:
             result, fault = self._validated(given, start, result)
             # A few iterations more are no excuse for meeting it less well.
             both = len(tried.trace.losses) + len(result.trace.losses)
-            why = fault or outliers.unmet(given.past, _met(result), both)
+            why = fault or outliers.unmet(given.past, met(result), both)
             attempts.append(name if why is None else f"{name}: {why}")
             if why is None:
-                return _retold(result if start is not ended else _after(result, tried), tried)
+                return retold(result if start is not ended else joined(result, tried), tried)
         return None
 
-    def _go_on(self, given: UpdateInput, tried: UpdateResult, attempts: list[str]) -> UpdateResult:
-        """On from where an update ended; the better of both."""
-        options = self._options(given, replace(SEARCH, name="on from where the update ended"))
+    def _far(self, given: UpdateInput) -> bool:
+        """True where no motion was known to start from, and the update was no longer for it: there was far to go.
+
+        A budget in milliseconds is kept all the same.
+        """
+        settings = self._settings
+        return settings.judge and settings.cold_longer <= 1 and given.motion is None and given.end is None
+
+    def _go_on(
+        self, given: UpdateInput, tried: UpdateResult, attempts: list[str], longer: float = SEARCH.longer
+    ) -> UpdateResult:
+        """On from where an update ended, for ``longer`` times the iterations; the better of both."""
+        options = self._options(given, replace(SEARCH, name="on from where the update ended", longer=longer))
         result = self._run(given, tried.gaussians, None, options)
         result, fault = self._validated(given, given.state, result)
-        after, before = (outliers.level_of(given.past, _met(one)) for one in (result, tried))
+        after, before = (outliers.level_of(given.past, met(one)) for one in (result, tried))
         attempts.append(options.name if fault is None else f"{options.name}: {fault}")
-        return _retold(_after(result, tried), tried) if fault is None and after > before else tried
+        return retold(joined(result, tried), tried) if fault is None and after > before else tried
 
     def _held(
         self,
@@ -295,7 +306,7 @@ class FrameSolver:
             psnr |= self._measured([*again, *given.suspects], result.gaussians)
         past = outliers.settle(given.past, psnr, given.brightness, result.exposure, len(trace.losses))
         if trace.errors.get(Candidate.END):
-            past = replace(past, error=_usual(given.past.error, trace.errors[trace.kept]))
+            past = replace(past, error=usual_errors(given.past.error, trace.errors[trace.kept]))
         motion = result.motion if result.motion is not None and result.motion.finite else None
         return replace(result, motion=motion, offsets=outliers.offsets(given.past, psnr)), past
 
@@ -317,33 +328,3 @@ def _standing(given: UpdateInput, trace: UpdateTrace, exposure: float, said: str
         given.state, given.motion, trace, outcome=outcome, attempts=[said], exposure=exposure, carried=given.carried
     )
     return result, past
-
-
-def _met(result: UpdateResult) -> dict[str, float]:
-    """DB of the cameras that were learnt from to the end."""
-    return {name: psnr for name, psnr in result.trace.fits.items() if name not in result.trace.left_out}
-
-
-def _after(result: UpdateResult, first: UpdateResult) -> UpdateResult:
-    """An update that went on from where another ended: its motion is that of both."""
-    if result.motion is None or first.motion is None:
-        return result
-    return replace(result, motion=result.motion.after(first.motion))
-
-
-def _retold(result: UpdateResult, first: UpdateResult) -> UpdateResult:
-    """A later attempt with the errors of the frame before and of the warm start as the first one found them."""
-    errors: dict[Candidate, dict[str, float]] = {**first.trace.errors}
-    errors.pop(Candidate.END, None)
-    if result.trace.errors:
-        errors[Candidate.END] = result.trace.errors[result.trace.kept]
-    shown = result.trace.shown if result.trace.kept is Candidate.END else {}
-    return replace(result, trace=replace(result.trace, errors=errors, kept=Candidate.END, shown=shown))
-
-
-def _usual(before: Mapping[str, float], now: Mapping[str, float]) -> dict[str, float]:
-    """The errors by view that are usual: they fall at once and rise slowly.
-
-    A noisy frame's error would else be enough for the next good one, which moved.
-    """
-    return {name: min(value, ERROR_RISE * before.get(name, value)) for name, value in now.items()}

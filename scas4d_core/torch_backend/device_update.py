@@ -178,7 +178,7 @@ class DeviceUpdate:
 
     def _on_device(self, view: TrainingView) -> TorchView:
         """The view as ``TorchUpdate`` takes it."""
-        camera = self._factory.rig[view.name]
+        camera = self._factory.posed[view.name]
         target = np.moveaxis(view.target, 0, -1)
         mask = target[..., LABEL] if target.shape[-1] > LABEL else None
         return TorchView(camera, target[..., :LABEL], mask, view.exposure[:LABEL])

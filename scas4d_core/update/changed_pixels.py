@@ -2,8 +2,10 @@
 
 What moves changes the blocks (4×4 pixels) that its supports meet. There, the moving Gaussians and those of the standing
 that meet these blocks are drawn, in the order of the whole picture, so that each pixel and each gradient has the bits
-that it has there. All other pixels show what stands alone: they were rendered once, when that last changed. The image
-loss is computed in the box around the changed blocks; that of the rest is a number a frame and view.
+that it has there. All other pixels show what stands alone: they were rendered once, when that last changed.
+
+The standing Gaussians to draw from are found once a frame and view, around where what moves is then; the blocks that
+are drawn, in each iteration. The image loss is computed near all that may be drawn; the rest is a number a frame.
 """
 
 from __future__ import annotations
@@ -38,12 +40,14 @@ MOST = 0.6
 
 @dataclass(eq=False)
 class Region:
-    """That which is drawn of one camera's pictures.
+    """Part of one camera's pictures that may be drawn in a frame.
 
     Attributes:
-        blocks: [tiles] uint64. rows: [R] int64, the Gaussians drawn, ascending. learnt: [R] uint8, 1 for the moving.
-        box: rows and columns of the picture that hold the blocks and ``REACH`` around. shown: [h, w] bool, the box's
-            pixels that are drawn.
+        blocks: [tiles] uint64; each time those of them are drawn that what moves reaches then.
+        rows: [R] int64, the Gaussians drawn, ascending. learnt: [R] uint8, 1 for the moving. moving: [M] int64, which
+            of the R these are.
+        box: rows and columns of the picture that hold the blocks and ``REACH`` around.
+        near: [h, columns] uint8, where in the box the losses can change, see ``image_loss.near``.
         view: whose pictures the following belong to; None: nobody's yet.
         target: [C, h, w], moments: twice the same, of the view in the box. rest: image loss, mask loss and squared
             error of the view outside of the box.
@@ -52,8 +56,9 @@ class Region:
     blocks: NDArray[np.uint64]
     rows: NDArray[np.int64]
     learnt: NDArray[np.uint8]
+    moving: NDArray[np.int64]
     box: tuple[slice, slice]
-    shown: NDArray[np.bool_]
+    near: NDArray[np.uint8]
     view: TrainingView | None = None
     target: Array = field(default_factory=lambda: np.empty((0, 0, 0), np.float32))
     moments: tuple[Array, Array] = ()  # type: ignore[assignment]
@@ -86,11 +91,12 @@ class ChangedPixels(PictureLoss):
         self._standing = np.flatnonzero(~self._moves)
         self._stood: State | None = None
         self._bases: dict[tuple[str, int, int], Array] = {}
+        self._poses: dict[tuple[str, int, int], Array] = {}
         self._base_rests: dict[tuple[str, int, int], Array] = {}
         self._base_means: dict[tuple[str, int, int], NDArray[np.float64]] = {}
         self._regions: dict[tuple[str, int, int], Region] = {}
         self._gradients: Gradients | None = None
-        self._scratch = np.empty(0, np.float32)
+        self._scratch, self._planes = np.empty(0, np.float32), np.empty(0, np.float32)
         self._shown_mean = np.zeros(3)
 
     def begin(self, previous: Gaussians) -> None:
@@ -120,9 +126,8 @@ class ChangedPixels(PictureLoss):
         if self._gradients is None or self._gradients.features.shape != features.shape:
             shapes = (means.shape, factors.shape, opacities.shape, features.shape, (len(means), 2))
             self._gradients = Gradients(*(np.zeros(shape, np.float32) for shape in shapes))
-        moves = np.flatnonzero(region.learnt)
-        for whole, part in zip(self._gradients, found, strict=True):
-            whole[self._moving] = part[moves]
+        for whole, part in zip(self._gradients, found, strict=True) if len(self._moving) else ():
+            tiles.put_rows(region.moving, self._moving, part.reshape(len(part), -1), whole.reshape(len(whole), -1))
         lap("render backward")
         return self._gradients
 
@@ -133,10 +138,10 @@ class ChangedPixels(PictureLoss):
 
     def shown(self, view: TrainingView) -> Picture:
         """See ``PictureLoss``."""
-        region, drawn = self._regions[_key(view)], self.rasterizer.picture
+        drawn, shown = self.rasterizer.picture, _pixels(self.rasterizer.drawn, view.camera)
         whole = Picture(self._base(view).copy(), self._base_rests[_key(view)].copy())
         for plane, new in zip((*whole.features, whole.rest), (*drawn.features, drawn.rest), strict=True):
-            np.copyto(plane[region.box], new[region.box], where=region.shown)
+            np.copyto(plane, new, where=shown)
         return whole
 
     def colour_shift(self, view: TrainingView) -> tuple[float, float, float]:
@@ -154,7 +159,8 @@ class ChangedPixels(PictureLoss):
             region = self._regions[key] = self._made(self._marks(state, view.camera), view)
         while True:
             part = taken(state, region.rows)
-            self.rasterizer.forward(*part, view.camera, self._background, drawing=Drawing(region.blocks, region.learnt))
+            drawing = Drawing(region.blocks, region.learnt, narrow=True)
+            self.rasterizer.forward(*part, view.camera, self._background, drawing=drawing)
             if not self.rasterizer.escaped:
                 return region
             region = self._regions[key] = self._made(self._marks(state, view.camera) | region.blocks, view)
@@ -170,9 +176,9 @@ class ChangedPixels(PictureLoss):
         meets = np.empty(len(self._standing), bool)
         tiles.find_meeting(splats, rects, _tiles(camera)[0], blocks, meets)
         rows = np.sort(np.concatenate([self._moving, self._standing[meets]]))
-        shown = np.repeat(np.repeat(as_grid(blocks, camera), BLOCK, 0), BLOCK, 1)[: camera.height, : camera.width]
+        learnt, shown = self._moves[rows].astype(np.uint8), _pixels(blocks, camera)
         box = _box(shown)
-        region = Region(blocks, rows, self._moves[rows].astype(np.uint8), box, np.ascontiguousarray(shown[box]))
+        region = Region(blocks, rows, learnt, np.flatnonzero(learnt), box, image_loss.near(shown[box]))
         self._follow(region, view)
         return region
 
@@ -182,16 +188,18 @@ class ChangedPixels(PictureLoss):
         where = (slice(None), *region.box)
         region.view, region.target = view, np.ascontiguousarray(view.target[where])
         region.moments = (np.ascontiguousarray(view.moments[0][where]), np.ascontiguousarray(view.moments[1][where]))
-        whole = self._losses(base, view, view.target, view.moments, np.empty_like(base))
+        whole = self._losses(base, view, view.target, view.moments, image_loss.LOSS_ALONE, base)
         view.__dict__.pop("moments", None)  # those of the box are kept, and nobody needs both
         part = np.ascontiguousarray(base[where])
-        region.rest = whole - self._losses(part, view, region.target, region.moments, np.empty_like(part))
+        near = region.near & (image_loss.WINDOWS | image_loss.LOSS)
+        region.rest = whole - self._losses(part, view, region.target, region.moments, near, part)
 
     def _base(self, view: TrainingView) -> Array:
         """[4, H, W] of what stands alone."""
         key = _key(view)
-        if key not in self._bases:
+        if key not in self._bases or not np.array_equal(self._poses[key], view.camera.pose):
             assert self._stood is not None
+            self._poses[key] = view.camera.pose
             picture = self.rasterizer.forward(*self._stood, view.camera, self._background)
             self._bases[key], self._base_rests[key] = picture.features.copy(), picture.rest.copy()
             self._base_means[key] = means(self._bases[key][:3])
@@ -199,30 +207,49 @@ class ChangedPixels(PictureLoss):
 
     def _compare_box(self, region: Region, view: TrainingView) -> None:
         """Fills the losses of what was rendered, and the gradient of what is drawn."""
-        where = (slice(None), *region.box)
-        base, planes = self._base(view)[where], self.rasterizer.planes[where]
-        part = np.where(region.shown, planes, base)
-        g_part = np.empty_like(part)
-        sums = region.rest + self._losses(part, view, region.target, region.moments, g_part)
+        base, (rows, columns) = self._base(view), region.box
+        box = (rows.start, rows.stop, columns.start, columns.stop)
+        part, g_part = self._part(len(base), box)
+        drawn, tiles_x = self.rasterizer.drawn, _tiles(view.camera)[0]
+        shifts = np.zeros(len(base))
+        tiles.take_blocks(self.rasterizer.planes, base, drawn, tiles_x, box, part, shifts)
+        sums = region.rest + self._losses(part, view, region.target, region.moments, region.near, g_part)
         g_image, _ = self.rasterizer.gradient_buffers()
-        g_image[where] = g_part
+        tiles.put_blocks(g_part, drawn, tiles_x, box, g_image)
         self.image_part, self.mask_part = float(sums[0]), float(sums[1])
         pixels = view.camera.height * view.camera.width
         self.psnr = 10 * log10(3 * pixels / max(float(sums[2]), SMALLEST_SQUARE))
-        key = _key(view)
-        self._shown_mean = self._base_means[key] + (part[:3] - base[:3]).sum(axis=(1, 2), dtype=np.float64) / pixels
+        self._shown_mean = self._base_means[_key(view)] + shifts[:3] / pixels
+
+    def _part(self, channels: int, box: tuple[int, int, int, int]) -> tuple[Array, Array]:
+        """[C, h, w] twice, of a box: buffers for what it shows and for the gradient of that."""
+        shape = (2, channels, box[1] - box[0], box[3] - box[2])
+        if self._planes.size < (size := int(np.prod(shape))):
+            self._planes = np.empty(size + size // 4, np.float32)
+        part, g_part = self._planes[:size].reshape(shape)
+        return part, g_part
 
     def _losses(
-        self, planes: Array, view: TrainingView, target: Array, moments: tuple[Array, Array], gradient: Array
+        self,
+        planes: Array,
+        view: TrainingView,
+        target: Array,
+        moments: tuple[Array, Array],
+        near: NDArray[np.uint8],
+        gradient: Array,
     ) -> NDArray[np.float64]:
-        """Image loss, mask loss and squared error of a part of a view's picture; its gradient is filled."""
+        """Image loss, mask loss and squared error of a part of a view's picture; its gradient is filled where wanted.
+
+        Without ``image_loss.GRADIENT`` it may be the picture itself, which stays as it is.
+        """
         channels, height, width = target.shape
         rows, g_exposure = np.empty((channels, height, 2), np.float32), np.empty((channels, height, 2), np.float32)
         image_loss.image_loss(
             planes, view.exposure, target, *moments, self._weights[:channels], view.camera.height * view.camera.width,
-            self._cleared(channels, height, width), gradient, rows, g_exposure,
+            self._cleared(channels, height, width), near, gradient, rows, g_exposure,
         )  # fmt: skip
-        gradient[channels:] = 0
+        if gradient is not planes:
+            gradient[channels:] = 0
         sums = rows.sum(axis=1, dtype=np.float64)
         return np.array([sums[:3, 0].sum(), sums[LABEL:, 0].sum(), sums[:3, 1].sum()])
 
@@ -251,7 +278,7 @@ def reached(
     splats, rects, _ = rasterizer.project(*taken(state, rows), camera)
     tiles_x, tiles_y = _tiles(camera)
     marks = np.zeros(tiles_x * tiles_y, np.uint64)
-    tiles.mark_blocks(splats, rects, tiles_x, marks)
+    tiles.mark_blocks(splats, rects, np.ones(len(rects), np.uint8), tiles_x, marks)
     return marks
 
 
@@ -272,6 +299,12 @@ def as_grid(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bool
     bits = np.unpackbits(blocks.astype("<u8").view(np.uint8).reshape(-1, 8), axis=1, bitorder="little")
     grid = bits.reshape(tiles_y, tiles_x, side, side).transpose(0, 3, 1, 2)
     return grid.reshape(tiles_y * side, tiles_x * side).astype(bool)
+
+
+def _pixels(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bool_]:
+    """[H, W] the pixels of blocks."""
+    grid = as_grid(blocks, camera)
+    return np.repeat(np.repeat(grid, BLOCK, 0), BLOCK, 1)[: camera.height, : camera.width]
 
 
 def as_blocks(grid: NDArray[np.bool_], camera: CameraArrays) -> NDArray[np.uint64]:

@@ -73,10 +73,13 @@ class ViewFactory:
 
     Args:
         rig: the cameras inside. source: the cameras as the pictures come in, where they are to be resized.
+
+    Attributes:
+        posed: the rig as it stands by now, of which the views are.
     """
 
     def __init__(self, rig: Rig, source: Rig | None = None) -> None:
-        self.rig = rig
+        self.rig = self.posed = rig
         self._source = source
         self._scratch: dict[tuple[int, int, int], Array] = {}
 
@@ -120,7 +123,7 @@ class ViewFactory:
         for name in self.rig.names:
             if name not in frame.images:
                 continue
-            camera = CameraArrays.of(self.rig[name])
+            camera = CameraArrays.of(self.posed[name])
             image, mask = pictures_of(frame, name, (camera.width, camera.height), use_masks)
             masked = mask is not None
             target = np.empty((3 + masked, camera.height, camera.width), np.float32)
@@ -136,7 +139,7 @@ class ViewFactory:
 
     def coarser(self, view: TrainingView, scale: float) -> TrainingView:
         """The view with its pictures resized by area averaging, and the camera that sees them so."""
-        camera = self.rig[view.name].scaled(scale)
+        camera = self.posed[view.name].scaled(scale)
         target = np.moveaxis(view.target, 0, -1)
         rows, columns = view.camera.height // camera.height, view.camera.width // camera.width
         if (rows * camera.height, columns * camera.width) == (view.camera.height, view.camera.width):
@@ -279,7 +282,8 @@ class PictureLoss:
         g_exposure = np.empty((channels, height, 2), np.float32)
         image_loss.image_loss(
             self.rasterizer.planes, view.exposure, view.target, *view.moments, self._weights[:channels],
-            height * width, self._factory.scratch(channels, height, width), g_image, rows, g_exposure,
+            height * width, self._factory.scratch(channels, height, width), image_loss.EVERYWHERE, g_image, rows,
+            g_exposure,
         )  # fmt: skip
         g_image[channels:] = 0
         sums = rows.sum(axis=1, dtype=np.float64)
@@ -316,32 +320,27 @@ class PictureLoss:
         blocks = np.full(-(-width // TILE) * -(-height // TILE), 2**64 - 1, np.uint64)
         drawing = Drawing(blocks, learnt)
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background, drawing=drawing)
-        g_image, g_alpha = self.rasterizer.gradient_buffers()
+        g_image, _ = self.rasterizer.gradient_buffers()
         gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
         here = (slice(None, 3), slice(height), slice(width))
         g_image[here] = (view.target[:3] - offset) / gain - self.rasterizer.planes[here]
         g_image[LABEL, :height, :width] = 1
-        found = self.rasterizer.backward(g_image, g_alpha, LABEL).features
+        found = self.rasterizer.feature_gradients(g_image)
         return found[:, :3].copy(), found[:, LABEL].copy()
 
     def coverage(
-        self,
-        means: Array,
-        factors: Array,
-        opacities: Array,
-        features: Array,
-        view: TrainingView,
-        pixels: Array | float = 1.0,
+        self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView, *pixels: Array
     ) -> Array:
-        """[N] pixels' worth of blending weight of each Gaussian in a view; the gradient of a channel's sum.
+        """[1 + P, N] pixels' worth of blending weight of each Gaussian in a view; the gradients of channels' sums.
 
         Args:
-            pixels: [H, W] what each pixel counts.
+            pixels: P times [H, W], up to three, what each pixel counts; before these come all, each counted once.
         """
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background)
-        g_image, g_alpha = self.rasterizer.gradient_buffers()
+        g_image, _ = self.rasterizer.gradient_buffers()
         g_image[:] = 0
-        g_image[LABEL, : view.camera.height, : view.camera.width] = pixels
-        weights = self.rasterizer.backward(g_image, g_alpha, LABEL).features[:, LABEL].copy()
+        for plane, count in zip(g_image, (1.0, *pixels), strict=False):
+            plane[: view.camera.height, : view.camera.width] = count
+        weights = self.rasterizer.feature_gradients(g_image).T[: 1 + len(pixels)].copy()
         g_image[:] = 0
         return weights

@@ -60,6 +60,7 @@ class Ingest:
 
     Args:
         log: of the scene. rules: of the scene.
+        can_begin: called before the first frame is accepted; raises Problem where the scene cannot begin.
         remaining: predicts the seconds until the frame at work ends.
         accepted: called when the queue has changed. ended: called for each frame that ends without the worker.
     """
@@ -69,6 +70,7 @@ class Ingest:
         log: SceneLog,
         rules: IngestRules,
         *,
+        can_begin: Callable[[], None],
         remaining: Callable[[], float],
         accepted: Callable[[], None],
         ended: Callable[[int], None],
@@ -78,6 +80,7 @@ class Ingest:
         self.rules = rules
         self.accepted = accepted
         self.ended = ended
+        self._can_begin = can_begin
         self._remaining = remaining
         self._sockets = 0
         self._coming: dict[int, asyncio.Event] = {}
@@ -207,7 +210,9 @@ class Ingest:
             raise self.full(index)
 
     def refuse_if_failed(self) -> None:
-        """Refuses any frame of a scene that cannot go on: 409."""
+        """Refuses any frame of a scene that cannot begin, 422, or go on, 409."""
+        if self.ledger.next_frame == 0:
+            self._can_begin()
         if self.ledger.fatal is not None:
             raise Problem(
                 409,

@@ -13,8 +13,9 @@ from fastapi import APIRouter, Request
 from numpy.typing import NDArray
 
 from client.wire import PointsReceipt
+from scas4d_core.rig_checks import RigError, check_points, pose_warnings
 from scas4d_core.storage.npz import write_npz
-from server.problems import Problem, counted
+from server.problems import Problem, counted, of_rig
 from server.routes.access import TheScene
 from server.storage.disk import full_disk, no_room
 
@@ -41,6 +42,10 @@ async def put(scene: TheScene, request: Request) -> PointsReceipt:
     body = await request.body()
     sha256 = hashlib.sha256(body).hexdigest()
     arrays = await asyncio.to_thread(read_points, body, MOST_POINTS)
+    try:
+        await asyncio.to_thread(check_points, scene.rig, arrays["positions"])
+    except RigError as error:
+        raise of_rig(error) from None
     receipt = PointsReceipt(points=len(arrays["positions"]), sha256=sha256)
     async with scene.log.lock:
         if scene.points_sha256 == sha256:
@@ -60,6 +65,7 @@ async def put(scene: TheScene, request: Request) -> PointsReceipt:
                 raise full_disk(error) from None
             raise
         scene.points_sha256 = sha256
+        scene.warnings = await asyncio.to_thread(pose_warnings, scene.rig, arrays["positions"])
     return receipt
 
 

@@ -7,10 +7,11 @@ from fastapi import APIRouter, Response
 from client.wire import SceneCreate, SceneList, SceneStatus
 from scas4d_core.cameras import CameraError
 from scas4d_core.presets import SettingError, preset
+from scas4d_core.rig_checks import RigError, check_scene
 from scas4d_core.settings import Settings
 from server.health import devices, estimate
 from server.http import validation
-from server.problems import Problem
+from server.problems import Problem, of_rig
 from server.routes.access import AllScenes, TheScene, TheSettings
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
@@ -29,11 +30,14 @@ def scene_settings(request: SceneCreate) -> Settings:
         raise Problem(422, fault, field=field, value=str(error.value), remedy=error.remedy) from None
 
 
-def check_unit(request: SceneCreate, settings: Settings) -> None:
-    """Refuses the unit 'auto' if it cannot be found from the rig."""
-    unit = settings.scene.metres_per_unit
+def check_rig(request: SceneCreate, settings: Settings) -> None:
+    """Refuses settings that cannot work with the rig, and the unit 'auto' if it cannot be found from it."""
+    unit, rig = settings.scene.metres_per_unit, request.rig.rig()
     try:
-        request.rig.rig().world_frame(unit)
+        rig.world_frame(unit)
+        check_scene(rig, settings.scene)
+    except RigError as error:
+        raise of_rig(error) from None
     except CameraError as error:
         field = "settings.scene.metres_per_unit"
         raise Problem(422, error.fault, field=field, value=unit, remedy=error.remedy) from None
@@ -53,7 +57,7 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
                 value=f"{camera.width}x{camera.height}",
                 remedy="send smaller pictures with the intrinsics to match, or raise SCAS4D_MAX_IMAGE_PIXELS",
             )
-    check_unit(request, settings)
+    check_rig(request, settings)
     estimate.check(request.rig, settings, server)
     await devices.require(settings.device)
     scene = await scenes.create(request, settings)

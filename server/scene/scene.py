@@ -12,9 +12,10 @@ from typing import Any
 from client.wire import Budget, FrameReportModel, FrameState, SceneBudget, SceneState, SceneStatus
 from scas4d_core.cameras import Camera
 from scas4d_core.errors import message_of
+from scas4d_core.rig_checks import RigError, check_start, pose_warnings
 from server.ingest.acknowledge import Ingest, IngestRules, uncancelled
 from server.ingest.open_frames import OpenFrames
-from server.problems import Problem
+from server.problems import Problem, of_rig
 from server.processes.messages import SceneSpec
 from server.processes.placement import Placement
 from server.processes.readers import Readers
@@ -52,7 +53,7 @@ class Scene:
     Attributes:
         log: journal, ledger and frame log. ingest: accepts whole frames. open_frames: accepts them camera by camera.
         updates: gives frames to the worker. readers: answer queries. replays: of its last frames.
-        points_sha256: of the initial cloud.
+        points_sha256: of the initial cloud. warnings: what looks wrong with the rig, a sentence each.
     """
 
     def __init__(
@@ -78,6 +79,7 @@ class Scene:
         )
         self.spec = SceneSpec(folder, rig, definition.settings, self.rules.minimum_cameras, asked.keep_states)
         self.points_sha256: str | None = None
+        self.warnings = pose_warnings(rig)
         self._definition = definition
         self._hub = hub
         self._background = Background(self._failed)
@@ -107,6 +109,7 @@ class Scene:
         self.ingest = Ingest(
             self.log,
             self.rules,
+            can_begin=self._check_start,
             remaining=self.updates.clock.remaining,
             accepted=self.updates.begin,
             ended=lambda index: self.updates.tell(FrameFinished(self.frames[index].report)),
@@ -126,6 +129,13 @@ class Scene:
             pause_seconds=server.scrub_pause_seconds,
         )
         self._background.run(scrub.run())
+
+    def _check_start(self) -> None:
+        """Refuses to begin where nothing tells how far away things are: 422."""
+        try:
+            check_start(self.rig, self.points_sha256 is not None)
+        except RigError as error:
+            raise of_rig(error) from None
 
     # Questions.
 
@@ -184,6 +194,7 @@ class Scene:
             states_deleted=ledger.states_deleted,
             effects=effects_of(self.spec.settings, self._newest_record),
             damage=self._damage.sentences,
+            warnings=self.warnings,
             created=self.created.isoformat(),
             ingest=self.request.ingest,
             settings=self.spec.settings.model_dump(mode="json"),

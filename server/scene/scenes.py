@@ -10,8 +10,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import NoReturn
 
+import numpy as np
+from numpy.typing import NDArray
+
 from client.wire import SceneCreate
 from scas4d_core.errors import message_of
+from scas4d_core.rig_checks import pose_warnings
 from scas4d_core.settings import Settings
 from scas4d_core.storage.npz import read_npz, sync_folder
 from server.problems import Problem, counted
@@ -137,6 +141,8 @@ class Scenes:
             found.damage[:0] = [damage] if damage is not None else []
             scene = Scene(definition, folder, found, self.server, self.placement, self.hub)
             scene.points_sha256 = await asyncio.to_thread(points_sha256, folder.points)
+            if (positions := await asyncio.to_thread(points_positions, folder.points)) is not None:
+                scene.warnings = pose_warnings(scene.rig, positions)
         except (DefinitionError, OSError) as error:
             self.unreadable[folder.name] = message_of(error)
             log.error("folder %s holds no scene that can be read; it is left as it is: %s", folder.path, error)
@@ -239,3 +245,11 @@ def points_sha256(path: Path) -> str | None:
         return None
     except ValueError:
         return ""
+
+
+def points_positions(path: Path) -> NDArray[np.float64] | None:
+    """Returns the positions [P, 3] of a scene's points, or None where it has none that can be read."""
+    try:
+        return np.asarray(read_npz(path, ("positions",))["positions"], np.float64)
+    except (FileNotFoundError, ValueError):
+        return None

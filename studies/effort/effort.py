@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from client.cli.evaluate import Report
 from client.cli.scores import Row, write_row
-from scas4d_core.captures import Capture, open_capture
+from scas4d_core.captures import Capture
 from scas4d_core.metrics import psnr as image_psnr
 from scas4d_core.presets import preset
 from scas4d_core.settings import Settings
+from studies.captures import open_measured
 from studies.effort.sequences import Shown, as_it_is, back_and_forth, repeated, slowed
 from studies.frontier.timing import started
 from studies.machine import core_version, machine
@@ -79,7 +80,7 @@ def measure_budgets(
     Args:
         folder: of the capture. out: folder of a study, with its frames 0. milliseconds: the budgets.
     """
-    capture = open_capture(folder)
+    capture = open_measured(folder)
     kept = []
     for budget in milliseconds:
         settings = changed(preset("scas4d"), budget_ms=budget)
@@ -115,7 +116,7 @@ def measure_adaptive(
         folder: of a capture with test cameras. out: folder of a study, with its frames 0. updates: of the capture.
         seeds: of the updates, tried on the capture as it is; what the first update finds or loses goes by chance.
     """
-    capture = open_capture(folder)
+    capture = open_measured(folder)
     few = min(updates, FEW)
     sequences: dict[str, tuple[int, Callable[[], Iterator[Shown]]]] = {
         "as it is": (seeds, lambda: as_it_is(capture, updates)),

@@ -19,7 +19,7 @@ import numpy as np
 
 from client.cli.evaluate import Report
 from client.cli.scores import Row
-from scas4d_core.captures import open_capture
+from client.importers.open_source import open_source
 from scas4d_core.presets import preset
 from scas4d_core.update.result import REPORT
 from studies.effort.effort import COUNTED_FROM, changed, leave
@@ -39,7 +39,7 @@ def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report
     """
     from scas4d_core.update.frame_update import FrameUpdate
 
-    capture = open_capture(folder)
+    capture = open_source(folder)
     settings = changed(preset("scas4d"), still=-1.0)
     shares: list[float] = []
     stages: list[dict[str, float]] = []

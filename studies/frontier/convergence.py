@@ -16,9 +16,10 @@ import numpy as np
 from client.cli.evaluate import Report
 from client.cli.scores import Row, read_row, write_row
 from scas4d_core import metrics
-from scas4d_core.captures import Capture, open_capture
+from scas4d_core.captures import Capture
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.warm_up import warm_up_elsewhere
+from studies.captures import open_measured
 from studies.frontier.frontier import Variant
 from studies.frontier.timing import started
 from studies.machine import core_version
@@ -62,7 +63,7 @@ def measure_convergence(
         report: takes the lines that are printed.
     """
     warm_up_elsewhere()
-    capture = open_capture(folder)
+    capture = open_measured(folder)
     updates = min(updates, capture.frame_count - 1)
     curves = []
     for variant in variants or [Variant(f"{name} {count}", name, count) for name, count in WATCHED]:

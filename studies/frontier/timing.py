@@ -20,7 +20,8 @@ import numpy as np
 
 from client.cli.evaluate import Report
 from client.cli.scores import Row, read_row, write_row
-from scas4d_core.captures import Capture, open_capture
+from client.importers.open_source import open_source
+from scas4d_core.captures import Capture
 from scas4d_core.settings import Settings
 from scas4d_core.warm_up import warm_up_elsewhere
 from studies.constants import all_varied
@@ -82,7 +83,7 @@ def measure_times(
     # These bring the kernels.
     from scas4d_core.kernels.jit import threads
 
-    capture = open_capture(folder)
+    capture = open_source(folder)
     turns = min(rounds + 1, capture.frame_count - 1)
     if turns < 2:
         raise ValueError(f"{folder} has {capture.frame_count} frame(s); timing needs at least 3")

@@ -71,12 +71,12 @@ def _frame_studies(
         typer.echo(table(rows))
         _end(violations(rows))
         return
-    from scas4d_core.captures import open_capture
+    from studies.captures import open_measured
     from studies.hard_frames.footage import AnyFootage, CapturedFootage, SyntheticFootage
     from studies.quality.settings import settings_of
 
     footages: list[AnyFootage] = [
-        CapturedFootage(open_capture(path), settings_of("scas4d"), QUALITY / "first") for path in captures
+        CapturedFootage(open_measured(path), settings_of("scas4d"), QUALITY / "first") for path in captures
     ]
     failed: list[str] = []
     for footage in footages or [SyntheticFootage()]:

@@ -24,8 +24,8 @@ from rich.progress import Progress
 
 from client.cli.evaluate import Report, peak_megabytes
 from client.cli.scores import Row
+from client.importers.open_source import open_source
 from scas4d_core.cameras import Camera, rig_inside
-from scas4d_core.captures import open_capture
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels.jit import threads
 from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
@@ -66,7 +66,7 @@ def study(
         raise ValueError(f"frames is {frames}; give at least 3: the first update is not counted")
     if settings.device != "cpu":
         raise ValueError(f"device is {settings.device!r}; this study is of the CPU kernels: give cpu")
-    capture = open_capture(folder)
+    capture = open_source(folder)
     first_file = store / "first" / f"{first_frame_key(capture, settings)}.npz"
     report(f"a run of {min(frames, capture.frame_count)} frames, frame 0 first, in a process of its own")
     warm_up_elsewhere()
@@ -285,7 +285,7 @@ def _scene_words(on: Row) -> str:
 
 def run_and_time(folder: Path, settings: Settings, frames: int, first_file: Path) -> Row:
     """Reconstructs so many frames, keeps frame 0, and tells seconds by update and this process's peak memory."""
-    capture = open_capture(folder)
+    capture = open_source(folder)
     count = min(frames, capture.frame_count)
     updates: list[Row] = []
     with Progress(console=Console(stderr=True), transient=True) as bars:

@@ -1,4 +1,4 @@
-"""`scripts/bench quality`, `refit`, `effects`, `switches`, `targets`, `table` and `processors`."""
+"""`scripts/bench quality`, `refit`, `effects`, `switches`, `drift`, `targets`, `table` and `processors`."""
 
 from __future__ import annotations
 
@@ -7,13 +7,17 @@ from typing import Annotated
 
 import typer
 
+from client.cli.capture_options import takes_capture
+from client.importers.open_source import CaptureOptions
 from studies.options import QUALITY, Again, Captures, Changes, write_page
 
 Study = Annotated[Path, typer.Option(help="Folder of the study: rows, pictures, frames 0. Run again to go on.")]
 
 
+@takes_capture
 def quality(
     captures: Captures,
+    options: CaptureOptions,
     out: Study = QUALITY,
     preset: Annotated[
         list[str] | None, typer.Option(help="Preset: scas4d (the default), adaptive or dynamic3dgs. May be repeated.")
@@ -56,13 +60,16 @@ def quality(
         points=points,
         lpips=lpips,
         again=again,
+        options=options,
     )
     if any("error" in row for row in rows):
         raise typer.Exit(1)
 
 
+@takes_capture
 def refit(
     captures: Captures,
+    options: CaptureOptions,
     out: Study = QUALITY,
     frame: Annotated[int, typer.Option(help="Frame that is fitted; negative ones count from the end.")] = -1,
     preset: Annotated[str, typer.Option(help="Named settings.")] = "scas4d",
@@ -89,11 +96,14 @@ def refit(
         points=points,
         changes=changes or (),
         again=again,
+        options=options,
     )
 
 
+@takes_capture
 def effects(
     captures: Captures,
+    options: CaptureOptions,
     out: Annotated[Path, typer.Option(help="Folder of the study. Run again to go on.")] = Path("out/effects"),
     name: Annotated[
         list[str] | None, typer.Option(help="Only this effect, by name; all when left out. May be repeated.")
@@ -128,6 +138,7 @@ def effects(
         frames=frames,
         changes=changes or (),
         again=again,
+        options=options,
     )
 
 
@@ -146,6 +157,24 @@ def switches(
     from studies.quality.switches import run
 
     run(captures, out, updates=updates, seeds=seed or (0,), changes=changes or (), again=again)
+
+
+def drift(
+    captures: Captures,
+    out: Study = QUALITY,
+    updates: Annotated[int, typer.Option(min=1, help="Of each capture.")] = 14,
+    pixels: Annotated[float, typer.Option(min=0, help="Of the files, that a camera drifts by in a frame.")] = 0.3,
+    most: Annotated[float, typer.Option(min=0, help="Of the files, that it drifts by in all.")] = 4.0,
+    again: Again = False,
+    changes: Changes = None,
+) -> None:
+    """Updates captures of which two cameras drift, or none, with the effect pose_drift and without.
+
+    Leaves drift.md in the study's folder; a run that was measured is not measured again.
+    """
+    from studies.quality.pose_drift import run
+
+    run(captures, out, updates=updates, pixels=pixels, most=most, changes=changes or (), again=again)
 
 
 def targets(

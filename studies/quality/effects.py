@@ -15,16 +15,18 @@ from typing import Any
 
 import numpy as np
 
-from client.cli.evaluate import Report, check_test_cameras, recorded
+from client.cli.evaluate import DEFAULT_OPTIONS, Report, recorded
 from client.cli.scores import Column, Row, digest, markdown, read_row, write_row
+from client.importers.open_source import CaptureOptions
 from scas4d_core import metrics
-from scas4d_core.captures import Capture, open_capture
+from scas4d_core.captures import Capture
 from scas4d_core.effects.effect import effect
 from scas4d_core.effects.registry import EFFECTS
 from scas4d_core.effects.switches import contradictions
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from scas4d_core.warm_up import warm_up_elsewhere
+from studies.captures import open_measured
 from studies.machine import core_version, machine
 from studies.quality.first_frame import first_of
 from studies.quality.settings import settings_of
@@ -59,15 +61,17 @@ def run(
     frames: int | None = None,
     changes: Sequence[str] = (),
     again: bool = False,
+    options: CaptureOptions = DEFAULT_OPTIONS,
     report: Report = print,
 ) -> list[Row]:
     """Measures every variant of each capture; prints the table and leaves it in ``out/effects.md``.
 
     Args:
-        captures: folders with test cameras. out: a file a finished run goes here; run again to go on.
+        captures: folders. out: a file a finished run goes here; run again to go on.
         names: of the effects; none: all, unless there are ``pins``. pins: further variants, effects pinned together.
         preset, changes: the settings that both share. seeds: of frame 0 and the updates, each tried.
-        frames: only so many; None: all. again: measure anew what ``out`` holds. report: takes the printed lines.
+        frames: only so many; None: all. again: measure anew what ``out`` holds.
+        options: how the captures are read. report: takes the printed lines.
 
     Raises:
         ValueError: an unknown effect or setting, a pin that the settings contradict, or fewer than two frames.
@@ -81,7 +85,7 @@ def run(
             settings = settings_of(preset, None, seed, changes)
             singles = variants(names or (() if pins else tuple(EFFECTS)), settings)
             for variant in [*singles, *pins]:
-                row = _row(folder, out, settings, variant, frames, again)
+                row = _row(folder, out, settings, variant, frames, again, options)
                 report(f"{row['capture']}, seed {seed}, {row['pinned']}: {row['gain']:+.2f} dB")
                 rows.append(row)
     table = markdown(rows, COLUMNS)
@@ -143,28 +147,35 @@ def without(pins: Pins) -> Iterator[None]:
         EFFECTS.update(before)
 
 
-def _row(folder: Path, out: Path, settings: Settings, pins: Pins, frames: int | None, again: bool) -> Row:
+def _row(
+    folder: Path,
+    out: Path,
+    settings: Settings,
+    pins: Pins,
+    frames: int | None,
+    again: bool,
+    options: CaptureOptions,
+) -> Row:
     """The row of a variant, measured where it is not on disk yet."""
-    capture = open_capture(folder)
-    check_test_cameras(capture, folder)
+    capture = open_measured(folder, options)
     count = min(frames or capture.frame_count, capture.frame_count)
     if count < 2:
         raise ValueError(f"effects are compared in updates: {capture.name} has one frame")
     words = ", ".join(f"{name} {mode}" for name, mode in pins.items())
     seed = settings.update.seed
     file = "-".join([capture.name, f"s{seed}", *(f"{name}-{mode}" for name, mode in pins.items())])
-    path = out / "effects" / f"{file}-{digest(recorded(settings, ()), count)}.json"
+    path = out / "effects" / f"{file}-{digest(recorded(settings, ()), count, *options.changed.items())}.json"
     found = None if again else read_row(path)
     if found is not None:
         return found
     known: Row = {"key": path.stem, "capture": capture.name, "seed": seed, "pinned": words, "frames": count}
     of = {"settings": recorded(settings, ()), "core": core_version(), "machine": machine()}
-    row = known | _compared(capture, folder, out, settings, pins, count) | of
+    row = known | _compared(capture, out, settings, pins, count) | of
     write_row(path, row)
     return row
 
 
-def _compared(capture: Capture, folder: Path, out: Path, settings: Settings, pins: Pins, count: int) -> Row:
+def _compared(capture: Capture, out: Path, settings: Settings, pins: Pins, count: int) -> Row:
     """Figures of a variant against auto."""
     given = (settings, pinned(settings, pins))
     scenes, psnr = [], np.zeros((2, count - 1))
@@ -174,7 +185,7 @@ def _compared(capture: Capture, folder: Path, out: Path, settings: Settings, pin
         first: dict[str, Any] = {"points": capture.points, "static": first_of(capture, out, one)}
         with without(removed):
             scenes.append(Reconstruction.start(capture.rig, capture.frame(0), one, **first))
-    truth, same = open_capture(folder, image_scale=settings.scene.image_scale), True
+    truth, same = capture.scaled(settings.scene.image_scale), True
     rig = truth.test_rig
     assert rig is not None
     for index in range(1, count):

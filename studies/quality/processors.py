@@ -22,8 +22,8 @@ import numpy as np
 
 from client.cli.evaluate import Report
 from client.cli.scores import Row, Store, digest
-from scas4d_core.captures import open_capture
 from scas4d_core.metrics import psnr
+from studies.captures import open_measured
 from studies.machine import core_version, machine
 from studies.quality.settings import settings_of
 
@@ -110,9 +110,8 @@ def measure(capture: Path, frames: int, seed: int, changes: Sequence[str]) -> Ro
     from scas4d_core.warm_up import warm_up_elsewhere
 
     warm_up_elsewhere()
-    opened = open_capture(capture)
-    if opened.test_rig is None:
-        raise ValueError(f"{capture} has no test cameras, so there is nothing to measure on")
+    opened = open_measured(capture)
+    assert opened.test_rig is not None
     settings = settings_of("scas4d", changes=changes)
     settings = settings.model_copy(update={"update": settings.update.model_copy(update={"seed": seed})})
     scene = Reconstruction.start(opened.rig, opened.frame(0), settings, points=opened.points)

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from client.cli import evaluate
-from client.cli.evaluate import Job, Report, check_test_cameras, page
+from client.cli.evaluate import DEFAULT_OPTIONS, Job, Report, page
 from client.cli.scores import QUALITY, Row, Store
-from scas4d_core.captures import open_capture
+from client.importers.open_source import CaptureOptions
 from scas4d_core.warm_up import warm_up_elsewhere
 from studies.constants import all_varied
 from studies.machine import core_version, machine
@@ -42,12 +42,13 @@ def run(
     pictures: Sequence[int] = (0, 1, -1),
     lpips: bool = False,
     again: bool = False,
+    options: CaptureOptions = DEFAULT_OPTIONS,
     report: Report = print,
 ) -> list[Row]:
     """Measures every capture under every preset; prints the table and leaves it in ``out/table.md``.
 
     Args:
-        captures: folders with test cameras.
+        captures: folders; those without test cameras are measured on their training cameras, and the rows say so.
         out: rows, per-frame lines and pictures go here; run again with the same folder to go on.
         presets: names.
         iterations: of an update, each tried; none: the preset's own.
@@ -60,6 +61,7 @@ def run(
         pictures: frames to save as truth | render | difference; negative ones count from the end.
         lpips: also LPIPS where its weights are installed.
         again: measure rows anew that are on disk already.
+        options: how the captures are read.
         report: takes the lines that are printed.
 
     Returns:
@@ -78,6 +80,7 @@ def run(
             points=points,
             pictures=tuple(pictures),
             lpips=lpips,
+            options=options,
         )
         for name in presets
         for count in (iterations or (None,))
@@ -115,10 +118,9 @@ def measure(job: Job, folder: Path, report: Report = print) -> Row:
     """Measures one capture, from a frame 0 that other rows of the study may have fitted already.
 
     Raises:
-        CaptureError: it cannot be read, or has no test cameras.
+        CaptureError: it cannot be read.
     """
-    given = open_capture(job.capture, use_masks=job.masks, use_points=job.points)
-    check_test_cameras(given, job.capture)
+    given = job.open_given()
     # These bring the kernels; the table and the command do not.
     from scas4d_core.kernels.jit import threads
     from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame

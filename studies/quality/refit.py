@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from client.cli.evaluate import Report, check_test_cameras, recorded
+from client.cli.evaluate import DEFAULT_OPTIONS, Report, recorded
 from client.cli.scores import Column, Row, Store, digest, markdown, read_row, write_row
-from scas4d_core.captures import open_capture
+from client.importers.open_source import CaptureOptions
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from scas4d_core.warm_up import warm_up_elsewhere
+from studies.captures import open_measured
 from studies.machine import core_version, machine
 from studies.quality.settings import settings_of
 
@@ -43,17 +44,18 @@ def run(
     points: bool = False,
     changes: Sequence[str] = (),
     again: bool = False,
+    options: CaptureOptions = DEFAULT_OPTIONS,
     report: Report = print,
 ) -> list[Row]:
     """Fits a frame of each capture from scratch; prints the table and leaves it in ``out/refit.md``.
 
     Args:
-        captures: folders with test cameras. out: folder of the study of quality. Run again to go on.
+        captures: folders. out: folder of the study of quality. Run again to go on.
         frame: that is fitted; negative ones count from the end.
         preset, changes: the settings; ``changes`` as ``"effects.direction=off"``.
         seeds: of frame 0, each tried.
         points: start from the capture's cloud, which is that of its first frame; else from the pictures alone.
-        again: fit anew what ``out`` holds. report: takes the printed lines.
+        again: fit anew what ``out`` holds. options: how the captures are read. report: takes the printed lines.
 
     Raises:
         ValueError: a frame that a capture does not have, or an unknown setting.
@@ -63,7 +65,7 @@ def run(
     for folder in captures:
         for seed in seeds:
             settings = settings_of(preset, None, seed, changes)
-            row = _refitted(folder, store.folder / "refit", frame, settings, seed, points, again)
+            row = _refitted(folder, store.folder / "refit", frame, settings, seed, points, again, options)
             rows.append(row | _beside(row, settings, preset, store))
             report(f"{row['capture']}, frame {row['frame']}, seed {seed}: {row['psnr']:.2f} dB")
     table = markdown(rows, COLUMNS)
@@ -72,21 +74,29 @@ def run(
     return rows
 
 
-def _refitted(folder: Path, rows: Path, frame: int, settings: Settings, seed: int, points: bool, again: bool) -> Row:
+def _refitted(
+    folder: Path,
+    rows: Path,
+    frame: int,
+    settings: Settings,
+    seed: int,
+    points: bool,
+    again: bool,
+    options: CaptureOptions,
+) -> Row:
     """The row of one frame, fitted where it is not on disk yet."""
-    capture = open_capture(folder, use_points=points)
-    check_test_cameras(capture, folder)
+    capture = open_measured(folder, options, use_points=points)
     index = range(capture.frame_count)[frame] if -capture.frame_count <= frame < capture.frame_count else None
     if index is None:
         raise ValueError(f"{capture.name} has no frame {frame}; give one of 0 to {capture.frame_count - 1}")
-    key = f"{capture.name}-{index}-s{seed}-{digest(recorded(settings, ()), points)}"
+    key = f"{capture.name}-{index}-s{seed}-{digest(recorded(settings, ()), points, *options.changed.items())}"
     found = None if again else read_row(rows / f"{key}.json")
     if found is not None:
         return found
     from scas4d_core.metrics.evaluation import measure_pictures
 
     scene = Reconstruction.start(capture.rig, capture.frame(index), settings, points=capture.points)
-    scores, _ = measure_pictures(scene, open_capture(folder, image_scale=settings.scene.image_scale), index)
+    scores, _ = measure_pictures(scene, capture.scaled(settings.scene.image_scale), index)
     assert scene.report is not None
     row: Row = {
         "key": key,

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from client.cli.evaluate import Report, recorded
 from client.cli.scores import Column, Row, digest, markdown, read_row, write_row
-from scas4d_core.captures import Capture, open_capture
+from client.importers.open_source import open_source
+from scas4d_core.captures import Capture
 from scas4d_core.captures.frame import Frame
 from scas4d_core.effects.effect import effect
 from scas4d_core.effects.registry import EFFECTS
@@ -56,7 +57,7 @@ def run(
             path = out / "switches" / f"{folder.resolve().name}-s{seed}-{digest(recorded(settings, ()), updates)}.json"
             row = None if again else read_row(path)
             if row is None:
-                row = {"key": path.stem, "seed": seed, **_played(open_capture(folder), out, settings, updates)}
+                row = {"key": path.stem, "seed": seed, **_played(open_source(folder), out, settings, updates)}
                 row |= {"settings": recorded(settings, ()), "core": core_version(), "machine": machine()}
                 write_row(path, row)
             report(f"{row['capture']}, seed {seed}: {row['switches']}")
@@ -95,7 +96,7 @@ def _played(capture: Capture, out: Path, settings: Settings, updates: int) -> Ro
 def played(capture: Capture, index: int) -> Frame:
     """Frame ``index`` of a capture that is played forwards and backwards without an end.
 
-    >>> capture = open_capture("samples/robot")
+    >>> capture = open_source("samples/robot")
     >>> last = capture.frame_count - 1
     >>> back = played(capture, last + 1)
     >>> back.index == last + 1, sorted(back.images) == sorted(capture.frame(last - 1).images)

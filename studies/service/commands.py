@@ -44,7 +44,7 @@ def faults(
     """
     from client.cli.changes import parse_changes
     from client.cli.extras import need_server
-    from scas4d_core.captures import open_capture
+    from client.importers.open_source import open_source
     from studies.service import faults as of_faults
     from studies.service.outcome import table
     from studies.service.study import Study, encoded_frames
@@ -52,7 +52,7 @@ def faults(
     need_server()
     if unknown := set(part or []) - set(of_faults.PARTS):
         raise typer.BadParameter(f"there is no part {sorted(unknown)[0]!r}; the parts are {', '.join(of_faults.PARTS)}")
-    opened = open_capture(capture)
+    opened = open_source(capture)
     study = Study(
         work.resolve(),
         opened,
@@ -113,12 +113,12 @@ def views(
     """
     from client.cli.changes import parse_changes
     from client.cli.extras import need_server
-    from scas4d_core.captures import open_capture
+    from client.importers.open_source import open_source
     from studies.service import views as of_views
 
     need_server()
     rows = of_views.measure(
-        open_capture(capture),
+        open_source(capture),
         work.resolve(),
         rates=rate or (1, 5, 20),
         updates=updates,

@@ -16,7 +16,8 @@ from pathlib import Path
 
 from client.sdk import Client
 from client.wire import FrameState
-from scas4d_core.captures import Capture, open_capture
+from scas4d_core.captures import Capture
+from studies.captures import open_measured
 from studies.service.process import Service
 
 PACKAGES = ("scas4d_core", "server", "client")
@@ -142,7 +143,7 @@ def _files(folder: Path, phase: str, root: Path) -> Iterator[str]:
 def run(sample: Path, told: Callable[[str], None] = print) -> bool:
     """Prints both lists; answers whether both are short enough."""
     with tempfile.TemporaryDirectory(prefix="scas4d-crossing-") as folder:
-        files = crossed(Path(folder), open_capture(sample))
+        files = crossed(Path(folder), open_measured(sample))
     for phase, most in (("frame", MOST_OF_A_FRAME), ("render", MOST_OF_A_RENDER)):
         told(f"a {phase} crosses {len(files[phase])} files (at most {most}):")
         for name in files[phase]:

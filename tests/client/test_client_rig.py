@@ -8,7 +8,6 @@ import time
 import pytest
 from running import Running, fake_settings
 
-from client.importers.source import CaptureSource
 from client.rig import Lateness, Pace, Sequence, push
 from client.sdk import Client
 from client.wire import IngestSettings
@@ -48,21 +47,21 @@ def test_a_pace_that_cannot_be_is_named(field, value):
 
 
 def test_a_loop_goes_back_and_forth_and_time_only_forward(capture):
-    sequence = Sequence(CaptureSource(capture), start=1, loop=True)
+    sequence = Sequence(capture, start=1, loop=True)
     assert [sequence.place(index) for index in range(9)] == [1, 2, 3, 2, 1, 2, 3, 2, 1]
     times = [sequence.time(index) for index in range(9)]
     assert times == pytest.approx([index / 30 for index in range(9)])
     assert sequence.files(3).images == {name: capture.encoded(2, name) for name in ("0", "1")}
     assert sequence.files(3).masks.keys() == {"0", "1"}
     sequence.close()
-    once = Sequence(CaptureSource(capture), start=1)
+    once = Sequence(capture, start=1)
     assert len(once) == 3
     once.close()
-    alone = Sequence(CaptureSource(capture), start=3, loop=True)
+    alone = Sequence(capture, start=3, loop=True)
     assert [alone.place(index) for index in range(3)] == [3, 3, 3]
     alone.close()
     with pytest.raises(ValueError, match=r"start 4 is not one of the frames 0…3"):
-        Sequence(CaptureSource(capture), start=4)
+        Sequence(capture, start=4)
 
 
 def test_the_summary_says_how_far_behind():

@@ -60,10 +60,15 @@ def fake_settings(folder, **changes):
 
 
 def make_rig(count=2):
-    pose = np.eye(4)
-    pose[2, 3] = 3
     k = np.array([[20.0, 0, WIDTH / 2], [0, 20, HEIGHT / 2], [0, 0, 1]])
-    return Rig(tuple(Camera(f"c{i}", k, pose, WIDTH, HEIGHT) for i in range(count)))
+    return Rig(tuple(Camera(f"c{i}", k, beside(i), WIDTH, HEIGHT) for i in range(count)))
+
+
+def beside(number):
+    """World to camera: 3 before the origin, micrometres beside one another: two places, with the same pictures."""
+    pose = np.eye(4)
+    pose[:3, 3] = [-4e-6 * number, 0, 3]
+    return pose
 
 
 def picture(red=0, size=(WIDTH, HEIGHT), format="PNG", mode="RGB", **options):

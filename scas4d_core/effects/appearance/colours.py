@@ -54,9 +54,11 @@ class Colours(Part):
         moving, standing = self.freed(work.rates)
         self._whole = self._whole or self.standing
         if self._whole:
+            self._before = work.previous.colours
             self._table, by_row = work.colours, np.full(self._count, standing, np.float32)
             by_row[self._rows] = moving
         else:
+            self._before = work.previous.colours[self._rows]
             self._table = work.colours[self._rows]
             by_row = np.full(len(self._rows), moving, np.float32)
         self._optimizer = schedule.Adam(self._table, [1.0] * 3, work.rates, by_row=by_row)
@@ -64,8 +66,7 @@ class Colours(Part):
 
     def loss(self, work: Work) -> float:
         """The mean absolute change."""
-        before = work.previous.colours if self._whole else work.previous.colours[self._rows]
-        self._change: Array = self._table - before
+        self._change: Array = self._table - self._before
         return float(self._soft * np.abs(self._change).sum(dtype=np.float64)) if work.tells else 0.0
 
     def step(self, work: Work, iteration: int, planned: int) -> None:

@@ -52,7 +52,7 @@ class Catching(Part):
         if arrays is None or not len(arrays["young"]) or not self._hierarchy.sizes:
             return
         rest = work.previous.retire(arrays["young"])
-        rig = self._factory.rig
+        rig = self._factory.posed
         hull = carve_new(novelties(rest, rest.colours, work.views, rig, self._renderer()))
         thing = np.full(len(work.previous), -1)
         thing[arrays["young"]] = arrays["thing"]

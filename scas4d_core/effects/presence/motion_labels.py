@@ -25,5 +25,5 @@ EFFECT = MotionLabels(
     group=Group.PRESENCE,
     says="Without masks only Gaussians that most cameras have seen in changed pixels move; all else stands.",
     gauge="What has moved once may always move: a label is given and never taken back.",
-    cost="a comparison of each view with the one before, two pictures of weights a view; it saves what stands",
+    cost="a comparison of each view with the one before, a picture and its weights a view; it saves what stands",
 )

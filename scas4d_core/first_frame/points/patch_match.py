@@ -39,7 +39,7 @@ def _random(key: int, draw: int) -> float:
 @kernel
 def _cost(
     patch: Any, weight: Any, mean: float, deviation: float, x: float, y: float, depth: float,
-    nx: float, ny: float, nz: float, inverse: Any, others: Any, matrices: Any, shifts: Any, best: int,
+    nx: float, ny: float, nz: float, inverse: Any, others: Any, sizes: Any, matrices: Any, shifts: Any, best: int,
 ) -> float:  # fmt: skip
     """1 − NCC, mean over the ``best`` best neighbours; NO_MATCH where fewer than that see the patch."""
     rx, ry = inverse[0] * x + inverse[1], inverse[2] * y + inverse[3]
@@ -49,7 +49,7 @@ def _cost(
         return NO_MATCH
     for v in range(others.shape[0]):
         m, t = matrices[v], shifts[v]
-        height, width = others.shape[1], others.shape[2]
+        height, width = sizes[v]
         # Pixel (a, b) of the reference lies at the inverse depth (n · ray) / reach, linear in a and b:
         # its image is M ray + T · (inverse depth), linear too (the homography of the plane).
         sum_w, sum_i, sum_ii, sum_ri = 0.0, 0.0, 0.0, 0.0
@@ -128,8 +128,8 @@ def _patch(image: Any, x: int, y: int, patch: Any, weight: Any) -> tuple[float, 
 
 @parallel_kernel
 def _sweep(
-    image: Any, active: Any, prior: Any, depth: Any, normal: Any, cost: Any, inverse: Any, others: Any, matrices: Any,
-    shifts: Any, near: float, far: float, round_: int, colour: int, best: int, seed: int,
+    image: Any, active: Any, prior: Any, depth: Any, normal: Any, cost: Any, inverse: Any, others: Any, sizes: Any,
+    matrices: Any, shifts: Any, near: float, far: float, round_: int, colour: int, best: int, seed: int,
 ) -> None:  # fmt: skip
     """One round over the pixels of one colour of the chequerboard; round 0 only gives each pixel its first plane."""
     height, width = image.shape
@@ -186,8 +186,9 @@ def _sweep(
                 if not (td >= near and td <= far) or facing > -0.15:
                     continue
                 tc = _cost(
-                    patch, weight, mean, deviation, px, py, td, tx, ty, tz, inverse, others, matrices, shifts, best
-                )
+                    patch, weight, mean, deviation, px, py, td, tx, ty, tz,
+                    inverse, others, sizes, matrices, shifts, best,
+                )  # fmt: skip
                 if tc < c:
                     d, c, nx, ny, nz = td, tc, tx, ty, tz
             depth[y, x], cost[y, x] = d, c
@@ -195,7 +196,7 @@ def _sweep(
 
 
 def patch_match(
-    image: Any, active: Any, prior: Any, inverse: Any, others: Any, matrices: Any, shifts: Any,
+    image: Any, active: Any, prior: Any, inverse: Any, others: Any, sizes: Any, matrices: Any, shifts: Any,
     *, near: float, far: float, iterations: int, best: int, seed: int,
 ) -> tuple[Any, Any, Any]:  # fmt: skip
     """Depth of each pixel of one picture.
@@ -205,7 +206,8 @@ def patch_match(
         active: [H, W] bool, pixels that are wanted.
         prior: [H, W] float64 depth to try first, 0 where unknown.
         inverse: [4] float64, (1/fx, −cx/fx, 1/fy, −cy/fy).
-        others: [V, H', W'] float32 neighbours' pictures.
+        others: [V, H', W'] float32 neighbours' pictures, each in the upper left corner of its plane.
+        sizes: [V, 2] int64, height and width of each neighbour's picture.
         matrices: [V, 3, 3] float64, K' R of each neighbour, R from the reference's axes.
         shifts: [V, 3] float64, K' t of each neighbour.
         near: depth at which to begin, world units.
@@ -224,7 +226,7 @@ def patch_match(
     for round_ in range(iterations + 1):
         for colour in range(2 if round_ else 1):
             _sweep(
-                image, active, prior, depth, normal, cost, inverse, others, matrices, shifts,
+                image, active, prior, depth, normal, cost, inverse, others, sizes, matrices, shifts,
                 near, far, round_, colour, best, seed,
             )  # fmt: skip
     depth[cost >= NO_MATCH] = 0.0

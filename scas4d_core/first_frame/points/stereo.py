@@ -105,10 +105,9 @@ def depth_maps(
         np.ascontiguousarray(v.image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32) / np.float32(255))
         for v in views
     ]
-    tall, wide = max(g.shape[0] for g in greys), max(g.shape[1] for g in greys)
     depths = []
     for i, view in enumerate(views):
-        chosen = [j for j in neighbours_of(views, i, middle, NEIGHBOURS) if greys[j].shape == (tall, wide)]
+        chosen = neighbours_of(views, i, middle, NEIGHBOURS)
         camera = view.camera
         if len(chosen) < fewest:
             depths.append(np.zeros(greys[i].shape))
@@ -124,7 +123,7 @@ def depth_maps(
             active[i],
             priors[i],
             np.array([1 / camera.fx, -camera.cx / camera.fx, 1 / camera.fy, -camera.cy / camera.fy]),
-            np.stack([greys[j] for j in chosen]),
+            *_stacked([greys[j] for j in chosen]),
             np.stack(matrices),
             np.stack(shifts),
             near=ranges[i][0],
@@ -139,6 +138,15 @@ def depth_maps(
         if progress is not None:
             progress(i + 1, len(views))
     return [DepthMap(view, depths[i], _agreement(views, depths, i)) for i, view in enumerate(views)]
+
+
+def _stacked(pictures: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Pictures as planes [V, H, W] of the largest size, each in the upper left corner, and their sizes [V, 2]."""
+    sizes = np.array([picture.shape for picture in pictures], np.int64)
+    planes = np.zeros((len(pictures), *sizes.max(axis=0)), np.float32)
+    for plane, picture in zip(planes, pictures, strict=True):
+        plane[: picture.shape[0], : picture.shape[1]] = picture
+    return planes, sizes
 
 
 def _confine(view: PosedPicture, depth: Float, hull: VisualHull) -> None:

@@ -112,6 +112,27 @@ def test_import_makes_a_capture_that_can_be_pushed(service, tmp_path):
     assert "put each camera's video into videos/<camera>.mp4" in broken.stderr
 
 
+def test_unlike_cameras_are_pushed_straight_from_their_folder(service, tmp_path):
+    pytest.importorskip("cv2")
+    from made_rigs.mixed import COUNT, write_rig
+
+    folder = write_rig(tmp_path / "mixed")
+    done = scas4d("push", str(folder), "--url", service.url, "--test", "c8", COLUMNS="200")
+    assert "2 of 2 frames committed" in done.stdout, done.stderr
+    assert "camera 'c2': its pictures have 16 bits; they are rounded to 8" in done.stdout
+    with Client(service.url) as client:
+        (status,) = client.scenes()
+        assert status.cameras == [f"c{number}" for number in range(COUNT - 1)]
+        client.delete_scene(status.id)
+
+
+def test_the_options_of_a_capture_are_those_of_every_command():
+    names = ("--calibration", "--pictures", "--capture-fps", "--masks", "--test", "--fit")
+    for command in ("push", "import", "reconstruct", "evaluate", "demo"):
+        said = scas4d(command, "--help", COLUMNS="200").stdout
+        assert [name for name in names if name not in said] == [], command
+
+
 def test_scenes_are_listed_whole_in_a_narrow_terminal(service):
     with Client(service.url) as client:
         rig = make_rig(2)

@@ -9,8 +9,9 @@ import pytest
 from PIL import Image
 
 from client.cli.evaluate import evaluate
+from client.cli.pictures import psnr
 from client.cli.reconstruct import reconstruct
-from scas4d_core.captures import CaptureError
+from client.importers.open_source import CaptureOptions, open_source
 from scas4d_core.query.ply import read_ply
 from scas4d_core.storage.history import History
 
@@ -19,7 +20,7 @@ CHANGES = {"static": {"iterations": 2}, "update": {"iterations": 2}}
 
 def test_it_leaves_pictures_states_and_a_ply_each_time_it_is_run(capture_folder, tmp_path):
     for frames in (3, 2):
-        reconstruct(capture_folder, tmp_path, frames=frames, preset="scas4d", changes=CHANGES)
+        reconstruct(open_source(capture_folder), tmp_path, frames=frames, preset="scas4d", changes=CHANGES)
         history = History.load(tmp_path / "states")
         assert history.indices == list(range(frames))  # of this run alone
         assert len(read_ply(tmp_path / "last.ply")) == len(history.gaussians(0))
@@ -48,11 +49,44 @@ def test_scores_are_printed_and_not_measured_twice(capture_folder, tmp_path):
     assert said[-1] == table
 
 
-def test_a_capture_without_test_cameras_is_refused(capture_folder, tmp_path):
+def test_a_capture_without_test_cameras_is_measured_on_those_it_has_and_says_so(capture_folder, tmp_path):
     folder = tmp_path / "capture"
     folder.mkdir()
     for path in capture_folder.iterdir():
         if path.name != "test_meta.json":
             (folder / path.name).symlink_to(path)
-    with pytest.raises(CaptureError, match="no test cameras"):
-        evaluate(folder, tmp_path / "out", changes={})
+    said: list[str] = []
+    row = evaluate(folder, tmp_path / "out", frames=2, changes=CHANGES, report=said.append)
+    assert row["measured_on"] == "training cameras"
+    assert "    no test cameras: the scores are those of the training cameras (--test holds some out)" in said
+    assert "static.iterations=2, training cameras |" in said[-1]
+    held = CaptureOptions(test=("1",))
+    other = evaluate(folder, tmp_path / "out", options=held, frames=2, changes=CHANGES, report=said.append)
+    assert (other["measured_on"], other["key"] == row["key"]) == ("test cameras", False)
+    assert "static.iterations=2, held out 1 |" in said[-1]
+    assert [path.name for path in sorted((tmp_path / "out/pictures" / other["key"]).glob("frame*"))] == [
+        "frame0000_camera1.png",
+        "frame0001_camera1.png",
+    ]
+
+
+def test_unlike_cameras_are_reconstructed_straight_from_their_folder(tmp_path):
+    """Three sizes, a fisheye, grey, 16 bits and a palette; two cameras of other sizes are held out."""
+    pytest.importorskip("cv2")
+    from made_rigs.mixed import write_rig
+
+    folder = write_rig(tmp_path / "mixed")
+    given = open_source(folder, test=("c0", "c5"))
+    changes = {"static": {"iterations": 150}, "update": {"iterations": 10}}
+    reconstruct(given, tmp_path / "out", frames=2, preset="scas4d", changes=changes)
+    for name, (width, height) in {"c0": (96, 72), "c5": (104, 64)}.items():
+        for t in range(2):
+            with Image.open(tmp_path / f"out/camera_{name}/{t:06d}.png") as picture:
+                assert picture.size == (3 * width, height)
+                truth, render, _ = np.split(np.asarray(picture.convert("RGB")), 3, axis=1)
+            assert psnr(truth, render) > 18
+    row = evaluate(
+        folder, tmp_path / "scores", options=CaptureOptions(test=("c0", "c5")), frames=2, changes=changes, report=print
+    )
+    assert row["measured_on"] == "test cameras"
+    assert row["psnr_first"] > 18

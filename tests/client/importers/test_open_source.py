@@ -158,7 +158,7 @@ def cut(folder):
 
 
 def resize(folder):
-    Image.new("RGB", (WIDTH // 2, HEIGHT // 2)).save(folder / "images/cam10/000000.png")
+    Image.new("RGB", (WIDTH - 8, HEIGHT)).save(folder / "images/cam10/000000.png")
 
 
 def empty(folder):
@@ -170,7 +170,7 @@ def empty(folder):
     ("damage", "said"),
     [
         (cut, r"images/cam2: has no pictures of 1 of 2 frames \(000001\), which 'cam1' has"),
-        (resize, r"cam10/000000.png: is 160x120 pixels, but camera 'cam10' was calibrated for 320x240"),
+        (resize, r"cam10/000000.png: is 312x240 pixels, but camera 'cam10' was calibrated for 320x240.*--fit"),
         (empty, r"images/cam1: has no pictures; give files ending in .jpg"),
         (
             lambda f: (f / "images/cam10").rename(f / "images/ten"),
@@ -200,7 +200,7 @@ def test_choices_that_cannot_be_are_named(straight):
         open_source(straight / "nowhere")
     with pytest.raises(CaptureError, match=r"videos: no such folder; put each camera's video into videos/<camera>.mp4"):
         open_source(straight, pictures="videos")
-    with pytest.raises(CaptureError, match=r"neither a transforms.json nor the folder of a COLMAP model"):
+    with pytest.raises(CaptureError, match=r"neither a transforms.json, nor the folder of a COLMAP model, nor cali"):
         open_source(straight, calibration=straight / "images")
     with pytest.raises(CaptureError, match="fps -1"):
         open_source(straight, fps=-1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from lenses import HEIGHT, WIDTH, dot_at, painted, seen
@@ -34,15 +36,16 @@ def distorted(tmp_path):
 
 
 def test_what_was_imported_is_a_capture(distorted, tmp_path):
-    source = open_source(distorted, encoding="png")
+    source = open_source(distorted, encoding="png", test=("cam2",))
+    rig = open_source(distorted).rig
     told = []
-    write_dynamic3dgs(source, tmp_path / "out", test=["cam2"], on_progress=lambda *now: told.append(now))
+    write_dynamic3dgs(source, tmp_path / "out", on_progress=lambda *now: told.append(now))
     capture = open_capture(tmp_path / "out")
     assert told == [("frames", 1, 2), ("frames", 2, 2)]
     assert (capture.full_rig.names, capture.full_test_rig.names) == (("cam1", "cam10"), ("cam2",))
     assert (capture.frame_count, capture.fps, capture.points) == (2, 12, None)
     for camera in capture.full_rig.cameras:
-        assert np.array_equal(camera.intrinsics, source.rig[camera.name].intrinsics)
+        assert np.array_equal(camera.intrinsics, rig[camera.name].intrinsics)
         for t in range(2):
             frame = capture.frame(t)
             for uv in camera.project(POINTS + np.array([0.05 * t, 0, 0]))[0]:
@@ -70,24 +73,29 @@ def test_a_cloud_of_unknown_foreground_comes_along(tmp_path):
 
 
 def test_what_cannot_be_written_is_named(distorted, tmp_path):
-    source = open_source(distorted)
     with pytest.raises(CaptureError, match=r"test camera 'cam3' is not one of cam1, cam2, cam10"):
-        write_dynamic3dgs(source, tmp_path / "out", test=["cam3"])
+        open_source(distorted, test=("cam3",))
     with pytest.raises(CaptureError, match="every camera is a test camera"):
-        write_dynamic3dgs(source, tmp_path / "out", test=source.rig.names)
+        open_source(distorted, test=("cam1", "cam2", "cam10"))
     with pytest.raises(CaptureError, match="is not empty; name a new folder"):
-        write_dynamic3dgs(source, distorted)
-    assert not (tmp_path / "out").exists()
+        write_dynamic3dgs(open_source(distorted), distorted)
 
 
-def test_cameras_of_different_sizes_are_named(tmp_path):
+def test_cameras_of_different_sizes_are_written_and_read(tmp_path):
     meta = transforms(lenses("PINHOLE"), "PINHOLE", path="{}.png", per_frame=True)
     meta["frames"][0] |= {"w": 100, "h": 80}
     write(tmp_path / "transforms.json", meta)
     for frame in meta["frames"]:
         Image.new("RGB", (frame["w"], frame["h"])).save(tmp_path / frame["file_path"])
-    with pytest.raises(CaptureError, match=rf"cam1 {WIDTH}x{HEIGHT}, cam2 100x80"):
-        write_dynamic3dgs(open_source(tmp_path), tmp_path / "out")
+    write_dynamic3dgs(open_source(tmp_path), tmp_path / "out")
+    capture = open_capture(tmp_path / "out")
+    sizes = [(camera.name, camera.width, camera.height) for camera in capture.rig.cameras]
+    assert sizes == [("cam1", WIDTH, HEIGHT), ("cam2", 100, 80), ("cam10", WIDTH, HEIGHT)]
+    assert capture.frame(0).images["cam2"].shape == (80, 100, 3)
+    meta = json.loads((tmp_path / "out/train_meta.json").read_text())
+    (tmp_path / "out/train_meta.json").write_text(json.dumps(meta | {"w": [100, 100]}))
+    with pytest.raises(CaptureError, match=r"w lists 2 sizes and cam_id 3 cameras; give one a camera"):
+        open_capture(tmp_path / "out")
 
 
 def test_a_folder_that_was_not_finished_is_no_capture(distorted, tmp_path):

@@ -183,7 +183,7 @@ ELSEWHERE[1][0][3] = 0.01
     [
         ({"w": 8.5}, r"w is 8\.5; give a whole number"),
         ({"h": 0}, "h is 0"),
-        ({"w": 16}, r"0[/\\]000000\.png: is 8x6 pixels, but train_meta\.json says 16x6 \(camera 0\)"),
+        ({"w": 16}, r"0[/\\]000000\.png: is 8x6 pixels, but camera '0' was calibrated for 16x6"),
         ({"k": [[[1, 2], [3, 4]]]}, r"k must have shape \[3, 3, 3, 3\]"),
         ({"k": [[1, 2], [3]]}, "k must be numbers"),
         ({"k": [[[["a"] * 3] * 3] * 3] * 3}, "k must be numbers"),

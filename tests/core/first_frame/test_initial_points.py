@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -40,6 +42,23 @@ def test_points_lie_on_the_box_and_cover_it(scene, cloud):
     assert np.percentile(distance, [50, 95]) == pytest.approx([0, 0], abs=1.2 * PIXEL)
     assert np.median(distance) < 0.35 * PIXEL
     gap = cKDTree(cloud.positions).query(scene.points_on_box(2000))[0]
+    assert np.percentile(gap, 95) < 3 * PIXEL
+
+
+def test_cameras_of_unlike_sizes_are_compared_by_stereo(scene, box, cloud):
+    """Every second camera is cut by some pixels at the right, every fourth at the bottom: the cloud stays as dense."""
+    rig, images, _ = box
+    cut = {}
+    for number, camera in enumerate(rig.cameras):
+        width, height = camera.width - 8 * (number % 2), camera.height - 10 * (number % 4 == 2)
+        cut[camera.name] = replace(camera, width=width, height=height)
+    unlike = Rig(tuple(cut.values()))
+    assert len({(camera.width, camera.height) for camera in unlike.cameras}) == 3
+    pictures = {name: image[: cut[name].height, : cut[name].width] for name, image in images.items()}
+    found = initial_points(unlike, pictures, {})
+    assert len(found) > 0.9 * len(cloud)
+    assert np.percentile(scene.distance_to_box(found.positions), 95) < 1.2 * PIXEL
+    gap = cKDTree(found.positions).query(scene.points_on_box(2000))[0]
     assert np.percentile(gap, 95) < 3 * PIXEL
 
 

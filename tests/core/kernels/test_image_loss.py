@@ -45,7 +45,18 @@ def test_loss_and_gradients_agree_with_the_twin(height: int, width: int, shown: 
     rows = np.empty((3, height, 2), np.float32)
     g_exposure = np.empty((3, height, 2), np.float32)
     image_loss.image_loss(
-        image, exposure, target, means, squares, weights, target[0].size, scratch, g_image, rows, g_exposure
+        image,
+        exposure,
+        target,
+        means,
+        squares,
+        weights,
+        target[0].size,
+        scratch,
+        image_loss.EVERYWHERE,
+        g_image,
+        rows,
+        g_exposure,
     )
 
     np.testing.assert_allclose(rows[..., 0].sum(dtype=np.float64), total.item(), rtol=1e-5, atol=1e-9)
@@ -69,7 +80,57 @@ def test_a_picture_equal_to_its_target_has_no_loss() -> None:
     rows, g_exposure = np.empty((2, 1, 20, 2), np.float32)
     exposure, weights = np.array([[1.0, 0.0]], np.float32), np.ones(1, np.float32)
     image_loss.image_loss(
-        target, exposure, target, means, squares, weights, target[0].size, scratch, g_image, rows, g_exposure
+        target,
+        exposure,
+        target,
+        means,
+        squares,
+        weights,
+        target[0].size,
+        scratch,
+        image_loss.EVERYWHERE,
+        g_image,
+        rows,
+        g_exposure,
     )
     assert abs(rows[..., 0].sum()) < 1e-6
     assert np.abs(g_image).max() < 1e-6
+
+
+@pytest.mark.parametrize("black", [False, True])
+def test_a_part_has_the_bits_of_the_whole(black: bool) -> None:
+    """Gradients of the pixels asked for; and the loss that changes with them, as a difference."""
+    height, width = 70, 90
+    rng = np.random.default_rng(3)
+    before, target = rng.uniform(size=(2, 3, height, width)).astype(np.float32)
+    if black:
+        before[:, :, 60:], target[:, :, 60:] = 0, 0
+        before[:, 50:], target[:, 50:] = 0, 0
+    shown = np.zeros((height, width), bool)
+    shown[12:20, 30:38] = shown[40:44, 4:8] = shown[66:, 88:] = True
+    after = np.where(shown, rng.uniform(size=before.shape).astype(np.float32), before)
+    exposure = np.tile(np.array([1.1, 0], np.float32), (3, 1))
+    means, squares = np.empty_like(target), np.empty_like(target)
+    scratch = np.zeros((6, 3, height + 10, image_loss.stride(width)), np.float32)
+    image_loss.target_moments(target, scratch, means, squares)
+
+    def found(image: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        scratch[:, :, 5:-5] = np.nan  # what another picture left
+        gradient, rows = np.full_like(image, np.nan), np.empty((3, height, 2), np.float32)
+        image_loss.image_loss(
+            image, exposure, target, means, squares, np.ones(3, np.float32), height * width, scratch, wanted,
+            gradient, rows, np.empty_like(rows),
+        )  # fmt: skip
+        return gradient, rows.sum(axis=(0, 1), dtype=np.float64)
+
+    near = image_loss.near(shown)
+    gradient, losses = found(after, near)
+    wanted, whole = found(after, image_loss.EVERYWHERE)
+    np.testing.assert_array_equal(gradient[:, shown], wanted[:, shown])
+    assert np.isnan(gradient).mean() > 0.5  # little else was computed
+    untouched, base = found(before, near & (image_loss.WINDOWS | image_loss.LOSS))
+    assert np.isnan(untouched).all()
+    _, alone = found(before, image_loss.LOSS_ALONE)
+    np.testing.assert_allclose(alone, found(before, image_loss.EVERYWHERE)[1])
+    np.testing.assert_allclose(alone - base + losses, whole, rtol=1e-6)
+    assert abs(whole[0] - alone[0]) > 1e-4

@@ -12,8 +12,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera
+from scas4d_core.kernels import tiles
 from scas4d_core.rasterize import twin
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
+from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Drawing
 from scas4d_core.rasterize.limits import DEFAULT, GSPLAT, Limits
 
 SIZES = [(5, 3), (16, 16), (37, 29), (64, 48), (100, 33)]
@@ -335,3 +336,73 @@ def test_screen_gradient_is_that_of_the_projected_centre() -> None:
     (wanted,) = torch.autograd.grad((picture.features * torch.tensor(g_image)).sum(), picture.means)
     visible = rasterizer.counts > 0
     np.testing.assert_allclose(screen[visible], wanted.numpy()[visible], rtol=2e-3, atol=2e-5 * wanted.abs().max())
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+@pytest.mark.parametrize("some", [False, True])
+def test_gradients_of_features_alone_have_the_bits_of_all_gradients(width: int, height: int, some: bool) -> None:
+    camera = make_camera(width, height, seed=width)
+    scene = make_scene(150, 4, camera, seed=height)
+    arrays = CameraArrays.of(camera)
+    learnt = (np.arange(150) % 3 > 0).astype(np.uint8) if some else np.ones(150, np.uint8)
+    blocks = np.full(-(-width // 32) * -(-height // 32), 2**64 - 1, np.uint64)
+    rasterizer = CpuRasterizer()
+    rasterizer.forward(*scene[:3], scene.features, arrays, scene.background, drawing=Drawing(blocks, learnt))
+    rng = np.random.default_rng(7)
+    planes, alpha = rasterizer.gradient_buffers()
+    planes[:, :height, :width] = rng.normal(size=(4, height, width))
+    found = rasterizer.feature_gradients(planes).copy()
+    wanted = rasterizer.backward(planes, alpha).features
+    np.testing.assert_array_equal(found, wanted)
+    assert np.count_nonzero(found.any(axis=1)) > 20 or width * height < 100
+    assert not found[learnt == 0].any()
+
+
+def test_gradients_of_features_that_overflow_are_left_out() -> None:
+    camera = make_camera(37, 29)
+    scene = make_scene(150, 4, camera)
+    rasterizer, *_ = render(scene, camera)
+    planes, _ = rasterizer.gradient_buffers()
+    planes[:, :29, :37] = 1e38
+    found = rasterizer.feature_gradients(planes)
+    assert np.isfinite(found).all()
+    assert rasterizer.guards["gradient_not_finite"] > 0
+
+
+def test_a_narrow_drawing_draws_the_blocks_that_are_reached() -> None:
+    camera = make_camera(100, 90, seed=4)
+    scene = make_scene(60, 4, camera, seed=2)
+    arrays, learnt = CameraArrays.of(camera), np.zeros(60, np.uint8)
+    rasterizer = CpuRasterizer()
+    whole = rasterizer.forward(*scene[:3], scene.features, arrays, scene.background)
+    wanted, seen = whole.features.copy(), np.flatnonzero(rasterizer.counts)
+    tiles_x, everywhere = 4, np.full(12, 2**64 - 1, np.uint64)
+    learnt[seen[:3]] = 1
+    drawing = Drawing(everywhere, learnt, narrow=True)
+    planes = rasterizer.forward(*scene[:3], scene.features, arrays, scene.background, drawing=drawing).features
+    drawn = rasterizer.drawn.copy()
+    assert not rasterizer.escaped
+    assert drawn.any()
+    assert (drawn != everywhere).any()
+    shown = np.zeros((90, 100), bool)
+    for y, x in np.ndindex(shown.shape):
+        shown[y, x] = drawn[y // 32 * tiles_x + x // 32] >> np.uint64(x % 32 // 4 * 8 + y % 32 // 4) & np.uint64(1)
+    np.testing.assert_array_equal(planes[:, shown], wanted[:, shown])
+
+    box = (3, 83, 10, 99)  # off the blocks' edges
+    here = (slice(None), slice(3, 83), slice(10, 99))
+    base = np.random.default_rng(1).random((4, 90, 100), np.float32)
+    part, shifts = np.empty((4, 80, 89), np.float32), np.zeros(4)
+    tiles.take_blocks(rasterizer.planes, base, drawn, tiles_x, box, part, shifts)
+    np.testing.assert_array_equal(part, np.where(shown, planes, base)[here])
+    np.testing.assert_allclose(shifts, (part.astype(np.float64) - base[here]).sum(axis=(1, 2)), rtol=1e-5)
+    out = np.zeros((4, 96, 128), np.float32)
+    tiles.put_blocks(part, drawn, tiles_x, box, out)
+    box_alone = np.zeros_like(shown)
+    box_alone[here[1:]] = shown[here[1:]]
+    np.testing.assert_array_equal(out[:, :90, :100], np.where(box_alone, planes, 0))
+
+    rasterizer.forward(
+        *scene[:3], scene.features, arrays, scene.background, drawing=Drawing(np.zeros(12, np.uint64), learnt, True)
+    )
+    assert rasterizer.escaped

@@ -15,10 +15,11 @@ from scas4d_core.effects.parts import NOTHING, Arrays
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust import outliers as judge
+from scas4d_core.robust.attempt_results import ERROR_RISE
 from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness
 from scas4d_core.robust.checks import lit as with_light
 from scas4d_core.robust.outliers import Past
-from scas4d_core.robust.solve_frame import ERROR_RISE, FrameSolver, UpdateInput
+from scas4d_core.robust.solve_frame import FrameSolver, UpdateInput
 from scas4d_core.settings import UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory

@@ -10,7 +10,7 @@ from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.structure.motion_mask import changed_pixels, with_reliable_labels
+from scas4d_core.structure.motion_mask import INSIDE_SHARE, changed_pixels, first_labels, with_reliable_labels
 
 RIG = make_rig()
 BOX = make_box()
@@ -80,3 +80,42 @@ def test_the_few_that_stand_in_an_object_move_with_it(standing: int, all_move: b
     np.testing.assert_array_equal(after.foreground[standing:], labels[standing:])
     if not all_move:
         assert after is hundred
+
+
+def with_one_at(*places: list[float]) -> Gaussians:
+    """The box and the plate, and behind them standing Gaussians at places in the world."""
+    row = Gaussians(**{name: array[-1:] for name, array in BOX.arrays().items()})
+    rows = [row.replace(means=np.float32([place]), ids=np.int64([len(BOX) + k])) for k, place in enumerate(places)]
+    return Gaussians(**{
+        name: np.concatenate([getattr(part, name) for part in (BOX, *rows)]) for name in BOX.arrays()
+    })  # fmt: skip
+
+
+def test_what_stands_inside_of_what_moves_moves_with_it() -> None:
+    inside, above, beside = [0.0, 0.02, 0.0], [0.0, -0.5, 0.0], [0.5, 0.0, 0.0]
+    state, masks = with_one_at(inside, above, beside), take_frame(0, 0.0, BOX, RIG).masks
+    labelled = first_labels(state, RIG, masks)
+    np.testing.assert_array_equal(labelled.moving[-3:], [True, False, False])
+    plate = slice(MOVING, len(BOX))
+    np.testing.assert_array_equal(labelled.moving[plate], False)
+    np.testing.assert_array_equal(labelled.foreground[:-3], state.foreground[:-3])
+    scene = Reconstruction.start(RIG, take_frame(0, 0.0, BOX, RIG), SETTINGS, static=StaticResult(state, {}, []))
+    scene.step(take_frame(1, 1.0, moved(BOX), RIG))
+    went = np.linalg.norm(scene.history.gaussians(1).means - state.means, axis=1)
+    assert went[-3] > 0.01
+    np.testing.assert_array_equal(went[-2:], 0)
+
+
+def test_masks_that_few_cameras_have_tell_of_no_inside() -> None:
+    state, masks = with_one_at([0.0, 0.02, 0.0]), take_frame(0, 0.0, BOX, RIG).masks
+    assert first_labels(state, RIG, {}) is state
+    assert first_labels(state, RIG, {name: masks[name] for name in list(masks)[:2]}) is state
+    assert first_labels(state, RIG, {name: masks[name] for name in list(masks)[:3]}).moving[-1]
+
+
+@pytest.mark.parametrize("ragged", [1, 2])
+def test_a_mask_that_misses_a_place_is_outvoted(ragged: int) -> None:
+    state, masks = with_one_at([0.0, 0.02, 0.0]), dict(take_frame(0, 0.0, BOX, RIG).masks)
+    for name in list(masks)[:ragged]:
+        masks[name] = np.zeros_like(masks[name])
+    assert first_labels(state, RIG, masks).moving[-1] == (1 - ragged / len(masks) >= INSIDE_SHARE)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from box_scene import make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
+from scas4d_core.cameras import Camera, Rig
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.rasterize.cpu import CpuRasterizer
@@ -94,6 +97,28 @@ def test_what_stands_is_rendered_anew_once_it_changed(monkeypatch: pytest.Monkey
     wanted = fresh.run(darker, factory.views(take_frame(1, 1.0, displaced(state, 0.02), RIG), {}), None, 1.0, 1)
     np.testing.assert_array_equal(after.gaussians.means, wanted.gaussians.means)
     np.testing.assert_allclose(after.trace.psnr, wanted.trace.psnr)
+
+
+def test_a_camera_that_is_posed_otherwise_is_rendered_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    state = few_move()
+    frame = take_frame(1, 1.0, displaced(state, 0.02), RIG)
+    turned = Rig(tuple(_turned(camera) if camera.name == "c1" else camera for camera in RIG.cameras))
+    made, factory = updater(state, 0.6, monkeypatch)
+    before = made.run(state, factory.views(frame, {}), None, 1.0, 1)
+    factory.posed = turned
+    after = made.run(state, factory.views(frame, {}), None, 1.0, 1)
+    fresh, factory = updater(state, 0.6, monkeypatch)
+    factory.posed = turned
+    wanted = fresh.run(state, factory.views(frame, {}), None, 1.0, 1)
+    np.testing.assert_array_equal(after.gaussians.means, wanted.gaussians.means)
+    np.testing.assert_allclose(after.trace.psnr, wanted.trace.psnr)
+    assert after.trace.fits["c1"] < before.trace.fits["c1"] - 3  # its picture is of the camera as it was
+
+
+def _turned(camera: Camera) -> Camera:
+    pose = camera.world_to_camera.copy()
+    pose[:3] = Rotation.from_rotvec([0, 0.05, 0]).as_matrix() @ pose[:3]
+    return replace(camera, world_to_camera=pose)
 
 
 def test_less_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+
+import numpy as np
 import pytest
 from running import make_rig
 
@@ -18,6 +21,10 @@ def make(http):
         answer = http.post("/v1/scenes", json={**body, "frames_per_second": 10})
         assert answer.status_code == 201, answer.text
         made.append(answer.json()["id"])
+        if cameras == 1:  # it begins with points only
+            file = io.BytesIO()
+            np.savez(file, positions=np.zeros((3, 3)), colours=np.zeros((3, 3), np.float32))
+            assert http.put(f"/v1/scenes/{made[-1]}/points", content=file.getvalue()).status_code == 200
         return made[-1]
 
     yield scene

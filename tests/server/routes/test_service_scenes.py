@@ -77,6 +77,10 @@ def set_camera(field, value):
     return lambda body: body["rig"]["cameras"][0].__setitem__(field, value)
 
 
+def set_setting(group, name, value):
+    return lambda body: body.__setitem__("settings", {group: {name: value}})
+
+
 def one_camera(body):
     body["rig"]["cameras"] = body["rig"]["cameras"][:1]
     body["settings"] = {"scene": {"metres_per_unit": "auto"}}
@@ -113,15 +117,36 @@ BAD = {
         "settings.effects.floor",
     ),
     "misspelt": (lambda b: b.__setitem__("rigg", 1), "rigg"),
+    "left-handed": (
+        set_camera("world_to_camera", [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]]),
+        "rig.cameras.0",
+    ),
+    "background above 1": (set_setting("scene", "background", [0, 1.5, 0]), "settings.scene.background.1"),
+    "background below 0": (set_setting("scene", "background", [0, 0, -0.1]), "settings.scene.background.2"),
+    "a few pixels": (set_setting("scene", "image_scale", 0.1), "settings.scene.image_scale"),
+    "pixels by the million": (set_camera("width", 100_000), "rig.cameras.0.width"),
+    "iterations": (set_setting("update", "iterations", 10**9), "settings.update.iterations"),
+    "iterations of frame 0": (set_setting("static", "iterations", 10**9), "settings.static.iterations"),
+    "clusters": (set_setting("update", "clusters", [64, 10**9]), "settings.update.clusters.1"),
+    "layers": (set_setting("update", "clusters", list(range(1, 18))), "settings.update.clusters"),
+    "Gaussians": (set_setting("static", "max_gaussians", 10**9), "settings.static.max_gaussians"),
+    "milliseconds": (set_setting("update", "budget_ms", 1e12), "settings.update.budget_ms"),
+    "patience": (set_setting("update", "patience", 10**9), "settings.update.patience"),
+    "unit": (set_setting("scene", "metres_per_unit", 1e-30), "settings.scene.metres_per_unit"),
+    "short focal length": (set_camera("intrinsics", [[1.0, 0, 12], [0, 20, 8], [0, 0, 1]]), "rig.cameras.0.intrinsics"),
+    "long focal length": (set_camera("intrinsics", [[20, 0, 12], [0, 1e6, 8], [0, 0, 1]]), "rig.cameras.0.intrinsics"),
 }
 
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_scene_is_refused_by_name(http, name):
     change, field = BAD[name]
+    scenes = len(http.get("/v1/scenes").json()["scenes"])
     document = problem(http.post("/v1/scenes", json=edited(change)), 422)
     assert field in document["field"]
     assert document["remedy"]
+    assert document["value"]
+    assert len(http.get("/v1/scenes").json()["scenes"]) == scenes
 
 
 def test_numbers_that_are_none_are_refused(http):
@@ -179,6 +204,72 @@ def test_bad_points_are_refused_by_name(http, quiet_scene, monkeypatch, name):
     monkeypatch.setattr(points, "MOST_POINTS", 1000)
     body, field = BAD_POINTS[name]
     assert problem(http.put(f"/v1/scenes/{quiet_scene}/points", content=body), 422)["field"] == field
+
+
+def test_a_left_handed_rig_is_told_the_way_out(http):
+    change, _ = BAD["left-handed"]
+    document = problem(http.post("/v1/scenes", json=edited(change)), 422)
+    assert "determinant -1: a left-handed frame" in document["detail"]
+    assert "mirror one axis" in document["remedy"]
+
+
+def beside_one_another(count):
+    """A rig whose cameras look along the world's z axis."""
+    return RigModel.of(make_rig(count)).model_dump(mode="json")
+
+
+@pytest.mark.parametrize("parts", [False, True])
+def test_cameras_at_one_place_need_points(http, sdk, parts):
+    body = {"rig": beside_one_another(2)}
+    for camera in body["rig"]["cameras"]:
+        camera["world_to_camera"] = np.eye(4).tolist()
+    id = http.post("/v1/scenes", json=body).json()["id"]
+    try:
+        if parts:
+            answer = http.put(
+                f"/v1/scenes/{id}/frames/0/cameras/c0", content=picture(), headers={"Content-Type": "image/png"}
+            )
+        else:
+            answer = http.put(f"/v1/scenes/{id}/frames/0", **put_frame(id, 0, pictures()).arguments)
+        document = problem(answer, 422)
+        assert (document["field"], document["value"]) == ("points", "nothing")
+        assert "all 2 cameras are at one place, and no points" in document["detail"]
+        assert sdk.scene(id).next_frame == 0
+        sdk.put_points(id, InitialPoints(np.array([[0, 0, 2.0]]), np.zeros((1, 3), np.float32)))
+        sdk.put_frame(id, 0, pictures())
+        assert sdk.wait(id, 0).gaussians == 1
+    finally:
+        sdk.delete_scene(id)
+
+
+def test_points_behind_all_cameras_are_refused(http, quiet_scene):
+    body = npz(positions=np.array([[0, 0, -9.0], [0, 1, -7]]), colours=C[:2])
+    document = problem(http.put(f"/v1/scenes/{quiet_scene}/points", content=body), 422)
+    assert (document["field"], document["value"]) == ("points", "2 points")
+    assert "behind all cameras" in document["detail"]
+
+
+def test_poses_the_wrong_way_round_are_a_warning(http, sdk):
+    """Seen from the right way round: two cameras left and right of z, 3 away, looking at the origin."""
+    body = {"rig": rig_json()}
+    for camera, angle in zip(body["rig"]["cameras"], (0.5, -0.5), strict=True):
+        c, s = np.cos(angle), np.sin(angle)
+        right = np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 3], [0, 0, 0, 1]])
+        camera["world_to_camera"] = np.linalg.inv(right @ turned_over(angle)).tolist()
+    id = http.post("/v1/scenes", json=body).json()["id"]
+    try:
+        assert sdk.scene(id).warnings == []  # two cameras say too little
+        cloud = np.random.default_rng(0).uniform(-0.3, 0.3, (50, 3))
+        sdk.put_points(id, InitialPoints(cloud, np.zeros((50, 3), np.float32)))
+        (said,) = sdk.scene(id).warnings
+        assert "the poses seem to be the wrong way round" in said
+    finally:
+        sdk.delete_scene(id)
+
+
+def turned_over(angle):
+    """The world turned by a quarter about x: inverted poses look past its origin then."""
+    return np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
 def test_nothing_is_unpickled(http, quiet_scene, tmp_path):

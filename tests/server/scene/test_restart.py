@@ -55,6 +55,23 @@ def test_everything_is_found_again(tmp_path):
         assert http.get(f"/v1/scenes/{id}").json()["gaussians"] == 3
 
 
+def test_warnings_of_points_are_found_again(tmp_path):
+    """The cameras see points 3 before them; given the wrong way round, the rig has them out of view."""
+    rig = RigModel.of(make_rig()).model_dump(mode="json")
+    quarter = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    for camera in rig["cameras"]:
+        camera["world_to_camera"] = np.linalg.inv(np.array(camera["world_to_camera"]) @ quarter).tolist()
+    cloud = np.random.default_rng(0).uniform(-0.3, 0.3, (50, 3))
+    with serving(tmp_path) as (http, sdk):
+        id = http.post("/v1/scenes", json={"rig": rig}).json()["id"]
+        assert sdk.scene(id).warnings == []
+        sdk.put_points(id, InitialPoints(cloud, np.zeros((50, 3), np.float32)))
+        (said,) = sdk.scene(id).warnings
+        assert "the wrong way round" in said
+    with serving(tmp_path) as (_, sdk):
+        assert sdk.scene(id).warnings == [said]
+
+
 def test_a_first_frame_that_failed_stays_failed(tmp_path):
     with serving(tmp_path) as (http, sdk):
         id = create(http)

@@ -11,6 +11,7 @@ from PIL import Image
 from client.cli.scores import Store, digest, markdown
 from scas4d_core.cameras import Camera, WorldFrame
 from scas4d_core.captures import InitialPoints, open_capture
+from scas4d_core.captures.reader import FileReader
 from scas4d_core.first_frame.static_scene import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import evaluation as measures
@@ -327,12 +328,13 @@ def test_frame_0_is_shared_by_those_who_see_the_same(capture_folder):
     for same in (["update.clusters=[64]"], ["update.iterations=2000"]):
         assert first_frame_key(capture, settings_of("scas4d", changes=same)) == name
     assert first_frame_key(capture, settings_of("dynamic3dgs", 300)) == name
+    later = FileReader(capture.pictures.images[1:], capture.pictures.masks, {})
     others = {
         name,
         first_frame_key(open_capture(capture_folder, use_masks=False), settings),
         first_frame_key(dataclasses.replace(capture, points=InitialPoints(plates(0), colours())), settings),
         first_frame_key(dataclasses.replace(capture, points=InitialPoints(plates(1), colours())), settings),
-        first_frame_key(dataclasses.replace(capture, image_files=capture.image_files[1:]), settings),
+        first_frame_key(dataclasses.replace(capture, pictures=later), settings),
         first_frame_key(capture, settings_of("scas4d", seed=1)),
         first_frame_key(capture, settings_of("scas4d", changes=["static.iterations=5"])),
         first_frame_key(capture, settings_of("scas4d", changes=["scene.image_scale=0.5"])),

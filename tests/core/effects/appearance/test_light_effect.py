@@ -69,7 +69,9 @@ def test_it_frees_no_colours_that_are_held() -> None:
 
 def followed(mode: str, lamp: float) -> tuple[float, Reconstruction]:
     """Mean error of the box's colours after frames in which a lamp goes from one side of the box to the other."""
-    settings = Settings.model_validate({"update": {"clusters": (2, 12), "iterations": 40}, "effects": {"light": mode}})
+    # The judge keeps the state before the last frame with 1 of 5 seeds, by chance.
+    update = {"clusters": (2, 12), "iterations": 40, "judge": False}
+    settings = Settings.model_validate({"update": update, "effects": {"light": mode}})
     scene = Reconstruction.start(RIG, take_frame(0, 0, BOX, RIG), settings, static=StaticResult(BOX, {}, []))
     for index in range(1, FRAMES):
         now = under(lamp * index * np.array([0.5, 0.0, 1.0]))

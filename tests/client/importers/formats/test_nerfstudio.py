@@ -5,7 +5,7 @@ import pytest
 from lenses import LENSES
 from rigs import lenses, transforms, write
 
-from client.importers.nerfstudio import read_transforms
+from client.importers.formats.nerfstudio import read_transforms
 from scas4d_core.captures import CaptureError
 
 TURNED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])

@@ -11,7 +11,7 @@ from lenses import HEIGHT, LENSES, WIDTH
 from rigs import colmap_model as model
 from rigs import lenses
 
-from client.importers.colmap import read_colmap
+from client.importers.formats.colmap import read_colmap
 from client.importers.lens import MODELS
 from scas4d_core.captures import CaptureError
 

@@ -1,0 +1,115 @@
+"""Options on how a capture is read, the same for every command and study that takes one: `takes_capture` adds them."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from enum import StrEnum
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+import typer
+
+from client.cli.progress import console
+from client.importers.open_source import CaptureOptions
+from scas4d_core.captures import Capture
+
+
+class PicturesFrom(StrEnum):
+    """The kind of files that hold a capture's pictures."""
+
+    IMAGES = "images"
+    VIDEOS = "videos"
+    NAMED = "named"
+
+
+class Fit(StrEnum):
+    """Ways in which pictures of another shape than calibrated came about."""
+
+    CORNER = "corner"
+    CENTRE = "centre"
+    STRETCH = "stretch"
+
+
+def _options(
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration, a file or a folder, if it is not in CAPTURE; docs/captures.md.")
+    ] = None,
+    pictures: Annotated[
+        PicturesFrom | None, typer.Option(help="Kind of pictures to take, where a capture has several.")
+    ] = None,
+    capture_fps: Annotated[
+        float | None, typer.Option(min=0.001, help="Frames a second of the capture, where its files do not say.")
+    ] = None,
+    masks: Annotated[bool, typer.Option(help="Use the capture's masks.")] = True,
+    test: Annotated[
+        list[str] | None, typer.Option(help="Hold out a camera, for measuring. May be repeated.", metavar="CAMERA")
+    ] = None,
+    fit: Annotated[
+        Fit | None,
+        typer.Option(
+            help="Pictures of another shape than calibrated were cut at the right and the bottom (corner), were cut "
+            "evenly (centre), or were resized (stretch)."
+        ),
+    ] = None,
+) -> CaptureOptions:
+    return CaptureOptions(
+        calibration=calibration,
+        pictures=None if pictures is None else pictures.value,
+        fps=capture_fps,
+        use_masks=masks,
+        test=tuple(test or ()),
+        fit=None if fit is None else fit.value,
+    )
+
+
+def takes_capture(command: Callable[..., None]) -> Callable[..., None]:
+    """Gives a command the options of a capture; they reach it as one `CaptureOptions`, its argument `options`.
+
+    An option that the command declares itself, as `masks`, stays its own.
+
+    >>> @takes_capture
+    ... def count(folder: Path, options: CaptureOptions) -> None:
+    ...     print(options.open(folder).frame_count, options.test)
+    >>> count(folder, test=["1"])
+    4 ('1',)
+    """
+    given, shared = _parameters(command), _parameters(_options)
+    own = [parameter for name, parameter in given.items() if name != "options"]
+    added = [
+        parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for name, parameter in shared.items()
+        if name not in given
+    ]
+    names = {parameter.name for parameter in added}
+
+    @wraps(command)
+    def run(*given: Any, **named: Any) -> None:
+        options = _options(**{name: named.pop(name) for name in list(named) if name in names})
+        command(*given, options=options, **named)
+
+    del run.__wrapped__
+    run.__signature__ = inspect.Signature([*own, *added])  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in (*own, *added)}
+    return run
+
+
+def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+    """The parameters of a function by name; their annotations are values, not strings."""
+    hints = get_type_hints(function, include_extras=True)
+    found = inspect.signature(function).parameters
+    return {name: parameter.replace(annotation=hints[name]) for name, parameter in found.items()}
+
+
+def opened(folder: Path, options: CaptureOptions, **more: Any) -> Capture:
+    """Opens a capture for a command, and prints the remarks on its reading; `more` as in `open_source`."""
+    capture = options.open(folder, **more)
+    print_remarks(capture)
+    return capture
+
+
+def print_remarks(capture: Capture) -> None:
+    """Prints the remarks on a capture's reading."""
+    for remark in capture.remarks:
+        console.print(remark, style="yellow", highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,1 @@
+"""Readers of calibrations, one file a tool; each returns a `Calibration`."""

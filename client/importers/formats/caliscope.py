@@ -1,0 +1,60 @@
+"""Reads caliscope's `camera_array.toml`.
+
+A table `[cameras.<id>]` a camera: `size` (width, height), `matrix`, `distortions` (5, of a `fisheye` 4), `rotation` as
+a matrix [3][3] or Rodrigues' vector [3], and `translation`, world to camera. Its videos are `cam_<id>.mp4`, those of
+earlier versions, which wrote `port` for `cam_id`, `port_<id>.mp4`; the camera has that name. `rotation_count` turns
+pictures for its trackers only, not for the calibration. Cameras that it was told to ignore, or that have no pose, are
+left out, with a remark. (github.com/mprib/caliscope, `src/caliscope/cameras/camera_array.py`.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from client.importers.calibration import Calibration, calibration_of_cameras
+from client.importers.formats.opencv_camera import opencv_camera, picture_size
+from scas4d_core.captures import CaptureError
+
+
+def is_caliscope(document: Mapping[str, Any]) -> bool:
+    """True where the file has a table of cameras."""
+    return isinstance(document.get("cameras"), Mapping)
+
+
+def read_caliscope(path: Path, document: Mapping[str, Any]) -> Calibration:
+    """Reads the rig of a parsed file.
+
+    Raises:
+        CaptureError: a field is missing or cannot be; the message names file, camera, field and remedy.
+    """
+    cameras, left_out = [], []
+    for key, table in document["cameras"].items():
+        where = f"{path}: [cameras.{key}]"
+        if not isinstance(table, Mapping):
+            raise CaptureError(f"{where} is no table of a camera; leave it out")
+        name = f"{'port' if 'port' in table else 'cam'}_{table.get('cam_id', table.get('port', key))}"
+        if table.get("ignore") is True or not _calibrated(table):
+            left_out.append(name)
+            continue
+        cameras.append(
+            opencv_camera(
+                where,
+                name,
+                matrix=table["matrix"],
+                distortions=table.get("distortions"),
+                rotation=table["rotation"],
+                translation=table["translation"],
+                size=picture_size(where, table.get("size")),
+                fisheye=table.get("fisheye") is True,
+            )
+        )
+    listed = ", ".join(left_out)
+    remarks = [f"{path.name}: left out, ignored or without a pose there: {listed}"] if left_out else []
+    return calibration_of_cameras(path, cameras, remarks)
+
+
+def _calibrated(table: Mapping[str, Any]) -> bool:
+    """True where intrinsics and a pose are there; rtoml wrote the text "null" for none."""
+    return all(isinstance(table.get(field), list) for field in ("matrix", "rotation", "translation"))

@@ -1,0 +1,79 @@
+"""Reads EasyMocap's `intri.yml` and `extri.yml`, files of OpenCV's FileStorage; `scas4d[importers]` has OpenCV.
+
+`names` lists the cameras. `intri.yml` has by camera `K_<name>` [3, 3] and `dist_<name>` (or `D_<name>`), and in some
+versions `H_<name>`, `W_<name>`; without these the size is that of the camera's pictures. `extri.yml` has `Rot_<name>`
+[3, 3], or only `R_<name>` [3] (Rodrigues' vector), and `T_<name>` [3], world to camera. A camera without a pose is left
+out, with a remark.
+(github.com/zju3dv/EasyMocap, `easymocap/mytools/camera_utils.py`.)
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from client.importers.calibration import Calibration, calibration_of_cameras
+from client.importers.formats.file_storage import first_of, read_storage, size_of_pictures
+from client.importers.formats.opencv_camera import numbers, opencv_camera, picture_size, rodrigues
+from client.importers.lens import LensCamera
+from scas4d_core.captures import CaptureError
+
+INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
+APART = 1e-3
+"""Largest entry by which a rotation and its vector may differ: EasyMocap writes six digits."""
+
+
+def is_easymocap(folder: Path) -> bool:
+    """True where both files lie in the folder."""
+    return all((folder / name).is_file() for name in (INTRINSICS, EXTRINSICS))
+
+
+def read_easymocap(folder: Path, capture: Path) -> Calibration:
+    """Reads the rig of a folder.
+
+    Args:
+        folder: of the two files. capture: folder with `images/` or `videos/`, for the pictures' sizes.
+
+    Raises:
+        CaptureError: a file or field is missing or cannot be; the message names it and the remedy.
+        MissingExtra: OpenCV is not there.
+    """
+    for name in (INTRINSICS, EXTRINSICS):
+        if not (folder / name).is_file():
+            raise CaptureError(f"{folder / name}: no such file; EasyMocap writes {INTRINSICS} and {EXTRINSICS}")
+    intrinsics, extrinsics = read_storage(folder / INTRINSICS), read_storage(folder / EXTRINSICS)
+    names = intrinsics.get("names")
+    if not isinstance(names, list) or not names:
+        raise CaptureError(f"{folder / INTRINSICS}: has no list `names` of its cameras")
+    texts = [name if isinstance(name, str) else f"{name:g}" for name in names if isinstance(name, str | float)]
+    posed = [name for name in texts if extrinsics.get(f"T_{name}") is not None]
+    left_out = ", ".join(name for name in texts if name not in posed and name != "none")
+    remarks = [f"{INTRINSICS}: left out, without a pose in {EXTRINSICS}: {left_out}"] if left_out else []
+    cameras = [_camera(folder, capture, name, intrinsics, extrinsics) for name in posed]
+    return calibration_of_cameras(folder, cameras, remarks)
+
+
+def _camera(
+    folder: Path, capture: Path, name: str, intrinsics: dict[str, Any], extrinsics: dict[str, Any]
+) -> LensCamera:
+    where = f"{folder / EXTRINSICS}: camera {name!r}"
+    rotation, vector = extrinsics.get(f"Rot_{name}"), extrinsics.get(f"R_{name}")
+    if rotation is None:
+        rotation = vector
+    elif vector is not None:
+        matrix = numbers(where, f"Rot_{name}", rotation, (9,)).reshape(3, 3)
+        if np.abs(rodrigues(numbers(where, f"R_{name}", vector, (3,))) - matrix).max() > APART:
+            raise CaptureError(f"{where}: R_{name} and Rot_{name} are different rotations; write the file anew")
+    where = f"{folder / INTRINSICS}: camera {name!r}"
+    size = [intrinsics.get(f"{side}_{name}") for side in "WH"]
+    return opencv_camera(
+        where,
+        name,
+        matrix=intrinsics.get(f"K_{name}"),
+        distortions=first_of(intrinsics, (f"dist_{name}", f"D_{name}")),
+        rotation=rotation,
+        translation=extrinsics.get(f"T_{name}"),
+        size=size_of_pictures(capture, name, where) if None in size else picture_size(where, size),
+    )

@@ -1,0 +1,89 @@
+"""Reads OpenCV's FileStorage, YAML or XML, with OpenCV: no other library reads its `%YAML:1.0` and `!!opencv-matrix`.
+
+Beside it, the size of a camera's pictures, which such files often lack.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from client.importers.extras import load, pyav
+from client.importers.pictures import READ
+from client.importers.videos import ENDS
+from scas4d_core.captures import CaptureError, ImageError
+from scas4d_core.captures.images import picture_size
+
+LARGEST_FILE = 16 << 20
+
+
+def read_storage(path: Path) -> dict[str, Any]:
+    """The top of a file by name: matrices as arrays [rows, cols], lists, numbers and texts; anything else as None.
+
+    Raises:
+        CaptureError: it cannot be read.
+        MissingExtra: OpenCV is not there.
+    """
+    cv2 = load("cv2", needed="reading OpenCV's YAML and XML files")
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise CaptureError(f"{path}: has more than {LARGEST_FILE >> 20} MB, which no calibration has")
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        if not storage.isOpened():
+            raise CaptureError(f"{path}: cannot be read as a file of OpenCV (FileStorage, YAML or XML)")
+        root = storage.root()
+        return {key: _value(root.getNode(key)) for key in root.keys()}  # noqa: SIM118 - a FileNode is no mapping
+    except (OSError, SystemError, cv2.error) as fault:
+        first = str(fault).strip().splitlines()[0] if str(fault).strip() else type(fault).__name__
+        raise CaptureError(f"{path}: cannot be read as a file of OpenCV, YAML or XML ({first})") from fault
+
+
+def _value(node: Any) -> Any:
+    if node.isInt() or node.isReal():
+        return node.real()
+    if node.isString():
+        return node.string()
+    if node.isSeq():
+        return [_value(node.at(i)) for i in range(node.size())]
+    if node.isMap():
+        return node.mat()  # None where the map is no matrix
+    return None
+
+
+def first_of(stored: Mapping[str, Any], names: tuple[str, ...]) -> Any:
+    """The first field of these names that is there; None where there is none."""
+    return next((stored[name] for name in names if stored.get(name) is not None), None)
+
+
+def size_of_pictures(folder: Path, camera: str, where: str) -> tuple[int, int]:
+    """(width, height) of the first picture in ``images/<camera>/``, or of ``videos/<camera>.mp4``.
+
+    Args:
+        folder: of the capture. where: the place in the calibration that names no size, for messages.
+
+    Raises:
+        CaptureError: there is neither, or it cannot be read.
+        MissingExtra: a video has to be read and PyAV is not there.
+    """
+    images = folder / "images" / camera
+    if images.is_dir():
+        for path in sorted(images.iterdir()):
+            if path.suffix.lower() in READ and not path.name.startswith("."):
+                try:
+                    return picture_size(path)
+                except ImageError as fault:
+                    raise CaptureError(str(fault)) from fault
+    for path in (folder / "videos" / f"{camera}{end}" for end in ENDS):
+        if path.is_file():
+            av = pyav()
+            try:
+                with av.open(str(path)) as container:
+                    context = container.streams.video[0].codec_context
+                    return int(context.width), int(context.height)
+            except (av.FFmpegError, IndexError) as fault:
+                raise CaptureError(f"{path}: cannot be read as video ({fault})") from fault
+    raise CaptureError(
+        f"{where} says nothing of the pictures' size, and there is no {images}/ nor {folder / 'videos' / camera}.mp4 "
+        "to tell it; give the pictures there, or the size in the file"
+    )

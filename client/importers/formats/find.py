@@ -1,0 +1,108 @@
+"""Finds the calibrations of laboratory tools in a folder, and reads one, whichever tool wrote it."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from client.importers.calibration import Calibration
+from client.importers.formats.anipose import is_anipose, read_anipose
+from client.importers.formats.caliscope import is_caliscope, read_caliscope
+from client.importers.formats.easymocap import EXTRINSICS, INTRINSICS, is_easymocap, read_easymocap
+from client.importers.formats.opencv_files import ENDS, camera_files, read_opencv_files
+from client.importers.formats.qualisys import END as QUALISYS
+from client.importers.formats.qualisys import read_qualisys
+from scas4d_core.captures import CaptureError
+
+FOLDERS = (".", "calibration")
+"""Where they are looked for in a capture."""
+CALISCOPE = "camera_array.toml"
+READ = (
+    f"caliscope's {CALISCOPE}, anipose's calibration.toml, FreeMoCap's *_calibration.toml, Pose2Sim's Calib*.toml, "
+    f"Qualisys' *{QUALISYS}, EasyMocap's {INTRINSICS} with {EXTRINSICS}, or OpenCV's <camera>{ENDS[0]} files"
+)
+
+
+def found_in(capture: Path) -> list[Path]:
+    """The calibrations in a capture's folder: a file each, or the folder of several that belong together."""
+    return [path for name in FOLDERS for path in _found_here(capture / name)]
+
+
+def _found_here(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    names = sorted(path for path in folder.iterdir() if path.is_file())
+    found = [path for path in names if path.name == CALISCOPE or path.name.lower().endswith(QUALISYS)]
+    found += [path for path in names if _is_toml(path)]
+    if is_easymocap(folder):
+        found.append(folder / INTRINSICS)
+    elif camera_files(folder):
+        found.append(folder)
+    return found
+
+
+def _is_toml(path: Path) -> bool:
+    """True for calibration.toml, Calib*.toml, and FreeMoCap's <recording>_camera_calibration.toml."""
+    name = path.name.lower()
+    return name.endswith("_calibration.toml") or (name.startswith("calib") and name.endswith(".toml"))
+
+
+def is_calibration(path: Path) -> bool:
+    """True where `read_found` knows the kind of a file or folder by its name."""
+    if path.is_dir():
+        return bool(_found_here(path))
+    return path.is_file() and (path.suffix.lower() in (".toml", *ENDS) or path.name.lower().endswith(QUALISYS))
+
+
+def read_found(path: Path, capture: Path) -> Calibration:
+    """Reads a calibration.
+
+    Args:
+        path: a file, or a folder with one calibration. capture: folder of the pictures, for sizes that files lack.
+
+    Raises:
+        CaptureError: of no known kind, several in the folder, or it cannot be read.
+        MissingExtra: it needs a package of the extra `importers`.
+    """
+    if path.is_dir():
+        here = _found_here(path)
+        if here == [path]:
+            return read_opencv_files(path, capture)
+        return read_found(only(here, path), capture)
+    if path.name.lower().endswith(QUALISYS):
+        return read_qualisys(path)
+    if path.suffix.lower() == ".toml":
+        return _read_toml(path)
+    if path.name in (INTRINSICS, EXTRINSICS):
+        return read_easymocap(path.parent, capture)
+    return read_opencv_files(path.parent, capture)
+
+
+def only(found: list[Path], folder: Path) -> Path:
+    """The one calibration that was found.
+
+    Raises:
+        CaptureError: there are several, or none.
+    """
+    if len(found) == 1:
+        return found[0]
+    if not found:
+        raise CaptureError(f"{folder}: has no calibration; give {READ}")
+    listed = ", ".join(str(path.relative_to(folder)) for path in found)
+    raise CaptureError(
+        f"{folder}: has {len(found)} calibrations ({listed}); say which: --calibration {found[0]}, or leave one"
+    )
+
+
+def _read_toml(path: Path) -> Calibration:
+    try:
+        with path.open("rb") as file:
+            document: dict[str, Any] = tomllib.load(file)
+    except (OSError, ValueError) as fault:  # TOML that is broken, and text that is no UTF-8
+        raise CaptureError(f"{path}: cannot be read as TOML ({fault})") from fault
+    if is_caliscope(document):
+        return read_caliscope(path, document)
+    if is_anipose(document):
+        return read_anipose(path, document)
+    raise CaptureError(f"{path}: has no tables of cameras with matrix and rotation; give {READ}")

@@ -1,0 +1,145 @@
+"""A camera as OpenCV calibrates it, which most laboratory tools write in a file format of their own. Numpy only.
+
+`matrix` [3, 3] with the first pixel's centre at (0, 0), so principal points gain half a pixel here; `distortions` in
+OpenCV's order; world to camera as a rotation, a matrix or Rodrigues' vector, and a translation: `X_cam = R X_world + t`
+with x right, y down, z forward. (docs.opencv.org, "Camera Calibration and 3D Reconstruction".)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.importers.lens import FISHEYE, PERSPECTIVE, LensCamera, lens_camera
+from scas4d_core.captures import CaptureError
+
+Float = NDArray[np.float64]
+
+HALF = 0.5
+"""OpenCV's centre of the first pixel is (0, 0), ours (0.5, 0.5)."""
+COUNTS = (0, 4, 5, 8, 12, 14)
+"""Numbers of coefficients that OpenCV has; those beyond the eighth, of thin prisms and tilted sensors, must be 0."""
+SKEW = 1e-6
+"""Largest skew, of the focal length, that is rounding."""
+LARGEST_SIDE = 1 << 16
+
+
+def opencv_camera(
+    where: str,
+    name: str,
+    *,
+    matrix: Any,
+    distortions: Any,
+    rotation: Any,
+    translation: Any,
+    size: tuple[int, int],
+    fisheye: bool = False,
+) -> LensCamera:
+    """Makes a camera of what a tool stored, checked.
+
+    Args:
+        where: file and place in it, for messages.
+        name: of the camera.
+        matrix: [3, 3]. distortions: 4, 5 or 8 coefficients, 4 of a fisheye, or None.
+        rotation: [3, 3], or Rodrigues' vector [3]; world to camera. translation: [3].
+        size: (width, height) in pixels.
+        fisheye: the coefficients are of `cv2.fisheye`.
+
+    Raises:
+        CaptureError: a field cannot be; the message names it and the remedy.
+
+    >>> lens = [[100, 0, 31.5], [0, 100, 23.5], [0, 0, 1]]
+    >>> camera = opencv_camera("rig.toml", "front", matrix=lens, distortions=[0, 0, 0, 0, 0], rotation=[0, 0, np.pi],
+    ...                        translation=[0, 0, 2], size=(64, 48))
+    >>> camera.model, camera.intrinsics[:2, 2].tolist(), camera.pinhole().centre.round(6).tolist()[2]
+    ('PINHOLE', [32.0, 24.0], -2.0)
+    """
+    k = numbers(where, "the camera matrix", matrix, (9,)).reshape(3, 3)
+    if np.abs(k[2, :2]).max() > 0 and not k[:2, 2].any():
+        raise CaptureError(
+            f"{where}: the camera matrix has cx, cy in its last row: it is transposed (MATLAB's); give its transpose"
+        )
+    if not np.allclose([k[1, 0], *k[2]], [0, 0, 0, 1]) or abs(k[0, 1]) > SKEW * abs(k[0, 0]):
+        raise CaptureError(
+            f"{where}: the camera matrix {k.tolist()} is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; "
+            "calibrate without skew"
+        )
+    model, coefficients = _distortion(where, distortions, fisheye)
+    pose = np.eye(4)
+    pose[:3, :3] = _rotation(where, rotation)
+    pose[:3, 3] = numbers(where, "translation", translation, (3,))
+    parameters = {"fx": k[0, 0], "fy": k[1, 1], "cx": k[0, 2] + HALF, "cy": k[1, 2] + HALF, **coefficients}
+    return lens_camera(name, model, parameters, pose, size, source=where)
+
+
+def _distortion(where: str, given: Any, fisheye: bool) -> tuple[str, dict[str, float]]:
+    """The model of a lens, and its coefficients by name."""
+    values = numbers(where, "distortions", [] if given is None else given, (4,) if fisheye else COUNTS)
+    if fisheye:
+        return "OPENCV_FISHEYE", dict(zip(FISHEYE, values, strict=True))
+    if values[8:].any():
+        raise CaptureError(
+            f"{where}: has distortions of thin prisms or a tilted sensor ({', '.join(f'{v:g}' for v in values[8:])}), "
+            "which are not read; calibrate with at most the rational model (8 coefficients)"
+        )
+    named = dict(zip(PERSPECTIVE, values[:8], strict=False))
+    if not values.any():
+        return "PINHOLE", {}
+    return "FULL_OPENCV" if values[5:].any() else "OPENCV", {key: value for key, value in named.items() if value}
+
+
+def _rotation(where: str, given: Any) -> Float:
+    values = numbers(where, "rotation", given, (3, 9))
+    return rodrigues(values) if values.size == 3 else values.reshape(3, 3)
+
+
+def rodrigues(vector: Float) -> Float:
+    """The rotation [3, 3] about a vector [3] by its length in radians.
+
+    >>> np.round(rodrigues(np.array([0, 0, np.pi / 2])))[0].tolist()
+    [0.0, -1.0, 0.0]
+    """
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    result: Float = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return result
+
+
+def numbers(where: str, field: str, given: Any, counts: Sequence[int]) -> Float:
+    """The numbers of a nested list, flat, float64.
+
+    Raises:
+        CaptureError: they are no finite numbers, or another count of them.
+    """
+    try:
+        values = np.array(given, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        values = np.empty(0)
+        counts = [count for count in counts if count] or counts
+    if values.size not in counts or not np.isfinite(values).all():
+        listed = " or ".join(str(count) for count in counts if count or len(counts) == 1)
+        raise CaptureError(f"{where}: {field} is {_short(given)}; give {listed} finite numbers")
+    return values
+
+
+def picture_size(where: str, given: Any) -> tuple[int, int]:
+    """(width, height) in whole pixels; some tools write them as 1088.0.
+
+    Raises:
+        CaptureError: it is not.
+    """
+    values = numbers(where, "size", given, (2,))
+    if (values != np.round(values)).any() or values.min() < 1 or values.max() > LARGEST_SIDE:
+        raise CaptureError(f"{where}: size is {_short(given)}; give width and height in whole pixels")
+    return int(values[0]), int(values[1])
+
+
+def _short(given: Any) -> str:
+    text = "missing" if given is None else repr(given)
+    return text if len(text) <= 80 else f"{text[:79]}…"

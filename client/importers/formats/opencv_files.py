@@ -1,0 +1,80 @@
+"""Reads a folder with one file of OpenCV's FileStorage a camera, `<camera>.yml`, `.yaml` or `.xml`.
+
+OpenCV itself has no layout for a rig; this is the one that its samples' fields lead to. In each file `camera_matrix`
+[3, 3], `distortion_coefficients`, `image_width`, `image_height` and, where true, `fisheye_model`, as its calibration
+sample writes them, and `R`, [3, 3] or Rodrigues' vector, and `T` [3], world to camera, as its stereo sample calls them.
+Other usual names are taken too. The sample's `extrinsic_parameters` are poses of the board, and no pose of the camera.
+(docs.opencv.org, "Camera calibration With OpenCV"; `samples/cpp/.../camera_calibration.cpp`.)
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from client.importers.calibration import Calibration, calibration_of_cameras
+from client.importers.formats.easymocap import EXTRINSICS, INTRINSICS
+from client.importers.formats.file_storage import first_of, read_storage, size_of_pictures
+from client.importers.formats.opencv_camera import opencv_camera, picture_size
+from client.importers.lens import LensCamera
+from scas4d_core.captures import CaptureError
+
+ENDS = (".yml", ".yaml", ".xml")
+MATRIX = ("camera_matrix", "cameraMatrix", "K", "M")
+DISTORTION = ("distortion_coefficients", "distCoeffs", "dist", "D")
+ROTATION = ("R", "Rot", "rotation", "rvec")
+TRANSLATION = ("T", "t", "translation", "tvec")
+FIRST_BYTES = 200
+MATRIX_FIELD = re.compile(rb"^\s*<?(" + "|".join(MATRIX).encode() + rb")\s*[ :>]", re.MULTILINE)
+
+
+def camera_files(folder: Path) -> list[Path]:
+    """The files of the folder that hold a camera's matrix; those of EasyMocap have several, and are not among them."""
+    if not folder.is_dir():
+        return []
+    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDS and path.is_file())
+    return [path for path in found if path.name not in (INTRINSICS, EXTRINSICS) and _is_camera(path)]
+
+
+def _is_camera(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            data = file.read(1 << 20)
+    except OSError:
+        return False
+    stored = data.lstrip().startswith(b"%YAML") or b"<opencv_storage" in data[:FIRST_BYTES]
+    return stored and MATRIX_FIELD.search(data) is not None
+
+
+def read_opencv_files(folder: Path, capture: Path) -> Calibration:
+    """Reads the rig of a folder, a camera a file.
+
+    Args:
+        folder: of the files. capture: folder with `images/` or `videos/`, for sizes that the files lack.
+
+    Raises:
+        CaptureError: a field is missing or cannot be; the message names file, field and remedy.
+        MissingExtra: OpenCV is not there.
+    """
+    return calibration_of_cameras(folder, [_camera(path, capture) for path in camera_files(folder)])
+
+
+def _camera(path: Path, capture: Path) -> LensCamera:
+    stored, where = read_storage(path), str(path)
+    rotation, translation = first_of(stored, ROTATION), first_of(stored, TRANSLATION)
+    if rotation is None or translation is None:
+        raise CaptureError(
+            f"{path}: has no pose; give R and T, world to camera (extrinsic_parameters of OpenCV's sample are poses of "
+            "its board)"
+        )
+    size = [stored.get("image_width"), stored.get("image_height")]
+    return opencv_camera(
+        where,
+        path.stem,
+        matrix=first_of(stored, MATRIX),
+        distortions=first_of(stored, DISTORTION),
+        rotation=rotation,
+        translation=translation,
+        size=size_of_pictures(capture, path.stem, where) if None in size else picture_size(where, size),
+        fisheye=stored.get("fisheye_model") in (1.0, "true", "1"),
+    )

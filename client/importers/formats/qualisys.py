@@ -1,0 +1,145 @@
+"""Reads Qualisys' calibrations, exported from QTM as `*.qca.txt`: XML, of which only attributes count.
+
+By camera (`active`, `serial`, `model`):
+
+- `transform`: x, y, z, the camera's place in millimetres, and r11 … r33, rows of world to camera with OpenGL's axes (x
+  right, y up, z back). The world becomes one of metres.
+- `intrinsic`: focalLengthU, centerPointU, … in subpixels of the sensor, 64 a pixel; `sensorMaxU` over the width of
+  `fov_video_max` says how many of them are a pixel. `radialDistortion1` … and `tangentalDistortion1`, `2` are OpenCV's
+  k1, k2, k3, p1, p2. Pose2Sim divides them by 64 as well: on the rig of its demonstration they agree with those of a
+  checkerboard only undivided (k1 −0.046 to −0.048 here; −0.031, −0.047, −0.052, −0.053 there).
+- `fov_video`: the part of the sensor that is recorded; the principal point counts from its corner.
+
+The first pixel's centre is taken to be (0, 0), as Pose2Sim takes it; Qualisys does not say. Cameras that record markers
+and no video are left out, with a remark.
+(github.com/perfanalytics/pose2sim, `read_qca` and `calib_qca_fun` in `Pose2Sim/calibration.py`.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.importers.calibration import Calibration, calibration_of_cameras
+from client.importers.formats.opencv_camera import opencv_camera, picture_size
+from client.importers.lens import LensCamera
+from scas4d_core.captures import CaptureError
+
+Float = NDArray[np.float64]
+
+END = ".qca.txt"
+PARTS = ("transform", "intrinsic", "fov_video", "fov_video_max")
+LARGEST_FILE = 16 << 20
+FLIP = np.diag([1.0, -1.0, -1.0])
+"""OpenGL's camera axes to OpenCV's."""
+METRES = 1e-3
+WHOLE = 0.1
+"""How far the subpixels of a pixel may be from a whole number; 69568 over 1087 and 122879 over 1919 are found."""
+
+
+@dataclass
+class _Camera:
+    """The attributes of one camera and of the elements in it."""
+
+    own: Mapping[str, str]
+    parts: dict[str, Mapping[str, str]] = field(default_factory=dict)
+
+
+def read_qualisys(path: Path) -> Calibration:
+    """Reads the rig of a `*.qca.txt`.
+
+    Raises:
+        CaptureError: no XML, or a field is missing or cannot be; the message names file, camera, field and remedy.
+    """
+    found = [camera for camera in _cameras(path) if camera.own.get("active", "1") not in ("0", "false")]
+    video = [camera for camera in found if _films(camera)] or found
+    markers = ", ".join(camera.own.get("serial", "?") for camera in found if camera not in video)
+    remarks = [f"{path.name}: left out, they record markers and no video: {markers}"] if markers else []
+    return calibration_of_cameras(path, [_lens(path, camera) for camera in video], remarks)
+
+
+def _films(camera: _Camera) -> bool:
+    model = camera.own.get("model", "none").lower()
+    return "video" in model or model == "none"
+
+
+def _cameras(path: Path) -> list[_Camera]:
+    """The cameras of the file. Documents that define entities are refused: no calibration does."""
+    found: list[_Camera] = []
+
+    def started(name: str, attributes: dict[str, str]) -> None:
+        if name == "camera":
+            found.append(_Camera(attributes))
+        elif found and name in PARTS:
+            found[-1].parts[name] = attributes
+
+    def declared(*_: Any) -> None:
+        raise CaptureError(f"{path}: declares a document type, which no calibration of QTM does; export it anew")
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = started
+    parser.StartDoctypeDeclHandler = declared
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise CaptureError(f"{path}: has more than {LARGEST_FILE >> 20} MB, which no calibration has")
+        parser.Parse(path.read_bytes(), True)
+    except (OSError, expat.ExpatError, LookupError) as fault:
+        raise CaptureError(
+            f"{path}: cannot be read as XML ({fault}); export the calibration from QTM as text (*.qca.txt)"
+        ) from fault
+    if not found:
+        raise CaptureError(f"{path}: lists no camera; export the calibration from QTM as text (*.qca.txt)")
+    return found
+
+
+def _lens(path: Path, camera: _Camera) -> LensCamera:
+    name = camera.own.get("serial", "")
+    where = f"{path}: camera {name!r}"
+
+    def number(part: str, key: str) -> float:
+        given = camera.parts.get(part, {}).get(key)
+        try:
+            value = float(given) if given is not None else np.nan
+        except ValueError:
+            value = np.nan
+        if not np.isfinite(value):
+            raise CaptureError(f"{where}: {part} has {key} = {given!r}; give a finite number")
+        return value
+
+    window = "fov_video_max" if "fov_video_max" in camera.parts else "fov_video"
+    unit: list[float] = []
+    for axis, low, high in (("U", "left", "right"), ("V", "top", "bottom")):
+        sensor = number("intrinsic", f"sensorMax{axis}") - number("intrinsic", f"sensorMin{axis}")
+        pixels = number(window, high) - number(window, low)
+        ratio = sensor / pixels if pixels > 0 else 0.0
+        if round(ratio) < 2 or abs(ratio - round(ratio)) > WHOLE or round(ratio) != (unit or [round(ratio)])[0]:
+            raise CaptureError(
+                f"{where}: sensorMax{axis} is {sensor:g} for the {pixels + 1:g} pixels of {window}: {ratio:.3g} "
+                "subpixels a pixel, where QTM has 64; export the calibration from QTM"
+            )
+        unit.append(float(round(ratio)))
+    corner = np.array([number("fov_video", "left"), number("fov_video", "top")])
+    size = (number("fov_video", "right") - corner[0] + 1, number("fov_video", "bottom") - corner[1] + 1)
+    matrix = np.eye(3)
+    matrix[0, 0], matrix[1, 1] = (number("intrinsic", f"focalLength{a}") / u for a, u in zip("UV", unit, strict=True))
+    matrix[:2, 2] = [number("intrinsic", f"centerPoint{a}") / u for a, u in zip("UV", unit, strict=True)] - corner
+    matrix[0, 1] = number("intrinsic", "skew") / unit[0]
+    radial = [number("intrinsic", f"radialDistortion{i}") for i in (1, 2, 3)]
+    tangential = [number("intrinsic", f"tangentalDistortion{i}") for i in (1, 2)]
+    rotation = FLIP @ [[number("transform", f"r{row}{column}") for column in (1, 2, 3)] for row in (1, 2, 3)]
+    place = METRES * np.array([number("transform", axis) for axis in "xyz"])
+    return opencv_camera(
+        where,
+        name,
+        matrix=matrix,
+        distortions=[*radial[:2], *tangential, radial[2]],
+        rotation=rotation,
+        translation=-rotation @ place,
+        size=picture_size(where, size),
+    )

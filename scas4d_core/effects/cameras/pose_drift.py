@@ -1,0 +1,316 @@
+"""Poses of cameras that drift: tripods sag, are knocked by a pixel or a few, and bend in the sun.
+
+Once a frame, after its update, the renderings of some cameras are compared with their pictures: the turn of a camera
+that would bring them onto each other is noted, as what the camera is off by against its calibration. One frame says
+little, for what moves is followed late. A camera is believed to have moved where its earlier frames tell what its
+residual is now, and by ``LEAST`` pixels; then its pose follows, half of the way a frame. All others keep theirs to the
+bit.
+
+The poses are those of the training views of the frames after: masks shift with their camera, probe views and what is
+new are seen from where it stands. Views that users ask for are rendered for the camera as it is given: "as camera 7"
+is as that was calibrated. Who is believed is decided before (``robust.outliers``): a camera that is off is set aside
+as ever, and looked at all the same; it comes back once its pose is found, and stays aside beyond the limit. A gain of
+a camera is the median over its pixels, which hardly sees a shift of some pixels; ``shadows`` may learn in such
+frames, but from all cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from math import radians
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Camera, Rig
+from scas4d_core.effects.cameras.alignment import (
+    Array,
+    Double,
+    Equations,
+    adjoint,
+    in_pixels,
+    motion_of,
+    of_the_world,
+    offset_of,
+    pictures,
+    solved,
+    turn_equations,
+    twist_equations,
+)
+from scas4d_core.effects.effect import Effect, Group, refused_on_gpu
+from scas4d_core.effects.evidence import Evidence
+from scas4d_core.effects.parts import Arrays, PartsBuilder
+from scas4d_core.frame_outcome import Candidate
+
+if TYPE_CHECKING:
+    from scas4d_core.effects.evidence import Seen
+    from scas4d_core.settings import Settings
+    from scas4d_core.update.picture_loss import TrainingView
+
+NAME = "pose_drift"
+CAMERAS = 4
+"""At least, of which one can be told to be off: between fewer, what moves passes for it."""
+ENOUGH = 0.5
+"""Share of the rig's cameras from which a frame teaches."""
+LEAST = 0.25
+"""Pixels from which a camera may be off: on captures whose cameras stand 0.15 at most, 0.4 on cloth that is shaken."""
+TIMES = 4.0
+"""The same, of the median over the cameras: where many seem to be off, what moves is followed late."""
+# Thresholds of the effect: shares on captures whose cameras stand, at half size, are 0.14 at most on cloth played
+# backwards, 0.07 on cloth and the wheel, 0.03 on the others.
+SHARE = 0.5
+"""Of the way to what a frame says, that poses and what is noted take: a drift is followed late by as much as it goes in
+a frame, and a frame in which a thing is followed late does half of the harm."""
+STANDING = 6
+"""Cameras that stand, others in each frame, that are rendered where the effect is on: they tell what of a twist is the
+scene's own motion."""
+LARGEST, TURN = 0.02, radians(1)
+"""Share of the picture's width, and angle, by which a pose is moved at most: a camera that is off by more has been
+moved, and is set aside as ever."""
+COVERED = 0.1
+"""Alpha from which a pixel has a depth."""
+SMALLEST = 1e-3
+"""Added to the 3×3 equations of a turn in pixels, 0.3 pixels of one that weighs nothing: a bare wall tells no turn."""
+
+
+def posed(rig: Rig, carried: Mapping[str, Arrays]) -> Rig:
+    """The cameras as they stand by now; the rig itself where none has moved.
+
+    Args:
+        rig: the cameras inside, as calibrated. carried: arrays of the effects.
+    """
+    twists = carried.get(NAME, {}).get("twists")
+    if twists is None or not twists.any():
+        return rig
+    return Rig(tuple(_moved(camera, twist) for camera, twist in zip(rig.cameras, twists, strict=True)))
+
+
+def _moved(camera: Camera, twist: Double) -> Camera:
+    return replace(camera, world_to_camera=motion_of(twist) @ camera.world_to_camera) if twist.any() else camera
+
+
+@dataclass(eq=False)
+class Poses:
+    """The cameras of a rig, a row each.
+
+    Attributes:
+        twists: [C, 6] float64 by which each is moved against its calibration: shift (metres) and turn, camera's axes.
+        moved: [C, 3] the same in pixels, see ``alignment.offset_of``, when last looked at.
+        offsets: [C, 3] pixels that each has been off by, against its calibration: a mean that forgets.
+        shares: [C] 0…1 of its residual that offsets of earlier frames explained: a mean that forgets.
+        looks: [C] frames in which it was looked at.
+    """
+
+    twists: Double
+    moved: Double
+    offsets: Double
+    shares: Double
+    looks: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, arrays: Arrays, count: int) -> Poses:
+        """From ``arrays``; those that are not there are 0."""
+        shapes = {"twists": (count, 6), "moved": (count, 3), "offsets": (count, 3), "shares": (count,)}
+        found: dict[str, NDArray[Any]] = {name: np.zeros(shape) for name, shape in shapes.items()}
+        found["looks"] = np.zeros(count, np.int64)
+        return cls(**{name: arrays[name].copy() if name in arrays else empty for name, empty in found.items()})
+
+    def arrays(self) -> Arrays:
+        """As they are carried to the next frame; no twists where no camera has moved."""
+        found: Arrays = {name: getattr(self, name) for name in ("moved", "offsets", "shares", "looks")}
+        return {**found, "twists": self.twists} if self.twists.any() else found
+
+    def look(self, row: int, turn: Equations) -> None:
+        """Notes what a camera's residual says, in the numbers of ``turn_equations``, relative to its present pose."""
+        here = self.moved[row]
+        now = here + np.linalg.solve(turn.matrix + SMALLEST * np.eye(3), turn.vector)
+        if self.looks[row] == 0:
+            self.offsets[row] = now
+        else:
+            without = _left(turn, -here)
+            explained = 1 - _left(turn, self.offsets[row] - here) / without if without > 0 else 0.0
+            self.shares[row] += SHARE * (max(0.0, explained) - self.shares[row])
+            self.offsets[row] += SHARE * (now - self.offsets[row])
+        self.looks[row] += 1
+
+    def seems(self) -> NDArray[np.bool_]:
+        """[C] the cameras that may have moved: they are rendered, to be looked at again at once."""
+        sizes, looked = np.linalg.norm(self.offsets, axis=1), self.looks > 0
+        usual = float(np.median(sizes[looked])) if looked.any() else 0.0
+        found: NDArray[np.bool_] = sizes >= max(LEAST, TIMES * usual)
+        return found
+
+    def off(self) -> NDArray[np.bool_]:
+        """[C] the cameras that have moved."""
+        return self.twists.any(axis=1) | (self.seems() & (self.shares >= EFFECT.on_above))
+
+
+def _left(turn: Equations, way: Double) -> float:
+    """The weighted squares that a turn leaves."""
+    return float(turn.energy - 2 * turn.vector @ way + way @ turn.matrix @ way)
+
+
+def stepped(
+    twists: Double, aligned: Mapping[int, tuple[Equations, Camera, Array]], follow: NDArray[np.bool_]
+) -> Double:
+    """[C, 6] the twists after a frame, for the cameras that follow.
+
+    A motion of the scene that its other cameras see as well is taken out before.
+
+    Args:
+        twists: before. aligned: by row, the equations of a camera, the camera as it is posed, and its lens.
+        follow: [C].
+    """
+    matrix, vector = np.eye(6) * 1e-6, np.zeros(6)
+    standing = [row for row in aligned if not follow[row]] or list(aligned)
+    for row in standing:
+        one, camera, _ = aligned[row]
+        units = of_the_world(one, camera.world_to_camera)
+        matrix += units.T @ one.matrix @ units
+        vector += units.T @ one.vector
+    scene = np.linalg.solve(matrix, vector)
+    after = twists.copy()
+    for row, (one, camera, lens) in aligned.items():
+        if follow[row]:
+            own = one.vector - one.matrix @ of_the_world(one, camera.world_to_camera) @ scene
+            after[row] = bounded(after[row] + SHARE * solved(one, lens, after[row], own), lens, one.depth)
+    return after
+
+
+def bounded(twist: Double, lens: Array, depth: float) -> Double:
+    """The twist, or as much of it as a pose may be moved by."""
+    size = float(np.linalg.norm(offset_of(lens, twist, depth)[:2])) / (LARGEST * float(lens[4]))
+    return twist / max(1.0, size, float(np.linalg.norm(twist[3:])) / TURN)
+
+
+def centred(twists: Double, rig: Rig, believed: NDArray[np.bool_]) -> Double:
+    """[C, 6] the twists without what most cameras share: that is a motion of the scene.
+
+    The median is taken of each number, in the world's axes, over the cameras that are believed. With a mean, a camera
+    that is off by 3 pixels would move the others, and the world with them.
+
+    Args:
+        rig: as calibrated, or as posed: a motion does not turn its own twist. believed: [C].
+    """
+    worlds = [
+        np.linalg.solve(adjoint(rig.cameras[row].world_to_camera), twists[row]) for row in np.flatnonzero(believed)
+    ]
+    middle = np.median(worlds, axis=0) if worlds else np.zeros(6)
+    if not middle.any():
+        return twists
+    after = twists.copy()
+    for row in np.flatnonzero(believed):
+        after[row] -= adjoint(rig.cameras[row].world_to_camera) @ middle
+    return after
+
+
+@dataclass(frozen=True)
+class PoseDrift(Effect):
+    """Poses that follow the pictures, once a frame."""
+
+    def refused(self, settings: Settings) -> tuple[str, str] | None:
+        """Refused where another device renders: the evidence is taken from the CPU's renderings."""
+        return refused_on_gpu(settings)
+
+    def noted(self, seen: Seen, on: bool) -> Arrays | None:
+        """What each camera is off by; where it is on, the poses of the frames after."""
+        if len(seen.views) < max(CAMERAS, ENOUGH * len(seen.rig)):
+            return None
+        poses = Poses.of(dict(seen.result.carried.get(NAME, {})), len(seen.rig))
+        rows = {name: row for row, name in enumerate(seen.rig.names)}
+        aligned = _aligned(seen, _looked_at(seen, poses, rows)) if on else {}
+        seems = poses.seems()
+        for row, (one, _, lens) in aligned.items():
+            poses.moved[row] = offset_of(lens, poses.twists[row], one.depth)
+            turn = in_pixels(lens)
+            matrix = turn.T @ one.matrix[3:, 3:] @ turn
+            poses.look(row, Equations(matrix, turn.T @ one.vector[3:], one.energy, one.depth))
+        trace = seen.result.trace
+        for view in seen.views if trace.kept is Candidate.END else ():
+            if rows[view.name] not in aligned and view.name in trace.shown and (on or not seems[rows[view.name]]):
+                every, planes = trace.shown[view.name]
+                _look(poses, rows[view.name], view, planes[:3], every)
+        if on and aligned:
+            believed = np.isin(np.arange(len(rows)), [rows[view.name] for view in seen.views])
+            poses.twists = centred(stepped(poses.twists, aligned, poses.off()), seen.rig, believed)
+            for row, (one, _, lens) in aligned.items():
+                poses.moved[row] = offset_of(lens, poses.twists[row], one.depth)
+        elif not on:
+            for view in [*(view for view in seen.views if seems[rows[view.name]]), *seen.suspects]:
+                _look(poses, rows[view.name], view, _rendered(seen, view)[0], 1)
+        return poses.arrays()
+
+    def evidence(self, seen: Seen) -> Evidence | None:
+        """The share of its residual that a shift found in earlier frames explains, of the camera with the largest."""
+        arrays = seen.result.carried.get(NAME)
+        if arrays is None:
+            return None
+        poses = Poses.of(dict(arrays), len(seen.rig))
+        shares = np.where(poses.seems(), poses.shares, 0.0)
+        row = int(shares.argmax())
+        if shares[row] == 0:
+            return Evidence(0.0, "")
+        size = float(np.linalg.norm(poses.offsets[row]))
+        return Evidence(float(shares[row]), f"camera {seen.rig.names[row]} is off by {size:.1f} pixels")
+
+    def join(self, builder: PartsBuilder) -> None:
+        """Adds nothing: updates know nothing of it, for the poses are those of their views."""
+
+
+def _looked_at(seen: Seen, poses: Poses, rows: Mapping[str, int]) -> list[TrainingView]:
+    """Views to be aligned: of cameras that are off or set aside, and of some that stand, others in each frame."""
+    off = poses.off()
+    standing = [view for view in seen.views if not off[rows[view.name]]]
+    count = len(standing)
+    some = {(seen.index + count * k // STANDING) % count for k in range(STANDING)} if count else set()
+    others = [view for view in seen.views if off[rows[view.name]]]
+    return [*(standing[k] for k in sorted(some)), *others, *seen.suspects]
+
+
+def _aligned(seen: Seen, views: list[TrainingView]) -> dict[int, tuple[Equations, Camera, Array]]:
+    """By row, the equations of each view, its camera and lens; without those that tell too little."""
+    rows, found = {name: row for row, name in enumerate(seen.rig.names)}, {}
+    for view in views:
+        shown, depth = _rendered(seen, view)
+        told = pictures(view.target[:3], _exposed(view, shown))
+        if told is not None:
+            equations = twist_equations(view.camera.lens, told, depth)
+            found[rows[view.name]] = (equations, seen.rig[view.name], view.camera.lens)
+    return found
+
+
+def _look(poses: Poses, row: int, view: TrainingView, shown: Array, every: int) -> None:
+    told = pictures(view.target[:3], _exposed(view, shown), every)
+    if told is not None:
+        poses.look(row, turn_equations(view.camera.lens, told))
+
+
+def _exposed(view: TrainingView, shown: Array) -> Array:
+    return view.exposure[:3, 0, None, None] * shown + view.exposure[:3, 1, None, None]
+
+
+def _rendered(seen: Seen, view: TrainingView) -> tuple[Array, Array]:
+    """[3, H, W] as a view is rendered, without its exposure, and [H, W] metres along z; NaN where nothing is."""
+    from scas4d_core.rasterize.shading import features_seen  # it loads the kernels
+    from scas4d_core.update.picture_loss import LABEL
+
+    state = seen.result.gaussians
+    planes, rest = seen.picture.render(state, features_seen(state, view.camera), view, LABEL)
+    alpha = 1 - rest
+    depth = np.where(alpha > COVERED, planes[LABEL] / np.maximum(alpha, np.float32(COVERED)), np.float32(np.nan))
+    return planes[:3].copy(), depth
+
+
+EFFECT = PoseDrift(
+    name=NAME,
+    group=Group.CAMERAS,
+    says="Cameras drift or are knocked by a pixel or a few: their poses follow the pictures, once a frame.",
+    gauge="The median twist of the cameras is 0, number by number: what most of them share is motion of the scene.",
+    cost="a look at some pixels of eight renderings a frame; on, a render of each camera that is off, and of six more",
+    auto=True,
+    on_above=0.2,
+    off_below=0.08,
+    kept=("twists",),
+)

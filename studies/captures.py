@@ -1,0 +1,27 @@
+"""Captures of studies, of any layout, with cameras to measure on."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from client.cli.evaluate import DEFAULT_OPTIONS
+from client.importers.open_source import CaptureOptions
+from scas4d_core.captures import Capture
+
+
+def open_measured(folder: Path | str, options: CaptureOptions = DEFAULT_OPTIONS, **more: Any) -> Capture:
+    """Opens a capture to measure on: where it has no test cameras on its training cameras, and says so.
+
+    Args:
+        folder: of the capture. options: how it is read. more: as in `open_source`.
+
+    >>> open_measured("samples/robot").full_test_rig.names
+    ('4', '11')
+    """
+    capture = options.open(folder, **more)
+    if capture.full_test_rig is not None:
+        return capture
+    print(f"{capture.name} has no test cameras: measured on its training cameras", file=sys.stderr)
+    return capture.measured_on_training()

@@ -1,0 +1,152 @@
+"""``scripts/bench drift``: captures of which two cameras drift, with poses that follow and without.
+
+The pictures of a drifting camera are those that it would take if it turned: a turn needs no depth. One turns across,
+one down, by so many pixels a frame and up to so many. Test cameras stand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from client.cli.evaluate import Report, recorded
+from client.cli.scores import Column, Row, digest, markdown, read_row, write_row
+from scas4d_core.cameras import Camera
+from scas4d_core.captures import Capture, open_capture
+from scas4d_core.captures.frame import Frame
+from scas4d_core.effects.cameras.alignment import in_pixels, motion_of, offset_of
+from scas4d_core.effects.cameras.pose_drift import NAME
+from scas4d_core.metrics.evaluation import measure_pictures
+from scas4d_core.rasterize.cpu import CameraArrays
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.settings import Settings
+from studies.machine import core_version, machine
+from studies.quality.first_frame import first_of
+from studies.quality.settings import settings_of
+
+COLUMNS = (
+    Column("capture", "capture"),
+    Column("cameras", "cameras"),
+    Column("poses", "poses"),
+    Column("updates", "updates", "d"),
+    Column("PSNR", "psnr", ".2f"),
+    Column("last five", "last", ".2f"),
+    Column("off by at the end", "true"),
+    Column("found", "found"),
+)
+WAYS = ("stand", "drift")
+"""Of the cameras."""
+MODES = ("off", "auto")
+"""Of the effect."""
+
+
+def run(
+    captures: Sequence[Path],
+    out: Path,
+    *,
+    updates: int = 14,
+    pixels: float = 0.3,
+    most: float = 4.0,
+    changes: Sequence[str] = (),
+    again: bool = False,
+    report: Report = print,
+) -> list[Row]:
+    """Updates each capture in four ways, prints the table and leaves it in ``out/drift.md``.
+
+    Args:
+        captures: folders. out: a file a finished run goes here; run again to go on. updates: of each.
+        pixels: of the capture's files that a camera drifts by in a frame. most: in all.
+        changes: to the settings. again: measure anew. report: takes the printed lines.
+    """
+    rows = []
+    for folder in captures:
+        for way, mode in ((way, mode) for way in WAYS for mode in MODES):
+            settings = settings_of("scas4d", None, 0, [*changes, f"effects.{NAME}={mode}"])
+            key = digest(recorded(settings, ()), updates, way, pixels, most)
+            path = out / "drift" / f"{folder.resolve().name}-{way}-{mode}-{key}.json"
+            row = None if again else read_row(path)
+            if row is None:
+                drift = (pixels, most) if way == "drift" else (0.0, 0.0)
+                row = {
+                    "key": path.stem,
+                    "cameras": way,
+                    "poses": mode,
+                    **_played(folder, out, settings, updates, drift),
+                }
+                row |= {"settings": recorded(settings, ()), "core": core_version(), "machine": machine()}
+                write_row(path, row)
+            report(f"{row['capture']}, cameras {way}, {NAME} {mode}: {row['psnr']:.2f} dB")
+            rows.append(row)
+    table = markdown(rows, COLUMNS)
+    (out / "drift.md").write_text(table + "\n")
+    report(table)
+    return rows
+
+
+def _played(folder: Path, out: Path, settings: Settings, updates: int, drift: tuple[float, float]) -> Row:
+    capture = open_capture(folder)
+    tests = open_capture(folder, image_scale=settings.scene.image_scale)
+    known = first_of(capture, out, settings)
+    scene = Reconstruction.start(capture.rig, capture.frame(0), settings, points=capture.points, static=known)
+    names, scores, offsets = capture.rig.names, list[float](), dict[str, NDArray[np.float64]]()
+    for index in range(1, min(updates, capture.frame_count - 1) + 1):
+        size = min(drift[1], index * drift[0])
+        offsets = {names[len(names) // 8]: np.array([size, 0, 0]), names[-len(names) // 3]: np.array([0, size, 0])}
+        scene.step(turned(capture, index, offsets if size else {}))
+        found = measure_pictures(scene, tests, index)[0]["psnr"]
+        scores.append(float("nan") if found is None else found)
+    arrays = scene.history.effects(scene.history.indices[-1]).get(NAME, {})
+    twists = arrays.get("twists", np.zeros((len(names), 6)))
+    told = {name: _pixels(scene, name, twists[names.index(name)]) for name in offsets}
+    scale = settings.scene.image_scale
+    return {
+        "capture": capture.name,
+        "updates": len(scores),
+        "psnr": float(np.mean(scores)),
+        "last": float(np.mean(scores[-5:])),
+        "true": _words({name: scale * offset for name, offset in offsets.items()}),
+        "found": _words(told),
+        "followed": [name for name, twist in zip(names, twists, strict=True) if twist.any()],
+    }
+
+
+def _pixels(scene: Reconstruction, name: str, twist: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[3] of the reconstruction's pictures; what is seen is taken to be as far away as the rig's middle."""
+    camera = scene.rig[name]
+    return offset_of(CameraArrays.of(camera).lens, twist, float(np.linalg.norm(camera.centre)))
+
+
+def _words(offsets: Mapping[str, NDArray[np.float64]]) -> str:
+    return "; ".join(f"{name}: {offset[0]:.2f}, {offset[1]:.2f}" for name, offset in offsets.items())
+
+
+def turned(capture: Capture, index: int, offsets: Mapping[str, NDArray[np.float64]]) -> Frame:
+    """A frame as some cameras see it that have turned by pixels across, down and round (``offset_of``)."""
+    frame = capture.frame(index)
+    images, masks = dict(frame.images), dict(frame.masks)
+    for name, offset in offsets.items():
+        images[name] = _seen(images[name], capture.rig[name], offset, 3)
+        if name in masks:
+            masks[name] = _seen(masks[name], capture.rig[name], offset, 0)
+    return replace(frame, images=images, masks=masks)
+
+
+def _seen(
+    picture: NDArray[np.uint8], camera: Camera, offset: NDArray[np.float64], order: Literal[0, 3]
+) -> NDArray[np.uint8]:
+    """A picture [H, W] or [H, W, 3] of a camera that turns, to splines of an order; its rim is repeated."""
+    twist = np.concatenate([np.zeros(3), in_pixels(CameraArrays.of(camera).lens) @ offset])
+    back = camera.intrinsics @ motion_of(twist)[:3, :3].T @ np.linalg.inv(camera.intrinsics)
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    x, y, z = np.einsum("ij,jhw->ihw", back, np.stack([u, v, np.ones_like(u)]))
+    places = np.stack([y / z - 0.5, x / z - 0.5])
+    planes = np.atleast_3d(picture).astype(np.float64)
+    found = [map_coordinates(planes[..., k], places, order=order, mode="nearest") for k in range(planes.shape[2])]
+    seen: NDArray[np.uint8] = np.rint(np.clip(np.stack(found, axis=-1), 0, 255)).astype(np.uint8).reshape(picture.shape)
+    return seen
