@@ -45,11 +45,11 @@ def backdrop(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64] | None:
     codes, counts = np.unique(everyone @ np.array([1 << 16, 1 << 8, 1]), return_counts=True)
     code = int(codes[counts.argmax()])
     painted = np.array([code >> 16, code >> 8 & 255, code & 255], np.float64)
-    if _shown([(some == painted).all(axis=1) for some in pixels], SAME):
+    if _shown([_alike(some, painted, 0) for some in pixels], SAME):
         return painted
     cells = np.ravel_multi_index(tuple(everyone.T // ALIKE), (256 // ALIKE,) * 3)
     common: NDArray[np.float64] = np.median(everyone[cells == np.bincount(cells).argmax()], axis=0)
-    plain = _shown([(np.abs(some - common) <= ALIKE).all(axis=1) for some in pixels], PLAIN)
+    plain = _shown([_alike(some, common, ALIKE) for some in pixels], PLAIN)
     return common if plain else None
 
 
@@ -63,7 +63,11 @@ def _sampled(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return image[EVERY // 2 :: EVERY, EVERY // 2 :: EVERY].reshape(-1, 3)
 
 
-def _shown(of_it: list[NDArray[np.bool_]], share: float) -> bool:
+def _alike(pixels: NDArray[np.uint8], colour: NDArray[np.float64], levels: int) -> Bool:
+    return np.asarray((np.abs(pixels - colour) <= levels).all(axis=1))
+
+
+def _shown(of_it: list[Bool], share: float) -> bool:
     """Whether so many pixels are of a backdrop, and in most cameras half as many; ``of_it``: by camera."""
     return bool(np.concatenate(of_it).mean() >= share and np.median([some.mean() for some in of_it]) >= share / 2)
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from scas4d_core.captures.frame import InitialPoints
 from scas4d_core.first_frame.points.posed_pictures import (
+    Bool,
     Float,
     InitialPointsError,
     PosedPicture,
@@ -32,7 +33,8 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
     No point of these is known to lie on a surface; the fit of frame 0 moves, removes and adds.
 
     Args:
-        views: with pictures. distances: of each camera to the middle of the stage, world units.
+        views: with pictures; points are in the masks of all that have one.
+        distances: of each camera to the middle of the stage, world units.
         seed: of the samples.
 
     Raises:
@@ -56,7 +58,8 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
         depth = distance * (NEAR + (FAR - NEAR) * rng.random(each))
         drawn.append(view.camera.unproject(uv, depth))
     points = np.concatenate(drawn)
-    inside = np.stack([pixels_inside(view.camera, points)[3] for view in views])
+    inside, free = np.stack([_seen(view, points) for view in views], axis=1)
+    points, inside = points[~free.any(axis=0)], inside[:, ~free.any(axis=0)]
     # Three cameras that agree by chance are rarer than two.
     for needed in (3, 2):
         shared = inside.sum(axis=0) >= needed
@@ -70,6 +73,12 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
     seen = observe(views, points[shared], inside[:, shared])
     best = np.argsort(seen.spread, kind="stable")[: int(KEPT * shared.sum())]
     return InitialPoints(points[shared][best], seen.colours[best])
+
+
+def _seen(view: PosedPicture, points: Float) -> tuple[Bool, Bool]:
+    """[P] twice: whether a view's picture holds a point, and whether that pixel is off its mask."""
+    column, line, _, inside = pixels_inside(view.camera, points)
+    return inside, inside & ~view.mask[line, column] if view.mask is not None else np.zeros_like(inside)
 
 
 def stage_distances(views: Sequence[PosedPicture], known: Float, radius: float) -> list[float]:
