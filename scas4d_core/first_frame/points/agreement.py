@@ -40,7 +40,7 @@ CONTRADICTED = 1
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """How points are searched for.
+    """Settings of a search for points.
 
     Attributes:
         labelled: views with the masks that were given, if any. views: the same, or with the silhouettes before a

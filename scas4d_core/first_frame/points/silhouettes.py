@@ -68,7 +68,7 @@ def _alike(pixels: NDArray[np.uint8], colour: NDArray[np.float64], levels: int) 
 
 
 def _shown(of_it: list[Bool], share: float) -> bool:
-    """Whether so many pixels are of a backdrop, and in most cameras half as many; ``of_it``: by camera."""
+    """True where so many pixels are of a backdrop, and half as many in most cameras; ``of_it``: by camera."""
     return bool(np.concatenate(of_it).mean() >= share and np.median([some.mean() for some in of_it]) >= share / 2)
 
 
