@@ -13,7 +13,7 @@ from typing import Any, TypedDict
 import numpy as np
 
 from scas4d_core.captures.frame import Frame
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_scene import FirstCloud, StaticResult
 from scas4d_core.frame_outcome import Alarm, Candidate, FrameOutcome, degraded_text
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust.alarms import left_out_alarms
@@ -67,6 +67,7 @@ class FrameReport:
         moving, gaussians: how many Gaussians move, and are there. born, retired, revived: how many were, in this frame.
         put_off: what the budget left no time for, in words; the next frame has some for it.
         alarms: what a person should look at (``robust/alarms.py``).
+        cloud: of frame 0: where its first points came from.
         cameras: by name, how well each camera's picture was met when it was last rendered: a bumped camera shows.
         used: cameras whose pictures were learnt from; none of a frame that was held or stood. dropped: cameras left
             out, with the reason.
@@ -107,6 +108,7 @@ class FrameReport:
     revived: int = 0
     put_off: list[str] = field(default_factory=list)
     alarms: list[Alarm] = field(default_factory=list)
+    cloud: FirstCloud | None = None
 
     def record(self) -> dict[str, Any]:
         """The report as JSON: numbers that are not finite are None."""
@@ -152,6 +154,7 @@ def report_of_first(
         used=[name for name in names if name in frame.images],
         dropped=dict(dropped or {}),
         alarms=left_out_alarms(names, frame.images, dropped or {}),
+        cloud=result.cloud,
     )
 
 

@@ -83,7 +83,7 @@ def calibration(
         by_name.setdefault(view.path.stem if one_folder else view.path.parent.name, []).append(view)
     cameras = []
     for name in sorted(by_name, key=natural):
-        if not _can_be_named(name):
+        if not can_be_named(name):
             raise CaptureError(
                 f"{source}: camera {name!r} (of {by_name[name][0].path}): {NAMES}; rename its pictures or their folder"
             )
@@ -102,7 +102,7 @@ def calibration_of_cameras(source: Path, cameras: Sequence[LensCamera], remarks:
         raise CaptureError(f"{source}: lists no camera with a pose; calibrate the rig's poses (extrinsics) too")
     names = [camera.name for camera in cameras]
     for name in names:
-        if not _can_be_named(name):
+        if not can_be_named(name):
             raise CaptureError(f"{source}: camera {name!r}: {NAMES}; rename it there and its pictures")
         if names.count(name) > 1:
             raise CaptureError(f"{source}: two cameras are called {name!r}; rename one, and its pictures")
@@ -110,7 +110,8 @@ def calibration_of_cameras(source: Path, cameras: Sequence[LensCamera], remarks:
     return Calibration(source, ordered, {camera.name: () for camera in ordered}, remarks=tuple(remarks))
 
 
-def _can_be_named(name: str) -> bool:
+def can_be_named(name: str) -> bool:
+    """True for a name that the service takes; none of these leads out of a folder."""
     return bool(re.match(CAMERA_NAME, name)) and name != "time" and not name.startswith("mask.")
 
 

@@ -95,6 +95,11 @@ def open_source(
     if fps is not None and not 0 < fps < 1e6:
         raise CaptureError(f"fps {fps!r} must be a positive number of frames per second")
     if calibration is None and (folder / TRAIN_META).exists():
+        if pictures is not None:
+            raise CaptureError(
+                f"{folder / TRAIN_META}: names the pictures of this capture; leave --pictures {pictures} out, or name "
+                "another calibration with --calibration"
+            )
         given = open_capture(folder, fps=fps, use_masks=use_masks, use_points=use_points, fit=fit)
     else:
         given = _imported(folder, read_calibration(folder, calibration), pictures, fps, encoding, use_masks, fit)

@@ -16,6 +16,9 @@ from scas4d_core.captures import Capture, CaptureError
 
 OnProgress = Callable[[str, int, int], None]
 
+UNEVEN = 0.1
+"""Frames by which a time may be off an even rate: stamps of videos are rounded."""
+
 
 def write_dynamic3dgs(
     source: Capture,
@@ -47,11 +50,12 @@ def write_dynamic3dgs(
     held_out = () if source.full_test_rig is None else source.full_test_rig.cameras
     cameras = [*source.full_rig.cameras, *held_out]
     count = min(frames or source.frame_count, source.frame_count)
-    ends: dict[str, str] = {}
+    ends: dict[tuple[str, int], str] = {}
+    fps = _rate(source, count)
 
     def write(index: int, name: str) -> None:
         picture, mask = source.encoded(index, name), source.encoded_mask(index, name)
-        ends[name] = end = _end_of(picture)
+        ends[name, index] = end = _end_of(picture)
         _put(out / "ims" / name / f"{index:06d}{end}", picture)
         if mask is not None:
             _put(out / "seg" / name / f"{index:06d}.png", mask)
@@ -66,11 +70,32 @@ def write_dynamic3dgs(
         foreground = () if points.foreground is None else (points.foreground[:, None],)
         np.savez(out / "init_pt_cld.npz", data=np.concatenate([points.positions, points.colours, *foreground], axis=1))
     if held_out:
-        _write_meta(out / "test_meta.json", held_out, count, ends, source.fps)
-    _write_meta(out / "train_meta.json", source.full_rig.cameras, count, ends, source.fps)
+        _write_meta(out / "test_meta.json", held_out, count, ends, fps)
+    _write_meta(out / "train_meta.json", source.full_rig.cameras, count, ends, fps)
 
 
-def _write_meta(path: Path, cameras: Sequence[Camera], count: int, ends: dict[str, str], fps: float) -> None:
+def _rate(source: Capture, count: int) -> float:
+    """Frames a second, which is all that the layout has of times.
+
+    Raises:
+        CaptureError: the frames are not a fixed time apart.
+    """
+    times = np.array([source.time(index) for index in range(count)])
+    if count < 2:
+        return source.fps
+    fps = float((count - 1) / (times[-1] - times[0]))
+    off = np.abs(times - times[0] - np.arange(count) / fps) * fps
+    if off.max() > UNEVEN:
+        raise CaptureError(
+            f"{source.name}: frame {int(off.argmax())} is {off.max():.2g} frames off an even rate of {fps:.5g} a "
+            "second, and this layout has no times; leave import out: every command reads the capture as it is"
+        )
+    return fps
+
+
+def _write_meta(
+    path: Path, cameras: Sequence[Camera], count: int, ends: dict[tuple[str, int], str], fps: float
+) -> None:
     meta: dict[str, Any] = {
         "w": _one_or_all([camera.width for camera in cameras]),
         "h": _one_or_all([camera.height for camera in cameras]),
@@ -78,7 +103,7 @@ def _write_meta(path: Path, cameras: Sequence[Camera], count: int, ends: dict[st
         "k": [[camera.intrinsics.tolist() for camera in cameras]] * count,
         "w2c": [[camera.world_to_camera.tolist() for camera in cameras]] * count,
         "cam_id": [[camera.name for camera in cameras]] * count,
-        "fn": [[f"{camera.name}/{t:06d}{ends[camera.name]}" for camera in cameras] for t in range(count)],
+        "fn": [[f"{camera.name}/{t:06d}{ends[camera.name, t]}" for camera in cameras] for t in range(count)],
     }
     path.write_text(json.dumps(meta))
 

@@ -100,6 +100,20 @@ class EffectModel(Model):
     idle: int = Field(default=0, description="Frames in a row with too little evidence to stay on.")
 
 
+class FirstCloudModel(Model):
+    """Origin of the points from which frame 0 was fitted, and how sure they are."""
+
+    way: str = Field(
+        description="given; else how the pictures gave them: agreement (of three cameras or more), backdrop "
+        "(silhouettes before a plain one), pairs (two cameras agree), volume (no camera confirms them: frame 0 is a "
+        "guess; give points, or more cameras); several are joined by +."
+    )
+    points: int
+    covered: float | None = Field(
+        description="0…1, share of the pictures in which there are points on which cameras agree; null where given."
+    )
+
+
 class FrameReportModel(Model):
     """Report of one frame: its state, times, errors and metrics."""
 
@@ -174,6 +188,7 @@ class FrameReportModel(Model):
     born: int = Field(default=0, description="Gaussians that were born in this frame.")
     retired: int = Field(default=0, description="Gaussians that left the scene in this frame; their ids stay theirs.")
     revived: int = Field(default=0, description="Retired Gaussians that came back in this frame, as themselves.")
+    cloud: FirstCloudModel | None = Field(default=None, description="Of frame 0, where its first points came from.")
     put_off: list[str] = Field(
         default_factory=list, description="Births for which the budget left no time; the next frame has some for them."
     )

@@ -10,6 +10,7 @@ cloud without known foreground has six columns.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -27,6 +28,8 @@ from scas4d_core.captures.images import ImageError, describe_pictures, picture_s
 from scas4d_core.captures.reader import FileReader, Files
 
 TRAIN_META = "train_meta.json"
+CAMERA_NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}"
+"""The names that the service takes as well; none leads out of a folder."""
 STILL_TOLERANCE = 1e-6
 """Largest change of an entry of k or w2c over time that still counts as a camera standing still."""
 
@@ -169,7 +172,14 @@ def _names(path: Path, cam_id: Any) -> list[str]:
         raise CaptureError(
             f"{path}: cam_id of frame {changed} differs from frame 0; list the same cameras in every frame"
         )
-    return [str(name) for name in cam_id[0]]
+    names = [str(name) for name in cam_id[0]]
+    for name in names:
+        if not re.fullmatch(CAMERA_NAME, name):
+            raise CaptureError(
+                f"{path}: cam_id {name!r} is no name: files are named after it; give a number, or letters, digits, "
+                "dots, dashes and underscores, at most 64"
+            )
+    return names
 
 
 def _still(path: Path, key: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -179,17 +179,18 @@ def resize_mask(mask: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
 
 
 def eight_bit_file(data: bytes, name: str = "picture") -> bytes:
-    """The bytes of a picture file as they are; a PNG of 16 bits is rounded to 8, as `decode_image` rounds.
+    """The bytes of a JPEG, PNG or WebP as they are; any other picture becomes a PNG, of 16 bits one of 8.
 
     Raises:
-        ImageError: a PNG of 16 bits that cannot be decoded.
+        ImageError: such a picture cannot be decoded.
 
     >>> file = io.BytesIO()
     >>> Image.fromarray(np.full((2, 4), 25700, np.uint16)).save(file, "PNG")
     >>> decode_image(eight_bit_file(file.getvalue()))[0, 0].tolist()
     [100, 100, 100]
     """
-    if not is_sixteen_bit(data):
+    sent = data.startswith((b"\xff\xd8", b"\x89PNG")) or data[8:12] == b"WEBP"
+    if sent and not is_sixteen_bit(data):
         return data
     file = io.BytesIO()
     Image.fromarray(decode_image(data, name=name)).save(file, "PNG", compress_level=1)

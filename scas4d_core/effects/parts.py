@@ -140,6 +140,7 @@ class PartsBuilder:
         scene, update: the settings, the floor inside. factory: of the scene's views. hierarchy: of the moving.
         first: the roots, Θ_0 with all born since (``preparation``). whole: whether a part needs whole pictures: it
             changes what stands, or how a camera sees it. exposes: whether a part changes the exposures of views.
+        follows: whether a part learns from a frame what the state before shows well enough: it never stands then.
         length: weight of the limit of the axes' lengths, which the cascade's kernel has in itself.
         mask: weight of the term of masks, which the comparison of pictures has in itself. learns_labels: whether what
             moves is learnt from motion where no masks are given.
@@ -154,6 +155,7 @@ class PartsBuilder:
     first: Gaussians
     whole: bool = False
     exposes: bool = False
+    follows: bool = False
     length: float = 0.0
     mask: float = 0.0
     learns_labels: bool = False

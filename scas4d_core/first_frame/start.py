@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,8 @@ from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.first_frame.glossy import fit_by_direction
 from scas4d_core.first_frame.initial_points import initial_points
-from scas4d_core.first_frame.static_scene import StaticResult, first_trainer
+from scas4d_core.first_frame.points.silhouettes import EVERY, backdrop, mean_colour
+from scas4d_core.first_frame.static_scene import FirstCloud, StaticResult, first_trainer
 from scas4d_core.frame_report import Progress
 from scas4d_core.robust.checks import axis_lengths
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings
@@ -22,16 +23,6 @@ from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.update.picture_loss import TrainingView, ViewFactory
 
 Colour = tuple[float, float, float]
-
-PLAIN = 0.2
-"""Share of all pixels that have one colour, from which it is that of a plain backdrop; most cameras have half of it."""
-SAME = 0.05
-"""Of pixels that have exactly one colour, from which it was painted behind a rendered or cut-out thing. Rooms whose
-colours are quantized have up to 0.03."""
-ALIKE = 8
-"""Levels of 255 by which the pixels of one colour may differ: noise, and the traces of JPEG."""
-EVERY = 4
-"""Pixels, between those that are looked at."""
 
 
 def with_background(settings: Settings, images: Mapping[str, NDArray[np.uint8]]) -> Settings:
@@ -54,27 +45,13 @@ def with_background(settings: Settings, images: Mapping[str, NDArray[np.uint8]])
     pictures = [image for image in pictures if min(image.shape[:2]) > EVERY]
     if not pictures:  # they are refused later, in words
         return settings
-    pixels = [image[EVERY // 2 :: EVERY, EVERY // 2 :: EVERY].reshape(-1, 3) for image in pictures]
-    everyone = np.concatenate(pixels)
-    codes, counts = np.unique(everyone @ np.array([1 << 16, 1 << 8, 1]), return_counts=True)
-    code = int(codes[counts.argmax()])
-    painted = np.array([code >> 16, code >> 8 & 255, code & 255])
-    if _plain([(some == painted).all(axis=1) for some in pixels], SAME):
-        return _over(settings, _colour(painted))
-    cells = np.ravel_multi_index(tuple(everyone.T // ALIKE), (256 // ALIKE,) * 3)
-    common = np.median(everyone[cells == np.bincount(cells).argmax()], axis=0)
-    plain = _plain([(np.abs(some - common) <= ALIKE).all(axis=1) for some in pixels], PLAIN)
-    return _over(settings, _colour(common if plain else everyone.mean(axis=0)))
+    found = backdrop(pictures)
+    return _over(settings, _colour(mean_colour(pictures) if found is None else found))
 
 
 def _colour(levels: NDArray[Any]) -> list[float]:
     found: list[float] = np.round(levels / 255, 4).tolist()
     return found
-
-
-def _plain(of_it: list[NDArray[np.bool_]], share: float) -> bool:
-    """Whether so many pixels are of a backdrop, and in most cameras half as many; ``of_it``: by camera."""
-    return bool(np.concatenate(of_it).mean() >= share and np.median([some.mean() for some in of_it]) >= share / 2)
 
 
 def _over(settings: Settings, background: Sequence[float]) -> Settings:
@@ -181,17 +158,22 @@ def fit_first(
     """
     static = settings.static
     if points is None:
-        points = initial_points(
+        found = initial_points(
             factory.rig, frame.images, frame.masks,
             lambda stage, done, total: on_progress(Progress(stage, done, total)),
         )  # fmt: skip
-        positions = points.positions
+        cloud, made = _columns(found), FirstCloud(found.way, len(found), found.covered)
     else:
-        positions = world.to_inside(points.positions)
+        inside = replace(points, positions=world.to_inside(points.positions))
+        cloud, made = _columns(inside), FirstCloud("given", len(points))
     views = factory.views(frame, {})
-    cloud = positions, points.colours, points.foreground
-    return fit_by_direction(
+    result = fit_by_direction(
         lambda: first_trainer(factory, views, *cloud, settings.scene, static),
         settings.effects.get("direction", "auto") if settings.device == "cpu" else "off",
         lambda done, loss: on_progress(Progress("fitting frame 0", done, static.iterations, {"loss": loss})),
     )
+    return replace(result, cloud=made)
+
+
+def _columns(cloud: InitialPoints) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32] | None]:
+    return cloud.positions, cloud.colours, cloud.foreground

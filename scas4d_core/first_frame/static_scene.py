@@ -62,6 +62,20 @@ SPLIT_SHRINK = 1.6
 """A split Gaussian's halves are smaller by this (3DGS)."""
 
 
+@dataclass(frozen=True)
+class FirstCloud:
+    """Where the first cloud of points came from.
+
+    Attributes:
+        way: "given", or as in ``initial_points.FoundPoints``. points: how many.
+        covered: share of the pictures that points cover on which cameras agree; None of a cloud that was given.
+    """
+
+    way: str
+    points: int
+    covered: float | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class StaticResult:
     """Result of fitting frame 0.
@@ -71,6 +85,7 @@ class StaticResult:
         losses: the training loss of every iteration. psnr: dB of the view that each iteration rendered.
         cameras: by name, the fit of each camera's picture in its last iteration.
         evidence: that was found for effects, by name.
+        cloud: where the first cloud came from; None where it is not known.
     """
 
     gaussians: Gaussians
@@ -79,6 +94,7 @@ class StaticResult:
     psnr: list[float] = field(default_factory=list)
     cameras: dict[str, CameraFit] = field(default_factory=dict)
     evidence: Mapping[str, Evidence] | None = None
+    cloud: FirstCloud | None = None
 
 
 STOP_ROUNDS = 5

@@ -279,12 +279,12 @@ class FrameSolver:
         return None
 
     def _far(self, given: UpdateInput) -> bool:
-        """True where no motion was known to start from, and the update was no longer for it: there was far to go.
+        """True for the first update of a scene, where it was no longer for that: there was far to go.
 
         A budget in milliseconds is kept all the same.
         """
-        settings = self._settings
-        return settings.judge and settings.cold_longer <= 1 and given.motion is None and given.end is None
+        settings, first = self._settings, given.past.updates == 0 and given.motion is None
+        return first and settings.judge and settings.cold_longer <= 1 and given.end is None
 
     def _go_on(
         self, given: UpdateInput, tried: UpdateResult, attempts: list[str], longer: float = SEARCH.longer

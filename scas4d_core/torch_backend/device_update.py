@@ -80,7 +80,7 @@ class DeviceUpdate:
         limits = scene_limits(scene.near, factory.rig.radius)
         parts = parts or joined(PartsBuilder(scene, settings, factory, hierarchy, first))
         self._picture = PictureLoss(factory, scene.behind, schedule.IMAGE_WEIGHT, parts.mask, limits=limits)
-        self._freedom = parts.freedom
+        self._freedom, self._follows = parts.freedom, parts.follows
         own = [part for part in parts.parts if not part.known_to_devices]
         for part in own:
             if hooks := not_on_devices(type(part)):
@@ -133,7 +133,7 @@ class DeviceUpdate:
         work = Work(previous, deformation, rates, views, self._picture, dict(carried))
         for begin in self._hooks.start:
             begin(work)
-        stands = best.stands(options.enough)
+        stands = not self._follows and best.stands(options.enough)
         if stands:
             stopping = Stopping(0)
         plan = ViewPlan(views, settings.views, most, rng)

@@ -83,7 +83,7 @@ class FrameUpdate:
         self._factory = factory
         parts = parts or joined(PartsBuilder(scene, settings, factory, hierarchy, first))
         self._hooks, self._length, self._freedom = Hooks(parts.parts), parts.length, parts.freedom
-        self._exposes = parts.exposes
+        self._exposes, self._follows = parts.exposes, parts.follows
         self._rates = freed(Rates.of(settings, len(hierarchy.sizes), factory.rig.radius), parts.freedom)
         limits = scene_limits(scene.near, factory.rig.radius)
         given = (factory, scene.behind, schedule.IMAGE_WEIGHT, parts.mask)
@@ -126,7 +126,7 @@ class FrameUpdate:
         tables = free_tables(deformation, work.rates)
         for start in self._hooks.start:
             start(work)
-        if best.stands(options.enough):
+        if not self._follows and best.stands(options.enough):
             stopping = Stopping(0)
         watch.lap("start")
         while (iteration := trace.iterations) < (planned := stopping.planned(iteration)):

@@ -126,7 +126,7 @@ class Ingest:
         elif head.index > awaited:
             raise self.gap(head.index)
         else:  # the frames before it are arriving: it is checked when they are here
-            self.refuse_if_failed()
+            self.refuse_if_it_cannot_go_on()
         return True
 
     def is_coming(self, index: int) -> bool:
@@ -193,7 +193,7 @@ class Ingest:
 
     def admit(self, index: int, seconds: float) -> None:
         """Refuses a frame that cannot be the next."""
-        self.refuse_if_failed()
+        self.refuse_if_it_cannot_go_on()
         if index != self.ledger.next_frame:
             raise self.gap(index)
         if index in self.ledger.open:
@@ -209,10 +209,14 @@ class Ingest:
         if not self.has_room():
             raise self.full(index)
 
-    def refuse_if_failed(self) -> None:
-        """Refuses any frame of a scene that cannot begin, 422, or go on, 409."""
+    def refuse_if_it_cannot_go_on(self) -> None:
+        """Refuses any frame of a scene that cannot begin, 422, or has failed, 409."""
         if self.ledger.next_frame == 0:
             self._can_begin()
+        self.refuse_if_failed()
+
+    def refuse_if_failed(self) -> None:
+        """Refuses, 409, what is asked of a scene that has failed."""
         if self.ledger.fatal is not None:
             raise Problem(
                 409,

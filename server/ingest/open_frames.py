@@ -57,7 +57,7 @@ class OpenFrames:
 
     def _admit(self, head: FrameHead, camera: str) -> None:
         ledger, index = self._ledger, head.index
-        self.ingest.refuse_if_failed()
+        self.ingest.refuse_if_it_cannot_go_on()
         if index >= ledger.next_frame + AHEAD:
             if not self.ingest.has_room():
                 raise self.ingest.full(index)

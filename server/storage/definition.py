@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
 from blake3 import blake3
+from pydantic import ValidationError
 
 from client.wire import SceneCreate
 from scas4d_core.errors import message_of
@@ -57,10 +59,28 @@ class Definition:
                 data["id"],
                 datetime.fromisoformat(data["created"]).astimezone(UTC),
                 SceneCreate.model_validate(data["request"]),
-                Settings.model_validate(data["settings"]),
+                _within_limits(data["settings"]),
             )
         except (KeyError, TypeError, ValueError) as error:  # pydantic's error is a ValueError
             raise DefinitionError(f"the definition cannot be read: {message_of(error)}") from None
+
+
+def _within_limits(stored: Any) -> Settings:
+    """The settings; numbers beyond a limit that came after them are brought to it, so that the scene stays readable."""
+    try:
+        return Settings.model_validate(stored)
+    except ValidationError as error:
+        faults = error.errors(include_url=False)
+        if any(fault["type"] != "less_than_equal" for fault in faults):
+            raise
+        settings = copy.deepcopy(stored)
+        for fault in faults:
+            *way, last = fault["loc"]
+            place = settings
+            for name in way:
+                place = place[name]
+            place[last] = fault["ctx"]["le"]
+        return Settings.model_validate(settings)
 
 
 def write_definition(folder: SceneFolder, definition: Definition) -> None:

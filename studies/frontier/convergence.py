@@ -18,6 +18,7 @@ from client.cli.scores import Row, read_row, write_row
 from scas4d_core import metrics
 from scas4d_core.captures import Capture
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.settings import Settings
 from scas4d_core.warm_up import warm_up_elsewhere
 from studies.captures import open_measured
 from studies.frontier.frontier import Variant
@@ -94,9 +95,14 @@ def read_convergence(out: Path, capture: str) -> Row | None:
     return read_row(out / "convergence" / f"{capture}.json")
 
 
+def once(settings: Settings) -> Settings:
+    """The settings with one attempt a frame: a first update does not go on from where it ended."""
+    return settings.model_copy(update={"update": settings.update.model_copy(update={"judge": False})})
+
+
 def _watched(capture: Capture, variant: Variant, out: Path, updates: int) -> list[dict[int, float]]:
     """For each update the test cameras' mean PSNR in dB, by iterations done."""
-    reconstruction = started(capture, variant.settings, out)
+    reconstruction = started(capture, once(variant.settings), out)
     curves: list[dict[int, float]] = []
     for index in range(1, updates + 1):
         curve: dict[int, float] = {}

@@ -17,8 +17,9 @@ from scipy.ndimage import map_coordinates
 
 from client.cli.evaluate import Report, recorded
 from client.cli.scores import Column, Row, digest, markdown, read_row, write_row
+from client.importers.open_source import open_source
 from scas4d_core.cameras import Camera
-from scas4d_core.captures import Capture, open_capture
+from scas4d_core.captures import Capture
 from scas4d_core.captures.frame import Frame
 from scas4d_core.effects.cameras.alignment import in_pixels, motion_of, offset_of
 from scas4d_core.effects.cameras.pose_drift import NAME
@@ -90,8 +91,8 @@ def run(
 
 
 def _played(folder: Path, out: Path, settings: Settings, updates: int, drift: tuple[float, float]) -> Row:
-    capture = open_capture(folder)
-    tests = open_capture(folder, image_scale=settings.scene.image_scale)
+    capture = open_source(folder)
+    tests = open_source(folder, image_scale=settings.scene.image_scale)
     known = first_of(capture, out, settings)
     scene = Reconstruction.start(capture.rig, capture.frame(0), settings, points=capture.points, static=known)
     names, scores, offsets = capture.rig.names, list[float](), dict[str, NDArray[np.float64]]()

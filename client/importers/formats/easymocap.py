@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from client.importers.calibration import Calibration, calibration_of_cameras
+from client.importers.calibration import NAMES, Calibration, calibration_of_cameras, can_be_named
 from client.importers.formats.file_storage import first_of, read_storage, size_of_pictures
 from client.importers.formats.opencv_camera import numbers, opencv_camera, picture_size, rodrigues
 from client.importers.lens import LensCamera
@@ -59,6 +59,8 @@ def _camera(
     folder: Path, capture: Path, name: str, intrinsics: dict[str, Any], extrinsics: dict[str, Any]
 ) -> LensCamera:
     where = f"{folder / EXTRINSICS}: camera {name!r}"
+    if not can_be_named(name):
+        raise CaptureError(f"{where}: {NAMES}; rename it there and its pictures")
     rotation, vector = extrinsics.get(f"Rot_{name}"), extrinsics.get(f"R_{name}")
     if rotation is None:
         rotation = vector

@@ -5,9 +5,12 @@ Beside it, the size of a camera's pictures, which such files often lack.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from client.importers.extras import load, pyav
 from client.importers.pictures import READ
@@ -16,6 +19,12 @@ from scas4d_core.captures import CaptureError, ImageError
 from scas4d_core.captures.images import picture_size
 
 LARGEST_FILE = 16 << 20
+TAG = re.compile(rb"</?[A-Za-z_]")
+LEVELS = np.zeros(256, np.int8)
+LEVELS[[ord("["), ord("{")]], LEVELS[[ord("]"), ord("}")]] = 1, -1
+DASHES = re.compile(rb" *(?:- )+")
+DEEPEST = 32
+"""Levels of nesting: OpenCV reads each by calling itself, and dies of some ten thousand."""
 
 
 def read_storage(path: Path) -> dict[str, Any]:
@@ -29,6 +38,8 @@ def read_storage(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > LARGEST_FILE:
             raise CaptureError(f"{path}: has more than {LARGEST_FILE >> 20} MB, which no calibration has")
+        if _depth(path.read_bytes()) > DEEPEST:
+            raise CaptureError(f"{path}: is nested deeper than {DEEPEST} levels, which no calibration is")
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
         if not storage.isOpened():
             raise CaptureError(f"{path}: cannot be read as a file of OpenCV (FileStorage, YAML or XML)")
@@ -37,6 +48,17 @@ def read_storage(path: Path) -> dict[str, Any]:
     except (OSError, SystemError, cv2.error) as fault:
         first = str(fault).strip().splitlines()[0] if str(fault).strip() else type(fault).__name__
         raise CaptureError(f"{path}: cannot be read as a file of OpenCV, YAML or XML ({first})") from fault
+
+
+def _depth(data: bytes) -> int:
+    """Levels of brackets, of indentation (YAML) or of tags (XML), whichever are most."""
+    brackets = np.cumsum(LEVELS[np.frombuffer(data, np.uint8)], dtype=np.int64)
+    tags = np.cumsum([-1 if tag.startswith(b"</") else 1 for tag in TAG.findall(data)])
+    lines = [line for line in data.splitlines() if line.strip()]
+    if len(tags):  # XML may be indented at will
+        return int(max(brackets.max(), tags.max()))
+    dashes = max((len(found[0]) // 2 for found in map(DASHES.match, lines) if found), default=0)
+    return int(max(brackets.max(initial=0), len({len(line) - len(line.lstrip()) for line in lines}), dashes))
 
 
 def _value(node: Any) -> Any:

@@ -99,7 +99,7 @@ def _read_toml(path: Path) -> Calibration:
     try:
         with path.open("rb") as file:
             document: dict[str, Any] = tomllib.load(file)
-    except (OSError, ValueError) as fault:  # TOML that is broken, and text that is no UTF-8
+    except (OSError, ValueError, RecursionError) as fault:  # broken, no UTF-8, or nested without end
         raise CaptureError(f"{path}: cannot be read as TOML ({fault})") from fault
     if is_caliscope(document):
         return read_caliscope(path, document)

@@ -87,8 +87,9 @@ class Light(Effect):
         return Evidence(min(1.0, change), f"the light changes by {change:.1%} a frame")
 
     def join(self, builder: PartsBuilder) -> None:
-        """Frees the colours that are learnt."""
+        """Frees the colours that are learnt, also from a frame that is shown well enough in the light before."""
         builder.shared(Colours).lit = True
+        builder.follows = True
 
 
 EFFECT = Light(

@@ -216,7 +216,7 @@ class PoseDrift(Effect):
 
     def noted(self, seen: Seen, on: bool) -> Arrays | None:
         """What each camera is off by; where it is on, the poses of the frames after."""
-        if len(seen.views) < max(CAMERAS, ENOUGH * len(seen.rig)):
+        if not _says(seen):
             return None
         poses = Poses.of(dict(seen.result.carried.get(NAME, {})), len(seen.rig))
         rows = {name: row for row, name in enumerate(seen.rig.names)}
@@ -245,7 +245,7 @@ class PoseDrift(Effect):
     def evidence(self, seen: Seen) -> Evidence | None:
         """The share of its residual that a shift found in earlier frames explains, of the camera with the largest."""
         arrays = seen.result.carried.get(NAME)
-        if arrays is None:
+        if arrays is None or not _says(seen):
             return None
         poses = Poses.of(dict(arrays), len(seen.rig))
         shares = np.where(poses.seems(), poses.shares, 0.0)
@@ -257,6 +257,10 @@ class PoseDrift(Effect):
 
     def join(self, builder: PartsBuilder) -> None:
         """Adds nothing: updates know nothing of it, for the poses are those of their views."""
+
+
+def _says(seen: Seen) -> bool:
+    return len(seen.views) >= max(CAMERAS, ENOUGH * len(seen.rig))
 
 
 def _looked_at(seen: Seen, poses: Poses, rows: Mapping[str, int]) -> list[TrainingView]:
@@ -308,7 +312,7 @@ EFFECT = PoseDrift(
     group=Group.CAMERAS,
     says="Cameras drift or are knocked by a pixel or a few: their poses follow the pictures, once a frame.",
     gauge="The median twist of the cameras is 0, number by number: what most of them share is motion of the scene.",
-    cost="a look at some pixels of eight renderings a frame; on, a render of each camera that is off, and of six more",
+    cost="a look at some pixels of eight renderings a frame, one render of each set aside; on, of those off and of six",
     auto=True,
     on_above=0.2,
     off_below=0.08,

@@ -104,3 +104,41 @@ def test_a_folder_that_was_not_finished_is_no_capture(distorted, tmp_path):
         write_dynamic3dgs(open_source(distorted), tmp_path / "out")
     with pytest.raises(CaptureError, match="no known capture layout"):
         open_capture(tmp_path / "out")
+
+
+def test_pictures_of_one_camera_that_end_otherwise_are_read_back(distorted, tmp_path):
+    straight = tmp_path / "straight"
+    rig = lenses("PINHOLE")
+    write(straight / "transforms.json", transforms(rig))
+    for name in rig:
+        (straight / "images" / name).mkdir(parents=True)
+        for t, end in enumerate((".png", ".jpg")):
+            Image.new("RGB", (WIDTH, HEIGHT), (40 * t, 0, 90)).save(straight / "images" / name / f"{t}{end}")
+    write_dynamic3dgs(open_source(straight), tmp_path / "out")
+    again = open_capture(tmp_path / "out")
+    assert again.frame_count == 2
+    assert np.abs(again.frame(1).images["cam1"].astype(int) - (40, 0, 90)).max() < 4
+
+
+@pytest.mark.parametrize(("times", "fps"), [((0.0, 0.5, 1.0), 2.0), ((0.0, 0.5, 3.0), None)])
+def test_times_become_the_rate_or_are_refused(tmp_path, times, fps):
+    rig = lenses("PINHOLE")
+    meta = transforms(rig)
+    meta["frames"] = [
+        {**one, "file_path": f"images/{name}/{t}.png", "time": time}
+        for name, one in zip(rig, meta["frames"], strict=True)
+        for t, time in enumerate(times)
+    ]
+    write(tmp_path / "studio" / "transforms.json", meta)
+    for name in rig:
+        (tmp_path / "studio/images" / name).mkdir(parents=True)
+        for t in range(3):
+            Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "studio/images" / name / f"{t}.png")
+    source = open_source(tmp_path / "studio")
+    if fps is None:
+        with pytest.raises(CaptureError, match=r"frame 1 is .* off an even rate"):
+            write_dynamic3dgs(source, tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+    else:
+        write_dynamic3dgs(source, tmp_path / "out")
+        assert open_capture(tmp_path / "out").fps == pytest.approx(fps)

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from scas4d_core.captures import CaptureError, ImageError, open_capture
+from scas4d_core.captures.images import decode_image
 
 SAMPLE = Path(__file__).parents[3] / "samples" / "robot"
 FRAMES = 3
@@ -316,3 +317,25 @@ def test_the_sample_capture_is_whole_and_small():
     pixels = np.floor(uv[seen]).astype(int)
     agree = truth.labels("4", 13)[pixels[:, 1], pixels[:, 0]] == truth.part_id[seen]
     assert agree.mean() > 0.95
+
+
+@pytest.mark.parametrize("name", ["../../away", "/etc", "a b", "", ".hidden"])
+def test_a_camera_name_that_leads_elsewhere_is_refused(folder, name):
+    change(folder / "test_meta.json", cam_id=[[name]] * FRAMES)
+    with pytest.raises(CaptureError, match="cam_id"):
+        open_capture(folder)
+
+
+def test_a_bitmap_is_sent_as_png(folder):
+    for path in (folder / "ims/0").iterdir():
+        Image.open(path).save(path.with_suffix(".bmp"))
+        path.unlink()
+    train = json.loads((folder / "train_meta.json").read_text())
+    train["fn"] = [
+        [name.replace(".png", ".bmp") if name.startswith("0/") else name for name in row] for row in train["fn"]
+    ]
+    (folder / "train_meta.json").write_text(json.dumps(train))
+    capture = open_capture(folder)
+    sent = capture.encoded(1, "0")
+    assert sent.startswith(b"\x89PNG")
+    assert np.array_equal(decode_image(sent), shade(0, 1))

@@ -1,6 +1,9 @@
-"""Where no motion is known an update goes on once more from where it ended: there is far to go."""
+"""The first update of a scene goes on once more from where it ended: there is far to go."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from box_scene import MOVING, make_box, make_rig, moved, take_frame
@@ -18,8 +21,9 @@ FURTHER = moved(BOX, Rotation.from_rotvec([0.1, 0.5, 0.0]), np.array([0.16, 0.0,
 TWICE = ["as set", "on from where the update ended"]
 
 
-def scene(**update: float) -> Reconstruction:
-    settings = Settings(update=UpdateSettings(iterations=15, clusters=(2, 12), **update))  # type: ignore[arg-type]
+def scene(effects: dict[str, Any] | None = None, **update: float) -> Reconstruction:
+    made = UpdateSettings(iterations=15, clusters=(2, 12), **update)  # type: ignore[arg-type]
+    settings = Settings(update=made, effects=effects or {})
     return Reconstruction.start(RIG, take_frame(0, 0.0, BOX, RIG), settings, static=StaticResult(BOX, {}, []))
 
 
@@ -61,3 +65,21 @@ def test_where_nothing_moves_there_is_nothing_to_go_on_with() -> None:
     report = one.step(take_frame(1, 0.1, BOX, RIG))
     assert (report.outcome, report.iterations) == (FrameOutcome.STOOD, 0)
     np.testing.assert_array_equal(one.history.newest.means, BOX.means)
+
+
+def test_a_later_update_without_a_motion_does_not_go_on() -> None:
+    one = scene()
+    one.step(take_frame(1, 0.1, FAR, RIG))
+    one._carried = replace(one._carried, motion=None)  # as where labels, clusters or neighbours are made anew
+    assert one.step(take_frame(2, 0.2, FURTHER, RIG)).attempts == ["as set"]
+
+
+def test_while_the_light_changes_no_frame_stands() -> None:
+    rng = np.random.default_rng(0)
+    for mode, iterations in (("off", 0), ("on", 15)):
+        one = scene(effects={"light": mode}, still=1.0)
+        for index in (1, 2, 3):
+            still = take_frame(index, 0.1 * index, FAR, RIG)
+            noisy = {name: image ^ rng.integers(0, 2, image.shape, np.uint8) for name, image in still.images.items()}
+            report = one.step(replace(still, images=noisy))
+        assert report.iterations == iterations

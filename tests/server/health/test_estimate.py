@@ -30,6 +30,7 @@ def rig(width, count=2):
     model = RigModel.of(make_rig(count)).model_dump(mode="json")
     for camera in model["cameras"]:
         camera["width"] = camera["height"] = width
+        camera["intrinsics"] = [[width, 0, width / 2], [0, width, width / 2], [0, 0, 1]]
     return model
 
 

@@ -51,6 +51,12 @@ def test_a_scene_has_the_budget_of_its_settings_until_another_is_put(sdk):
     sdk.delete_scene(id)
 
 
+def test_a_scene_that_still_waits_for_its_points_takes_one(sdk):
+    id = sdk.create_scene(make_rig(1)).id  # of one camera: frame 0 needs points
+    assert sdk.set_budget(id, iterations=50).effective.iterations == 50
+    sdk.delete_scene(id)
+
+
 def test_it_holds_from_the_first_frame_that_is_not_begun(sdk, scene):
     push(sdk, scene, 0, 1)
     assert sdk.set_budget(scene, iterations=25).since == 2

@@ -313,7 +313,7 @@ def test_watching_an_update_does_not_change_it(box_capture, with_frame_0):
     assert drawn["iterations"] == [0, 1, 2, 4, 7, 10, 12]
     assert drawn["psnr"][-1] > drawn["psnr"][0] + 1
     capture = open_capture(box_capture)
-    unwatched = timing.started(capture, short.settings, with_frame_0)
+    unwatched = timing.started(capture, convergence.once(short.settings), with_frame_0)
     ends = []
     for index in (1, 2):
         unwatched.step(capture.frame(index))

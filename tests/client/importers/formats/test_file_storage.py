@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 
 import numpy as np
@@ -10,6 +11,7 @@ from lenses import HEIGHT, WIDTH
 from rigs import NAMES, easymocap, lenses, opencv_file, opencv_matrix, write_pictures
 
 from client.importers.extras import MissingExtra
+from client.importers.formats.file_storage import read_storage
 from client.importers.open_source import open_source, read_calibration
 from scas4d_core.captures import CaptureError
 
@@ -135,4 +137,35 @@ def test_opencv_is_asked_for_by_name(tmp_path, monkeypatch):
 def test_a_camera_without_a_pose_is_refused(tmp_path):
     (tmp_path / "cam1.yml").write_text(opencv_file(lenses()["cam1"], pose=False))
     with pytest.raises(CaptureError, match=r"cam1.yml: has no pose; give R and T, world to camera"):
+        read_calibration(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "%YAML:1.0\n---\nx: " + "[ " * 40 + "1" + " ]" * 40,
+        "%YAML:1.0\n---\n" + "".join(f"{'   ' * level}a{level}:\n" for level in range(40)),
+        "%YAML:1.0\n---\nx:\n  " + "- " * 40 + "1\n",
+        "<?xml version='1.0'?><opencv_storage>" + "<a>" * 40 + "</a>" * 40 + "</opencv_storage>",
+    ],
+)
+def test_files_nested_without_end_are_refused(tmp_path, text):
+    path = tmp_path / "cam1.yml"
+    path.write_text(text)
+    with pytest.raises(CaptureError, match="nested deeper"):
+        read_storage(path)
+
+
+def test_toml_nested_without_end_is_refused(tmp_path):
+    (tmp_path / "calibration.toml").write_text("x = " + "[" * 5000)
+    with pytest.raises(CaptureError, match="TOML"):
+        read_calibration(tmp_path)
+
+
+def test_a_camera_of_easymocap_looks_for_its_pictures_in_the_folder_alone(tmp_path):
+    rig = lenses()
+    easymocap(rig, tmp_path, sizes=False)
+    for file in (tmp_path / "intri.yml", tmp_path / "extri.yml"):
+        file.write_text(re.sub(r'(["_])cam', r"\1../../cam", file.read_text()))
+    with pytest.raises(CaptureError, match="letters, digits"):
         read_calibration(tmp_path)

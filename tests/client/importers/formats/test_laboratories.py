@@ -219,7 +219,7 @@ def test_poses_the_wrong_way_round_are_remarked(tmp_path):
         rig[f"c{i}"] = camera("PINHOLE", f"c{i}", to_camera)
     write_pictures(tmp_path / "images", names=rig)
     (tmp_path / "calibration.toml").write_text(anipose(rig))
-    assert open_source(tmp_path).remarks == []
+    assert open_source(tmp_path).remarks == ()
     wrong = {name: camera("PINHOLE", name, np.linalg.inv(lens.world_to_camera)) for name, lens in rig.items()}
     (tmp_path / "calibration.toml").write_text(anipose(wrong))
     (remark,) = open_source(tmp_path).remarks

@@ -225,7 +225,7 @@ def test_where_most_cameras_seem_to_be_off_none_is() -> None:
             poses.look(row, Equations(400 * np.eye(3), 400 * way, 400.0, 1.0))
     assert poses.shares.min() > 0.2
     assert not poses.off().any()
-    seen: Any = SimpleNamespace(result=SimpleNamespace(carried={NAME: poses.arrays()}), rig=RIG)
+    seen: Any = SimpleNamespace(result=SimpleNamespace(carried={NAME: poses.arrays()}), rig=RIG, views=[*RIG.names])
     found = effect(NAME).evidence(seen)
     assert found is not None
     assert found.share == 0
@@ -252,7 +252,7 @@ def test_the_switch_stays_on_for_a_camera_that_stays_moved_and_goes_off_with_it(
 
 
 def test_evidence_of_nothing() -> None:
-    seen: Any = SimpleNamespace(result=SimpleNamespace(carried={}), rig=RIG)
+    seen: Any = SimpleNamespace(result=SimpleNamespace(carried={}), rig=RIG, views=[*RIG.names])
     assert effect(NAME).evidence(seen) is None
     seen.result.carried[NAME] = Poses.of({}, 6).arrays()
     found = effect(NAME).evidence(seen)
@@ -274,3 +274,12 @@ def test_another_device_is_refused() -> None:
 def test_a_few_cameras_teach_nothing() -> None:
     seen: Any = SimpleNamespace(views=[1, 2, 3], rig=RIG)
     assert effect(NAME).noted(seen, on=True) is None
+
+
+def test_a_frame_of_few_cameras_is_no_evidence() -> None:
+    seen: Any = SimpleNamespace(
+        result=SimpleNamespace(carried={NAME: Poses.of({}, len(RIG)).arrays()}), rig=RIG, views=[*RIG.names]
+    )
+    assert effect(NAME).evidence(seen) is not None
+    seen.views = seen.views[:1]
+    assert effect(NAME).evidence(seen) is None

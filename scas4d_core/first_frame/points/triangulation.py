@@ -16,7 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from scas4d_core.cameras import Camera
-from scas4d_core.first_frame.posed_pictures import Float, PosedPicture
+from scas4d_core.first_frame.points.posed_pictures import Float, PosedPicture
 
 RATIO = 0.8
 """Best over second-best descriptor distance among the candidates on the epipolar line (Lowe 2004, section 7.1)."""

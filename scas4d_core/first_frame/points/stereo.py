@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
-from scas4d_core.first_frame.patch_match import patch_match
-from scas4d_core.first_frame.posed_pictures import Bool, Float, PosedPicture, pixels_inside
-from scas4d_core.first_frame.visual_hull import VisualHull
+from scas4d_core.first_frame.points.patch_match import patch_match
+from scas4d_core.first_frame.points.posed_pictures import Bool, Float, PosedPicture, pixels_inside
+from scas4d_core.first_frame.points.visual_hull import VisualHull
 
 WIDTH = 320
 """Pixels: wider pictures are halved until they are not."""
 NEIGHBOURS = 4
 """Other cameras that each picture is compared with."""
+FEWEST_NEIGHBOURS = 2
+"""A picture with fewer of them is compared with none: a match in a single one is often wrong."""
 ITERATIONS = 4
 """Rounds of propagation and refinement."""
 MAX_COST = 0.35
@@ -82,6 +84,7 @@ def depth_maps(
     iterations: int = ITERATIONS,
     seed: int = 0,
     hull: VisualHull | None = None,
+    fewest: int = FEWEST_NEIGHBOURS,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[DepthMap]:
     """PatchMatch of every view against its neighbours, then the comparison of all depths.
@@ -95,6 +98,7 @@ def depth_maps(
         iterations: rounds of PatchMatch.
         seed: of the random planes.
         hull: of the masks: depths of masked pixels that lie outside it are false.
+        fewest: neighbours that a picture needs.
         progress: called with (views done, views).
     """
     greys = [
@@ -105,7 +109,7 @@ def depth_maps(
     for i, view in enumerate(views):
         chosen = neighbours_of(views, i, middle, NEIGHBOURS)
         camera = view.camera
-        if len(chosen) < 2:
+        if len(chosen) < fewest:
             depths.append(np.zeros(greys[i].shape))
             continue
         matrices, shifts = [], []
@@ -125,7 +129,7 @@ def depth_maps(
             near=ranges[i][0],
             far=ranges[i][1],
             iterations=iterations,
-            best=2,
+            best=min(FEWEST_NEIGHBOURS, len(chosen)),
             seed=seed * 1009 + i,
         )
         depths.append(np.where(cost <= MAX_COST, depth, 0.0))

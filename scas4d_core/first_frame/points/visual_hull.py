@@ -12,7 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt
 
-from scas4d_core.first_frame.posed_pictures import Bool, Float, PosedPicture, front_depth, look_at_point, pixels_inside
+from scas4d_core.first_frame.points.posed_pictures import (
+    Bool,
+    Float,
+    PosedPicture,
+    front_depth,
+    look_at_point,
+    pixels_inside,
+)
 
 SEEN_SHARE = 0.35
 """Share of the masked cameras that must see a voxel: at the edges of the stage few do, and ghosts stay uncarved."""

@@ -1,0 +1,179 @@
+"""Points on which cameras agree: features, stereo, the hull of the masks, and the surfaces that they support."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scas4d_core.captures.frame import InitialPoints
+from scas4d_core.first_frame.points.merging import SPACING, merged, thinned
+from scas4d_core.first_frame.points.posed_pictures import Bool, Float, PosedPicture, look_at_point, pixels_inside
+from scas4d_core.first_frame.points.stereo import (
+    FEWEST_NEIGHBOURS,
+    DepthMap,
+    depth_maps,
+    fused_points,
+    halved,
+    looked_through,
+)
+from scas4d_core.first_frame.points.surfaces import (
+    TOLERANCE,
+    Support,
+    fit_surfaces,
+    sample_surfaces,
+    settle,
+    surface_depth,
+)
+from scas4d_core.first_frame.points.triangulation import Triangulation, triangulate
+from scas4d_core.first_frame.points.visual_hull import MISSES, VisualHull, carve, contradicted, pixel_at
+
+OnProgress = Callable[[str, int, int], None]
+"""Called with a stage, the steps done and the steps in all."""
+
+LOOKED_THROUGH = 2
+"""Cameras looking through an unconfirmed point that refute it: one depth may be wrong."""
+CONTRADICTED = 1
+"""Masks speaking against a point that refute it: one is enough, for all masks agree on the hull behind the point."""
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """Settings of a search for points.
+
+    Attributes:
+        labelled: views with the masks that were given, if any. views: the same, or with the silhouettes before a
+            backdrop. backdrop: true where the masks of ``views`` are those silhouettes.
+        min_views: cameras that must agree on a point. stereo: whether there is dense stereo. iterations: its rounds.
+        max_points: kept at most. radius: of the rig, world units. seed: of every random choice.
+    """
+
+    labelled: Sequence[PosedPicture]
+    views: Sequence[PosedPicture]
+    backdrop: bool
+    min_views: int
+    stereo: bool
+    iterations: int
+    max_points: int
+    radius: float
+    seed: int
+
+
+def agreed_points(search: Search, on_progress: OnProgress) -> InitialPoints:
+    """Points on which ``search.min_views`` cameras agree.
+
+    Raises:
+        InitialPointsError: there is none.
+    """
+    views, plain, min_views, seed = search.views, search.backdrop, search.min_views, search.seed
+    middle = look_at_point(views)
+    pixel = pixel_at(views, middle)
+
+    on_progress("triangulation", 0, 1)
+    triangulated = triangulate(views, min_views=min_views, seed=seed)
+    on_progress("hull", 0, 1)
+    hull = carve(views, misses=0.0 if plain else MISSES, min_views=min_views)
+    supports: list[Support] = []
+    if not plain and len(triangulated.positions) >= 10:
+        standing = triangulated.positions[~_in_foreground(views, triangulated)]
+        supports = fit_surfaces(
+            standing,
+            np.array([view.camera.centre for view in views]),
+            TOLERANCE * search.radius,
+            seed=seed,
+        )
+
+    maps: list[DepthMap] = []
+    if search.stereo:
+        maps = _stereo(search, triangulated, hull, supports, middle, on_progress)
+    on_progress("merging", 0, 1)
+    confirmed = np.concatenate([fused_points(maps, min_views), triangulated.positions])
+    if not plain and len(hull.cells):
+        confirmed = confirmed[contradicted(views, hull, confirmed, MISSES) < CONTRADICTED]
+
+    solid = _free_hull(hull, maps, min_views)
+    walls = np.zeros((0, 3))
+    if supports:
+        # One sample for about every four pixels of stereo's pictures is as dense as the thinning below needs.
+        stride = max(2, max(view.camera.width for view in views) // 160)
+        samples = sample_surfaces(views, supports, stride, search.radius)
+        samples, _ = thinned(samples, 2.0 * SPACING * pixel)
+        samples = settle(samples, supports, confirmed, 4.0 * TOLERANCE * search.radius)
+        walls = samples[looked_through(maps, samples, min_views) < LOOKED_THROUGH]
+    sources = (confirmed, solid, walls)
+    return merged(search.labelled, views, sources, pixel, plain, search.stereo, search.max_points)
+
+
+def _in_foreground(views: Sequence[PosedPicture], triangulated: Triangulation) -> Bool:
+    """[P] true where most of the cameras that saw a triangulated point have it in their mask."""
+    points = triangulated.positions
+    said, yes = np.zeros(len(points)), np.zeros(len(points))
+    for view, seen in zip(views, triangulated.views.T, strict=True):
+        if view.mask is None:
+            continue
+        column, line, _, inside = pixels_inside(view.camera, points)
+        said += inside & seen
+        yes += inside & seen & view.mask[line, column]
+    result: Bool = yes > 0.5 * np.maximum(said, 1)
+    return result
+
+
+def _stereo(
+    search: Search,
+    triangulated: Triangulation,
+    hull: VisualHull,
+    supports: Sequence[Support],
+    middle: Float,
+    on_progress: OnProgress,
+) -> list[DepthMap]:
+    """Depth maps of all pictures, halved; the search starts from hull, surfaces and triangulated points."""
+    views, plain = search.views, search.backdrop
+    small = [halved(view) for view in views]
+    hull_surface = hull.centres[hull.surface()]
+    known = hull_surface if plain else np.concatenate([triangulated.positions, hull_surface])
+    ranges, priors, active = [], [], []
+    for view in small:
+        camera = view.camera
+        shape = (camera.height, camera.width)
+        prior = np.zeros(shape)
+        depth = camera.to_camera(known)[:, 2] if len(known) else np.zeros(0)
+        depth = depth[depth > 0]
+        if supports:
+            rows, columns = np.indices(shape)
+            first = surface_depth(view, supports, np.stack([columns + 0.5, rows + 0.5], -1).reshape(-1, 2))[1]
+            prior = np.where(np.isfinite(first), first, 0.0).reshape(shape)
+            depth = np.concatenate([depth, prior[prior > 0][::16]])
+        if len(depth) < 10:
+            depth = np.array([0.05, 2.0]) * float(np.linalg.norm(camera.centre - middle))
+        # Features do not reach the ends of the scene, a hull does.
+        low, high = (0.9, 1.1) if plain else (0.6, 1.3)
+        ranges.append((low * float(np.percentile(depth, 1)), high * float(np.percentile(depth, 99))))
+        if len(hull_surface):
+            column, line, there, inside = pixels_inside(camera, hull_surface)
+            nearest = np.full(shape, np.inf)
+            np.minimum.at(nearest, (line[inside], column[inside]), there[inside])
+            prior = np.where(np.isfinite(nearest), nearest, prior)
+        priors.append(prior)
+        active.append(view.mask if plain and view.mask is not None else np.ones(shape, dtype=bool))
+    return depth_maps(
+        small,
+        ranges,
+        priors,
+        active,
+        middle,
+        iterations=search.iterations,
+        seed=search.seed,
+        hull=hull,
+        fewest=min(FEWEST_NEIGHBOURS, search.min_views - 1),
+        progress=lambda done, total: on_progress("stereo", done, total),
+    )
+
+
+def _free_hull(hull: VisualHull, maps: Sequence[DepthMap], min_views: int) -> Float:
+    """[P, 3] surface of the hull without the space that cameras look through."""
+    if len(hull.cells) == 0:
+        return np.zeros((0, 3))
+    solid = looked_through(maps, hull.centres, min_views, margin=0.01) < LOOKED_THROUGH
+    rest = replace(hull, cells=hull.cells[solid])
+    return rest.centres[rest.surface()]

@@ -1,0 +1,134 @@
+"""Merges candidates for initial points: thins, colours and labels them, drops those that the pictures contradict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from scas4d_core.captures.frame import InitialPoints
+from scas4d_core.first_frame.points.posed_pictures import (
+    Bool,
+    Float,
+    InitialPointsError,
+    PosedPicture,
+    observe,
+    pixels_inside,
+    visible_from,
+)
+
+SPACING = 1.5
+"""Distance of neighbouring points, pixels at the middle of the stage; twice that on the background."""
+COLOUR_SPREAD = 0.12
+"""Median deviation of the cameras' colours (0…1) above which a point that stereo has not confirmed is in the wrong
+place."""
+CROWD = 4
+"""Stereo points that the 27 cells about one must hold: true surfaces are seen by many pixels, strays by few."""
+
+
+def merged(
+    labelled: Sequence[PosedPicture],
+    views: Sequence[PosedPicture],
+    sources: tuple[Float, Float, Float],
+    pixel: float,
+    plain: bool,
+    stereo: bool,
+    max_points: int,
+) -> InitialPoints:
+    """Thins, colours and labels the candidates, and drops those that the pictures contradict.
+
+    ``sources``: points that cameras agree on, points of the hull, points of fitted surfaces; a later source counts only
+    where no earlier one has a point.
+    """
+    fine = SPACING * pixel
+    # Cameras that must see a point and agree on its colour: none once more, where stereo or features agree already;
+    # two for the hull, which all masks support; one for a wall that is known from elsewhere.
+    needed_by = (0, 2, 1)
+    points, needed = np.zeros((0, 3)), np.zeros(0, dtype=np.intp)
+    for source, (candidates, views_needed) in enumerate(zip(sources, needed_by, strict=True)):
+        new, sizes = thinned(candidates, fine)
+        if source == 0 and stereo and len(new):
+            # Features are few and checked; the hull and the walls cover those that lie near no point of stereo.
+            crowd = np.asarray(cKDTree(candidates).query_ball_point(new, 1.5 * fine, return_length=True))
+            new = new[(crowd >= CROWD) | (sizes >= CROWD)]
+        elif len(points) and len(new):
+            new = new[np.asarray(cKDTree(points).query(new)[0]) > 2.5 * fine]
+        points = np.concatenate([points, new])
+        needed = np.concatenate([needed, np.full(len(new), views_needed, dtype=np.intp)])
+    if len(points) == 0:
+        raise InitialPointsError(
+            "images: no point is supported by enough cameras; check that the calibration belongs to the pictures, "
+            "or start from a point cloud"
+        )
+    visible = visible_from(views, points, fine)
+    foreground = labelled_share(labelled, points, visible)
+    if plain:
+        # A point that projects to the plain background there lies beside an outline, and has none of its colour.
+        for row, view in zip(visible, views, strict=True):
+            column, line, _, _ = pixels_inside(view.camera, points)
+            row &= np.asarray(view.mask)[line, column]
+    elif foreground is not None:
+        # A person in front of a wall is no sample of the wall's colour, nor the wall of the person's.
+        for row, view in zip(visible, views, strict=True):
+            if view.mask is not None:
+                column, line, _, _ = pixels_inside(view.camera, points)
+                row &= view.mask[line, column] == (foreground > 0.5)
+    seen = observe(views, points, visible)
+    good = (seen.count >= np.maximum(needed, 1)) & ((needed == 0) | (seen.spread <= COLOUR_SPREAD))
+    coarse = np.zeros(len(points), dtype=bool) if foreground is None else foreground < 0.5
+    scale = 1.0
+    while True:
+        chosen = good.copy()
+        for group, spacing in ((coarse, 2.0 * fine * scale), (~coarse, fine * scale)):
+            members = np.flatnonzero(group & good)
+            if len(members) and spacing > fine:
+                chosen[members] = False
+                chosen[members[spaced(points[members], spacing)]] = True
+        if chosen.sum() <= max_points:
+            break
+        scale *= 1.15
+    if not chosen.any():
+        raise InitialPointsError(
+            "images: the cameras contradict every candidate point; check that the calibration belongs to the pictures, "
+            "or start from a point cloud"
+        )
+    return InitialPoints(points[chosen], seen.colours[chosen], None if foreground is None else foreground[chosen])
+
+
+def labelled_share(views: Sequence[PosedPicture], points: Float, visible: Bool) -> NDArray[np.float32] | None:
+    """[P] share of the cameras that may see each point whose mask holds it; None without masks."""
+    said, yes = np.zeros(len(points)), np.zeros(len(points))
+    for row, view in zip(visible, views, strict=True):
+        if view.mask is None:
+            continue
+        column, line, _, inside = pixels_inside(view.camera, points)
+        said += row & inside
+        yes += row & inside & view.mask[line, column]
+    if all(view.mask is None for view in views):
+        return None
+    return (yes / np.maximum(said, 1)).astype(np.float32)
+
+
+def spaced(points: Float, cell: float) -> NDArray[np.intp]:
+    """Index of one point for each cubic cell, the nearest to the mean of the cell's points: that spreads evenly."""
+    cells = np.floor(points / cell).astype(np.int64)
+    _, where = np.unique(cells, axis=0, return_inverse=True)
+    where = where.ravel()
+    count = np.bincount(where)
+    means = np.stack([np.bincount(where, points[:, axis]) for axis in range(3)], axis=-1) / count[:, None]
+    order = np.lexsort((((points - means[where]) ** 2).sum(-1), where))
+    result: NDArray[np.intp] = order[np.concatenate([[0], np.cumsum(count)[:-1]])]
+    return result
+
+
+def thinned(points: Float, cell: float) -> tuple[Float, NDArray[np.intp]]:
+    """Means [Q, 3] of the points in each cubic cell of edge ``cell``, and the number of points in each [Q]."""
+    if len(points) == 0:
+        return points.reshape(-1, 3), np.zeros(0, dtype=np.intp)
+    cells = np.floor(points / cell).astype(np.int64)
+    _, where, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    where = where.ravel()
+    means = np.stack([np.bincount(where, points[:, axis]) for axis in range(3)], axis=-1) / count[:, None]
+    return means, count

@@ -1,0 +1,100 @@
+"""The backdrop of a scene, and silhouettes of what stands before it, read off the pictures alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+
+from scas4d_core.first_frame.points.posed_pictures import Bool, PosedPicture
+
+TOLERANCE = 8
+"""Difference from the background, of 255 in any channel, that still counts as background: above resampling and mild
+compression noise."""
+PLAIN_BORDER = 0.95
+"""Share of the border of every picture in one colour from which the background counts as plain."""
+SMALL_HOLE = 12
+"""Pixels: background islands up to this size inside the object are dark texture, not holes."""
+
+PLAIN = 0.2
+"""Share of all pixels that have one colour, from which it is that of a plain backdrop; most cameras have half of it."""
+SAME = 0.05
+"""Of pixels that have exactly one colour, from which it was painted behind a rendered or cut-out thing. Rooms whose
+colours are quantized have up to 0.03."""
+ALIKE = 8
+"""Levels of 255 by which the pixels of one colour may differ: noise, and the traces of JPEG."""
+EVERY = 4
+"""Pixels, between those that are looked at."""
+
+
+def _border(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.concatenate([image[0], image[-1], image[1:-1, 0], image[1:-1, -1]])
+
+
+def backdrop(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64] | None:
+    """Colour [3], in levels of 255, of a plain backdrop that a good part of the pictures shows; None where none does.
+
+    Args:
+        images: [H, W, 3] each, wider and higher than ``EVERY`` pixels.
+    """
+    pixels = [_sampled(image) for image in images]
+    everyone = np.concatenate(pixels)
+    codes, counts = np.unique(everyone @ np.array([1 << 16, 1 << 8, 1]), return_counts=True)
+    code = int(codes[counts.argmax()])
+    painted = np.array([code >> 16, code >> 8 & 255, code & 255], np.float64)
+    if _shown([_alike(some, painted, 0) for some in pixels], SAME):
+        return painted
+    cells = np.ravel_multi_index(tuple(everyone.T // ALIKE), (256 // ALIKE,) * 3)
+    common: NDArray[np.float64] = np.median(everyone[cells == np.bincount(cells).argmax()], axis=0)
+    plain = _shown([_alike(some, common, ALIKE) for some in pixels], PLAIN)
+    return common if plain else None
+
+
+def mean_colour(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
+    """[3] mean of all pictures, in levels of 255."""
+    mean: NDArray[np.float64] = np.concatenate([_sampled(image) for image in images]).mean(axis=0)
+    return mean
+
+
+def _sampled(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return image[EVERY // 2 :: EVERY, EVERY // 2 :: EVERY].reshape(-1, 3)
+
+
+def _alike(pixels: NDArray[np.uint8], colour: NDArray[np.float64], levels: int) -> Bool:
+    return np.asarray((np.abs(pixels - colour) <= levels).all(axis=1))
+
+
+def _shown(of_it: list[Bool], share: float) -> bool:
+    """True where so many pixels are of a backdrop, and half as many in most cameras; ``of_it``: by camera."""
+    return bool(np.concatenate(of_it).mean() >= share and np.median([some.mean() for some in of_it]) >= share / 2)
+
+
+def plain_background(views: Sequence[PosedPicture]) -> NDArray[np.uint8] | None:
+    """Colour [3] uint8 that the borders of all pictures share; None where they do not."""
+    borders = [_border(view.image) for view in views]
+    colour = np.median(np.concatenate(borders), axis=0)
+    for border in borders:
+        same = np.abs(border - colour).max(axis=1) <= TOLERANCE
+        if same.mean() < PLAIN_BORDER:
+            return None
+    result: NDArray[np.uint8] = colour.astype(np.uint8)
+    return result
+
+
+def silhouette(image: NDArray[np.uint8], background: NDArray[np.uint8]) -> Bool:
+    """[H, W] bool, true where the picture differs from the background or is a small island of it within the object."""
+    other = np.abs(image.astype(np.int16) - background.astype(np.int16)).max(axis=-1) > TOLERANCE
+    islands, count = label(~other)
+    sizes = np.bincount(islands.ravel(), minlength=count + 1)
+    small = sizes <= SMALL_HOLE
+    small[0] = False
+    result: Bool = other | small[islands]
+    return result
+
+
+def with_silhouettes(views: Sequence[PosedPicture], background: NDArray[np.uint8]) -> list[PosedPicture]:
+    """The views with the silhouette as their mask."""
+    return [replace(view, mask=silhouette(view.image, background)) for view in views]

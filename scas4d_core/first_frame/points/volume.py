@@ -1,0 +1,98 @@
+"""Points of the volume that cameras share: the last way to a cloud, where nothing is confirmed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from scas4d_core.captures.frame import InitialPoints
+from scas4d_core.first_frame.points.posed_pictures import (
+    Bool,
+    Float,
+    InitialPointsError,
+    PosedPicture,
+    look_at_point,
+    observe,
+    pixels_inside,
+)
+
+SAMPLES = 60_000
+"""Points drawn: about one for four pixels of stereo's pictures."""
+KEPT = 0.25
+"""Share of them that stay: those whose colour differs least from camera to camera are refuted least."""
+NEAR, FAR = 0.3, 1.7
+"""Depths between which points are drawn, times the distance of the camera to the middle of the stage."""
+FEW = 10
+"""Points whose median depth is believed."""
+
+
+def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], seed: int) -> InitialPoints:
+    """Points along the rays of all pixels, those on whose colour the cameras that might see them differ least.
+
+    No point of these is known to lie on a surface; the fit of frame 0 moves, removes and adds.
+
+    Args:
+        views: with pictures; points are in the masks of all that have one.
+        distances: of each camera to the middle of the stage, world units.
+        seed: of the samples.
+
+    Raises:
+        InitialPointsError: no two cameras look at one place.
+
+    >>> from scas4d_core.cameras import Camera
+    >>> def seen(x):
+    ...     pose = np.eye(4)
+    ...     pose[:3, 3] = -x, 0, 2
+    ...     lens = [[40, 0, 16], [0, 40, 16], [0, 0, 1]]
+    ...     return PosedPicture(Camera(f"c{x}", lens, pose, 32, 32), np.full((32, 32, 3), 90, np.uint8))
+    >>> cloud = shared_volume([seen(0.0), seen(0.3)], [2.0, 2.0], seed=0)
+    >>> len(cloud) > 1000, cloud.colours[0].round(2)
+    (True, array([0.35, 0.35, 0.35], dtype=float32))
+    """
+    rng = np.random.default_rng(seed)
+    each = SAMPLES // len(views)
+    drawn: list[Float] = []
+    for view, distance in zip(views, distances, strict=True):
+        uv = rng.random((each, 2)) * (view.camera.width, view.camera.height)
+        depth = distance * (NEAR + (FAR - NEAR) * rng.random(each))
+        drawn.append(view.camera.unproject(uv, depth))
+    points = np.concatenate(drawn)
+    inside, free = np.stack([_seen(view, points) for view in views], axis=1)
+    points, inside = points[~free.any(axis=0)], inside[:, ~free.any(axis=0)]
+    # Three cameras that agree by chance are rarer than two.
+    for needed in (3, 2):
+        shared = inside.sum(axis=0) >= needed
+        if shared.sum() >= KEPT * each:
+            break
+    else:
+        raise InitialPointsError(
+            "images: no two cameras look at one place; check that the calibration belongs to the pictures, and that "
+            "poses are world-to-camera, or start from a point cloud"
+        )
+    seen = observe(views, points[shared], inside[:, shared])
+    best = np.argsort(seen.spread, kind="stable")[: int(KEPT * shared.sum())]
+    return InitialPoints(points[shared][best], seen.colours[best])
+
+
+def _seen(view: PosedPicture, points: Float) -> tuple[Bool, Bool]:
+    """[P] twice: whether a view's picture holds a point, and whether that pixel is off its mask."""
+    column, line, _, inside = pixels_inside(view.camera, points)
+    return inside, inside & ~view.mask[line, column] if view.mask is not None else np.zeros_like(inside)
+
+
+def stage_distances(views: Sequence[PosedPicture], known: Float, radius: float) -> list[float]:
+    """Distance of each camera to what it looks at: to known points, else to where the optical axes meet.
+
+    Args:
+        views: of the cameras. known: [P, 3] triangulated points, or none. radius: of the rig, the distance where all
+            cameras look in one direction.
+    """
+    middle = look_at_point(views)
+    found = []
+    for view in views:
+        depth = view.camera.to_camera(known)[:, 2] if len(known) else np.zeros(0)
+        depth = depth[depth > 0]
+        ahead = float(view.camera.to_camera(middle[None])[0, 2])
+        found.append(float(np.median(depth)) if len(depth) >= FEW else ahead if ahead > radius / 10 else radius)
+    return found
