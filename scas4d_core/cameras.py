@@ -16,6 +16,8 @@ from scas4d_core.errors import InputError
 
 Float = NDArray[np.float64]
 
+CAMERA_NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}$"
+"""The names that captures and the service take: files are named after them, and none leads out of a folder."""
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of R Rᵀ − I that still counts as a rotation: calibration files round to 4–6 digits."""
 

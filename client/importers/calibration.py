@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from client.importers.lens import LensCamera
-from client.wire.base import CAMERA_NAME
+from scas4d_core.cameras import CAMERA_NAME
 from scas4d_core.captures import CaptureError, InitialPoints
 
 STILL_TOLERANCE = 1e-6
@@ -112,7 +112,7 @@ def calibration_of_cameras(source: Path, cameras: Sequence[LensCamera], remarks:
 
 def can_be_named(name: str) -> bool:
     """True for a name that the service takes; none of these leads out of a folder."""
-    return bool(re.match(CAMERA_NAME, name)) and name != "time" and not name.startswith("mask.")
+    return bool(re.fullmatch(CAMERA_NAME, name)) and name != "time" and not name.startswith("mask.")
 
 
 def _still(source: Path, name: str, views: Sequence[CalibratedImage]) -> LensCamera:

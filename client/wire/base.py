@@ -6,10 +6,11 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
+from scas4d_core.cameras import CAMERA_NAME
+
 MAX_CAMERAS = 512
 MAX_PIXELS_A_SIDE = 16_384
 
-CAMERA_NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}$"
 CameraName = Annotated[
     str,
     Field(

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.cameras import Camera, CameraError, Rig
+from scas4d_core.cameras import CAMERA_NAME, Camera, CameraError, Rig
 from scas4d_core.captures.capture import Capture
 from scas4d_core.captures.files import CaptureError, read_json, read_npz
 from scas4d_core.captures.fit import Fit, fitted_intrinsics
@@ -28,8 +28,6 @@ from scas4d_core.captures.images import ImageError, describe_pictures, picture_s
 from scas4d_core.captures.reader import FileReader, Files
 
 TRAIN_META = "train_meta.json"
-CAMERA_NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}"
-"""The names that the service takes as well; none leads out of a folder."""
 STILL_TOLERANCE = 1e-6
 """Largest change of an entry of k or w2c over time that still counts as a camera standing still."""
 

@@ -22,7 +22,7 @@ from scas4d_core.first_frame.points.posed_pictures import (
 )
 from scas4d_core.first_frame.points.silhouettes import backdrop, plain_background, with_silhouettes
 from scas4d_core.first_frame.points.stereo import ITERATIONS
-from scas4d_core.first_frame.points.triangulation import triangulate
+from scas4d_core.first_frame.points.triangulation import matched_tracks, triangulate
 from scas4d_core.first_frame.points.visual_hull import pixel_at
 from scas4d_core.first_frame.points.volume import shared_volume, stage_distances
 
@@ -105,9 +105,11 @@ def initial_points(
     labelled = collect_views(rig, images, masks)
     background = plain_background(labelled)
     views = labelled if background is None else with_silhouettes(labelled, background)
+    on_progress("triangulation", 0, 1)
+    tracks = matched_tracks(labelled)
     first = Search(
-        labelled, views, background is not None, min(MIN_VIEWS, len(views)), stereo, stereo_iterations, max_points,
-        rig.radius, seed,
+        labelled, views, tracks, background is not None, min(MIN_VIEWS, len(views)), stereo, stereo_iterations,
+        max_points, rig.radius, seed,
     )  # fmt: skip
     spacing = SPACING * pixel_at(labelled, look_at_point(labelled))
     found: FoundPoints | None = None
@@ -123,7 +125,7 @@ def initial_points(
     if found is not None and found.covered > LITTLE:
         return found
     before = next((search.views for way, search in ways if way == "backdrop"), views)
-    known = triangulate(before, min_views=2, seed=seed).positions
+    known = triangulate(before, tracks, min_views=2, seed=seed).positions
     volume = shared_volume(before, stage_distances(before, known, rig.radius), seed)
     confirmed = 0.0 if found is None else found.covered
     return replace(_joined(found, volume, "volume", before, 4 * spacing), covered=confirmed)

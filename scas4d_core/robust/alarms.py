@@ -171,11 +171,8 @@ def _judged(
     if not np.isnan(sharper):
         now = replace(now, blur=before.blur + 1 if abs(sharper) > SHARPNESS[0] else 0)
         if abs(sharper) > SHARPNESS[1] or now.blur >= ROW:
-            size, words = (
-                100 * abs(np.expm1(sharper)),
-                ("sharper: noise?" if sharper > 0 else "less sharp: out of focus?"),
-            )
-            text = f"its picture is {size:.0f} % {words.replace(':', ' than usual beside the others:')}"
+            how, why = ("sharper", "noise?") if sharper > 0 else ("less sharp", "out of focus?")
+            text = f"its picture is {100 * abs(np.expm1(sharper)):.0f} % {how} than usual beside the others: {why}"
             alarms.append(Alarm(AlarmKind.CAMERA_SHARPNESS, name, text))
     if np.isnan(before.sharp):
         now = replace(now, sharp=sharp)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from scas4d_core.cameras import Rig
+from scas4d_core.first_frame.points.posed_pictures import pixels_inside
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView
 
@@ -73,12 +74,9 @@ def with_what_masks_hold(gaussians: Gaussians, rig: Rig, masks: Mapping[str, NDA
     for camera in rig.cameras:
         if camera.name not in masks:
             continue
-        pixels, depths = camera.project(points)
-        size = np.array([camera.width, camera.height])
-        shown = (depths > 0) & ((pixels >= 0) & (pixels < size)).all(axis=1)  # behind a camera pixels are NaN
-        column, row = pixels[shown].astype(np.int64).T
-        seen += shown
-        held[shown] += masks[camera.name][row, column] > 0
+        column, row, _, inside = pixels_inside(camera, points)
+        seen += inside
+        held += inside & (masks[camera.name][row, column] > 0)
     within = (seen >= INSIDE_CAMERAS) & (held >= INSIDE_SHARE * seen)
     if not within.any():
         return gaussians

@@ -26,7 +26,7 @@ from scas4d_core.first_frame.points.surfaces import (
     settle,
     surface_depth,
 )
-from scas4d_core.first_frame.points.triangulation import Triangulation, triangulate
+from scas4d_core.first_frame.points.triangulation import Tracks, Triangulation, triangulate
 from scas4d_core.first_frame.points.visual_hull import MISSES, VisualHull, carve, contradicted, pixel_at
 
 OnProgress = Callable[[str, int, int], None]
@@ -46,11 +46,12 @@ class Search:
         labelled: views with the masks that were given, if any. views: the same, or with the silhouettes before a
             backdrop. backdrop: true where the masks of ``views`` are those silhouettes.
         min_views: cameras that must agree on a point. stereo: whether there is dense stereo. iterations: its rounds.
-        max_points: kept at most. radius: of the rig, world units. seed: of every random choice.
+        tracks: of features. max_points: kept at most. radius: of the rig, world units. seed: of every random choice.
     """
 
     labelled: Sequence[PosedPicture]
     views: Sequence[PosedPicture]
+    tracks: Tracks
     backdrop: bool
     min_views: int
     stereo: bool
@@ -70,8 +71,7 @@ def agreed_points(search: Search, on_progress: OnProgress) -> InitialPoints:
     middle = look_at_point(views)
     pixel = pixel_at(views, middle)
 
-    on_progress("triangulation", 0, 1)
-    triangulated = triangulate(views, min_views=min_views, seed=seed)
+    triangulated = triangulate(views, search.tracks, min_views=min_views, seed=seed)
     on_progress("hull", 0, 1)
     hull = carve(views, misses=0.0 if plain else MISSES, min_views=min_views)
     supports: list[Support] = []

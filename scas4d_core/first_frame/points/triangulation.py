@@ -109,16 +109,21 @@ def guided_matches(
     return np.stack([rows[good], best_b[good]], axis=1)
 
 
-def triangulate(views: Sequence[PosedPicture], *, min_views: int = 3, seed: int = 0) -> Triangulation:
-    """Matches SIFT features over all pairs of views and triangulates each track robustly (LO-RANSAC), poses fixed.
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """SIFT features of all views, and those that match from view to view.
 
-    Args:
-        views: pictures of one moment.
-        min_views: inlier views a point needs.
-        seed: of RANSAC.
+    Attributes:
+        pixels: [F, 2] of all features. owner: [F] index of the view of each. groups: indices of features, one a track.
     """
-    import pycolmap
 
+    pixels: Float
+    owner: NDArray[np.intp]
+    groups: list[NDArray[np.intp]]
+
+
+def matched_tracks(views: Sequence[PosedPicture]) -> Tracks:
+    """Matches SIFT features over all pairs of views; masks do not matter."""
     found = [(view.camera, uv, descriptors) for view, (uv, descriptors) in zip(views, features(views), strict=True)]
     offsets = np.concatenate([[0], np.cumsum([len(uv) for _, uv, _ in found])])
     owner = np.repeat(np.arange(len(views)), np.diff(offsets))
@@ -133,7 +138,24 @@ def triangulate(views: Sequence[PosedPicture], *, min_views: int = 3, seed: int 
     _, track = connected_components(graph, directed=False)
     order = np.argsort(track, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(track[order])) + 1) if len(order) else []
+    return Tracks(pixels, owner, groups)
 
+
+def triangulate(
+    views: Sequence[PosedPicture], tracks: Tracks | None = None, *, min_views: int = 3, seed: int = 0
+) -> Triangulation:
+    """Triangulates each track of features robustly (LO-RANSAC), poses fixed.
+
+    Args:
+        views: pictures of one moment.
+        tracks: ``matched_tracks`` of them, where that is known already.
+        min_views: inlier views a point needs.
+        seed: of RANSAC.
+    """
+    import pycolmap
+
+    tracks = tracks or matched_tracks(views)
+    pixels, owner = tracks.pixels, tracks.owner
     cameras = [
         pycolmap.Camera(
             model="PINHOLE",
@@ -154,7 +176,7 @@ def triangulate(views: Sequence[PosedPicture], *, min_views: int = 3, seed: int 
     options.ransac.max_num_trials = 500
 
     positions, seen, errors = [], [], []
-    for group in groups:
+    for group in tracks.groups:
         if len(np.unique(owner[group])) < min_views:
             continue
         who = owner[group]
