@@ -13,6 +13,7 @@ from scas4d_core.cameras import Rig
 from scas4d_core.captures.frame import InitialPoints
 from scas4d_core.first_frame.points.agreement import Search, agreed_points
 from scas4d_core.first_frame.points.merging import SPACING
+from scas4d_core.first_frame.points.plane import plane_points
 from scas4d_core.first_frame.points.posed_pictures import (
     InitialPointsError,
     PosedPicture,
@@ -22,6 +23,7 @@ from scas4d_core.first_frame.points.posed_pictures import (
 )
 from scas4d_core.first_frame.points.silhouettes import backdrop, plain_background, with_silhouettes
 from scas4d_core.first_frame.points.stereo import ITERATIONS
+from scas4d_core.first_frame.points.surroundings import Stage, surroundings
 from scas4d_core.first_frame.points.triangulation import matched_tracks, triangulate
 from scas4d_core.first_frame.points.visual_hull import pixel_at
 from scas4d_core.first_frame.points.volume import shared_volume, stage_distances
@@ -48,12 +50,15 @@ class FoundPoints(InitialPoints):
 
     Attributes:
         way: "agreement" (of three cameras or more), "backdrop" (silhouettes before a plain backdrop), "pairs" (two
-            cameras agree) or "volume" (what cameras share; no point is confirmed); several are joined by " + ".
+            cameras agree), "plane" (a floor or table on which pictures agree), "surroundings" (what each camera sees,
+            far behind) or "volume" (what cameras share; no point is confirmed); several are joined by " + ".
         covered: share of the pictures' cells that hold a point that cameras have agreed on, median over the cameras.
+        stage: that the surroundings lie beyond; None without these.
     """
 
     way: str = "agreement"
     covered: float = 0.0
+    stage: Stage | None = None
 
 
 def initial_points(
@@ -73,7 +78,8 @@ def initial_points(
     ``MIN_VIEWS`` cameras agree and few look through, gives what has texture; the visual hull (of the masks, or of
     silhouettes before a plain background) and the fitted surfaces give the rest. Where that covers too little of the
     pictures, as with a few cameras far apart, the ways that follow add to it: silhouettes before a backdrop that does
-    not fill the borders, points on which two cameras agree, and, last of all, the volume that cameras share.
+    not fill the borders, points on which two cameras agree, a plane on which pictures agree, and what each camera sees,
+    painted far behind the stage. Where next to nothing is found, points fill the volume that cameras share.
 
     Args:
         rig: calibrated cameras, in the user's world.
@@ -115,20 +121,35 @@ def initial_points(
     found: FoundPoints | None = None
     ways = _ways(first, masked=bool(masks))
     for way, search in ways:
-        try:
-            cloud = agreed_points(search, on_progress)
-        except InitialPointsError:
-            continue
-        found = _joined(found, cloud, way, search.views, spacing)
-        if found.covered >= ENOUGH:
+        found = _found(found, way, lambda search=search: agreed_points(search, on_progress), search.views, spacing)
+        if way != "pairs" and found is not None and found.covered >= ENOUGH:
             return found
-    if found is not None and found.covered > LITTLE:
-        return found
+    on_progress("plane", 0, 1)
+    found = _found(found, "plane", lambda: plane_points(labelled), views, spacing)
     before = next((search.views for way, search in ways if way == "backdrop"), views)
     known = triangulate(before, tracks, min_views=2, seed=seed).positions
-    volume = shared_volume(before, stage_distances(before, known, rig.radius), seed)
+    distances = stage_distances(before, known, rig.radius)
     confirmed = 0.0 if found is None else found.covered
-    return replace(_joined(found, volume, "volume", before, 4 * spacing), covered=confirmed)
+    if found is None or confirmed <= LITTLE:
+        found = _joined(found, shared_volume(before, distances, seed), "volume", before, 4 * spacing)
+    if before is views and not first.backdrop:  # else the backdrop's colour is what lies behind
+        found = _joined(found, surroundings(before, distances), "surroundings", before, 0.0)
+        found = replace(found, stage=Stage.of(before, distances))
+    return replace(found, covered=confirmed)
+
+
+def _found(
+    found: FoundPoints | None,
+    way: str,
+    search: Callable[[], InitialPoints],
+    views: Sequence[PosedPicture],
+    spacing: float,
+) -> FoundPoints | None:
+    """The points found before with those of a way; alone where it finds none."""
+    try:
+        return _joined(found, search(), way, views, spacing)
+    except InitialPointsError:
+        return found
 
 
 def _ways(first: Search, masked: bool) -> list[tuple[str, Search]]:

@@ -162,13 +162,13 @@ def fit_first(
             factory.rig, frame.images, frame.masks,
             lambda stage, done, total: on_progress(Progress(stage, done, total)),
         )  # fmt: skip
-        cloud, made = _columns(found), FirstCloud(found.way, len(found), found.covered)
+        cloud, made, stage = _columns(found), FirstCloud(found.way, len(found), found.covered), found.stage
     else:
         inside = replace(points, positions=world.to_inside(points.positions))
-        cloud, made = _columns(inside), FirstCloud("given", len(points))
+        cloud, made, stage = _columns(inside), FirstCloud("given", len(points)), None
     views = factory.views(frame, {})
     result = fit_by_direction(
-        lambda: first_trainer(factory, views, *cloud, settings.scene, static),
+        lambda: first_trainer(factory, views, *cloud, settings.scene, static, stage),
         settings.effects.get("direction", "auto") if settings.device == "cpu" else "off",
         lambda done, loss: on_progress(Progress("fitting frame 0", done, static.iterations, {"loss": loss})),
     )

@@ -19,6 +19,7 @@ from scas4d_core.first_frame.initial_gaussians import (
     budget,
     initial_parameters,
 )  # fmt: skip
+from scas4d_core.first_frame.points.surroundings import Stage
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels import activation
 from scas4d_core.kernels.adam import EVERY_ROW, adam
@@ -117,6 +118,7 @@ class StaticTrainer:
         self.parameters = parameters
         self.budget = budget(views, scene, settings)
         self.shading: Shading | None = None
+        self.stage: Stage | None = None
         self.radius = factory.rig.radius
         limits = scene_limits(scene.near, self.radius)
         self.loss = PictureLoss(factory, scene.behind, 1.0, WEIGHT_MASK, False, limits)
@@ -283,7 +285,10 @@ class StaticTrainer:
         for view in self.views:
             (seen,) = self.loss.coverage(self._means, self._factors, self._opacities, self._features, view)
             counts += seen > SEEN_PIXELS
-        keep = counts >= min(MIN_VIEWS, len(self.views))
+        needed = np.full(len(counts), min(MIN_VIEWS, len(self.views)))
+        if self.stage is not None:  # surroundings hide nothing from others
+            needed[~self.stage.holds(self._means)] = 1
+        keep = counts >= needed
         if keep.any():
             self._take(np.flatnonzero(keep), [], [])
 
@@ -339,11 +344,17 @@ def first_trainer(
     foreground: Array | None,
     scene: SceneSettings,
     settings: StaticSettings,
+    stage: Stage | None = None,
 ) -> StaticTrainer:
-    """The trainer of ``start.fit_static_scene``, before its first iteration; arguments and errors are the same."""
+    """The trainer of ``start.fit_static_scene``, before its first iteration; arguments and errors are the same.
+
+    ``stage``: inside world, that surroundings lie beyond, which one camera alone may see; None without these.
+    """
     if len(positions) == 0:
         raise ValueError("the first cloud holds no point; give points, masks, or more overlapping cameras")
     rng = np.random.default_rng(settings.seed)
     limit = max(1, int(INITIAL_SHARE * budget(views, scene, settings)))
     parameters = initial_parameters(positions, colours, foreground, limit, rng)
-    return StaticTrainer(factory, views, parameters, scene, settings)
+    trainer = StaticTrainer(factory, views, parameters, scene, settings)
+    trainer.stage = stage
+    return trainer

@@ -75,7 +75,8 @@ def agreed_points(search: Search, on_progress: OnProgress) -> InitialPoints:
     on_progress("hull", 0, 1)
     hull = carve(views, misses=0.0 if plain else MISSES, min_views=min_views)
     supports: list[Support] = []
-    if not plain and len(triangulated.positions) >= 10:
+    # Two cameras meet somewhere on an epipolar line by chance: of such points there are planes everywhere.
+    if not plain and min_views > 2 and len(triangulated.positions) >= 10:
         standing = triangulated.positions[~_in_foreground(views, triangulated)]
         supports = fit_surfaces(
             standing,

@@ -1,0 +1,254 @@
+"""The plane on which pictures agree: a floor or a table that cameras see from sides too different for stereo."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_closing, binary_erosion, binary_opening, gaussian_filter, uniform_filter
+
+from scas4d_core.captures.frame import InitialPoints
+from scas4d_core.first_frame.points.merging import SPACING, labelled_share
+from scas4d_core.first_frame.points.posed_pictures import (
+    Bool,
+    Float,
+    InitialPointsError,
+    PosedPicture,
+    look_at_point,
+    observe,
+    pixels_inside,
+)
+from scas4d_core.first_frame.points.visual_hull import pixel_at
+
+Planes = NDArray[np.float32]
+
+CELLS = 48
+"""Cells along the side of the square in which a plane is looked for; it is as wide as most pictures at the middle."""
+MOST_CELLS = 160
+"""Cells along it in which its points are taken at most."""
+REACH = 1.5
+"""Farthest plane that is tried, half squares from the middle of the stage."""
+OFFSETS = 37
+"""Places tried along a normal: two cells apart."""
+TILT, TILTS = 0.2, 5
+"""Largest tilt about either axis of the square, radians, and how many are tried."""
+ROUNDS = 6
+"""Of refinement, each in steps smaller by ``SHRINK``."""
+SHRINK = 1.7
+UNLIKE = 0.8
+"""Largest cosine between two normals that are both worth trying."""
+PATCH = 7
+"""Side, in cells, of the patches that are compared."""
+TEXTURE = 4.0
+"""Standard deviation, grey levels, below which a patch says nothing."""
+ALIKE, HALF_ALIKE = 0.6, 0.3
+"""Correlation of two cameras' patches from which they agree on a cell, and from which it counts for the plane."""
+PAIRS = 2
+"""Pairs of cameras that must agree on a cell, so at least three cameras."""
+BEYOND_CHANCE = 1.8
+"""How much more pictures must agree on a plane than mirrored pictures do, which agree by chance alone: 2.2 to 4.7 where
+there is a floor or a table (six rigs), 0.9 to 1.6 where there is none (three)."""
+FEWEST_CELLS = 40
+"""Cells on which cameras agree, for a plane to be believed."""
+MOST_VIEWS = 6
+"""Views that are compared: of more, some, evenly chosen."""
+CLOSED = 15
+"""Cells across of a gap between agreeing cells that belongs to the plane all the same."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A square piece of a plane.
+
+    Attributes:
+        middle: [3] world. normal: [3] of unit length. half: half of its side, world units.
+    """
+
+    middle: Float
+    normal: Float
+    half: float
+
+    def cells(self, count: int) -> Float:
+        """[count, count, 3] centres of the cells, world.
+
+        >>> Plane(np.zeros(3), np.array([0.0, 0.0, 1.0]), 2.0).cells(2).shape
+        (2, 2, 3)
+        """
+        first, second = _axes(self.normal)
+        steps = self.half * ((np.arange(count) + 0.5) / count * 2 - 1)
+        across, along = np.meshgrid(steps, steps)
+        return self.middle + across[..., None] * first + along[..., None] * second
+
+
+def plane_points(labelled: Sequence[PosedPicture]) -> InitialPoints:
+    """Points of the plane on which most pictures agree: its agreeing cells, and the gaps between these.
+
+    A plane is known from two angles and an offset, so it can be tried: laid on it, the pictures of cameras that stand
+    far apart show the same, undistorted (plane sweeping, Collins 1996). Patches are compared by correlation, so
+    exposures may differ.
+
+    Args:
+        labelled: views, with masks if these were given.
+
+    Raises:
+        InitialPointsError: pictures agree on no plane.
+
+    >>> from scas4d_core.cameras import Camera
+    >>> texture = np.random.default_rng(0).integers(0, 255, (100, 100, 1), np.uint8).repeat(3, axis=2)
+    >>> def looking_down(x):  # from two metres above, at the origin of a floor of tiles of six centimetres
+    ...     back = np.array([x, 0, 2]) / np.hypot(x, 2)
+    ...     rotation = np.array([np.cross([0, 1, 0], -back), [0, 1, 0], -back])
+    ...     pose = np.eye(4)
+    ...     pose[:3, :3], pose[:3, 3] = rotation, -rotation @ [x, 0, 2]
+    ...     camera = Camera(str(x), np.array([[100.0, 0, 60], [0, 100, 60], [0, 0, 1]]), pose, 120, 120)
+    ...     uv = np.stack(np.meshgrid(np.arange(120) + 0.5, np.arange(120) + 0.5), axis=-1).reshape(-1, 2)
+    ...     ray = camera.unproject(uv, np.ones(len(uv))) - camera.centre
+    ...     tile = (camera.centre - ray * 2 / ray[:, 2:])[:, :2] / 0.06 % 100
+    ...     return PosedPicture(camera, texture[tuple(tile.astype(int).T)].reshape(120, 120, 3))
+    >>> found = plane_points([looking_down(x) for x in (-2.0, 0.1, 2.0)])
+    >>> len(found) > 500, bool(np.abs(found.positions[:, 2]).max() < 0.05)
+    (True, True)
+    """
+    views = [labelled[i] for i in np.unique(np.linspace(0, len(labelled) - 1, MOST_VIEWS).astype(int))]
+    plane = agreed_plane(views)
+    count = min(MOST_CELLS, max(CELLS, int(2 * plane.half / (SPACING * pixel_at(views, plane.middle)))))
+    points = plane.cells(count)
+    smooth = _smooth(views, plane, count)
+    sure = _agreement(views, smooth, points[None])[1][0] >= min(PAIRS, len(views) - 1)
+    within = binary_opening(binary_closing(np.pad(sure, CLOSED), np.ones((CLOSED, CLOSED))), np.ones((5, 5)))
+    flat = points[within[CLOSED:-CLOSED, CLOSED:-CLOSED]]
+    inside = np.array([pixels_inside(view.camera, flat)[3] for view in labelled])
+    shared = inside.sum(axis=0) >= min(PAIRS, len(views))
+    flat, inside = flat[shared], inside[:, shared]
+    if not len(flat):
+        raise InitialPointsError("images: cameras agree on no plane; start from a point cloud")
+    return InitialPoints(flat, observe(labelled, flat, inside).colours, labelled_share(labelled, flat, inside))
+
+
+def agreed_plane(views: Sequence[PosedPicture]) -> Plane:
+    """The plane on which pictures agree most: level, parallel to the ring of cameras, or facing them.
+
+    Raises:
+        InitialPointsError: they agree on none, or hardly more than mirrored pictures do.
+    """
+    found = [(_best(views, start), start) for start in _starts(views)]
+    (score, plane), start = max(found, key=lambda one: one[0][0])
+    mirrored = [replace(view, image=np.ascontiguousarray(view.image[:, ::-1])) for view in views]
+    smooth = _smooth(views, plane, CELLS)
+    cells = int((_agreement(views, smooth, plane.cells(CELLS)[None])[1][0] >= min(PAIRS, len(views) - 1)).sum())
+    if cells < FEWEST_CELLS or score < BEYOND_CHANCE * _best(mirrored, start, refine=False)[0]:
+        raise InitialPointsError("images: cameras agree on no plane; start from a point cloud")
+    return plane
+
+
+def _starts(views: Sequence[PosedPicture]) -> list[Plane]:
+    """Planes through the middle of the stage about which to search, their normals unlike."""
+    middle = look_at_point(views)
+    centres = np.array([view.camera.centre for view in views])
+    up = -np.mean([view.camera.rotation[1] for view in views], axis=0)
+    ring = np.linalg.svd(centres - centres.mean(axis=0))[2][2]
+    facing = np.mean([view.camera.rotation[2] for view in views], axis=0)
+    reach = [max(view.camera.width, view.camera.height) / (2 * view.camera.fx) for view in views]
+    half = float(np.median(reach * np.linalg.norm(centres - middle, axis=1)))
+    chosen: list[Plane] = []
+    for normal in (up, ring, facing):
+        length = float(np.linalg.norm(normal))
+        if length < 0.3:  # the cameras have no common up, or do not look in one direction
+            continue
+        if all(abs(normal @ other.normal) < UNLIKE * length for other in chosen):
+            chosen.append(Plane(middle, normal / length, half))
+    return chosen
+
+
+def _best(views: Sequence[PosedPicture], start: Plane, refine: bool = True) -> tuple[float, Plane]:
+    """The score of the best plane about a start, and that plane."""
+    smooth = _smooth(views, start, CELLS)
+    tilts = np.linspace(-TILT, TILT, TILTS)
+    tried = np.stack(np.meshgrid(tilts, tilts), axis=-1).reshape(-1, 2)
+    best, at = -1.0, np.zeros(3)
+    for offset in np.linspace(-REACH, REACH, OFFSETS):
+        moves = np.column_stack([np.full(len(tried), offset), tried])
+        scores = _agreement(views, smooth, np.stack([_moved(start, move).cells(CELLS) for move in moves]))[0]
+        if scores.max() > best:
+            best, at = float(scores.max()), moves[int(scores.argmax())]
+    steps = np.array([REACH / OFFSETS, TILT / TILTS, TILT / TILTS])
+    for _ in range(ROUNDS if refine else 0):
+        moves = at + np.concatenate([np.diag(steps), -np.diag(steps)])
+        scores = _agreement(views, smooth, np.stack([_moved(start, move).cells(CELLS) for move in moves]))[0]
+        if scores.max() > best:
+            best, at = float(scores.max()), moves[int(scores.argmax())]
+        else:
+            steps = steps / SHRINK
+    return best, _moved(start, at)
+
+
+def _moved(start: Plane, move: Float) -> Plane:
+    """``start`` moved along its normal by ``move[0]`` half squares, its normal tilted by ``move[1:]``."""
+    first, second = _axes(start.normal)
+    normal = start.normal + move[1] * first + move[2] * second
+    return Plane(start.middle + move[0] * start.half * start.normal, normal / np.linalg.norm(normal), start.half)
+
+
+def _axes(normal: Float) -> tuple[Float, Float]:
+    """Two unit vectors across a normal and each other."""
+    first = np.cross(normal, np.eye(3)[int(np.abs(normal).argmin())])
+    first /= np.linalg.norm(first)
+    return first, np.cross(normal, first)
+
+
+def _smooth(views: Sequence[PosedPicture], plane: Plane, count: int) -> list[Planes]:
+    """Grey pictures without what is finer than a cell."""
+    cell = 2 * plane.half / count / pixel_at(views, plane.middle)
+    return [gaussian_filter(view.image.mean(axis=2, dtype=np.float32), max(0.5, cell / 2)) for view in views]
+
+
+def _agreement(
+    views: Sequence[PosedPicture], smooth: Sequence[Planes], points: Float
+) -> tuple[Float, NDArray[np.intp]]:
+    """How much pictures agree on planes.
+
+    Args:
+        points: [T, C, C, 3] cells of each plane, world.
+
+    Returns:
+        [T] sums of correlations beyond ``HALF_ALIKE``; [T, C, C] pairs of cameras that agree on a cell.
+    """
+    laid = [_laid(view, picture, points) for view, picture in zip(views, smooth, strict=True)]
+    scores, pairs = np.zeros(len(points)), np.zeros(points.shape[:3], np.intp)
+    for i, (one, mean, spread, told) in enumerate(laid):
+        for other, other_mean, other_spread, other_told in laid[:i]:
+            both = told & other_told
+            if not both.any():
+                continue
+            covariance = _box(one * other) - mean * other_mean
+            alike = np.where(both, covariance / np.maximum(spread * other_spread, 1), 0)
+            pairs += alike > ALIKE
+            scores += np.maximum(alike - HALF_ALIKE, 0).sum(axis=(1, 2))
+    return scores, pairs
+
+
+def _laid(view: PosedPicture, picture: Planes, points: Float) -> tuple[Planes, Planes, Planes, Bool]:
+    """A picture laid on planes: [T, C, C] values, their means and deviations over patches, and which patches tell."""
+    uv, depth = view.camera.project(points.reshape(-1, 3))
+    height, width = picture.shape
+    with np.errstate(invalid="ignore"):
+        column, line = uv[:, 0] - 0.5, uv[:, 1] - 0.5
+        inside = (depth > 0) & (column >= 0) & (column < width - 1) & (line >= 0) & (line < height - 1)
+    column, line = np.where(inside, column, 0), np.where(inside, line, 0)
+    left, top = column.astype(np.intp), line.astype(np.intp)
+    right, down = (column - left).astype(np.float32), (line - top).astype(np.float32)
+    upper = picture[top, left] * (1 - right) + picture[top, left + 1] * right
+    lower = picture[top + 1, left] * (1 - right) + picture[top + 1, left + 1] * right
+    values: Planes = (upper * (1 - down) + lower * down).reshape(points.shape[:3])
+    mean = _box(values)
+    spread = np.sqrt(np.maximum(_box(values * values) - mean * mean, 0))
+    whole = binary_erosion(inside.reshape(points.shape[:3]), np.ones((1, PATCH, PATCH)))
+    return values, mean, spread, whole & (spread > TEXTURE)
+
+
+def _box(values: Planes) -> Planes:
+    """Means over patches of each plane."""
+    means: Planes = uniform_filter(values, (1, PATCH, PATCH), mode="nearest")
+    return means
