@@ -25,6 +25,7 @@ from scas4d_core.first_frame.points.stereo import ITERATIONS
 from scas4d_core.first_frame.points.triangulation import matched_tracks, triangulate
 from scas4d_core.first_frame.points.visual_hull import pixel_at
 from scas4d_core.first_frame.points.volume import shared_volume, stage_distances
+from scas4d_core.first_frame.time_limit import TimeLimit
 
 OnProgress = Callable[[str, int, int], None]
 """Called with a stage, the steps done and the steps in all."""
@@ -66,6 +67,7 @@ def initial_points(
     stereo: bool = True,
     stereo_iterations: int = ITERATIONS,
     seed: int = 0,
+    limit: TimeLimit | None = None,
 ) -> FoundPoints:
     """Finds points on the surfaces that the pictures of one moment show.
 
@@ -84,6 +86,7 @@ def initial_points(
         stereo: dense stereo where the pictures have texture.
         stereo_iterations: rounds of propagation and refinement.
         seed: of every random choice; the same seed gives the same points.
+        limit: of the time of frame 0; where it is short, pictures are looked at less finely (``limit.shortened``).
 
     Returns:
         Points in the user's units; ``foreground`` is None where no masks were given.
@@ -106,10 +109,11 @@ def initial_points(
     background = plain_background(labelled)
     views = labelled if background is None else with_silhouettes(labelled, background)
     on_progress("triangulation", 0, 1)
-    tracks = matched_tracks(labelled)
+    limit = limit or TimeLimit(None)
+    tracks = matched_tracks(labelled, limit)
     first = Search(
         labelled, views, tracks, background is not None, min(MIN_VIEWS, len(views)), stereo, stereo_iterations,
-        max_points, rig.radius, seed,
+        max_points, rig.radius, seed, limit,
     )  # fmt: skip
     spacing = SPACING * pixel_at(labelled, look_at_point(labelled))
     found: FoundPoints | None = None

@@ -18,7 +18,7 @@ from scas4d_core.first_frame.points.posed_pictures import (
     pixels_inside,
     visible_from,
 )
-from scas4d_core.first_frame.points.stereo import DepthMap, fused_points, halved, looked_through
+from scas4d_core.first_frame.points.stereo import DepthMap, fused_points, looked_through
 from scas4d_core.first_frame.points.triangulation import fundamental_matrix, triangulate
 
 HALF = np.array([0.5, 0.35, 0.4])
