@@ -120,7 +120,7 @@ class GlossTrial:
             if shading is not None:
                 shading.show(means, turns, colours, view.camera, shown)
             trainer.loss.measure(means, factors, opacities, shown, view)
-            # Those of colours alone: half of what the whole backward costs.
+            # Those of colours alone: positions and shapes stay.
             gradients = rasterizer.feature_gradients(rasterizer.gradient_buffers()[0])
             errors.append(10 ** (-trainer.loss.psnr / 10))
             if shading is not None:

@@ -219,7 +219,8 @@ class StaticTrainer:
             self.shading.saw(self._means, turns, colours, view.camera, gradients.features)
             self.shading.step(1 - 0.9 * at / self.settings.iterations)
         self.psnr.append(self.loss.psnr)
-        if at >= self._last - len(self.views) * self.schedule.stride:
+        # A shorter fit ends somewhere in a round: two hold every view.
+        if at >= self._last - len(self.views) * (1 if self.schedule.stride == 1 else 2 * self.schedule.stride):
             self.cameras[view.name] = camera_fit(self.loss.psnr, self.loss.colour_shift(view))
         activation.activate_backward(
             self.parameters, self._factors, self._opacities, self._features, gradients.means, gradients.factors,

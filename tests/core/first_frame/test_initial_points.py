@@ -13,6 +13,7 @@ from scas4d_core.first_frame.points.posed_pictures import (
     InitialPointsError,
     PosedPicture,
     collect_views,
+    halved,
     look_at_point,
     observe,
     pixels_inside,
