@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -23,7 +24,8 @@ NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 
 
-class Constant(NamedTuple):
+@dataclass(frozen=True)
+class Constant:
     """A former setting: the value that it has for good, and the dotted name of the constant that holds it.
 
     ``place`` is empty where the feature went and only ``value``, which switched it off or was its default, is accepted.
@@ -298,9 +300,7 @@ class UpdateSettings(SettingsModel):
         0.05, gt=0, le=1, description="All rates decay to this fraction over the frame (cosine); 1: constant."
     )
     beta1: float = Field(0.8, ge=0, lt=1, description="Adam's first decay.")
-    beta2: float = Field(
-        0.95, ge=0, lt=1, description="Adam's second decay; 100 iterations are too few for the usual 0.999."
-    )
+    beta2: Share = Field(0.95, description="Adam's second decay; 100 iterations are too few for the usual 0.999.")
     momentum: float = Field(
         0.0, ge=0, le=1, description="Share of what the layers leave of the previous motion that Δp starts from."
     )

@@ -96,7 +96,9 @@ class Job:
         words = [
             f"{name}={json.dumps(value, separators=(',', ':'))}"
             for name, value in _flat(own)
-            if name not in ("update.iterations", "update.seed", "static.seed") and dict(_flat(usual)).get(name) != value
+            if name not in ("update.iterations", "update.seed", "static.seed")
+            and (name, value) != ("static.seconds", None)  # studies have no limit, and depend on no machine
+            and dict(_flat(usual)).get(name) != value
         ]
         words += ["no masks"] * (not self.masks) + ["no points"] * (not self.points)
         words += [f"held out {', '.join(self.options.test)}"] if self.options.test else []

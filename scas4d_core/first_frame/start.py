@@ -178,7 +178,7 @@ def fit_first(
     )
     if len(result.planned) > 1:
         limit.shortened.append(f"{len(result.losses)} of {static.iterations} iterations, each phase as much shorter")
-    return replace(result, cloud=made, shortened=limit.shortened)
+    return replace(result, cloud=made, shortened=[*limit.shortened, *result.shortened])
 
 
 def _at_most(limit: TimeLimit) -> dict[str, float]:

@@ -58,7 +58,7 @@ class DepthMap:
 
 @dataclass(frozen=True)
 class Effort:
-    """How finely stereo looks: pictures no wider than ``width`` pixels, and rounds of propagation and refinement."""
+    """Effort of stereo: pictures no wider than ``width`` pixels, and rounds of propagation and refinement."""
 
     width: int
     iterations: int
