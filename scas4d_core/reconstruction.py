@@ -124,7 +124,7 @@ class Reconstruction(CommittedScene):
         self = cls(rig, with_background(settings, frame.images), History() if history is None else history)
         began, scaled = perf_counter(), self._factory.scaled(frame)
         told = progress or (lambda _: None)
-        result = static or fit_first(scaled, points, self._factory, self.settings, self.world, told, started)
+        result = static or fit_first(scaled, points, self._factory, self.settings, self.world, told)
         self.static = result = replace(result, gaussians=first_labels(result.gaussians, self.rig, scaled.masks))
         fitted = perf_counter()
         lengths = axis_lengths(result.gaussians)

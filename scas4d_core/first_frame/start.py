@@ -149,7 +149,6 @@ def fit_first(
     settings: Settings,
     world: WorldFrame,
     on_progress: Callable[[Progress], None],
-    started: float | None = None,
 ) -> StaticResult:
     """Fits frame 0 to its pictures, from a cloud that is given or made from the pictures.
 
@@ -157,10 +156,9 @@ def fit_first(
 
     Args:
         frame: with pictures of the size of the factory's rig. points: in the user's world. world: user's to inside.
-        on_progress: called with the progress of each stage. started: ``perf_counter`` when frame 0 was begun;
-            its time (``StaticSettings.seconds``) counts from it. None: now.
+        on_progress: called with the progress of each stage.
     """
-    static, limit = settings.static, TimeLimit(settings.static.seconds, started)
+    static, limit = settings.static, TimeLimit(settings.static.seconds)
     if points is None:
         found = initial_points(
             factory.rig, frame.images, frame.masks,

@@ -26,8 +26,7 @@ class TimeLimit:
     """Bounds the seconds of frame 0; asks for less work before it begins, by the pace that was measured.
 
     Args:
-        seconds: that frame 0 may take; None: as many as it needs. began: moment of ``clock``; None: now.
-        clock: in seconds.
+        seconds: that frame 0 may take from now on; None: as many as it needs. clock: in seconds.
 
     Attributes:
         shortened: what there was no time for, in words.
@@ -41,11 +40,8 @@ class TimeLimit:
     (20.0, 2, 0)
     """
 
-    def __init__(
-        self, seconds: float | None, began: float | None = None, clock: Callable[[], float] = perf_counter
-    ) -> None:
-        self.seconds, self.clock = seconds, clock
-        self._began = clock() if began is None else began
+    def __init__(self, seconds: float | None, clock: Callable[[], float] = perf_counter) -> None:
+        self.seconds, self.clock, self._began = seconds, clock, clock()
         self.shortened: list[str] = []
 
     @property

@@ -148,7 +148,7 @@ def test_a_report_says_what_was_shortened(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(fit_schedule, "FEWEST", 30)
     frame, told = take_frame(0, 0.0, BOX, RIG), []
     for seconds, shorter in ((None, False), (1e6, False), (30.0, True)):
-        monkeypatch.setattr(start, "TimeLimit", lambda limit, began: TimeLimit(limit, 0.0, Clock(0.1)))
+        monkeypatch.setattr(start, "TimeLimit", lambda seconds: TimeLimit(seconds, Clock(0.1)))
         settings = Settings(static=StaticSettings(iterations=150, max_gaussians=600, seconds=seconds))
         points = InitialPoints(BOX.means.astype(np.float64), BOX.colours, None)
         scene = Reconstruction.start(RIG, frame, settings, points=points, progress=told.append)
