@@ -16,6 +16,7 @@ from scas4d_core.first_frame.fit_schedule import FitProgress
 from scas4d_core.first_frame.glossy import fit_by_direction
 from scas4d_core.first_frame.initial_points import initial_points
 from scas4d_core.first_frame.points.silhouettes import EVERY, backdrop, mean_colour
+from scas4d_core.first_frame.points.stereo import load_stereo
 from scas4d_core.first_frame.static_scene import FirstCloud, StaticResult, first_trainer
 from scas4d_core.first_frame.time_limit import TimeLimit
 from scas4d_core.frame_report import Progress
@@ -158,6 +159,8 @@ def fit_first(
         frame: with pictures of the size of the factory's rig. points: in the user's world. world: user's to inside.
         on_progress: called with the progress of each stage.
     """
+    if points is None:
+        load_stereo()
     static, limit = settings.static, TimeLimit(settings.static.seconds)
     if points is None:
         found = initial_points(

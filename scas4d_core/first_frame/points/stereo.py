@@ -77,17 +77,13 @@ def planned(views: Sequence[PosedPicture], middle: Float, iterations: int, limit
     paced = next((i for i in range(len(tiny)) if len(neighbours_of(tiny, i, middle, NEIGHBOURS)) > 1), None)
     if paced is None:
         return efforts[0]
-    seconds = 0.0
-    for _ in range(2):  # the first time loads the kernel
-        began, camera = limit.clock(), tiny[paced].camera
-        shape, far = (camera.height, camera.width), 2.0 * float(np.linalg.norm(camera.centre - middle))
-        _match(tiny, [_grey(view) for view in tiny], paced, middle, (far / 8, far), np.zeros(shape),
-               np.ones(shape, bool), 1, 2, 0)  # fmt: skip
-        seconds = limit.clock() - began
-    each = seconds / (camera.width * camera.height * (PLANES_FIRST + PLANES_EACH))
-    pixels = sum(view.camera.width * view.camera.height for view in (halved(view, WIDTH) for view in views))
+    began, camera = limit.clock(), tiny[paced].camera
+    shape, far = (camera.height, camera.width), 2.0 * float(np.linalg.norm(camera.centre - middle))
+    wanted = np.ones(shape, bool)
+    _match(tiny, [_grey(view) for view in tiny], paced, middle, (far / 8, far), np.zeros(shape), wanted, 1, 2, 0)
+    each = (limit.clock() - began) / (camera.width * camera.height * (PLANES_FIRST + PLANES_EACH))
     costs = [
-        each * pixels * (effort.width / WIDTH) ** 2 * (PLANES_FIRST + PLANES_EACH * effort.iterations)
+        each * (PLANES_FIRST + PLANES_EACH * effort.iterations) * sum(_pixels(view, effort.width) for view in views)
         for effort in efforts
     ]
     index = limit.chosen(STEREO, costs)
@@ -98,6 +94,23 @@ def planned(views: Sequence[PosedPicture], middle: Float, iterations: int, limit
         found = efforts[index]
         limit.shortened.append(f"stereo on pictures of {found.width} pixels at most, {found.iterations} rounds")
     return efforts[index]
+
+
+def load_stereo() -> None:
+    """Loads the kernel, or compiles it where nobody has: in seconds that are no measure of the pace."""
+    grey, planes = np.zeros((16, 16), np.float32), np.zeros((1, 16, 16), np.float32)
+    patch_match(
+        grey, np.ones((16, 16), bool), np.zeros((16, 16)), np.ones(4), planes, np.full((1, 2), 16), np.eye(3)[None],
+        np.ones((1, 3)), near=1.0, far=2.0, iterations=1, best=1, seed=0,
+    )  # fmt: skip
+
+
+def _pixels(view: PosedPicture, width: int) -> int:
+    """Pixels of a view once it is ``halved``."""
+    columns, rows = view.camera.width, view.camera.height
+    while columns > width:
+        columns, rows = columns // 2, rows // 2
+    return columns * rows
 
 
 def neighbours_of(views: Sequence[PosedPicture], index: int, middle: Float, count: int) -> list[int]:
