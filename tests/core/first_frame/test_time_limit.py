@@ -14,7 +14,7 @@ from scas4d_core.first_frame import fit_schedule, start, static_scene
 from scas4d_core.first_frame.fit_schedule import FEWEST, FitSchedule
 from scas4d_core.first_frame.initial_gaussians import initial_parameters
 from scas4d_core.first_frame.static_scene import StaticTrainer
-from scas4d_core.first_frame.time_limit import POINTS, TimeLimit
+from scas4d_core.first_frame.time_limit import STEREO, TimeLimit
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings
 from scas4d_core.update.picture_loss import ViewFactory
@@ -166,7 +166,7 @@ def test_a_report_says_what_was_shortened(monkeypatch: pytest.MonkeyPatch) -> No
 def test_of_several_ways_the_best_that_ends_in_time_is_chosen() -> None:
     clock = Clock()
     limit = TimeLimit(100.0, clock=clock)
-    assert limit.chosen(POINTS, [50, 40, 5]) == 1
-    clock.now = 44
-    assert limit.chosen(POINTS, [50, 40, 5]) == 3
-    assert TimeLimit(None).chosen(POINTS, [1e9]) == 0
+    assert limit.chosen(STEREO, [50, 30, 5]) == 1
+    clock.now = 34
+    assert limit.chosen(STEREO, [50, 30, 5]) == 3
+    assert TimeLimit(None).chosen(STEREO, [1e9]) == 0
