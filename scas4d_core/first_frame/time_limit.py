@@ -11,8 +11,8 @@ FEATURES = 0.15
 MATCHES = 0.2
 """their matches,"""
 STEREO = 0.35
-"""and stereo, each time that it is tried. Without a limit, all points of basketball, 27 cameras of 640x360, take a third
-of its frame 0, those of rigs of four to seven cameras less than a fifth."""
+"""and stereo, each time that it is tried. Without a limit, all points of basketball, 27 cameras of 640x360, take a
+third of its frame 0, those of rigs of four to seven cameras less than a fifth."""
 AFTER_S = 2.5
 """Seconds kept for what follows the fit: clusters, neighbours and the commit took 1 to 2 with 50,000 to 90,000
 Gaussians."""
