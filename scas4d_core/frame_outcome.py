@@ -140,3 +140,33 @@ def outcome_of(record: Mapping[str, Any]) -> FrameOutcome | None:
     if "taken as it is" in text:
         return FrameOutcome.ACCEPTED
     return FrameOutcome.RELOCATED if "less than usual" in text else FrameOutcome.RETRIED
+
+
+COVERS_LITTLE = 0.25
+"""Share of the pictures up to which the points of frame 0 that cameras agree on cover little: as
+``first_frame.initial_points.ENOUGH``, from which no other way to points is tried."""
+
+
+def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:
+    """Sentences that say how unsure frame 0 is, for what its first points were made from; none where it is sure.
+
+    Args:
+        cloud: record of a ``FirstCloud``; None: of a frame that is not the first.
+
+    >>> cloud_warnings({"way": "agreement", "points": 9000, "covered": 0.9})
+    []
+    >>> cloud_warnings({"way": "agreement + pairs", "points": 900, "covered": 0.12})[0][:75]
+    'frame 0 is in part a guess: the points on which cameras agree cover 12 % of'
+    """
+    if cloud is None or cloud.get("covered") is None:
+        return []
+    remedy = (
+        "give points, masks, more cameras that look at the same place, or a plain backdrop, and begin a new scene if "
+        "its views are poor"
+    )
+    if cloud["covered"] == 0:
+        return [f"frame 0 is a guess: no two cameras agree on any of its first points; {remedy}"]
+    if cloud["covered"] < COVERS_LITTLE:
+        share = f"cover {100 * cloud['covered']:.0f} % of the pictures"
+        return [f"frame 0 is in part a guess: the points on which cameras agree {share}; {remedy}"]
+    return []

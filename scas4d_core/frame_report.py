@@ -13,7 +13,7 @@ from typing import Any, TypedDict
 import numpy as np
 
 from scas4d_core.captures.frame import Frame
-from scas4d_core.first_frame.static_scene import FirstCloud, StaticResult
+from scas4d_core.first_frame.static_result import FirstCloud, StaticResult
 from scas4d_core.frame_outcome import Alarm, Candidate, FrameOutcome, degraded_text
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust.alarms import left_out_alarms
@@ -76,7 +76,8 @@ class FrameReport:
         exposure: times that the frame was seen to be brighter than the light in which the colours are; of a frame that
             was not tried, as the mean brightness of its pictures says. A light that stays becomes that of the colours.
         held: Gaussians held one by one as they were before. guards: by name, how often each guard acted.
-        planned: (iteration, iterations in all) whenever the stopping rule planned otherwise.
+        planned: (iteration, iterations in all) whenever the stopping rule, or the time of frame 0, planned otherwise.
+        shortened: of frame 0: what its time (``StaticSettings.seconds``) was too short for, in words.
         curve: of the last attempt.
         errors: mean image loss on the probe views by candidate, in pictures without the gain of ``exposure``.
             kept: the candidate that the state is; "still" where the frame was held.
@@ -109,6 +110,7 @@ class FrameReport:
     put_off: list[str] = field(default_factory=list)
     alarms: list[Alarm] = field(default_factory=list)
     cloud: FirstCloud | None = None
+    shortened: list[str] = field(default_factory=list)
 
     def record(self) -> dict[str, Any]:
         """The report as JSON: numbers that are not finite are None."""
@@ -155,6 +157,8 @@ def report_of_first(
         dropped=dict(dropped or {}),
         alarms=left_out_alarms(names, frame.images, dropped or {}),
         cloud=result.cloud,
+        planned=list(result.planned),
+        shortened=list(result.shortened),
     )
 
 

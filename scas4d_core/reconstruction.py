@@ -20,7 +20,7 @@ from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.effects.evidence import FitTime, Seen
 from scas4d_core.effects.switches import kept_of, switches_record
 from scas4d_core.first_frame.start import FirstFrame, as_begun, fit_first, with_background
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_report import FrameReport, Progress, report_of_first, report_of_update
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import Preparation, room_for_births

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -18,11 +19,13 @@ from scas4d_core.errors import InputError
 
 Positive = Annotated[float, Field(gt=0)]
 Unit = Annotated[float, Field(ge=0, le=1)]
+Share = Annotated[float, Field(ge=0, lt=1)]
 NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 
 
-class Constant(NamedTuple):
+@dataclass(frozen=True)
+class Constant:
     """A former setting: the value that it has for good, and the dotted name of the constant that holds it.
 
     ``place`` is empty where the feature went and only ``value``, which switched it off or was its default, is accepted.
@@ -137,10 +140,13 @@ class StaticSettings(SettingsModel):
         "weight_mask": Constant(3.0, "scas4d_core.first_frame.static_scene.WEIGHT_MASK"),
     }
     iterations: int = Field(3000, ge=1, le=1_000_000, description="Iterations of frame 0, one training view each.")
-    stop_gain: float = Field(
+    seconds: Annotated[float, Field(gt=0, le=1_000_000)] | None = Field(
+        110.0,
+        description="Seconds that frame 0 may take, points and fit; where they are too few, points are looked for less "
+        "finely, the fit has fewer iterations (500 at least), and the result depends on the machine. None: no limit.",
+    )
+    stop_gain: Share = Field(
         0.0,
-        ge=0,
-        lt=1,
         description="Stop rule: frame 0 ends before its iterations are through, once none are added any more and five "
         "rounds over all views lower the mean training loss by less than this share. 0: never; 0.01 saves a simple "
         "scene a part of its wait.",
@@ -226,10 +232,8 @@ class UpdateSettings(SettingsModel):
         description="Milliseconds that a frame may take, decoding and commit included; then there are as many "
         "iterations as fit, whatever `iterations` says. None: no limit.",
     )
-    stop_gain: float = Field(
+    stop_gain: Share = Field(
         0.0,
-        ge=0,
-        lt=1,
         description="An update cools down and ends once ten iterations lower its error on four training views by less "
         "than this share, after all layers have begun. 0: never.",
     )
@@ -273,10 +277,8 @@ class UpdateSettings(SettingsModel):
         min_length=1,
         description="One per layer, coarse to fine; with more layers the last is repeated.",
     )
-    own_start: float = Field(
+    own_start: Share = Field(
         0.4,
-        ge=0,
-        lt=1,
         description="Share of the iterations after which each Gaussian's own Δp, ΔR and Δs begin to learn; the layers "
         "of clusters begin one after the other before.",
     )
@@ -298,9 +300,7 @@ class UpdateSettings(SettingsModel):
         0.05, gt=0, le=1, description="All rates decay to this fraction over the frame (cosine); 1: constant."
     )
     beta1: float = Field(0.8, ge=0, lt=1, description="Adam's first decay.")
-    beta2: float = Field(
-        0.95, ge=0, lt=1, description="Adam's second decay; 100 iterations are too few for the usual 0.999."
-    )
+    beta2: Share = Field(0.95, description="Adam's second decay; 100 iterations are too few for the usual 0.999.")
     momentum: float = Field(
         0.0, ge=0, le=1, description="Share of what the layers leave of the previous motion that Δp starts from."
     )

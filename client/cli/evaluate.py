@@ -23,7 +23,7 @@ from scas4d_core.presets import preset
 from scas4d_core.settings import Settings
 
 if TYPE_CHECKING:
-    from scas4d_core.first_frame.static_scene import StaticResult
+    from scas4d_core.first_frame.static_result import StaticResult
     from scas4d_core.reconstruction import Reconstruction
 
 Report = Callable[[str], None]
@@ -96,7 +96,9 @@ class Job:
         words = [
             f"{name}={json.dumps(value, separators=(',', ':'))}"
             for name, value in _flat(own)
-            if name not in ("update.iterations", "update.seed", "static.seed") and dict(_flat(usual)).get(name) != value
+            if name not in ("update.iterations", "update.seed", "static.seed")
+            and (name, value) != ("static.seconds", None)  # studies have no limit, and depend on no machine
+            and dict(_flat(usual)).get(name) != value
         ]
         words += ["no masks"] * (not self.masks) + ["no points"] * (not self.points)
         words += [f"held out {', '.join(self.options.test)}"] if self.options.test else []

@@ -19,7 +19,7 @@ from scas4d_core.rig_checks import check_rig
 from scas4d_core.settings import Settings
 
 if TYPE_CHECKING:
-    from scas4d_core.first_frame.static_scene import StaticResult
+    from scas4d_core.first_frame.static_result import StaticResult
     from scas4d_core.frame_report import FrameReport
     from scas4d_core.reconstruction import Reconstruction
     from scas4d_core.storage.history import History
@@ -110,6 +110,8 @@ def reconstruct(given: Capture, out: Path, *, frames: int | None, preset: str, c
     with Bars() as bars:
         for reconstruction, done in reconstruct_frames(given, settings, count, history=history, progress=bars):
             index = done.index
+            if index == 0 and reconstruction.report is not None and reconstruction.report.shortened:
+                console.print(f"frame 0, for want of time: {'; '.join(reconstruction.report.shortened)}")
             truth = capture.test_frame(index) if capture.test_rig is not None else capture.frame(index)
             scores = []
             for camera in cameras:

@@ -189,6 +189,11 @@ class FrameReportModel(Model):
     retired: int = Field(default=0, description="Gaussians that left the scene in this frame; their ids stay theirs.")
     revived: int = Field(default=0, description="Retired Gaussians that came back in this frame, as themselves.")
     cloud: FirstCloudModel | None = Field(default=None, description="Of frame 0, where its first points came from.")
+    shortened: list[str] = Field(
+        default_factory=list,
+        description="Of frame 0: what its time (setting `static.seconds`) was too short for. With none, frame 0 does "
+        "not depend on the machine.",
+    )
     put_off: list[str] = Field(
         default_factory=list, description="Births for which the budget left no time; the next frame has some for them."
     )

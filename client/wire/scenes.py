@@ -92,8 +92,14 @@ class ProgressModel(Model):
 
     stage: str
     done: int
-    total: int
-    detail: dict[str, float] = Field(default_factory=dict)
+    total: int = Field(
+        description="Steps of the stage; where the time of frame 0 is short, there may come to be fewer."
+    )
+    detail: dict[str, float] = Field(
+        default_factory=dict,
+        description="Figures by name: `loss`; `seconds_left`, predicted; `seconds_at_most`, what is left of the "
+        "setting `static.seconds`.",
+    )
 
 
 class EffectStatus(EffectModel):
@@ -155,8 +161,8 @@ class SceneStatus(Model):
     )
     warnings: list[str] = Field(
         default_factory=list,
-        description="What looks wrong with the rig and may be right, a sentence each: poses that seem to be the wrong "
-        "way round.",
+        description="What looks wrong and may be right, a sentence each: poses that seem to be the wrong way round; a "
+        "frame 0 whose first points no camera confirms, or that cover little of the pictures.",
     )
     created: str = Field(description="UTC, ISO 8601.")
     ingest: IngestSettings = IngestSettings()

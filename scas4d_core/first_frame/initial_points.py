@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from scas4d_core.first_frame.points.surroundings import Stage, surroundings
 from scas4d_core.first_frame.points.triangulation import matched_tracks, triangulate
 from scas4d_core.first_frame.points.visual_hull import pixel_at
 from scas4d_core.first_frame.points.volume import shared_volume, stage_distances
+from scas4d_core.first_frame.time_limit import TimeLimit
 
 OnProgress = Callable[[str, int, int], None]
 """Called with a stage, the steps done and the steps in all."""
@@ -71,6 +73,7 @@ def initial_points(
     stereo: bool = True,
     stereo_iterations: int = ITERATIONS,
     seed: int = 0,
+    limit: TimeLimit | None = None,
 ) -> FoundPoints:
     """Finds points on the surfaces that the pictures of one moment show.
 
@@ -90,6 +93,7 @@ def initial_points(
         stereo: dense stereo where the pictures have texture.
         stereo_iterations: rounds of propagation and refinement.
         seed: of every random choice; the same seed gives the same points.
+        limit: of the time of frame 0; where it is short, pictures are looked at less finely (``limit.shortened``).
 
     Returns:
         Points in the user's units; ``foreground`` is None where no masks were given.
@@ -112,20 +116,21 @@ def initial_points(
     background = plain_background(labelled)
     views = labelled if background is None else with_silhouettes(labelled, background)
     on_progress("triangulation", 0, 1)
-    tracks = matched_tracks(labelled)
+    limit = limit or TimeLimit(None)
+    tracks = matched_tracks(labelled, limit)
     first = Search(
         labelled, views, tracks, background is not None, min(MIN_VIEWS, len(views)), stereo, stereo_iterations,
-        max_points, rig.radius, seed,
+        max_points, rig.radius, seed, limit,
     )  # fmt: skip
     spacing = SPACING * pixel_at(labelled, look_at_point(labelled))
     found: FoundPoints | None = None
     ways = _ways(first, masked=bool(masks))
     for way, search in ways:
-        found = _found(found, way, lambda search=search: agreed_points(search, on_progress), search.views, spacing)
+        found = _found(found, way, partial(agreed_points, search, on_progress), search.views, spacing)
         if way != "pairs" and found is not None and found.covered >= ENOUGH:
             return found
     on_progress("plane", 0, 1)
-    found = _found(found, "plane", lambda: plane_points(labelled), views, spacing)
+    found = _found(found, "plane", partial(plane_points, labelled), views, spacing)
     before = next((search.views for way, search in ways if way == "backdrop"), views)
     known = triangulate(before, tracks, min_views=2, seed=seed).positions
     distances = stage_distances(before, known, rig.radius)

@@ -12,10 +12,14 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures.frame import Frame, InitialPoints
+from scas4d_core.first_frame.fit_schedule import FitProgress
 from scas4d_core.first_frame.glossy import fit_by_direction
 from scas4d_core.first_frame.initial_points import initial_points
 from scas4d_core.first_frame.points.silhouettes import EVERY, backdrop, mean_colour
-from scas4d_core.first_frame.static_scene import FirstCloud, StaticResult, first_trainer
+from scas4d_core.first_frame.points.stereo import load_stereo
+from scas4d_core.first_frame.static_result import FirstCloud, StaticResult
+from scas4d_core.first_frame.static_scene import first_trainer
+from scas4d_core.first_frame.time_limit import TimeLimit
 from scas4d_core.frame_report import Progress
 from scas4d_core.robust.checks import axis_lengths
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings
@@ -112,7 +116,7 @@ def fit_static_scene(
     foreground: NDArray[np.float32] | None,
     scene: SceneSettings,
     settings: StaticSettings,
-    progress: Callable[[int, float], None] | None = None,
+    progress: Callable[[FitProgress], None] | None = None,
 ) -> StaticResult:
     """Fits Θ_0 to the views of frame 0, from a cloud of points.
 
@@ -120,7 +124,7 @@ def fit_static_scene(
         factory: of the scene's views. views: of frame 0; their exposures are learnt in place.
         positions: [P, 3] metres in the inside world. colours: [P, 3] in 0…1. foreground: [P] in 0…1, or None.
         scene, settings: of the scene, of frame 0.
-        progress: called with the iterations done and the last loss.
+        progress: called after each iteration.
 
     Raises:
         ValueError: the cloud is empty.
@@ -156,11 +160,13 @@ def fit_first(
         frame: with pictures of the size of the factory's rig. points: in the user's world. world: user's to inside.
         on_progress: called with the progress of each stage.
     """
-    static = settings.static
+    if points is None:
+        load_stereo()
+    static, limit = settings.static, TimeLimit(settings.static.seconds)
     if points is None:
         found = initial_points(
             factory.rig, frame.images, frame.masks,
-            lambda stage, done, total: on_progress(Progress(stage, done, total)),
+            lambda stage, done, total: on_progress(Progress(stage, done, total, _at_most(limit))), limit=limit,
         )  # fmt: skip
         cloud, made, stage = _columns(found), FirstCloud(found.way, len(found), found.covered), found.stage
     else:
@@ -168,11 +174,24 @@ def fit_first(
         cloud, made, stage = _columns(inside), FirstCloud("given", len(points)), None
     views = factory.views(frame, {})
     result = fit_by_direction(
-        lambda: first_trainer(factory, views, *cloud, settings.scene, static, stage),
+        lambda: first_trainer(factory, views, *cloud, settings.scene, static, limit, stage),
         settings.effects.get("direction", "auto") if settings.device == "cpu" else "off",
-        lambda done, loss: on_progress(Progress("fitting frame 0", done, static.iterations, {"loss": loss})),
+        lambda now: on_progress(Progress("fitting frame 0", now.done, now.planned, _figures(now, limit))),
     )
-    return replace(result, cloud=made)
+    if len(result.planned) > 1:
+        limit.shortened.append(f"{len(result.losses)} of {static.iterations} iterations, each phase as much shorter")
+    return replace(result, cloud=made, shortened=[*limit.shortened, *result.shortened])
+
+
+def _at_most(limit: TimeLimit) -> dict[str, float]:
+    """The seconds after which frame 0 should be through, where that is known."""
+    return {"seconds_at_most": max(0.0, limit.left())} if limit.bounded else {}
+
+
+def _figures(now: FitProgress, limit: TimeLimit) -> dict[str, float]:
+    """The figures of a progress of the fit."""
+    left = {} if now.seconds is None else {"seconds_left": now.seconds}
+    return {"loss": now.loss, **left, **_at_most(limit)}
 
 
 def _columns(cloud: InitialPoints) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32] | None]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.effects.evidence import Evidence
+from scas4d_core.first_frame.exposures import TRIAL, Exposures
+from scas4d_core.first_frame.fit_schedule import FitProgress, FitSchedule, FitStep
 from scas4d_core.first_frame.initial_gaussians import (
     COLOUR,
     LABEL,
@@ -20,6 +20,8 @@ from scas4d_core.first_frame.initial_gaussians import (
     initial_parameters,
 )  # fmt: skip
 from scas4d_core.first_frame.points.surroundings import Stage
+from scas4d_core.first_frame.static_result import StaticResult
+from scas4d_core.first_frame.time_limit import TimeLimit
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels import activation
 from scas4d_core.kernels.adam import EVERY_ROW, adam
@@ -56,48 +58,8 @@ RATE_COLOUR, RATE_OPACITY, RATE_SCALE, RATE_ROTATION, RATE_EXPOSURE = 2.5e-3, 5e
 gain and offset."""
 WEIGHT_MASK = 3.0
 """Weight of the mask loss where masks are given; in frame 0 it teaches the labels only."""
-EXPOSURE_TRIAL, EXPOSURE_SPREAD = 0.3, 0.015
-"""Share of the iterations after which exposure terms are assessed, and the standard deviation of the gains over cameras
-below which they are given up. After 900 iterations it was 0.004 and 0.007 on equal cameras, 0.033 on a real rig."""
 SPLIT_SHRINK = 1.6
 """A split Gaussian's halves are smaller by this (3DGS)."""
-
-
-@dataclass(frozen=True)
-class FirstCloud:
-    """Where the first cloud of points came from.
-
-    Attributes:
-        way: "given", or as in ``initial_points.FoundPoints``. points: how many.
-        covered: share of the pictures that points cover on which cameras agree; None of a cloud that was given.
-    """
-
-    way: str
-    points: int
-    covered: float | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class StaticResult:
-    """Result of fitting frame 0.
-
-    Attributes:
-        gaussians: Θ_0. exposures: [3, 2] gain and offset of each training camera; empty without exposure terms.
-        losses: the training loss of every iteration. psnr: dB of the view that each iteration rendered.
-        cameras: by name, the fit of each camera's picture in its last iteration.
-        evidence: that was found for effects, by name.
-        cloud: where the first cloud came from; None where it is not known.
-    """
-
-    gaussians: Gaussians
-    exposures: dict[str, Array]
-    losses: list[float]
-    psnr: list[float] = field(default_factory=list)
-    cameras: dict[str, CameraFit] = field(default_factory=dict)
-    evidence: Mapping[str, Evidence] | None = None
-    cloud: FirstCloud | None = None
-
-
 STOP_ROUNDS = 5
 """Rounds over all views that the stop rule compares with as many before: in fewer the order of views is noise."""
 
@@ -112,6 +74,7 @@ class StaticTrainer:
         parameters: Array,
         scene: SceneSettings,
         settings: StaticSettings,
+        limit: TimeLimit | None = None,
     ) -> None:
         self.settings = settings
         self.views = views
@@ -125,11 +88,12 @@ class StaticTrainer:
         self._masked = any(len(view.target) > 3 for view in views)
         self.random = np.random.default_rng(settings.seed)
         self._reset_moments()
-        self.exposing = settings.exposure is not False
+        self.exposures = Exposures(views, settings.exposure is not False, RATE_EXPOSURE, BETA1, BETA2)
         self.psnr: list[float] = []
-        self._last = settings.iterations
+        self._last, self._steps = float(settings.iterations), 0
         self.cameras: dict[str, CameraFit] = {}
-        self._exposure_moments = {view.name: np.zeros((2, *view.exposure.shape), np.float32) for view in views}
+        self._start, self._until = len(parameters), int(DENSIFY_UNTIL * settings.iterations)
+        self.schedule = FitSchedule(settings.iterations, limit or TimeLimit(None), self._expected)
 
     def shapes(self) -> tuple[Array, Array, Array, Array]:
         """Means, factors, opacities and features of the parameters as they are."""
@@ -154,37 +118,44 @@ class StaticTrainer:
         self._gradients = np.empty_like(self.parameters)
 
     def train(
-        self, progress: Callable[[int, float], None] | None = None, enough: Callable[[int], bool] | None = None
+        self, progress: Callable[[FitProgress], None] | None = None, enough: Callable[[FitStep], bool] | None = None
     ) -> list[float]:
-        """Runs all iterations, or fewer by the stop rule.
+        """Runs all iterations, or fewer by the stop rule or for want of time.
 
         Args:
-            progress: called with the iteration and its loss. enough: called with the iterations done; True ends it.
+            progress: called after each iteration. enough: called after each; True ends the fit.
         """
-        settings = self.settings
+        settings, schedule, until = self.settings, self.schedule, self._until
         losses: list[float] = []
-        order = view_order(len(self.views), settings.iterations, self.random)
         self._allocate()
-        start = len(self.parameters)
-        until = int(DENSIFY_UNTIL * settings.iterations)
-        for iteration, index in enumerate(order):
-            losses.append(self.step(self.views[index], iteration))
-            done = iteration + 1
-            if DENSIFY_FROM <= done <= until and done % DENSIFY_EVERY == 0:
-                share = (done - DENSIFY_FROM) / max(until - DENSIFY_FROM, 1)
-                self.control_density(round(start + (self.budget - start) * min(1.0, share + 0.1)))
-            if done == until or done == (until + settings.iterations) // 2:
+        for index in view_order(len(self.views), settings.iterations, self.random):
+            now = schedule.next()
+            losses.append(self.step(self.views[index], now.begun))
+            if now.ended >= DENSIFY_FROM and now.begun < until and now.passes(DENSIFY_EVERY):
+                self.control_density(self._target(now.ended))
+            if now.reaches(until) or now.reaches((until + settings.iterations) // 2):
                 self.remove_unseen()
-            if done > until and self._last == settings.iterations and self._settled(losses):
-                self._last = min(settings.iterations, done + len(self.views))
+            if now.ended > until and self._last == settings.iterations and self._settled(losses):
+                self._last = min(self._last, now.ended + len(self.views) * schedule.stride)
                 self.remove_unseen()
-            if settings.exposure == "auto" and done == round(EXPOSURE_TRIAL * settings.iterations):
-                self._assess_exposure()
+            if settings.exposure == "auto" and now.reaches(round(TRIAL * settings.iterations)):
+                self.exposures.assess()
+            schedule.took(len(self.parameters))
             if progress is not None:
-                progress(done, losses[-1])
-            if done == self._last or (enough is not None and enough(done)):
+                progress(FitProgress(schedule.done, schedule.total, losses[-1], schedule.seconds))
+            if now.ended >= self._last or (enough is not None and enough(now)):
                 break
         return losses
+
+    def _target(self, at: float) -> int:
+        """Gaussians that density control aims at, at a moment of the schedule."""
+        share = (at - DENSIFY_FROM) / max(self._until - DENSIFY_FROM, 1)
+        return round(self._start + (self.budget - self._start) * min(1.0, share + 0.1))
+
+    def _expected(self, at: float) -> float:
+        """Gaussians at a moment of the schedule: of this fit where it is to come, else of another one like it."""
+        aim, now = self._target(min(at, self._until)) if at >= DENSIFY_FROM else self._start, self.schedule.at
+        return aim if at < now else len(self.parameters) if now >= self._until else max(len(self.parameters), aim)
 
     def _settled(self, losses: list[float]) -> bool:
         """True once rounds over all views no longer lower the loss; one more round of them follows."""
@@ -194,8 +165,11 @@ class StaticTrainer:
         before, now = np.mean(losses[-2 * window : -window]), np.mean(losses[-window:])
         return bool(before - now < self.settings.stop_gain * before)
 
-    def step(self, view: TrainingView, iteration: int) -> float:
-        """One iteration: renders the view, compares, carries the gradient back, steps Adam. Returns the loss."""
+    def step(self, view: TrainingView, at: float) -> float:
+        """One iteration, at a moment of the schedule: renders the view, carries the gradient back, steps Adam.
+
+        Returns the loss.
+        """
         activation.activate(self.parameters, self._means, self._factors, self._opacities, self._features)
         if self.shading is not None:
             turns, colours = without_turn(len(self._means)), self._features[:, :3].copy()
@@ -203,9 +177,10 @@ class StaticTrainer:
         gradients = self.loss.evaluate(self._means, self._factors, self._opacities, self._features, view)
         if self.shading is not None:
             self.shading.saw(self._means, turns, colours, view.camera, gradients.features)
-            self.shading.step(1 - 0.9 * iteration / self.settings.iterations)
+            self.shading.step(1 - 0.9 * at / self.settings.iterations)
         self.psnr.append(self.loss.psnr)
-        if iteration >= self._last - len(self.views):
+        # A shorter fit ends somewhere in a round: two hold every view.
+        if at >= self._last - len(self.views) * (1 if self.schedule.stride == 1 else 2 * self.schedule.stride):
             self.cameras[view.name] = camera_fit(self.loss.psnr, self.loss.colour_shift(view))
         activation.activate_backward(
             self.parameters, self._factors, self._opacities, self._features, gradients.means, gradients.factors,
@@ -215,16 +190,16 @@ class StaticTrainer:
         visible = self.loss.rasterizer.counts > 0
         self._screen += np.sqrt(np.square(gradients.screen * width).sum(axis=1))
         self._seen += visible
+        self._steps += 1
         adam(
-            self.parameters, self._gradients, self._first, self._second, self._rates(iteration), EVERY_ROW, BETA1,
-            BETA2, iteration + 1,
+            self.parameters, self._gradients, self._first, self._second, self._rates(at), EVERY_ROW, BETA1, BETA2,
+            self._steps,
         )  # fmt: skip
-        if self.exposing:
-            self._step_exposure(view, iteration)
+        self.exposures.step(view, self.loss.exposure_gradient, self._steps)
         return self.loss.image_part + self.loss.mask_part
 
-    def _rates(self, iteration: int) -> Array:
-        share = iteration / max(self.settings.iterations - 1, 1)
+    def _rates(self, at: float) -> Array:
+        share = at / max(self.settings.iterations - 1, 1)
         position = RATE_POSITION ** (1 - share) * RATE_POSITION_END**share
         rates = np.empty(activation.COLUMNS, np.float32)
         rates[MEAN] = position * self.radius
@@ -234,25 +209,6 @@ class StaticTrainer:
         rates[COLOUR] = RATE_COLOUR
         rates[LABEL] = RATE_OPACITY if self._masked else 0.0
         return rates
-
-    def _step_exposure(self, view: TrainingView, iteration: int) -> None:
-        """Adam on the camera's gain and offset; afterwards their mean over cameras is brought back to 1 and 0."""
-        moments = self._exposure_moments[view.name]
-        rates = np.full(2, RATE_EXPOSURE, np.float32)
-        gradient = self.loss.exposure_gradient[: len(view.exposure)].copy()
-        gradient[3:] = 0
-        adam(view.exposure, gradient, moments[0], moments[1], rates, EVERY_ROW, BETA1, BETA2, iteration + 1)
-        centre = np.mean([other.exposure[:3] for other in self.views], axis=0) - np.array([1, 0], np.float32)
-        for other in self.views:
-            other.exposure[:3] -= centre
-
-    def _assess_exposure(self) -> None:
-        """Gives up gains and offsets that hardly differ from camera to camera."""
-        gains = np.array([view.exposure[:3, 0] for view in self.views])
-        if gains.std(axis=0).mean() < EXPOSURE_SPREAD:
-            self.exposing = False
-            for view in self.views:
-                view.exposure[:] = (1, 0)
 
     def control_density(self, target: int) -> None:
         """Removes Gaussians that are all but transparent; clones or splits those with the largest screen gradients.
@@ -332,8 +288,8 @@ class StaticTrainer:
 
     def result(self, losses: list[float]) -> StaticResult:
         """Of the iterations so far."""
-        exposures = {view.name: view.exposure[:3].copy() for view in self.views} if self.exposing else {}
-        return StaticResult(self.gaussians(), exposures, losses, self.psnr, self.cameras)
+        found, planned = self.exposures.found(), self.schedule.planned
+        return StaticResult(self.gaussians(), found, losses, self.psnr, self.cameras, planned=planned)
 
 
 def first_trainer(
@@ -344,6 +300,7 @@ def first_trainer(
     foreground: Array | None,
     scene: SceneSettings,
     settings: StaticSettings,
+    limit: TimeLimit | None = None,
     stage: Stage | None = None,
 ) -> StaticTrainer:
     """The trainer of ``start.fit_static_scene``, before its first iteration; arguments and errors are the same.
@@ -353,8 +310,8 @@ def first_trainer(
     if len(positions) == 0:
         raise ValueError("the first cloud holds no point; give points, masks, or more overlapping cameras")
     rng = np.random.default_rng(settings.seed)
-    limit = max(1, int(INITIAL_SHARE * budget(views, scene, settings)))
-    parameters = initial_parameters(positions, colours, foreground, limit, rng)
-    trainer = StaticTrainer(factory, views, parameters, scene, settings)
+    most = max(1, int(INITIAL_SHARE * budget(views, scene, settings)))
+    parameters = initial_parameters(positions, colours, foreground, most, rng)
+    trainer = StaticTrainer(factory, views, parameters, scene, settings, limit)
     trainer.stage = stage
     return trainer

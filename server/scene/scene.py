@@ -194,7 +194,7 @@ class Scene:
             states_deleted=ledger.states_deleted,
             effects=effects_of(self.spec.settings, self._newest_record),
             damage=self._damage.sentences,
-            warnings=self.warnings,
+            warnings=[*self.warnings, *updates.cloud_warnings],
             created=self.created.isoformat(),
             ingest=self.request.ingest,
             settings=self.spec.settings.model_dump(mode="json"),

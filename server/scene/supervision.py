@@ -119,6 +119,7 @@ class WorkClock:
         self._stage = ""
         self._stage_began = 0.0
         self._done = 0.0
+        self._first_end: float | None = None
         self._stalled_until: float | None = None
 
     @property
@@ -129,13 +130,14 @@ class WorkClock:
     def begin(self, *, first: bool) -> None:
         """Notes that the worker has a frame; ``first``: there is no committed state before it."""
         self._began, self._first, self._stalled_until = self._now(), first, None
-        self._stage, self._done = "", 0.0
+        self._stage, self._done, self._first_end = "", 0.0, None
 
-    def progress(self, stage: str, done: int, total: int) -> None:
-        """Notes how far frame 0 is in one of its stages."""
+    def progress(self, stage: str, done: int, total: int, seconds: float | None = None) -> None:
+        """Notes how far frame 0 is in one of its stages; `seconds`: predicted until its end."""
         if stage != self._stage:
             self._stage, self._stage_began = stage, self._now()
         self._done = done / total if total > 0 else 0.0
+        self._first_end = None if seconds is None else self._now() + seconds
 
     def stall(self, seconds: float) -> None:
         """Notes that the frame at work waits for room on the disk and is tried again after so long."""
@@ -156,6 +158,8 @@ class WorkClock:
             return max(0.0, self._stalled_until - now) + self.update_seconds
         elapsed = now - self._began
         if self._first:
+            if self._first_end is not None and now < self._first_end:
+                return max(SHORTEST_S, self._first_end - now)
             in_stage = now - self._stage_began
             if 0 < self._done < 1:
                 return max(SHORTEST_S, in_stage * (1 - self._done) / self._done)

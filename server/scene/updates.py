@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from client.wire import FrameReportModel, FrameState, ProgressModel, Retention
+from scas4d_core.frame_outcome import cloud_warnings
 from server.health import metrics
 from server.processes import worker
 from server.processes.messages import (
@@ -47,6 +48,7 @@ class Updates:
     Attributes:
         trouble: why the scene is degraded: a sentence about the last frame, the worker or the disk, or None.
         progress: of frame 0, while it is at work. gaussians: in the newest state, where it is known.
+        cloud_warnings: how unsure frame 0 is, a sentence each.
     """
 
     def __init__(
@@ -80,6 +82,7 @@ class Updates:
         self.trouble = self._last_trouble()
         self.progress: ProgressModel | None = None
         self.gaussians: int | None = None
+        self.cloud_warnings: list[str] = []
         self._index: int | None = None
         self._ready = False
         self._holding = 0
@@ -157,7 +160,7 @@ class Updates:
                 self.progress = ProgressModel(
                     stage=message.stage, done=message.done, total=message.total, detail=message.detail
                 )
-                self.clock.progress(message.stage, message.done, message.total)
+                self.clock.progress(message.stage, message.done, message.total, message.detail.get("seconds_left"))
                 self.tell(SceneChanged())
             case FrameCommitted():
                 self._background.run(self._commit(message))
@@ -190,6 +193,7 @@ class Updates:
             await self._log.write(*events)
         if ready.indices and ready.report:
             self._record(ready.indices[-1], ready.report)
+            self._background.run(self._look_at_first())
             self._readers.refresh()
             if ready.indices[-1] > newest:  # committed by a worker that died before it could say so
                 self.tell(FrameFinished(ledger.frames[ready.indices[-1]].report))
@@ -197,6 +201,13 @@ class Updates:
         self._ready = True
         self.mending.taken_up(ready.damaged)
         self.begin()
+
+    async def _look_at_first(self) -> None:
+        """Says again what was said of frame 0, of which a new process knows nothing."""
+        report = await self._reports.of(self._ledger.committed[0]) if self._ledger.committed else None
+        if report is not None and report.cloud is not None:
+            self.cloud_warnings = cloud_warnings(report.cloud.model_dump())
+            self.tell(SceneChanged())
 
     async def _commit(self, message: FrameCommitted) -> None:
         self.deaths.committed()
@@ -246,6 +257,8 @@ class Updates:
     def _record(self, index: int, record: Mapping[str, Any]) -> None:
         self._ledger.frames.set_record(index, record)
         self.gaussians = record.get("gaussians")
+        if (cloud := record.get("cloud")) is not None:
+            self.cloud_warnings = cloud_warnings(cloud)
 
     def _last_trouble(self) -> str | None:
         """Returns what went wrong with the newest frame that was tried, or None."""

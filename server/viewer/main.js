@@ -169,9 +169,10 @@ function showStatus(status) {
     const progress = status.progress;
     if (status.state === "failed") curtain("The scene has failed", $("trouble").textContent);
     else if (progress) {
-      const loss = progress.detail?.loss;
+      const { loss, seconds_left: left, seconds_at_most: most } = progress.detail ?? {};
+      const when = left !== undefined ? ` · about ${Math.ceil(left)} s left` : most ? ` · ${Math.ceil(most)} s at most` : "";
       curtain("Reconstructing the first frame", `${progress.stage[0].toUpperCase()}${progress.stage.slice(1)}`,
-        `${progress.done} of ${progress.total}${loss === undefined ? "" : ` · loss ${loss.toFixed(4)}`}`,
+        `${progress.done} of ${progress.total}${loss === undefined ? "" : ` · loss ${loss.toFixed(4)}`}${when}`,
         progress.total ? progress.done / progress.total : null);
     } else if (status.state === "initialising") curtain("Reconstructing the first frame", "The pictures are being read");
     else curtain("Waiting for the first frame", "The scene accepts frames.", `PUT ${scenePath(status.id)}/frames/0`);

@@ -19,12 +19,12 @@ from client.cli.evaluate import Report
 from client.cli.scores import Row, write_row
 from scas4d_core.captures import Capture
 from scas4d_core.metrics import psnr as image_psnr
-from scas4d_core.presets import preset
 from scas4d_core.settings import Settings
 from studies.captures import open_measured
 from studies.effort.sequences import Shown, as_it_is, back_and_forth, repeated, slowed
 from studies.frontier.timing import started
 from studies.machine import core_version, machine
+from studies.quality.settings import settings_of
 
 TOLERANCE = 0.05
 """Of a budget that a frame may be off, or one iteration if that is more."""
@@ -83,7 +83,7 @@ def measure_budgets(
     capture = open_measured(folder)
     kept = []
     for budget in milliseconds:
-        settings = changed(preset("scas4d"), budget_ms=budget)
+        settings = changed(settings_of("scas4d"), budget_ms=budget)
         one = Kept(budget)
         with tempfile.TemporaryDirectory() as directory:
             reconstruction = started(capture, settings, out, Path(directory))
@@ -127,7 +127,7 @@ def measure_adaptive(
     for what, (tries, frames) in sequences.items():
         turns = Turns(("scas4d", name))
         for seed in range(tries):
-            fixed, spare = (changed(preset(key), seed=seed) for key in turns.names)
+            fixed, spare = (changed(settings_of(key), seed=seed) for key in turns.names)
             turns.take(capture, (changed(fixed, still=-1.0), spare), frames(), out)
         answer = {"sequence": what, **turns.row()}
         answers.append(answer)

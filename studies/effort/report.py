@@ -20,10 +20,10 @@ import numpy as np
 from client.cli.evaluate import Report
 from client.cli.scores import Row
 from client.importers.open_source import open_source
-from scas4d_core.presets import preset
 from scas4d_core.update.result import REPORT
 from studies.effort.effort import COUNTED_FROM, changed, leave
 from studies.frontier.timing import started
+from studies.quality.settings import settings_of
 
 TARGET = 0.02
 """Share of an update that its report may cost."""
@@ -40,7 +40,7 @@ def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report
     from scas4d_core.update.frame_update import FrameUpdate
 
     capture = open_source(folder)
-    settings = changed(preset("scas4d"), still=-1.0)
+    settings = changed(settings_of("scas4d"), still=-1.0)
     shares: list[float] = []
     stages: list[dict[str, float]] = []
     cpu: dict[bool, list[float]] = {True: [], False: []}

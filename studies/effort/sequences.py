@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from scas4d_core.captures import Capture, Frame
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.presets import preset
 from studies.frontier.timing import started
+from studies.quality.settings import settings_of
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,10 @@ def slowed(capture: Capture, updates: int, out: Path, factor: int = 3) -> Iterat
 
     Training pictures and truth are both rendered, so that its figures compare with each other and with no others.
     """
-    source = started(capture, preset("scas4d"), out)
+    source = started(capture, settings_of("scas4d"), out)
     for index in range(1, min(updates + 1, capture.frame_count)):
         source.step(capture.frame(index))
-    drawn = started(capture, preset("scas4d"), out)  # draws the states in between
+    drawn = started(capture, settings_of("scas4d"), out)  # draws the states in between
     step = capture.frame(1).time - capture.frame(0).time
     number = 0
     for index in range(1, min(updates + 1, capture.frame_count)):

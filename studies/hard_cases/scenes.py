@@ -40,7 +40,7 @@ class HardScene:
         """See ``Problem``: on the CPU."""
         if backend != CPU:
             return None
-        from scas4d_core.first_frame.static_scene import StaticResult
+        from scas4d_core.first_frame.static_result import StaticResult
         from scas4d_core.reconstruction import Reconstruction
 
         states = [ball_on_a_floor(BALL, np.random.default_rng(0))]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import Capture
 from scas4d_core.captures.frame import Frame, InitialPoints
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings

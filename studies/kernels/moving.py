@@ -14,7 +14,7 @@ import numpy as np
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures.frame import Frame
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings

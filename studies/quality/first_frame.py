@@ -17,7 +17,7 @@ import numpy as np
 
 from scas4d_core.captures import Capture
 from scas4d_core.effects.evidence import Evidence
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
@@ -39,7 +39,10 @@ def first_frame_key(capture: Capture, settings: Settings) -> str:
         settings: those of the scene and of frame 0 count.
     """
     hasher = hashlib.sha256()
-    described = [VERSION, settings.scene.model_dump(mode="json"), settings.static.model_dump(mode="json")]
+    static = settings.static.model_dump(mode="json")
+    if static["seconds"] is None:  # those that were kept before there was a limit have the same name
+        del static["seconds"]
+    described = [VERSION, settings.scene.model_dump(mode="json"), static]
     hasher.update(json.dumps(described, sort_keys=True).encode())
     for camera in capture.full_rig.cameras:
         hasher.update(f"{camera.name} {camera.width} {camera.height}".encode())

@@ -17,7 +17,7 @@ def settings_of(
     changes: Sequence[str] = (),
     device: str | None = None,
 ) -> Settings:
-    """A preset with changes.
+    """A preset with changes; the time of frame 0 has no limit, so that a study does not depend on the machine's load.
 
     Args:
         name: of the preset.
@@ -29,7 +29,7 @@ def settings_of(
     Raises:
         ValueError: an unknown preset or setting, or a value out of range.
     """
-    own: dict[str, Any] = {"static": {"seed": seed}, "update": {"seed": seed}}
+    own: dict[str, Any] = {"static": {"seed": seed, "seconds": None}, "update": {"seed": seed}}
     if iterations is not None:
         own["update"]["iterations"] = iterations
     if device is not None:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.effects import effect as effect_module
 from scas4d_core.effects.evidence import Seen
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.remake import remake
 from scas4d_core.robust.solve_frame import FrameSolver, Solved, UpdateInput

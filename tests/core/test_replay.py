@@ -9,7 +9,7 @@ import pytest
 from box_scene import SHIFT, make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.replay import replay, summary

@@ -23,7 +23,7 @@ from scas4d_core.settings import Settings, StaticSettings, UpdateSettings
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "robot"
 SETTINGS = Settings(
-    static=StaticSettings(iterations=40, max_gaussians=2500),
+    static=StaticSettings(iterations=40, max_gaussians=2500, seconds=None),
     update=UpdateSettings(iterations=8),
 )
 static_scene.DENSIFY_FROM = static_scene.DENSIFY_EVERY = 10  # densified, as short as it is

@@ -19,7 +19,7 @@ import numpy as np
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.storage.history import History, HistoryError
 
-SLOW, SLOW_RAISES, RAISES, DIES, HELD, LEAVES_OUT, STANDS = 200, 201, 250, 251, 240, 241, 242
+SLOW, SLOW_RAISES, RAISES, DIES, HELD, LEAVES_OUT, STANDS, GUESSED = 200, 201, 250, 251, 240, 241, 242, 243
 ITERATIONS = 100
 MS_EACH = 2.0
 RAISES_IN_REPLAY, DIES_IN_REPLAY = 666, 667
@@ -139,6 +139,8 @@ class FakeReconstruction:
             record["dropped"] = {**record["dropped"], "c1": "it shows nothing"}
             out = {"what": "camera_left_out", "camera": "c1", "evidence": "left out of this frame: it shows nothing"}
             record["alarms"] = [*record.get("alarms", []), out]
+        if red == GUESSED and not known:
+            record |= {"cloud": {"way": "volume", "points": count, "covered": 0.0}, "shortened": ["no stereo"]}
         first = self.iterations // 2
         record["curve"] = [
             {"iterations": first, "milliseconds": MS_EACH * first, "loss": 0.5},

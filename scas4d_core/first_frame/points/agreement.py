@@ -9,14 +9,21 @@ import numpy as np
 
 from scas4d_core.captures.frame import InitialPoints
 from scas4d_core.first_frame.points.merging import SPACING, merged, thinned
-from scas4d_core.first_frame.points.posed_pictures import Bool, Float, PosedPicture, look_at_point, pixels_inside
+from scas4d_core.first_frame.points.posed_pictures import (
+    Bool,
+    Float,
+    PosedPicture,
+    halved,
+    look_at_point,
+    pixels_inside,
+)
 from scas4d_core.first_frame.points.stereo import (
     FEWEST_NEIGHBOURS,
     DepthMap,
     depth_maps,
     fused_points,
-    halved,
     looked_through,
+    planned,
 )
 from scas4d_core.first_frame.points.surfaces import (
     TOLERANCE,
@@ -28,6 +35,7 @@ from scas4d_core.first_frame.points.surfaces import (
 )
 from scas4d_core.first_frame.points.triangulation import Tracks, Triangulation, triangulate
 from scas4d_core.first_frame.points.visual_hull import MISSES, VisualHull, carve, contradicted, pixel_at
+from scas4d_core.first_frame.time_limit import TimeLimit
 
 OnProgress = Callable[[str, int, int], None]
 """Called with a stage, the steps done and the steps in all."""
@@ -47,6 +55,7 @@ class Search:
             backdrop. backdrop: true where the masks of ``views`` are those silhouettes.
         min_views: cameras that must agree on a point. stereo: whether there is dense stereo. iterations: its rounds.
         tracks: of features. max_points: kept at most. radius: of the rig, world units. seed: of every random choice.
+        limit: of the time of frame 0.
     """
 
     labelled: Sequence[PosedPicture]
@@ -59,6 +68,7 @@ class Search:
     max_points: int
     radius: float
     seed: int
+    limit: TimeLimit
 
 
 def agreed_points(search: Search, on_progress: OnProgress) -> InitialPoints:
@@ -103,7 +113,7 @@ def agreed_points(search: Search, on_progress: OnProgress) -> InitialPoints:
         samples = settle(samples, supports, confirmed, 4.0 * TOLERANCE * search.radius)
         walls = samples[looked_through(maps, samples, min_views) < LOOKED_THROUGH]
     sources = (confirmed, solid, walls)
-    return merged(search.labelled, views, sources, pixel, plain, search.stereo, search.max_points)
+    return merged(search.labelled, views, sources, pixel, plain, bool(maps), search.max_points)
 
 
 def _in_foreground(views: Sequence[PosedPicture], triangulated: Triangulation) -> Bool:
@@ -130,7 +140,10 @@ def _stereo(
 ) -> list[DepthMap]:
     """Depth maps of all pictures, halved; the search starts from hull, surfaces and triangulated points."""
     views, plain = search.views, search.backdrop
-    small = [halved(view) for view in views]
+    effort = planned(views, middle, search.iterations, search.limit)
+    if effort is None:
+        return []
+    small = [halved(view, effort.width) for view in views]
     hull_surface = hull.centres[hull.surface()]
     known = hull_surface if plain else np.concatenate([triangulated.positions, hull_surface])
     ranges, priors, active = [], [], []
@@ -163,7 +176,7 @@ def _stereo(
         priors,
         active,
         middle,
-        iterations=search.iterations,
+        iterations=effort.iterations,
         seed=search.seed,
         hull=hull,
         fewest=min(FEWEST_NEIGHBOURS, search.min_views - 1),

@@ -113,10 +113,7 @@ def labelled_share(views: Sequence[PosedPicture], points: Float, visible: Bool) 
 
 def spaced(points: Float, cell: float) -> NDArray[np.intp]:
     """Index of one point for each cubic cell, the nearest to the mean of the cell's points: that spreads evenly."""
-    cells = np.floor(points / cell).astype(np.int64)
-    _, where = np.unique(cells, axis=0, return_inverse=True)
-    where = where.ravel()
-    count = np.bincount(where)
+    where, count = _cells(points, cell)
     means = np.stack([np.bincount(where, points[:, axis]) for axis in range(3)], axis=-1) / count[:, None]
     order = np.lexsort((((points - means[where]) ** 2).sum(-1), where))
     result: NDArray[np.intp] = order[np.concatenate([[0], np.cumsum(count)[:-1]])]
@@ -127,8 +124,17 @@ def thinned(points: Float, cell: float) -> tuple[Float, NDArray[np.intp]]:
     """Means [Q, 3] of the points in each cubic cell of edge ``cell``, and the number of points in each [Q]."""
     if len(points) == 0:
         return points.reshape(-1, 3), np.zeros(0, dtype=np.intp)
-    cells = np.floor(points / cell).astype(np.int64)
-    _, where, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    where = where.ravel()
+    where, count = _cells(points, cell)
     means = np.stack([np.bincount(where, points[:, axis]) for axis in range(3)], axis=-1) / count[:, None]
     return means, count
+
+
+def _cells(points: Float, cell: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Index [P] of the cubic cell of each point, in the order of x, y and z, and the number of points in each cell."""
+    cells = np.floor(points / cell).astype(np.int64)
+    cells -= cells.min(axis=0)
+    size = cells.max(axis=0) + 1
+    if float(size[0]) * float(size[1]) * float(size[2]) < 2**62:  # one number a cell sorts ten times faster than three
+        cells = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+    _, where, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    return where.ravel(), count

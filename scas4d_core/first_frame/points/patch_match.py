@@ -22,6 +22,8 @@ TEXTURE = 0.012
 """Standard deviation of a patch (0…1), below which a match means nothing: three steps of an 8-bit picture."""
 NO_MATCH = 2.0
 """Cost of a patch that cannot be compared; the cost of one that can is 1 − NCC, between 0 and 2."""
+ROUNDED = 1e-6
+"""By how much the cost of a perfect match may be below 0, for want of digits."""
 
 _SAMPLES = (2 * REACH + 1) ** 2
 
@@ -39,69 +41,95 @@ def _random(key: int, draw: int) -> float:
 @kernel
 def _cost(
     patch: Any, weight: Any, mean: float, deviation: float, x: float, y: float, depth: float,
-    nx: float, ny: float, nz: float, inverse: Any, others: Any, sizes: Any, matrices: Any, shifts: Any, best: int,
+    nx: float, ny: float, nz: float, inverse: Any, rays: Any, inverses: Any, others: Any, sizes: Any, shifts: Any,
+    best: int, enough: float,
 ) -> float:  # fmt: skip
-    """1 − NCC, mean over the ``best`` best neighbours; NO_MATCH where fewer than that see the patch."""
+    """1 − NCC, mean over the ``best`` best neighbours; NO_MATCH where fewer see the patch, or it is over ``enough``.
+
+    ``rays`` [V, samples, 3]: see ``_rays``; ``inverses`` [samples]: scratch.
+    """
     rx, ry = inverse[0] * x + inverse[1], inverse[2] * y + inverse[3]
     reach = depth * (nx * rx + ny * ry + nz)  # n · X of the plane's centre
     low0, low1, low2, low3 = NO_MATCH, NO_MATCH, NO_MATCH, NO_MATCH
     if abs(reach) < 1e-9:
         return NO_MATCH
-    for v in range(others.shape[0]):
-        m, t = matrices[v], shifts[v]
+    # Pixel (a, b) of the reference lies at the inverse depth (n · ray) / reach, linear in a and b.
+    k = 0
+    for j in range(-REACH, REACH + 1):
+        qy = inverse[2] * (y + j * STEP) + inverse[3]
+        for i in range(-REACH, REACH + 1):
+            qx = inverse[0] * (x + i * STEP) + inverse[1]
+            s = (nx * qx + ny * qy + nz) / reach
+            if s <= 0.0:
+                return NO_MATCH
+            inverses[k] = s
+            k += 1
+    count = others.shape[0]
+    for v in range(count):
+        t = shifts[v]
         height, width = sizes[v]
-        # Pixel (a, b) of the reference lies at the inverse depth (n · ray) / reach, linear in a and b:
-        # its image is M ray + T · (inverse depth), linear too (the homography of the plane).
+        # Its image is M ray + T · (inverse depth), linear too (the homography of the plane).
         sum_w, sum_i, sum_ii, sum_ri = 0.0, 0.0, 0.0, 0.0
         inside = True
-        k = 0
-        for j in range(-REACH, REACH + 1):
-            qy = inverse[2] * (y + j * STEP) + inverse[3]
-            for i in range(-REACH, REACH + 1):
-                qx = inverse[0] * (x + i * STEP) + inverse[1]
-                s = (nx * qx + ny * qy + nz) / reach
-                w3 = m[2, 0] * qx + m[2, 1] * qy + m[2, 2] + t[2] * s
-                if s <= 0.0 or w3 <= 1e-6:
-                    inside = False
-                    break
-                u = (m[0, 0] * qx + m[0, 1] * qy + m[0, 2] + t[0] * s) / w3 - 0.5
-                r = (m[1, 0] * qx + m[1, 1] * qy + m[1, 2] + t[1] * s) / w3 - 0.5
-                if not (u >= 0.0 and r >= 0.0 and u < width - 1.001 and r < height - 1.001):
-                    inside = False
-                    break
-                c0, r0 = int(u), int(r)
-                fu, fr = u - c0, r - r0
-                top = others[v, r0, c0] * (1.0 - fu) + others[v, r0, c0 + 1] * fu
-                low = others[v, r0 + 1, c0] * (1.0 - fu) + others[v, r0 + 1, c0 + 1] * fu
-                value = top * (1.0 - fr) + low * fr
-                w = weight[k]
-                sum_w += w
-                sum_i += w * value
-                sum_ii += w * value * value
-                sum_ri += w * value * patch[k]
-                k += 1
-            if not inside:
+        for k in range(_SAMPLES):
+            s = inverses[k]
+            w3 = rays[v, k, 2] + t[2] * s
+            if w3 <= 1e-6:
+                inside = False
                 break
-        if not inside:
-            continue
-        centre = sum_i / sum_w
-        spread = sum_ii / sum_w - centre * centre
-        if spread < 0.25 * TEXTURE * TEXTURE:
-            continue
-        cost = 1.0 - (sum_ri / sum_w - centre * mean) / (deviation * np.sqrt(spread))
-        if cost < low0:
-            low0, low1, low2, low3 = cost, low0, low1, low2
-        elif cost < low1:
-            low1, low2, low3 = cost, low1, low2
-        elif cost < low2:
-            low2, low3 = cost, low2
-        elif cost < low3:
-            low3 = cost
+            u = (rays[v, k, 0] + t[0] * s) / w3 - 0.5
+            r = (rays[v, k, 1] + t[1] * s) / w3 - 0.5
+            if not (u >= 0.0 and r >= 0.0 and u < width - 1.001 and r < height - 1.001):
+                inside = False
+                break
+            c0, r0 = int(u), int(r)
+            fu, fr = u - c0, r - r0
+            top = others[v, r0, c0] * (1.0 - fu) + others[v, r0, c0 + 1] * fu
+            low = others[v, r0 + 1, c0] * (1.0 - fu) + others[v, r0 + 1, c0 + 1] * fu
+            value = top * (1.0 - fr) + low * fr
+            w = weight[k]
+            sum_w += w
+            sum_i += w * value
+            sum_ii += w * value * value
+            sum_ri += w * value * patch[k]
+        if inside:
+            centre = sum_i / sum_w
+            spread = sum_ii / sum_w - centre * centre
+            if spread >= 0.25 * TEXTURE * TEXTURE:
+                cost = 1.0 - (sum_ri / sum_w - centre * mean) / (deviation * np.sqrt(spread))
+                if cost < low0:
+                    low0, low1, low2, low3 = cost, low0, low1, low2
+                elif cost < low1:
+                    low1, low2, low3 = cost, low1, low2
+                elif cost < low2:
+                    low2, low3 = cost, low2
+                elif cost < low3:
+                    low3 = cost
+        # The rest cannot make up for what the best so far lack, were they perfect.
+        sure = best - (count - 1 - v)
+        least = low0 if sure == 1 else low0 + low1 if sure == 2 else low0 + low1 + low2 if sure == 3 else 0.0
+        if sure >= 1 and v < count - 1 and least - ROUNDED >= best * enough:
+            return NO_MATCH
     if best == 1:
         return low0
     if best == 2:
         return 0.5 * (low0 + low1) if low1 < NO_MATCH else NO_MATCH
     return (low0 + low1 + low2) / 3.0 if low2 < NO_MATCH else NO_MATCH
+
+
+@inline
+def _rays(x: float, y: float, inverse: Any, matrices: Any, rays: Any) -> None:
+    """Fills [V, samples, 3]: the rays of the samples about a pixel, as each neighbour's M turns them."""
+    for v in range(matrices.shape[0]):
+        m = matrices[v]
+        k = 0
+        for j in range(-REACH, REACH + 1):
+            qy = inverse[2] * (y + j * STEP) + inverse[3]
+            for i in range(-REACH, REACH + 1):
+                qx = inverse[0] * (x + i * STEP) + inverse[1]
+                for axis in range(3):
+                    rays[v, k, axis] = m[axis, 0] * qx + m[axis, 1] * qy + m[axis, 2]
+                k += 1
 
 
 @kernel
@@ -134,7 +162,8 @@ def _sweep(
     """One round over the pixels of one colour of the chequerboard; round 0 only gives each pixel its first plane."""
     height, width = image.shape
     for y in prange(height):
-        patch, weight = np.empty(_SAMPLES), np.empty(_SAMPLES)
+        patch, weight, inverses = np.empty(_SAMPLES), np.empty(_SAMPLES), np.empty(_SAMPLES)
+        rays = np.empty((others.shape[0], _SAMPLES, 3))
         for x in range(width):
             if not active[y, x] or (round_ > 0 and (x + y) % 2 != colour):
                 continue
@@ -144,6 +173,7 @@ def _sweep(
                 continue
             key = ((seed * 64 + round_) * height + y) * width + x + 1
             px, py = x + 0.5, y + 0.5
+            _rays(px, py, inverse, matrices, rays)
             d, c = depth[y, x], cost[y, x]
             nx, ny, nz = normal[y, x, 0], normal[y, x, 1], normal[y, x, 2]
             tries = 3 if round_ == 0 else 8 + 4
@@ -187,7 +217,7 @@ def _sweep(
                     continue
                 tc = _cost(
                     patch, weight, mean, deviation, px, py, td, tx, ty, tz,
-                    inverse, others, sizes, matrices, shifts, best,
+                    inverse, rays, inverses, others, sizes, shifts, best, c,
                 )  # fmt: skip
                 if tc < c:
                     d, c, nx, ny, nz = td, tc, tx, ty, tz

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_closing, binary_erosion, binary_opening, gaussian_filter, uniform_filter
+from scipy.ndimage import binary_closing, binary_opening, gaussian_filter, minimum_filter, uniform_filter
 
 from scas4d_core.captures.frame import InitialPoints
 from scas4d_core.first_frame.points.merging import SPACING, labelled_share
@@ -117,7 +117,9 @@ def plane_points(labelled: Sequence[PosedPicture]) -> InitialPoints:
     points = plane.cells(count)
     smooth = _smooth(views, plane, count)
     sure = _agreement(views, smooth, points[None])[1][0] >= min(PAIRS, len(views) - 1)
-    within = binary_opening(binary_closing(np.pad(sure, CLOSED), np.ones((CLOSED, CLOSED))), np.ones((5, 5)))
+    within = binary_opening(
+        binary_closing(np.pad(sure, CLOSED), np.ones((CLOSED, CLOSED), bool)), np.ones((5, 5), bool)
+    )
     flat = points[within[CLOSED:-CLOSED, CLOSED:-CLOSED]]
     inside = np.array([pixels_inside(view.camera, flat)[3] for view in labelled])
     shared = inside.sum(axis=0) >= min(PAIRS, len(views))
@@ -207,7 +209,7 @@ def _smooth(views: Sequence[PosedPicture], plane: Plane, count: int) -> list[Pla
 def _agreement(
     views: Sequence[PosedPicture], smooth: Sequence[Planes], points: Float
 ) -> tuple[Float, NDArray[np.intp]]:
-    """How much pictures agree on planes.
+    """Agreement of pictures on planes.
 
     Args:
         points: [T, C, C, 3] cells of each plane, world.
@@ -243,8 +245,9 @@ def _laid(view: PosedPicture, picture: Planes, points: Float) -> tuple[Planes, P
     lower = picture[top + 1, left] * (1 - right) + picture[top + 1, left + 1] * right
     values: Planes = (upper * (1 - down) + lower * down).reshape(points.shape[:3])
     mean = _box(values)
-    spread = np.sqrt(np.maximum(_box(values * values) - mean * mean, 0))
-    whole = binary_erosion(inside.reshape(points.shape[:3]), np.ones((1, PATCH, PATCH)))
+    variance = _box(values * values) - mean * mean
+    spread = np.sqrt(variance.clip(0))
+    whole: Bool = minimum_filter(inside.reshape(points.shape[:3]), (1, PATCH, PATCH), mode="constant")
     return values, mean, spread, whole & (spread > TEXTURE)
 
 

@@ -69,6 +69,20 @@ def collect_views(
     return views
 
 
+def halved(view: PosedPicture, width: int) -> PosedPicture:
+    """The view at half, a quarter … of its size, until it is no wider than ``width`` pixels."""
+    image, mask, camera = view.image.astype(np.float32), view.mask, view.camera
+    while camera.width > width and camera.width >= 2 and camera.height >= 2:
+        h, w = camera.height // 2 * 2, camera.width // 2 * 2
+        image = image[:h, :w].reshape(h // 2, 2, w // 2, 2, 3).mean((1, 3))
+        if mask is not None:
+            mask = np.asarray(mask[:h, :w].reshape(h // 2, 2, w // 2, 2).any((1, 3)), dtype=np.bool_)
+        # Blocks of 2 × 2 with pixel centres at +0.5: every pixel coordinate is halved exactly, odd sizes or not.
+        matrix = camera.intrinsics * np.array([[0.5], [0.5], [1.0]])
+        camera = type(camera)(camera.name, matrix, camera.world_to_camera, w // 2, h // 2)
+    return PosedPicture(camera, np.rint(image).astype(np.uint8), mask)
+
+
 class Posed(Protocol):
     """Whatever has a camera."""
 

@@ -10,11 +10,16 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
 from scas4d_core.first_frame.points.patch_match import patch_match
-from scas4d_core.first_frame.points.posed_pictures import Bool, Float, PosedPicture, pixels_inside
+from scas4d_core.first_frame.points.posed_pictures import Bool, Float, PosedPicture, halved, pixels_inside
 from scas4d_core.first_frame.points.visual_hull import VisualHull
+from scas4d_core.first_frame.time_limit import STEREO, TimeLimit
 
 WIDTH = 320
 """Pixels: wider pictures are halved until they are not."""
+PACE_WIDTH = 80
+"""The same of those on which the pace is measured: a thirtieth of the work on one picture."""
+PLANES_FIRST, PLANES_EACH = 3, 12
+"""Planes that each pixel tries at first, and in a round (``patch_match``)."""
 NEIGHBOURS = 4
 """Other cameras that each picture is compared with."""
 FEWEST_NEIGHBOURS = 2
@@ -51,18 +56,61 @@ class DepthMap:
         return result
 
 
-def halved(view: PosedPicture, width: int = WIDTH) -> PosedPicture:
-    """The view at half, a quarter … of its size, until it is no wider than ``width`` pixels."""
-    image, mask, camera = view.image.astype(np.float32), view.mask, view.camera
-    while camera.width > width and camera.width >= 2 and camera.height >= 2:
-        h, w = camera.height // 2 * 2, camera.width // 2 * 2
-        image = image[:h, :w].reshape(h // 2, 2, w // 2, 2, 3).mean((1, 3))
-        if mask is not None:
-            mask = np.asarray(mask[:h, :w].reshape(h // 2, 2, w // 2, 2).any((1, 3)), dtype=np.bool_)
-        # Blocks of 2 × 2 with pixel centres at +0.5: every pixel coordinate is halved exactly, odd sizes or not.
-        matrix = camera.intrinsics * np.array([[0.5], [0.5], [1.0]])
-        camera = type(camera)(camera.name, matrix, camera.world_to_camera, w // 2, h // 2)
-    return PosedPicture(camera, np.rint(image).astype(np.uint8), mask)
+@dataclass(frozen=True)
+class Effort:
+    """Effort of stereo: pictures no wider than ``width`` pixels, and rounds of propagation and refinement."""
+
+    width: int
+    iterations: int
+
+
+def planned(views: Sequence[PosedPicture], middle: Float, iterations: int, limit: TimeLimit) -> Effort | None:
+    """The effort that there is time for, by the pace on pictures of a few pixels; None: not even for the least.
+
+    Args:
+        views: at full size. middle: see ``depth_maps``. iterations: wanted. limit: of the time of frame 0.
+    """
+    efforts = [Effort(width, rounds) for width in (WIDTH, WIDTH // 2) for rounds in (iterations, -(-iterations // 2))]
+    if not limit.bounded:
+        return efforts[0]
+    tiny = [halved(view, PACE_WIDTH) for view in views]
+    paced = next((i for i in range(len(tiny)) if len(neighbours_of(tiny, i, middle, NEIGHBOURS)) > 1), None)
+    if paced is None:
+        return efforts[0]
+    began, camera = limit.clock(), tiny[paced].camera
+    shape, far = (camera.height, camera.width), 2.0 * float(np.linalg.norm(camera.centre - middle))
+    wanted = np.ones(shape, bool)
+    _match(tiny, [_grey(view) for view in tiny], paced, middle, (far / 8, far), np.zeros(shape), wanted, 1, 2, 0)
+    each = (limit.clock() - began) / (camera.width * camera.height * (PLANES_FIRST + PLANES_EACH))
+    costs = [
+        each * (PLANES_FIRST + PLANES_EACH * effort.iterations) * sum(_pixels(view, effort.width) for view in views)
+        for effort in efforts
+    ]
+    index = limit.chosen(STEREO, costs)
+    if index == len(efforts):
+        limit.shortened.append("no stereo")
+        return None
+    if index:
+        found = efforts[index]
+        limit.shortened.append(f"stereo on pictures of {found.width} pixels at most, {found.iterations} rounds")
+    return efforts[index]
+
+
+def load_stereo() -> None:
+    """Loads the kernel, or compiles it where nobody has: in seconds that are no measure of the pace."""
+    grey, planes = np.zeros((16, 16), np.float32), np.zeros((1, 16, 16), np.float32)
+    patch_match(
+        grey, np.ones((16, 16), bool), np.zeros((16, 16)), np.ones(4), planes, np.full((1, 2), 16), np.eye(3)[None],
+        np.ones((1, 3)), near=1.0, far=2.0, iterations=1, best=1, seed=0,
+    )  # fmt: skip
+
+
+def _pixels(view: PosedPicture, width: int) -> int:
+    """Pixels of a view once it is ``halved``."""
+    columns, rows = view.camera.width, view.camera.height
+    while columns > width:
+        columns, rows = columns // 2, rows // 2
+    return columns * rows
 
 
 def neighbours_of(views: Sequence[PosedPicture], index: int, middle: Float, count: int) -> list[int]:
@@ -101,43 +149,63 @@ def depth_maps(
         fewest: neighbours that a picture needs.
         progress: called with (views done, views).
     """
-    greys = [
-        np.ascontiguousarray(v.image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32) / np.float32(255))
-        for v in views
-    ]
+    greys = [_grey(view) for view in views]
     depths = []
     for i, view in enumerate(views):
-        chosen = neighbours_of(views, i, middle, NEIGHBOURS)
-        camera = view.camera
-        if len(chosen) < fewest:
-            depths.append(np.zeros(greys[i].shape))
-            continue
-        matrices, shifts = [], []
-        for j in chosen:
-            other = views[j].camera
-            rotation = other.rotation @ camera.rotation.T
-            matrices.append(other.intrinsics @ rotation)
-            shifts.append(other.intrinsics @ (other.translation - rotation @ camera.translation))
-        depth, _, cost = patch_match(
-            greys[i],
-            active[i],
-            priors[i],
-            np.array([1 / camera.fx, -camera.cx / camera.fx, 1 / camera.fy, -camera.cy / camera.fy]),
-            *_stacked([greys[j] for j in chosen]),
-            np.stack(matrices),
-            np.stack(shifts),
-            near=ranges[i][0],
-            far=ranges[i][1],
-            iterations=iterations,
-            best=min(FEWEST_NEIGHBOURS, len(chosen)),
-            seed=seed * 1009 + i,
+        depths.append(
+            _match(views, greys, i, middle, ranges[i], priors[i], active[i], iterations, fewest, seed * 1009 + i)
         )
-        depths.append(np.where(cost <= MAX_COST, depth, 0.0))
         if hull is not None and len(hull.cells) and view.mask is not None:
             _confine(view, depths[-1], hull)
         if progress is not None:
             progress(i + 1, len(views))
     return [DepthMap(view, depths[i], _agreement(views, depths, i)) for i, view in enumerate(views)]
+
+
+def _grey(view: PosedPicture) -> NDArray[np.float32]:
+    """[H, W] luma in 0…1."""
+    weights = np.array([0.299, 0.587, 0.114], np.float32)
+    return np.ascontiguousarray(view.image.astype(np.float32) @ weights / np.float32(255))
+
+
+def _match(
+    views: Sequence[PosedPicture],
+    greys: Sequence[NDArray[np.float32]],
+    index: int,
+    middle: Float,
+    depths: tuple[float, float],
+    prior: Float,
+    active: Bool,
+    iterations: int,
+    fewest: int,
+    seed: int,
+) -> Float:
+    """[H, W] depth of one view by its match with its neighbours, 0 where none is believed; see ``depth_maps``."""
+    chosen = neighbours_of(views, index, middle, NEIGHBOURS)
+    camera = views[index].camera
+    if len(chosen) < fewest:
+        return np.zeros(greys[index].shape)
+    matrices, shifts = [], []
+    for j in chosen:
+        other = views[j].camera
+        rotation = other.rotation @ camera.rotation.T
+        matrices.append(other.intrinsics @ rotation)
+        shifts.append(other.intrinsics @ (other.translation - rotation @ camera.translation))
+    depth, _, cost = patch_match(
+        greys[index],
+        active,
+        prior,
+        np.array([1 / camera.fx, -camera.cx / camera.fx, 1 / camera.fy, -camera.cy / camera.fy]),
+        *_stacked([greys[j] for j in chosen]),
+        np.stack(matrices),
+        np.stack(shifts),
+        near=depths[0],
+        far=depths[1],
+        iterations=iterations,
+        best=min(FEWEST_NEIGHBOURS, len(chosen)),
+        seed=seed,
+    )
+    return np.where(cost <= MAX_COST, depth, 0.0)
 
 
 def _stacked(pictures: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scas4d_core.captures.frame import InitialPoints
-from scas4d_core.first_frame.points.posed_pictures import Float, PosedPicture, look_at_point
+from scas4d_core.first_frame.points.posed_pictures import Bool, Float, PosedPicture, look_at_point
 
 ACROSS = 40
 """Points along the longer side of a picture; the fit refines them."""
@@ -34,13 +35,13 @@ class Stage:
         """Of cameras with these distances to what they look at, world units."""
         return cls(look_at_point(views), STAGE * max(distances))
 
-    def holds(self, points: Float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    def holds(self, points: NDArray[np.floating]) -> Bool:
         """[P] which points [P, 3] are on the stage.
 
         >>> Stage(np.zeros(3), 2.0).holds(np.array([[1.0, 0, 0], [3.0, 0, 0]]))
         array([ True, False])
         """
-        held: np.ndarray[tuple[int], np.dtype[np.bool_]] = np.linalg.norm(points - self.middle, axis=1) < self.radius
+        held: Bool = np.linalg.norm(points - self.middle, axis=1) < self.radius
         return held
 
 

@@ -6,7 +6,7 @@ test than in a search over the whole picture, and wide baselines keep their matc
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from scas4d_core.cameras import Camera
-from scas4d_core.first_frame.points.posed_pictures import Float, PosedPicture
+from scas4d_core.first_frame.points.posed_pictures import Float, PosedPicture, halved
+from scas4d_core.first_frame.time_limit import FEATURES, MATCHES, TimeLimit
 
 RATIO = 0.8
 """Best over second-best descriptor distance among the candidates on the epipolar line (Lowe 2004, section 7.1)."""
@@ -27,6 +28,8 @@ MAX_FEATURES = 4096
 EPIPOLAR_ERROR = 2.0
 """Pixels that a match may lie off its epipolar line, and the bound of the reprojection error; residuals of a
 calibration are near 0.5."""
+FEW_PAIRS = 10
+"""Pairs of pictures that are matched in any case, and by which the pace is measured."""
 MIN_ANGLE_DEG = 2.0
 """Rays that meet under less say little about depth."""
 
@@ -46,8 +49,12 @@ class Triangulation:
     error: Float
 
 
-def features(views: Sequence[PosedPicture]) -> list[tuple[Float, NDArray[np.float32]]]:
-    """SIFT of every view: keypoints [K, 2] (pixel centres at +0.5, as in COLMAP) and unit descriptors [K, 128]."""
+def features(views: Sequence[PosedPicture], limit: TimeLimit | None = None) -> list[tuple[Float, NDArray[np.float32]]]:
+    """SIFT of every view: keypoints [K, 2] (pixel centres at +0.5, as in COLMAP) and unit descriptors [K, 128].
+
+    Args:
+        limit: of the time of frame 0; where it is short, features of all pictures are those of half or less their size.
+    """
     import pycolmap
 
     options: Any = pycolmap.FeatureExtractionOptions()
@@ -60,16 +67,39 @@ def features(views: Sequence[PosedPicture]) -> list[tuple[Float, NDArray[np.floa
     pycolmap.logging.minloglevel = max(level, 1)  # COLMAP logs a line for each picture otherwise
     try:
         sift = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-        found = []
-        for view in views:
-            grey = view.image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
-            keypoints, raw = sift.extract_from_float32_array(np.ascontiguousarray(grey / np.float32(255)))
-            descriptors = np.asarray(raw.data, dtype=np.float32).reshape(-1, 128)
-            descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-12)
-            found.append((np.array([(point.x, point.y) for point in keypoints]).reshape(-1, 2), descriptors))
+        return _all_features(views, sift.extract_from_float32_array, limit or TimeLimit(None))
     finally:
         pycolmap.logging.minloglevel = level
+
+
+def _all_features(
+    views: Sequence[PosedPicture], extract: Callable[[NDArray[np.float32]], Any], limit: TimeLimit
+) -> list[tuple[Float, NDArray[np.float32]]]:
+    """``features`` by a function that takes grey pictures; the first picture tells the pace."""
+    found: list[tuple[Float, NDArray[np.float32]]] = []
+    size, began, divisor = [view.camera.width * view.camera.height for view in views], limit.clock(), 1
+    for view in views:
+        if len(found) == 1 and divisor == 1:
+            each = (limit.clock() - began) / size[0]
+            index = limit.chosen(FEATURES, [each * sum(size[1:]), *(each * sum(size) / n**2 for n in (2, 4))])
+            if index:
+                divisor = 2 ** min(index, 2)
+                limit.shortened.append(f"features of pictures of a size of 1/{divisor}")
+                found = [_features(views[0], extract, divisor)]
+        found.append(_features(view, extract, divisor))
     return found
+
+
+def _features(
+    view: PosedPicture, extract: Callable[[NDArray[np.float32]], Any], divisor: int
+) -> tuple[Float, NDArray[np.float32]]:
+    """Features of a view, of a size of 1/``divisor``; a power of two."""
+    image = view.image if divisor == 1 else halved(view, -(-view.camera.width // divisor)).image
+    grey = image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
+    keypoints, raw = extract(np.ascontiguousarray(grey / np.float32(255)))
+    descriptors = np.asarray(raw.data, dtype=np.float32).reshape(-1, 128)
+    descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-12)
+    return divisor * np.array([(point.x, point.y) for point in keypoints]).reshape(-1, 2), descriptors
 
 
 def fundamental_matrix(first: Camera, second: Camera) -> Float:
@@ -104,8 +134,10 @@ def guided_matches(
     def runner_up(block: NDArray[np.float32]) -> NDArray[np.float32]:
         return np.partition(block, 1, axis=1)[:, 1] if block.shape[1] > 1 else np.full(len(block), 2.0, np.float32)
 
-    good = (best_a[best_b] == rows) & (value < MAX_DESCRIPTOR_DISTANCE) & (value < RATIO * runner_up(distance))
-    good &= value < RATIO * runner_up(distance.T)[best_b]
+    # Few features have a mutual partner, and only of these the second best is asked for.
+    good = np.flatnonzero((best_a[best_b] == rows) & (value < MAX_DESCRIPTOR_DISTANCE))
+    good = good[value[good] < RATIO * runner_up(distance[good])]
+    good = good[value[good] < RATIO * runner_up(distance[:, best_b[good]].T)]
     return np.stack([rows[good], best_b[good]], axis=1)
 
 
@@ -122,23 +154,47 @@ class Tracks:
     groups: list[NDArray[np.intp]]
 
 
-def matched_tracks(views: Sequence[PosedPicture]) -> Tracks:
-    """Matches SIFT features over all pairs of views; masks do not matter."""
-    found = [(view.camera, uv, descriptors) for view, (uv, descriptors) in zip(views, features(views), strict=True)]
+def matched_tracks(views: Sequence[PosedPicture], limit: TimeLimit | None = None) -> Tracks:
+    """Matches SIFT features over all pairs of views; masks do not matter.
+
+    Args:
+        limit: of the time of frame 0; where it is short, pairs that look in different directions are left out.
+    """
+    limit = limit or TimeLimit(None)
+    told = features(views, limit)
+    found = [(view.camera, uv, descriptors) for view, (uv, descriptors) in zip(views, told, strict=True)]
     offsets = np.concatenate([[0], np.cumsum([len(uv) for _, uv, _ in found])])
     owner = np.repeat(np.arange(len(views)), np.diff(offsets))
     pixels = np.concatenate([uv for _, uv, _ in found]) if len(owner) else np.zeros((0, 2))
-    pairs = [
-        guided_matches(found[a], found[b]) + offsets[[a, b]]
-        for a in range(len(views))
-        for b in range(a + 1, len(views))
-    ]
+    chosen = _pairs_in_time(found, limit)
+    pairs = [guided_matches(found[a], found[b]) + offsets[[a, b]] for a, b in chosen]
     edges = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.intp)
     graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(owner), len(owner)))
     _, track = connected_components(graph, directed=False)
     order = np.argsort(track, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(track[order])) + 1) if len(order) else []
     return Tracks(pixels, owner, groups)
+
+
+def _pairs_in_time(
+    found: Sequence[tuple[Camera, Float, NDArray[np.float32]]], limit: TimeLimit
+) -> list[tuple[int, int]]:
+    """Pairs of views that there is time to match: all, or those that look in like directions."""
+    pairs = [(a, b) for a in range(len(found)) for b in range(a + 1, len(found))]
+    if not limit.bounded or len(pairs) <= FEW_PAIRS:
+        return pairs
+    axes = np.array([camera.rotation[2] for camera, _, _ in found])
+    pairs.sort(key=lambda pair: -float(axes[pair[0]] @ axes[pair[1]]))
+    work = np.array([len(found[a][1]) * len(found[b][1]) for a, b in pairs], np.float64)
+    began = limit.clock()
+    for a, b in pairs[:FEW_PAIRS]:
+        guided_matches(found[a], found[b])
+    each = (limit.clock() - began) / max(float(work[:FEW_PAIRS].sum()), 1.0)
+    most = int((each * np.cumsum(work) <= limit.left(MATCHES)).sum())
+    if most < len(pairs):
+        most = max(most, FEW_PAIRS)
+        limit.shortened.append(f"features matched in {most} of {len(pairs)} pairs of pictures")
+    return sorted(pairs[:most])
 
 
 def triangulate(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,19 +62,27 @@ class VisualHull:
 
     def about(self, points: Float) -> Bool:
         """[P] true for points [P, 3] within the hull or nearer to it than two voxels (and some a little farther)."""
-        pairs = np.unique(self.cells // 2, axis=0)
-        low = pairs.min(0) - 2
-        size = pairs.max(0) + 3 - low
-        strides = np.array([size[1] * size[2], size[2], 1])
-        keys = np.sort((pairs - low) @ strides)
+        low, size, strides, keys = self._surroundings
         at = np.floor((points - self.origin) / self.voxel + 0.5).astype(np.int64) // 2
         near = ((at > low) & (at < low + size - 1)).all(axis=1)
         mine = (at - low) @ strides
-        found = np.zeros(len(points), dtype=bool)
-        for step in np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) @ strides:
-            found |= keys[np.searchsorted(keys, mine + step).clip(max=len(keys) - 1)] == mine + step
-        result: Bool = found & near
+        result: Bool = near & (keys[np.searchsorted(keys, mine).clip(max=len(keys) - 1)] == mine)
         return result
+
+    @cached_property
+    def _surroundings(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Of a grid twice as coarse: lowest cell, size, strides, and keys in order of the cells in or beside the hull.
+
+        It is made once: stereo asks of every picture, and the hull may have millions of voxels.
+        """
+        halved = self.cells // 2
+        low = halved.min(0) - 2
+        size = halved.max(0) + 3 - low
+        strides = np.array([size[1] * size[2], size[2], 1])
+        keys = np.unique((halved - low) @ strides)
+        for stride in strides:
+            keys = np.unique(np.concatenate([keys - stride, keys, keys + stride]))
+        return low, size, strides, keys
 
     def surface(self) -> Bool:
         """[M] true for voxels with at least one of their six neighbours empty."""

@@ -13,13 +13,15 @@ from scas4d_core.first_frame.points.posed_pictures import (
     InitialPointsError,
     PosedPicture,
     collect_views,
+    halved,
     look_at_point,
     observe,
     pixels_inside,
     visible_from,
 )
-from scas4d_core.first_frame.points.stereo import DepthMap, fused_points, halved, looked_through
-from scas4d_core.first_frame.points.triangulation import fundamental_matrix, triangulate
+from scas4d_core.first_frame.points.stereo import DepthMap, fused_points, looked_through
+from scas4d_core.first_frame.points.triangulation import features, fundamental_matrix, triangulate
+from scas4d_core.first_frame.time_limit import TimeLimit
 
 HALF = np.array([0.5, 0.35, 0.4])
 PIXEL = 2.6 / 190.0
@@ -85,6 +87,53 @@ def test_same_seed_same_points(box):
     one, two = (initial_points(rig, images, {}, stereo_iterations=1, seed=4) for _ in range(2))
     assert np.array_equal(one.positions, two.positions)
     assert np.array_equal(one.colours, two.colours)
+
+
+class Ticking:
+    """A clock that goes on by so many seconds whenever it is read."""
+
+    def __init__(self, tick):
+        self.now, self.tick = 0.0, tick
+
+    def __call__(self):
+        self.now += self.tick
+        return self.now
+
+
+def test_with_time_enough_the_points_are_those_without_a_limit(box, cloud):
+    rig, images, _ = box
+    found = initial_points(rig, images, {}, limit=(limit := TimeLimit(1e6, Ticking(0.01))))
+    assert np.array_equal(found.positions, cloud.positions)
+    assert limit.shortened == []
+
+
+@pytest.mark.parametrize(
+    ("tick", "said"),
+    [
+        (0.3, ["stereo on pictures of 320 pixels at most, 2 rounds"]),
+        (0.6, ["no stereo"]),
+        (1.4, ["features of pictures of a size of 1/2", "features matched in", "no stereo"]),
+        (4.0, ["features of pictures of a size of 1/4", "features matched in", "no stereo"]),
+    ],
+)
+def test_the_shorter_the_time_the_less_finely_points_are_looked_for(scene, box, cloud, tick, said):
+    """By the pace on the first picture, the first pairs, and small pictures; nothing is begun and then broken off."""
+    rig, images, _ = box
+    found = initial_points(rig, images, {}, limit=(limit := TimeLimit(100.0, Ticking(tick))))
+    assert len(limit.shortened) == len(said)
+    assert all(text.startswith(start) for text, start in zip(limit.shortened, said, strict=True))
+    assert found.covered > 0.5 * cloud.covered
+    assert np.median(scene.distance_to_box(found.positions)) < 2 * PIXEL
+
+
+def test_features_of_smaller_pictures_lie_where_those_of_whole_ones_do(box):
+    rig, images, _ = box
+    views = collect_views(rig, images, {})[:2]
+    extracted = [features(views, limit) for limit in (None, TimeLimit(10.0, Ticking(0.7)))]
+    whole, small = ((found[0][0], found[1][0]) for found in extracted)
+    for many, few in zip(whole, small, strict=True):
+        assert 5 < len(few) < len(many)
+        assert np.median(cKDTree(many).query(few)[0]) < 1.5
 
 
 def test_budget_of_points_is_kept(box):

@@ -141,7 +141,7 @@ def test_surroundings_that_one_camera_sees_are_kept_and_floaters_are_not(views, 
     def kept(stage: Stage | None) -> int:
         factory = ViewFactory(rig)
         trainer = first_trainer(
-            factory, factory.views(frame, {}), cloud.positions, cloud.colours, None, SceneSettings(), few, stage
+            factory, factory.views(frame, {}), cloud.positions, cloud.colours, None, SceneSettings(), few, stage=stage
         )
         trainer.train()
         means = trainer.gaussians().means

@@ -10,10 +10,11 @@ from box_scene import held_out_camera, make_box, make_rig, photograph, take_fram
 
 from scas4d_core.captures.frame import Frame
 from scas4d_core.first_frame import static_scene
+from scas4d_core.first_frame.exposures import SPREAD
+from scas4d_core.first_frame.fit_schedule import FitProgress
 from scas4d_core.first_frame.initial_gaussians import initial_parameters, logit
 from scas4d_core.first_frame.start import fit_static_scene
 from scas4d_core.first_frame.static_scene import (
-    EXPOSURE_SPREAD,
     STOP_ROUNDS,
     StaticResult,
     StaticTrainer,
@@ -154,7 +155,7 @@ def test_exposures_of_the_cameras_are_recovered(monkeypatch: pytest.MonkeyPatch)
     assert np.abs([result.exposures[name][:, 1] for name in RIG.names]).max() < 0.02
 
 
-@pytest.mark.parametrize(("spread", "kept"), [(0.5 * EXPOSURE_SPREAD, False), (2.0 * EXPOSURE_SPREAD, True)])
+@pytest.mark.parametrize(("spread", "kept"), [(0.5 * SPREAD, False), (2.0 * SPREAD, True)])
 def test_exposures_are_given_up_where_the_cameras_are_alike(spread: float, kept: bool) -> None:
     views = ViewFactory(RIG).views(take_frame(0, 0.0, BOX, RIG), {})
     parameters = initial_parameters(*cloud(), None, 1000, np.random.default_rng(0))
@@ -162,8 +163,8 @@ def test_exposures_are_given_up_where_the_cameras_are_alike(spread: float, kept:
     trainer = StaticTrainer(ViewFactory(RIG), views, parameters, SceneSettings(), settings)
     for view, side in zip(views, (-1, 1, -1, 1, -1, 1), strict=True):
         view.exposure[:3] = (1 + side * spread, 0.02 * side)
-    trainer._assess_exposure()
-    assert trainer.exposing == kept
+    trainer.exposures.assess()
+    assert trainer.exposures.on == kept
     assert all((view.exposure == (1, 0)).all() for view in views) != kept
 
 
@@ -192,12 +193,11 @@ def test_an_empty_cloud_is_refused() -> None:
 def test_progress_counts_every_iteration() -> None:
     factory = ViewFactory(RIG)
     views = factory.views(take_frame(0, 0.0, BOX, RIG), {})
-    seen: list[tuple[int, float]] = []
+    seen: list[FitProgress] = []
     short = SETTINGS.model_copy(update={"iterations": 5})
-    result = fit_static_scene(
-        factory, views, *cloud(), None, SceneSettings(), short, lambda done, loss: seen.append((done, loss))
-    )
-    assert seen == list(enumerate(result.losses, start=1))
+    result = fit_static_scene(factory, views, *cloud(), None, SceneSettings(), short, seen.append)
+    assert [(now.done, now.loss) for now in seen] == list(enumerate(result.losses, start=1))
+    assert {now.planned for now in seen} == {5}
 
 
 def test_frame_0_ends_early_once_nothing_is_gained(monkeypatch: pytest.MonkeyPatch) -> None:

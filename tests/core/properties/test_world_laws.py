@@ -16,7 +16,7 @@ from law_cases import law, some_rotation
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import Capture, InitialPoints, open_capture
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics.image import psnr
 from scas4d_core.reconstruction import Reconstruction

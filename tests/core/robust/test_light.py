@@ -10,7 +10,7 @@ import pytest
 
 from scas4d_core.captures.frame import Frame
 from scas4d_core.effects.registry import Mode
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.metrics import psnr

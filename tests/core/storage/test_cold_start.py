@@ -12,7 +12,7 @@ from scas4d_core.effects.appearance import camera_gain, shadows
 from scas4d_core.effects.effect import effect
 from scas4d_core.effects.presence.entering import NOBODY
 from scas4d_core.effects.switches import kept_of
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.remake import remake

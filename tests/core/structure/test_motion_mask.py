@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from box_scene import MOVING, make_box, make_rig, moved, take_frame
 
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings, UpdateSettings

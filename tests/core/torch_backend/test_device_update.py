@@ -14,7 +14,7 @@ from box_scene import MOVING, make_box, make_rig, moved, take_frame, to_user
 from effect_cases import of_whole_pictures
 
 from scas4d_core import reconstruction
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import SMALLEST_CLUSTER

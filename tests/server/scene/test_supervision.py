@@ -40,6 +40,17 @@ def test_frame_0_is_never_taken_for_an_update(clock, hand):
     assert clock.remaining() == pytest.approx(0.7)
 
 
+def test_frame_0_says_itself_when_it_ends(clock, hand):
+    clock.begin(first=True)
+    hand.at += 10
+    clock.progress("fitting frame 0", 100, 3000, 40.0)
+    hand.at += 15
+    assert clock.remaining() == pytest.approx(25)
+    hand.at += 40  # it did not: what is known is how far it is
+    clock.progress("fitting frame 0", 2750, 3000)
+    assert clock.remaining() == pytest.approx(5)
+
+
 def test_an_update_is_the_median_of_the_last_ones_less_what_has_gone(clock, hand):
     for seconds in (9, 9, 9, *[0.5] * UPDATES_KEPT):
         run(clock, hand, seconds)

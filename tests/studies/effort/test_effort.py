@@ -100,14 +100,14 @@ def test_the_page_tells_what_reports_cost(tmp_path: Path) -> None:
 
 
 def test_reports_are_measured_with_and_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    few = effort.preset("scas4d")
+    few = effort.settings_of("scas4d")
     few = few.model_copy(
         update={
             "static": few.static.model_copy(update={"iterations": 20}),
             "update": few.update.model_copy(update={"iterations": 5}),
         }
     )
-    monkeypatch.setattr(effort_report, "preset", lambda name: few)
+    monkeypatch.setattr(effort_report, "settings_of", lambda name: few)
     row = effort_report.measure_report(SAMPLE, tmp_path, updates=3, report=lambda line: None)
     assert row["updates"] == 2
     assert 0 < row["share"] <= row["share_worst"] < 1

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from client.cli.scores import Store
 from scas4d_core.captures import open_capture
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.metrics import evaluation as measures
 from scas4d_core.settings import UpdateSettings
 from studies.commands import app

@@ -12,7 +12,7 @@ from client.cli.scores import Store, digest, markdown
 from scas4d_core.cameras import Camera, WorldFrame
 from scas4d_core.captures import InitialPoints, open_capture
 from scas4d_core.captures.reader import FileReader
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import evaluation as measures
 from scas4d_core.query.parts import parts

@@ -14,7 +14,7 @@ from scas4d_core.effects.appearance.camera_gain import FOOT, NAME, POWER, exposu
 from scas4d_core.effects.effect import effect
 from scas4d_core.effects.parts import PartsBuilder
 from scas4d_core.effects.switches import contradictions, joined
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import SceneSettings, Settings, UpdateSettings

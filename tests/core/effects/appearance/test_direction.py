@@ -19,7 +19,8 @@ from scas4d_core.effects.parts import PartsBuilder
 from scas4d_core.effects.switches import first_switches, joined, names_on
 from scas4d_core.first_frame.glossy import fit_by_direction
 from scas4d_core.first_frame.normals import surface_normals
-from scas4d_core.first_frame.static_scene import StaticResult, first_trainer
+from scas4d_core.first_frame.static_result import StaticResult
+from scas4d_core.first_frame.static_scene import first_trainer
 from scas4d_core.first_frame.strengths import strengths_seen
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels.appearance.direction import CELLS, MIDDLE, NEARNESS, SIDE

@@ -10,7 +10,7 @@ from effect_cases import builder, same, updated
 from scas4d_core.effects.appearance.colours import FASTER, Colours
 from scas4d_core.effects.appearance.light import change_of_light, orientation_and_place
 from scas4d_core.effects.switches import contradictions, first_switches, joined, names_on
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings, UpdateSettings

@@ -8,7 +8,7 @@ from box_scene import make_box, make_rig, take_frame
 
 from scas4d_core.effects.appearance.shadows import NAME
 from scas4d_core.effects.switches import contradictions, first_switches
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction

@@ -12,7 +12,7 @@ from scas4d_core.cameras import Rig
 from scas4d_core.effects.coherence.bending import EFFECT, PATCH, Bends, bend, turns_of
 from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
 from scas4d_core.effects.switches import contradictions, first_switches, joined, names_on
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.presets import PRESETS
 from scas4d_core.reconstruction import Reconstruction

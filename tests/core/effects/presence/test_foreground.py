@@ -9,7 +9,7 @@ from box_scene import make_rig, moved, take_frame
 from effect_cases import BEFORE, UPDATE, builder, same, updated
 
 from scas4d_core.effects.switches import first_switches, joined, names_on
-from scas4d_core.first_frame.static_scene import StaticResult
+from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
