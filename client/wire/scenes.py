@@ -156,7 +156,7 @@ class SceneStatus(Model):
     warnings: list[str] = Field(
         default_factory=list,
         description="What looks wrong with the rig and may be right, a sentence each: poses that seem to be the wrong "
-        "way round.",
+        "way round; after frame 0, cameras that its pictures show to be off, and what came of refining them.",
     )
     created: str = Field(description="UTC, ISO 8601.")
     ingest: IngestSettings = IngestSettings()

@@ -47,6 +47,7 @@ class Updates:
     Attributes:
         trouble: why the scene is degraded: a sentence about the last frame, the worker or the disk, or None.
         progress: of frame 0, while it is at work. gaussians: in the newest state, where it is known.
+        first: the report of the first committed frame, or what of it matters later: the calibration.
     """
 
     def __init__(
@@ -80,6 +81,7 @@ class Updates:
         self.trouble = self._last_trouble()
         self.progress: ProgressModel | None = None
         self.gaussians: int | None = None
+        self.first: Mapping[str, Any] = {}
         self._index: int | None = None
         self._ready = False
         self._holding = 0
@@ -246,6 +248,17 @@ class Updates:
     def _record(self, index: int, record: Mapping[str, Any]) -> None:
         self._ledger.frames.set_record(index, record)
         self.gaussians = record.get("gaussians")
+        self._recall(record)
+
+    def _recall(self, record: Mapping[str, Any]) -> None:
+        """Keeps the calibration, which the report of the first frame has, and no other."""
+        if record.get("calibration"):
+            self.first = {"calibration": record["calibration"]}
+
+    async def recall(self) -> None:
+        """Reads the first report of a scene that is found again; to be called before anybody asks for it."""
+        if self._ledger.committed:
+            self._recall(await self._reports.record(self._ledger.committed[0]))
 
     def _last_trouble(self) -> str | None:
         """Returns what went wrong with the newest frame that was tried, or None."""
