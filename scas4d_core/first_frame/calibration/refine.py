@@ -23,6 +23,8 @@ LEAST_CAMERAS = 3
 """Of two cameras nothing tells which one is off."""
 SURE = 2.0
 """Standard errors by which the loss of matches held out has to fall."""
+FEWEST_HELD = 20
+"""Matches held out, of fewer of which a standard error says little."""
 
 
 def first_calibration(
@@ -106,6 +108,8 @@ def refined_rig(rig: Rig, matches: Matches) -> Refinement:
     before = list(matches.cameras)
     tracks = tracks_of(learnt.without(fixed))
     best = _Test.of(held, before, adjusted(before, tracks))
+    if len(best.losses) < FEWEST_HELD:
+        return _kept(f"only {len(best.losses)} matches could be held out to test it")
     if not best.better:
         return _kept(
             f"{len(best.losses)} matches that were held out are not met better: {best.before:.2f} px before, "
@@ -151,7 +155,7 @@ class _Test:
     def better(self) -> bool:
         """True where the loss has fallen by more than chance."""
         count = len(self.losses)
-        return count >= FEWEST and float(self.losses.mean()) > SURE * float(self.losses.std()) / count**0.5
+        return count >= FEWEST_HELD and float(self.losses.mean()) > SURE * float(self.losses.std()) / count**0.5
 
 
 def _refinement(rig: Rig, matches: Matches, test: _Test, fixed: Sequence[int], *, focal: bool) -> Refinement:

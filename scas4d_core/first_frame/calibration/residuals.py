@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import nan
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,24 +24,33 @@ OFF, TIMES = 0.9, 2.0
 have 0.1 to 0.6, up to 1.6 times the median; a camera turned by two pixels has 0.9 to 2.2 (docs/method.md)."""
 
 
-def median_residual(distances: Float) -> tuple[float, int]:
-    """The median distance of right matches, the density of wrong ones taken off; and how many are right.
+class Spread(NamedTuple):
+    """Distances of right matches: their median, what it is at least (two standard errors), and how many they are."""
+
+    median: float
+    least: float
+    right: int
+
+
+def spread_of(distances: Float) -> Spread:
+    """Median distance of right matches, the density of wrong ones taken off.
 
     Args:
         distances: [M] pixels from epipolar lines, of right and wrong matches.
 
     >>> right, wrong = np.linspace(0, 1, 101), np.linspace(0, 80, 81)
-    >>> median_residual(np.concatenate([right, wrong]))
-    (0.5, 100)
+    >>> spread_of(np.concatenate([right, wrong]))
+    Spread(median=0.5, least=0.4, right=100)
     """
     ordered = np.sort(distances)
     near = int(np.searchsorted(ordered, NEAR))
     density = (int(np.searchsorted(ordered, FAR)) - near) / (FAR - NEAR)
     right = near - density * NEAR
     if right < FEWEST or right < PURE * near:
-        return nan, max(0, round(right))
+        return Spread(nan, nan, max(0, round(right)))
     surplus = np.arange(1, near + 1) - density * ordered[:near]
-    return float(ordered[int(np.argmax(surplus >= right / 2))]), round(right)
+    median, least = (float(ordered[int(np.argmax(surplus >= rank))]) for rank in (right / 2, right / 2 - right**0.5))
+    return Spread(median, least, round(right))
 
 
 def residuals(matches: Matches) -> tuple[dict[str, CameraResidual], list[str]]:
@@ -53,9 +63,9 @@ def residuals(matches: Matches) -> tuple[dict[str, CameraResidual], list[str]]:
     off: list[int] = []
     while True:
         found = [_of_camera(index, measured, off) for index in range(len(matches.cameras))]
-        known = {index: median for index, (median, _) in enumerate(found) if not np.isnan(median) and index not in off}
-        worst = max(known, key=lambda index: known[index], default=None)
-        if worst is None or known[worst] <= max(OFF, TIMES * float(np.median(list(known.values())))):
+        known = {index: one for index, one in enumerate(found) if not np.isnan(one.median) and index not in off}
+        worst = max(known, key=lambda index: known[index].least, default=None)
+        if worst is None or known[worst].least <= max(OFF, TIMES * float(np.median([m for m, *_ in known.values()]))):
             break
         off.append(worst)
         if 2 * len(off) >= len(known) + len(off):
@@ -63,13 +73,13 @@ def residuals(matches: Matches) -> tuple[dict[str, CameraResidual], list[str]]:
             found = [_of_camera(index, measured, off) for index in range(len(matches.cameras))]
             break
     cameras = {
-        camera.name: CameraResidual(median * float(scale), count)
-        for camera, scale, (median, count) in zip(matches.cameras, matches.scale, found, strict=True)
+        camera.name: CameraResidual(one.median * float(scale), one.right)
+        for camera, scale, one in zip(matches.cameras, matches.scale, found, strict=True)
     }
     return cameras, [matches.cameras[index].name for index in sorted(off)]
 
 
-def _of_camera(index: int, measured: Sequence[tuple[Pair, Float]], off: Sequence[int]) -> tuple[float, int]:
-    """``median_residual`` of a camera's matches with those cameras that are not off."""
+def _of_camera(index: int, measured: Sequence[tuple[Pair, Float]], off: Sequence[int]) -> Spread:
+    """``spread_of`` a camera's matches with those cameras that are not off."""
     own = [distances for pair, distances in measured if index in pair and not {*pair} - {index} & {*off}]
-    return median_residual(np.concatenate([*own, np.zeros(0)]))
+    return spread_of(np.concatenate([*own, np.zeros(0)]))

@@ -9,7 +9,7 @@ import pytest
 from made_rigs import matches as made_matches
 
 from scas4d_core.first_frame.calibration.matches import epipolar_distances
-from scas4d_core.first_frame.calibration.residuals import FEWEST, median_residual, residuals
+from scas4d_core.first_frame.calibration.residuals import FEWEST, residuals, spread_of
 
 RING = made_matches.ring()
 
@@ -56,14 +56,22 @@ def test_pixels_are_those_of_the_pictures_that_came(matches):
 def test_wrong_matches_do_not_shift_the_median():
     rng = np.random.default_rng(0)
     right, wrong = np.abs(rng.normal(size=4000)) * 0.5, rng.uniform(0, 80, 4000)
-    median, count = median_residual(np.concatenate([right, wrong]))
+    median, least, count = spread_of(np.concatenate([right, wrong]))
     assert median == pytest.approx(np.median(right), rel=0.1)
+    assert 0.9 * median < least < median
     assert count == pytest.approx(4000, rel=0.05)
 
 
 @pytest.mark.parametrize("distances", [np.zeros(0), np.full(FEWEST - 1, 0.3), np.linspace(0, 80, 500)])
 def test_of_few_matches_and_of_chance_nothing_is_claimed(distances):
-    assert np.isnan(median_residual(distances)[0])
+    assert np.isnan(spread_of(distances).median)
+
+
+def test_a_camera_of_which_many_matches_are_near_is_not_named(matches):
+    """Things that repeat, as the turns of a spring, have wrong matches beside the right ones."""
+    rng = np.random.default_rng(0)
+    some = np.concatenate([np.abs(rng.normal(size=16)) * 0.2, rng.uniform(0.8, 4, 19)])
+    assert spread_of(some).median > 0.9 > spread_of(some).least
 
 
 def test_distances_are_those_to_the_epipolar_lines(matches):
