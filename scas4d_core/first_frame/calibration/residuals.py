@@ -40,7 +40,7 @@ def spread_of(distances: Float) -> Spread:
 
     >>> right, wrong = np.linspace(0, 1, 101), np.linspace(0, 80, 81)
     >>> spread_of(np.concatenate([right, wrong]))
-    Spread(median=0.5, least=0.4, right=100)
+    Spread(median=0.49, least=0.39, right=101)
     """
     ordered = np.sort(distances)
     near = int(np.searchsorted(ordered, NEAR))
