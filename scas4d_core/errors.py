@@ -49,3 +49,7 @@ def _last_part(found: re.Match[str]) -> str:
     if not first or not os.path.isdir(f"/{first}"):
         return path
     return path.rstrip("/").rsplit("/", 1)[-1]
+
+
+class StepError(ValueError):
+    """A frame that cannot be stepped to; the state is as it was."""

@@ -13,6 +13,7 @@ from typing import Any, TypedDict
 import numpy as np
 
 from scas4d_core.captures.frame import Frame
+from scas4d_core.first_frame.calibration.record import Calibration
 from scas4d_core.first_frame.static_result import FirstCloud, StaticResult
 from scas4d_core.frame_outcome import Alarm, Candidate, FrameOutcome, degraded_text
 from scas4d_core.gaussians import Gaussians
@@ -67,7 +68,7 @@ class FrameReport:
         moving, gaussians: how many Gaussians move, and are there. born, retired, revived: how many were, in this frame.
         put_off: what the budget left no time for, in words; the next frame has some for it.
         alarms: what a person should look at (``robust/alarms.py``).
-        cloud: of frame 0: where its first points came from.
+        cloud: of frame 0: where its first points came from. calibration: of frame 0, against its pictures.
         cameras: by name, how well each camera's picture was met when it was last rendered: a bumped camera shows.
         used: cameras whose pictures were learnt from; none of a frame that was held or stood. dropped: cameras left
             out, with the reason.
@@ -111,6 +112,12 @@ class FrameReport:
     alarms: list[Alarm] = field(default_factory=list)
     cloud: FirstCloud | None = None
     shortened: list[str] = field(default_factory=list)
+    calibration: Calibration | None = None
+
+    @property
+    def warnings(self) -> list[str]:
+        """Sentences on what looks wrong with the rig."""
+        return [] if self.calibration is None else self.calibration.warnings
 
     def record(self) -> dict[str, Any]:
         """The report as JSON: numbers that are not finite are None."""
@@ -136,12 +143,13 @@ def report_of_first(
     moving: int,
     seconds: dict[str, float],
     dropped: Mapping[str, str] | None,
+    calibration: Calibration | None = None,
 ) -> FrameReport:
     """The report of frame 0.
 
     Args:
         names: of the rig's cameras. moving: Gaussians in the hierarchy. seconds: by stage.
-        dropped: cameras that the caller has left out, with the reason.
+        dropped: cameras that the caller has left out, with the reason. calibration: as it was measured.
     """
     return FrameReport(
         index=frame.index,
@@ -159,6 +167,7 @@ def report_of_first(
         cloud=result.cloud,
         planned=list(result.planned),
         shortened=list(result.shortened),
+        calibration=calibration,
     )
 
 

@@ -19,6 +19,9 @@ from scas4d_core.cameras import Rig, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.effects.evidence import FitTime, Seen
 from scas4d_core.effects.switches import kept_of, switches_record
+from scas4d_core.errors import StepError
+from scas4d_core.first_frame.calibration.record import Calibration, in_use
+from scas4d_core.first_frame.calibration.refine import first_calibration
 from scas4d_core.first_frame.start import FirstFrame, as_begun, fit_first, with_background
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_report import FrameReport, Progress, report_of_first, report_of_update
@@ -44,18 +47,15 @@ from scas4d_core.update.schedule import TimeBudget
 __all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "ResumePoint", "StepError", "View"]
 
 
-class StepError(ValueError):
-    """A frame that cannot be stepped to; the state is as it was."""
-
-
 class Reconstruction(CommittedScene):
     """One scene, from frame 0 on. Made by ``start`` or, from the files of another process, by ``resume``.
 
-    A process should call ``warm_up.warm_up_elsewhere`` before: else the kernels may be compiled here, in a minute.
+    A process should call ``warm_up.warm_up_elsewhere`` before: else the kernels may be compiled here.
 
     Attributes:
-        rig: the training cameras inside, image-scaled. world: user's world to inside. history: the committed states.
-        report: of the last frame committed by this object. resumed: where it was taken up again, or None.
+        calibrated: the training cameras as given, or as frame 0 refined them. rig: the same inside, image-scaled.
+        world: user's world to inside, by the cameras as given. history: the committed states. report: of the last frame
+        committed by this object. resumed: where it was taken up again, or None.
         populates: whether effects may add, retire and revive Gaussians.
 
     >>> from scas4d_core.captures import open_capture
@@ -69,23 +69,24 @@ class Reconstruction(CommittedScene):
     (256, 256, 3)
     """
 
-    def __init__(self, rig: Rig, settings: Settings, history: History) -> None:
-        """Without a frame yet; ``rig`` in the user's world, at the size of the frames' pictures."""
+    def __init__(self, rig: Rig, settings: Settings, history: History, found: Calibration | None = None) -> None:
+        """Without a frame yet; ``rig`` as given, of the frames' pictures. ``found``: None: as the history began."""
         require_device(settings.device)
         world, scale = rig.world_frame(settings.scene.metres_per_unit), settings.scene.image_scale
+        limits = scene_limits(settings.scene.near, rig_inside(world, rig.cameras).radius)
+        super().__init__(history, world, limits)
+        self.calibrated = rig = in_use(rig, history.first_report if found is None else {"calibration": asdict(found)})
         self.rig = rig_inside(world, rig.scaled(scale).cameras)
-        super().__init__(history, world, limits := scene_limits(settings.scene.near, self.rig.radius))
         self.settings, self._update = settings, settings.update
         self._factory = ViewFactory(self.rig, None if scale == 1.0 else rig)
         self._picture = PictureLoss(self._factory, settings.scene.behind, 1.0, 0.0, limits=limits)
         self._preparation = Preparation(self._factory, self.settings, self.world, self._picture)
-        self.populates = True
         self.static: StaticResult | None = None
         self.report: FrameReport | None = None
         self.resumed: ResumePoint | None = None
         self._fixed: FirstFrame
         self._updater: Updater
-        self._carried = CarryOver()
+        self.populates, self._carried = True, CarryOver()
         self._checkpoints = None if history.directory is None else Checkpoints(history.directory)
         self._budget = TimeBudget(settings.update.budget_ms)
 
@@ -109,8 +110,8 @@ class Reconstruction(CommittedScene):
         Args:
             rig: training cameras, user's world and units, at the size of the frame's pictures.
             frame: with a picture of every camera, or of most; masks where there are.
-            points: a first cloud in the user's world; without it one is made from the pictures. progress: told of each
-                stage. history: to commit to; None: in memory. static: a frame 0 that was fitted before, taken as it is.
+            points: a first cloud, user's world; None: made from the pictures. progress: told of each stage.
+            history: to commit to; None: in memory. static: a frame 0 that was fitted before, taken as it is.
             dropped, notes, started: see ``step``; the stage "load" has the time before: decoding, loading the kernels.
 
         Raises:
@@ -121,21 +122,25 @@ class Reconstruction(CommittedScene):
             raise ValueError(f"frame {frame.index}: time {frame.time} s must be finite")
         if static is None:
             check_rig(rig, settings.scene, None if points is None else points.positions)
-        self = cls(rig, with_background(settings, frame.images), History() if history is None else history)
-        began, scaled = perf_counter(), self._factory.scaled(frame)
-        told = progress or (lambda _: None)
+        began, told = perf_counter(), progress or (lambda _: None)
+        frame = replace(frame, images=dict(frame.images))  # decoded once
+        found = first_calibration(rig, frame, settings.static, told, measured=static is None)
+        settings, checked = with_background(settings, frame.images), perf_counter()
+        self = cls(rig, settings, History() if history is None else history, found)
+        scaled = self._factory.scaled(frame)
         result = static or fit_first(scaled, points, self._factory, self.settings, self.world, told)
         self.static = result = replace(result, gaussians=first_labels(result.gaussians, self.rig, scaled.masks))
         fitted = perf_counter()
-        lengths = axis_lengths(result.gaussians)
-        self._fixed = FirstFrame(len(frame.masks) > 0, result.exposures, lengths, self.settings.scene.behind)
+        fixed = len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians), self.settings.scene.behind
+        self._fixed = FirstFrame(*fixed)
         self._roots = result.gaussians
         switches, effects = self._preparation.begun(scaled, result)
         self._updater, structure = self._preparation.updater(result.gaussians, switches)
         seen = self._factory.views(scaled, {}, False) if self._learns_labels else ()
         load = {} if started is None else {"load": began - started}
-        seconds = {**load, "fit": fitted - began, "prepare": perf_counter() - fitted}
-        report = report_of_first(frame, result, self.rig.names, len(self._updater.hierarchy.rows), seconds, dropped)
+        stages = {"calibration": checked - began, "fit": fitted - checked, "prepare": perf_counter() - fitted}
+        rows = len(self._updater.hierarchy.rows)
+        report = report_of_first(frame, result, self.rig.names, rows, {**load, **stages}, dropped, found)
         psnr, shown = {name: fit["psnr"] for name, fit in result.cameras.items()}, fingerprints(frame.images)
         past = replace(first_watched(Past.of_first(psnr, brightness(frame.images)), frame.images), fitted=frame.time)
         carried = CarryOver(seen=seen, structure=structure, past=past, shown=shown, switches=switches, effects=effects)
@@ -148,9 +153,9 @@ class Reconstruction(CommittedScene):
     ) -> Reconstruction:
         """Resume a scene where its last commit left it; on the CPU it goes on with the same bits.
 
-        Where the newest state or its checkpoint is damaged, it goes on from the one before, and the frames after it are
-        taken back from the history: ``resumed.undone`` names the frames that have to be given again. If one of them is
-        not ``held``, a whole newest state is worth more than the same bits: it goes on from that with a cold start.
+        Where the newest state or its checkpoint is damaged, it goes on from the one before; frames after it are taken
+        back from the history, and ``resumed.undone`` names those to be given again. If one of them is not ``held``, a
+        whole newest state is worth more than the same bits: it goes on from that with a cold start.
 
         Args:
             rig, settings: as given to ``start``. history: of the scene, on disk, opened with ``History.open``.
@@ -187,7 +192,7 @@ class Reconstruction(CommittedScene):
 
     @classmethod
     def aside(cls, rig: Rig, settings: Settings, history: History, index: int) -> Reconstruction:
-        """A copy in memory that goes on from a committed frame with a cold start; ``history`` is read, not changed.
+        """A copy in memory that goes on from a committed frame, cold; ``history`` is read, not changed.
 
         Args:
             rig, settings: as given to ``start``; those of the update may be others. index: a committed frame.
@@ -223,8 +228,7 @@ class Reconstruction(CommittedScene):
         Args:
             frame: later than the last; with the pictures of some cameras or all.
             dropped: cameras that the caller has left out, with the reason; committed with the report.
-            notes: further facts to commit with the report, as JSON; they stand beside its own.
-            started: ``perf_counter`` when the work on the frame began, where that was before; a budget counts from it.
+            notes: further facts to commit with it, as JSON. started: when the work began; a budget counts from it.
 
         Raises:
             StepError: not later than the last frame, no picture of the rig, or a picture of another size.
@@ -289,8 +293,7 @@ class Reconstruction(CommittedScene):
         return report
 
     @property
-    def _learns_labels(self) -> bool:
-        """True where motion tells what moves: no masks do, and the effects ask for it."""
+    def _learns_labels(self) -> bool:  # motion tells what moves: no masks do, and the effects ask for it
         return self._preparation.parts.learns_labels and not self._fixed.masked
 
     def _seconds_to(self, frame: Frame) -> float:
@@ -318,11 +321,7 @@ class Reconstruction(CommittedScene):
         stop_gain: float | None = None,
         still: float | None = None,
     ) -> None:
-        """Give the updates from here on another budget, see ``UpdateSettings``; None: as the scene was made.
-
-        Raises:
-            ValueError: a value out of range.
-        """
+        """Give the updates from here on another budget; None: as made. ValueError: out of ``UpdateSettings``' range."""
         given = {"iterations": iterations, "budget_ms": budget_ms, "stop_gain": stop_gain, "still": still}
         changes = {name: value for name, value in given.items() if value is not None}
         self._update = UpdateSettings.model_validate({**self.settings.update.model_dump(), **changes})

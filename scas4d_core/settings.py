@@ -162,6 +162,10 @@ class StaticSettings(SettingsModel):
         description="Learn a colour gain and offset per training camera (held-out cameras are scored raw). 'auto': "
         "give it up after 30 % of the iterations where the cameras turn out alike: then it only fits noise.",
     )
+    refine_calibration: bool = Field(
+        default=False,
+        description="Refine the cameras' poses on features of frame 0, where those held out are met better.",
+    )
     seed: int = Field(0, ge=0, description="Seed of the order of views and of the split of Gaussians.")
 
 
@@ -179,6 +183,7 @@ class Weights(SettingsModel):
     constants: ClassVar[Mapping[str, Constant]] = {
         "image": Constant(1.0, "scas4d_core.update.schedule.IMAGE_WEIGHT"),
         "soft_colour": Constant(0.01, "scas4d_core.update.schedule.SOFT_COLOUR_WEIGHT"),
+        "floor": Constant(2.0, "scas4d_core.effects.coherence.floor.FLOOR_WEIGHT"),
     }
 
     mask: NotNegative = Field(
@@ -197,7 +202,6 @@ class Weights(SettingsModel):
     )
     rotation: NotNegative = Field(4.0, description="Likewise.")
     scale: NotNegative = Field(10.0, description="Likewise, the paper's 0.48 to 0.05.")
-    floor: NotNegative = Field(2.0, description="Dynamic3DGaussians; only where the scene names a floor.")
 
 
 class UpdateSettings(SettingsModel):
@@ -282,9 +286,7 @@ class UpdateSettings(SettingsModel):
         description="Share of the iterations after which each Gaussian's own Δp, ΔR and Δs begin to learn; the layers "
         "of clusters begin one after the other before.",
     )
-    cold_longer: float = Field(
-        1.0, gt=0, description="Factor on the iterations where there is no motion to start from."
-    )
+    cold_longer: Positive = Field(1.0, description="Factor on the iterations where there is no motion to start from.")
     cold_start: float = Field(
         2.0, ge=1, description="Factor on the layers' rates where there is no motion to start from: further to go."
     )
@@ -301,9 +303,7 @@ class UpdateSettings(SettingsModel):
     )
     beta1: float = Field(0.8, ge=0, lt=1, description="Adam's first decay.")
     beta2: Share = Field(0.95, description="Adam's second decay; 100 iterations are too few for the usual 0.999.")
-    momentum: float = Field(
-        0.0, ge=0, le=1, description="Share of what the layers leave of the previous motion that Δp starts from."
-    )
+    momentum: Unit = Field(0.0, description="Share of what the layers leave of the motion before that Δp starts from.")
     weights: Weights = Field(default_factory=Weights)
     use_masks: bool = Field(True, description="Use the frame's masks where it has any.")
     seed: int = Field(0, ge=0, description="Seed of the order of views and of the sampled neighbours.")

@@ -202,6 +202,10 @@ def measure(
         for reconstruction, done in frames:
             index = done.index
             line: Row = {"index": index, "seconds": done.seconds, "stages": {}}
+            if index == 0:
+                for sentence in reconstruction.report.warnings if reconstruction.report is not None else ():
+                    report(f"    {sentence}")
+                truth = truth if unseen else truth.measured_on_training(reconstruction.calibrated)
             if index == 0 and static is not None:
                 line["seconds"] = static[1]
             elif index == 0 and fitted is not None and reconstruction.static is not None:

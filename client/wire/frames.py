@@ -114,6 +114,48 @@ class FirstCloudModel(Model):
     )
 
 
+class CameraResidualModel(Model):
+    """Distance of the features of one camera's picture from the calibration."""
+
+    pixels: float | None = Field(
+        description="Median distance of matching features from their epipolar lines, pixels of its pictures; null "
+        "where too few tell."
+    )
+    matches: int = Field(description="Right matches, about.")
+
+
+class RefinedCameraModel(Model):
+    """A camera after refinement, against the calibration as it was given."""
+
+    turned: float = Field(description="Degrees.")
+    moved: float = Field(description="Of its centre, in the calibration's unit.")
+    focal: float = Field(description="Times its focal length.")
+    before: float | None = Field(description="Its residual as given, pixels; null where too few matches tell.")
+    after: float | None = Field(description="The same, refined.")
+    fixed: bool = Field(description="Left as given for want of matches.")
+    pose: list[list[float]] = Field(description="4×4 world to camera, in the world of the calibration.")
+
+
+class RefinementModel(Model):
+    """Outcome of refining a calibration."""
+
+    accepted: bool = Field(description="The scene has the refined rig.")
+    text: str = Field(description="For people, with figures.")
+    before: float | None = Field(description="Typical distance of matches held out from their epipolar lines, pixels.")
+    after: float | None = Field(description="The same, refined.")
+    matches: int = Field(description="Held out.")
+    cameras: dict[str, RefinedCameraModel] = Field(description="By name; none where it was not accepted.")
+
+
+class CalibrationModel(Model):
+    """The calibration against the pictures of frame 0."""
+
+    cameras: dict[str, CameraResidualModel] = Field(description="By name, as it was given.")
+    off: list[str] = Field(description="Cameras that are clearly off.")
+    warnings: list[str] = Field(description="For people, a sentence each; they stand in the status of the scene too.")
+    refined: RefinementModel | None = Field(description="Null where `static.refine_calibration` does not ask for it.")
+
+
 class FrameReportModel(Model):
     """Report of one frame: its state, times, errors and metrics."""
 
@@ -193,6 +235,9 @@ class FrameReportModel(Model):
         default_factory=list,
         description="Of frame 0: what its time (setting `static.seconds`) was too short for. With none, frame 0 does "
         "not depend on the machine.",
+    )
+    calibration: CalibrationModel | None = Field(
+        default=None, description="Of frame 0, the calibration against its pictures."
     )
     put_off: list[str] = Field(
         default_factory=list, description="Births for which the budget left no time; the next frame has some for them."

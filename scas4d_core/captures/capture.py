@@ -162,9 +162,13 @@ class Capture:
         held = tuple(camera for camera in self.full_rig.cameras if camera.name in names)
         return replace(self, full_rig=Rig(train), full_test_rig=Rig(held + others))
 
-    def measured_on_training(self) -> Capture:
-        """The same capture with its training cameras for test cameras: tells how well seen pictures are met."""
-        return replace(self, full_test_rig=self.full_rig)
+    def measured_on_training(self, rig: Rig | None = None) -> Capture:
+        """The same capture with its training cameras for test cameras: tells how well seen pictures are met.
+
+        Args:
+            rig: these cameras as a scene has refined them; None: as they are.
+        """
+        return replace(self, full_test_rig=self.full_rig if rig is None else rig)
 
     def _check(self, index: int) -> None:
         if not 0 <= index < self.frame_count:

@@ -115,7 +115,7 @@ def refused_at_zero(settings: Settings, key: str) -> Refusal | None:
     """Fault and remedy where a rate or weight of the update is 0.
 
     Args:
-        key: in the settings of the update, as "rate_colour" and "weights.floor".
+        key: in the settings of the update, as "rate_colour" and "weights.rigidity".
     """
     if attrgetter(key)(settings.update) > 0:
         return None

@@ -175,6 +175,13 @@ class FramesReader:
         return report
 
     @property
+    def first_report(self) -> dict[str, Any]:
+        """The report of the first frame; empty where there is none that can be read."""
+        with suppress(HistoryError):
+            return self.report(next(iter(self._times))) if self._times else {}
+        return {}
+
+    @property
     def background(self) -> tuple[float, float, float]:
         """RGB in 0…1 behind everything, which frame 0 has found; black where its report has none.
 

@@ -12,6 +12,7 @@ from typing import Any
 from client.wire import Budget, FrameReportModel, FrameState, SceneBudget, SceneState, SceneStatus
 from scas4d_core.cameras import Camera
 from scas4d_core.errors import message_of
+from scas4d_core.first_frame.calibration.record import in_use
 from scas4d_core.rig_checks import RigError, check_start, pose_warnings
 from server.ingest.acknowledge import Ingest, IngestRules, uncancelled
 from server.ingest.open_frames import OpenFrames
@@ -194,7 +195,7 @@ class Scene:
             states_deleted=ledger.states_deleted,
             effects=effects_of(self.spec.settings, self._newest_record),
             damage=self._damage.sentences,
-            warnings=[*self.warnings, *updates.cloud_warnings],
+            warnings=[*self.warnings, *updates.first_warnings],
             created=self.created.isoformat(),
             ingest=self.request.ingest,
             settings=self.spec.settings.model_dump(mode="json"),
@@ -209,8 +210,8 @@ class Scene:
         return None if entry is None else entry.record
 
     def camera(self, name: str) -> Camera:
-        """Returns a camera of the rig; see `camera_of`."""
-        return camera_of(self.rig, name)
+        """Returns a camera of the rig, as frame 0 refined it where that was asked for; see `camera_of`."""
+        return camera_of(in_use(self.rig, self.updates.first), name)
 
     def committed_frame(self, index: int | None, field: str = "frame") -> int:
         """Returns the index, or the last one for None, once it is checked that its state can be read.

@@ -143,6 +143,7 @@ class Scenes:
             scene.points_sha256 = await asyncio.to_thread(points_sha256, folder.points)
             if (positions := await asyncio.to_thread(points_positions, folder.points)) is not None:
                 scene.warnings = pose_warnings(scene.rig, positions)
+            await scene.updates.recall()
         except (DefinitionError, OSError) as error:
             self.unreadable[folder.name] = message_of(error)
             log.error("folder %s holds no scene that can be read; it is left as it is: %s", folder.path, error)

@@ -110,7 +110,11 @@ class FrameReports:
 
     async def is_committed(self, index: int) -> bool:
         """Returns whether a readable state of the frame is on disk, whatever the ledger says."""
-        return bool(await asyncio.to_thread(self._read, index))
+        return bool(await self.record(index))
+
+    async def record(self, index: int) -> Mapping[str, Any]:
+        """Reads the record of a commit from disk; empty where its state is deleted or damaged."""
+        return await asyncio.to_thread(self._read, index)
 
     def _read(self, index: int) -> dict[str, Any]:
         """Reads the record of a commit; empty where its state is deleted or damaged."""

@@ -48,7 +48,7 @@ class Updates:
     Attributes:
         trouble: why the scene is degraded: a sentence about the last frame, the worker or the disk, or None.
         progress: of frame 0, while it is at work. gaussians: in the newest state, where it is known.
-        cloud_warnings: how unsure frame 0 is, a sentence each.
+        first: what of the first frame's report matters later: its cloud and its calibration.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Updates:
         self.trouble = self._last_trouble()
         self.progress: ProgressModel | None = None
         self.gaussians: int | None = None
-        self.cloud_warnings: list[str] = []
+        self.first: Mapping[str, Any] = {}
         self._index: int | None = None
         self._ready = False
         self._holding = 0
@@ -193,7 +193,6 @@ class Updates:
             await self._log.write(*events)
         if ready.indices and ready.report:
             self._record(ready.indices[-1], ready.report)
-            self._background.run(self._look_at_first())
             self._readers.refresh()
             if ready.indices[-1] > newest:  # committed by a worker that died before it could say so
                 self.tell(FrameFinished(ledger.frames[ready.indices[-1]].report))
@@ -201,13 +200,6 @@ class Updates:
         self._ready = True
         self.mending.taken_up(ready.damaged)
         self.begin()
-
-    async def _look_at_first(self) -> None:
-        """Says again what was said of frame 0, of which a new process knows nothing."""
-        report = await self._reports.of(self._ledger.committed[0]) if self._ledger.committed else None
-        if report is not None and report.cloud is not None:
-            self.cloud_warnings = cloud_warnings(report.cloud.model_dump())
-            self.tell(SceneChanged())
 
     async def _commit(self, message: FrameCommitted) -> None:
         self.deaths.committed()
@@ -257,8 +249,22 @@ class Updates:
     def _record(self, index: int, record: Mapping[str, Any]) -> None:
         self._ledger.frames.set_record(index, record)
         self.gaussians = record.get("gaussians")
-        if (cloud := record.get("cloud")) is not None:
-            self.cloud_warnings = cloud_warnings(cloud)
+        self._recall(record)
+
+    def _recall(self, record: Mapping[str, Any]) -> None:
+        """Keeps what the report of the first frame alone has."""
+        if record.get("cloud") or record.get("calibration"):
+            self.first = {"cloud": record.get("cloud"), "calibration": record.get("calibration") or {}}
+
+    @property
+    def first_warnings(self) -> list[str]:
+        """What the report of the first frame says to look at, a sentence each."""
+        return [*cloud_warnings(self.first.get("cloud")), *self.first.get("calibration", {}).get("warnings", [])]
+
+    async def recall(self) -> None:
+        """Reads the first report of a scene that is found again; to be called before anybody asks for it."""
+        if self._ledger.committed:
+            self._recall(await self._reports.record(self._ledger.committed[0]))
 
     def _last_trouble(self) -> str | None:
         """Returns what went wrong with the newest frame that was tried, or None."""

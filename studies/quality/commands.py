@@ -1,4 +1,4 @@
-"""`scripts/bench quality`, `refit`, `effects`, `switches`, `drift`, `targets`, `table` and `processors`."""
+"""`scripts/bench quality`, `refit`, `effects`, `switches`, `drift`, `calibration`, `targets`, `table`, `processors`."""
 
 from __future__ import annotations
 
@@ -175,6 +175,22 @@ def drift(
     from studies.quality.pose_drift import run
 
     run(captures, out, updates=updates, pixels=pixels, most=most, changes=changes or (), again=again)
+
+
+def calibration(
+    captures: Captures,
+    out: Study = QUALITY,
+    fit: Annotated[bool, typer.Option(help="Fit frame 0 to rigs with faults, as given and refined.")] = True,
+    again: Again = False,
+    changes: Changes = None,
+) -> None:
+    """Puts faults into calibrations: what frame 0 tells of each, and what refining them is worth.
+
+    Leaves calibration.md in the study's folder; a fit that was measured is not measured again.
+    """
+    from studies.quality.calibration import run
+
+    run(captures, out, fit=fit, changes=changes or (), again=again)
 
 
 def targets(

@@ -19,7 +19,8 @@ import numpy as np
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.storage.history import History, HistoryError
 
-SLOW, SLOW_RAISES, RAISES, DIES, HELD, LEAVES_OUT, STANDS, GUESSED = 200, 201, 250, 251, 240, 241, 242, 243
+SLOW, SLOW_RAISES, RAISES, DIES = 200, 201, 250, 251
+HELD, LEAVES_OUT, STANDS, GUESSED, REFINES = 240, 241, 242, 243, 244
 ITERATIONS = 100
 MS_EACH = 2.0
 RAISES_IN_REPLAY, DIES_IN_REPLAY = 666, 667
@@ -77,6 +78,20 @@ def state(points, index, before=None, red=0):
     )
 
 
+def refined(camera):
+    """The calibration of frame 0 with one camera shifted."""
+    pose = camera.world_to_camera.copy()
+    pose[0, 3] += 0.25
+    figures = {"turned": 0.0, "moved": 0.25, "focal": 1.0, "before": 2.0, "after": None, "fixed": False}
+    outcome = {"accepted": True, "text": "", "before": 2.0, "after": 0.5, "matches": 100}
+    return {
+        "cameras": {"c0": {"pixels": None, "matches": 3}},
+        "off": [camera.name],
+        "warnings": [f"the fake refined {camera.name}"],
+        "refined": {**outcome, "cameras": {camera.name: {**figures, "pose": pose.tolist()}}},
+    }
+
+
 @dataclass
 class Resumed:
     index: int
@@ -100,6 +115,8 @@ class FakeReconstruction:
             progress(Progress("fitting", done + 1, 3, {"psnr": 30.0}))
         given = points.positions if points is not None else np.array([[0.0, 0, 0], [0.5, 0, 0]])
         scene = cls(rig.world_frame().to_inside(given), history)
+        if int(next(iter(frame.images.values()))[0, 0, 0]) == REFINES:
+            notes = {**(notes or {}), "calibration": refined(rig.cameras[1])}
         scene.commit(frame, dropped, notes)
         return scene
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.cameras import WorldFrame
-from scas4d_core.effects.effect import Effect, Group, refused_at_zero
+from scas4d_core.effects.effect import Effect, Group
 from scas4d_core.effects.parts import Part, PartsBuilder, Work
 
 if TYPE_CHECKING:
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float32]
 Plane = tuple[float, float, float, float]
+
+FLOOR_WEIGHT = 2.0
+"""Beside 1 for the image loss (Dynamic3DGaussians). A scene that wants no such term names no floor."""
 
 
 def floor_inside(plane: Sequence[float], world: WorldFrame) -> Plane:
@@ -77,18 +80,18 @@ class FloorPart(Part):
 
 @dataclass(frozen=True)
 class Floor(Effect):
-    """The term ``weights.floor``, for the plane ``scene.floor``."""
+    """The term for the plane ``scene.floor``."""
 
     def refused(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused without a plane, and with a weight of 0."""
+        """Refused without a plane."""
         if settings.scene.floor is None:
             return "the scene names no floor", "give scene.floor, a plane (a, b, c, d)"
-        return refused_at_zero(settings, "weights.floor")
+        return None
 
     def join(self, builder: PartsBuilder) -> None:
         """Adds the term."""
         assert builder.scene.floor is not None
-        builder.parts.append(FloorPart(builder.scene.floor, builder.hierarchy.rows, builder.update.weights.floor))
+        builder.parts.append(FloorPart(builder.scene.floor, builder.hierarchy.rows, FLOOR_WEIGHT))
 
 
 EFFECT = Floor(

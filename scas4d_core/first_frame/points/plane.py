@@ -243,7 +243,7 @@ def _laid(view: PosedPicture, picture: Planes, points: Float) -> tuple[Planes, P
     right, down = (column - left).astype(np.float32), (line - top).astype(np.float32)
     upper = picture[top, left] * (1 - right) + picture[top, left + 1] * right
     lower = picture[top + 1, left] * (1 - right) + picture[top + 1, left + 1] * right
-    values: Planes = (upper * (1 - down) + lower * down).reshape(points.shape[:3])
+    values = np.asarray(upper * (1 - down) + lower * down, np.float32).reshape(points.shape[:3])
     mean = _box(values)
     variance = _box(values * values) - mean * mean
     spread = np.sqrt(variance.clip(0))

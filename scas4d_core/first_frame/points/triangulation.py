@@ -30,6 +30,8 @@ EPIPOLAR_ERROR = 2.0
 calibration are near 0.5."""
 FEW_PAIRS = 10
 """Pairs of pictures that are matched in any case, and by which the pace is measured."""
+FAINT_CONTRAST = 0.0017
+"""A quarter of COLMAP's: smooth walls have little, and the known poses throw wrong matches out."""
 MIN_ANGLE_DEG = 2.0
 """Rays that meet under less say little about depth."""
 
@@ -49,20 +51,26 @@ class Triangulation:
     error: Float
 
 
-def features(views: Sequence[PosedPicture], limit: TimeLimit | None = None) -> list[tuple[Float, NDArray[np.float32]]]:
+def features(
+    views: Sequence[PosedPicture],
+    limit: TimeLimit | None = None,
+    *,
+    most: int = MAX_FEATURES,
+    contrast: float = FAINT_CONTRAST,
+) -> list[tuple[Float, NDArray[np.float32]]]:
     """SIFT of every view: keypoints [K, 2] (pixel centres at +0.5, as in COLMAP) and unit descriptors [K, 128].
 
     Args:
         limit: of the time of frame 0; where it is short, features of all pictures are those of half or less their size.
+        most: features a picture, the largest. contrast: least difference of Gaussians, pictures in 0…1.
     """
     import pycolmap
 
     options: Any = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.num_threads = 1
-    options.sift.max_num_features = MAX_FEATURES
-    # A quarter of COLMAP's contrast: smooth walls have little, and the known poses throw wrong matches out.
-    options.sift.peak_threshold = 0.0017
+    options.sift.max_num_features = most
+    options.sift.peak_threshold = contrast
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = max(level, 1)  # COLMAP logs a line for each picture otherwise
     try:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from client.cli.evaluate import evaluate
 from client.cli.pictures import psnr
@@ -68,6 +71,28 @@ def test_a_capture_without_test_cameras_is_measured_on_those_it_has_and_says_so(
         "frame0000_camera1.png",
         "frame0001_camera1.png",
     ]
+
+
+def test_a_calibration_that_is_refined_is_said_and_measured_with(tmp_path, capsys):
+    """The third camera of the sample is turned by three pixels; without test cameras the refined ones are measured."""
+    folder, sample = tmp_path / "capture", Path("samples/robot").resolve()
+    folder.mkdir()
+    for path in sample.iterdir():
+        if path.name not in ("train_meta.json", "test_meta.json"):
+            (folder / path.name).symlink_to(path)
+    meta = json.loads((sample / "train_meta.json").read_text())
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec([3 / meta["k"][0][2][0][0], 0, 0]).as_matrix()
+    for poses in meta["w2c"]:
+        poses[2] = (turn @ poses[2]).tolist()
+    (folder / "train_meta.json").write_text(json.dumps(meta))
+    few = {"scene": {"image_scale": 0.25}, "static": {"iterations": 2, "refine_calibration": True}}
+    said: list[str] = []
+    row = evaluate(folder, tmp_path / "out", frames=1, changes=few, report=said.append)
+    assert row["measured_on"] == "training cameras"
+    assert any("the calibration was refined, as asked" in line for line in said)
+    reconstruct(open_source(folder), tmp_path / "shown", frames=1, preset="scas4d", changes=few)
+    assert "the calibration was refined, as asked" in " ".join(capsys.readouterr().out.split())
 
 
 def test_unlike_cameras_are_reconstructed_straight_from_their_folder(tmp_path):

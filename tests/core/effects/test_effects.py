@@ -24,7 +24,7 @@ from scas4d_core.errors import InputError
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.settings import SceneSettings, Settings
 
-WEIGHTS = ("rigidity", "isometry", "rotation", "scale", "floor")
+WEIGHTS = ("rigidity", "isometry", "rotation", "scale")
 
 
 @pytest.mark.parametrize("name", EFFECTS)

@@ -1,0 +1,249 @@
+"""Bundle adjustment of a calibrated rig on matches of one moment, held to the calibration as far as nothing denies it.
+
+Matches leave some of a rig's numbers open: where it is, which way it looks, how large it is, and nearly open some
+others, as whether its ring is a little bent. Here each camera is drawn to its pose as calibrated, by a Cauchy loss:
+what matches do not tell stays, and a camera that is far off comes free, and takes no other along. pycolmap triangulates
+here; its own bundle adjustment has no such term, and moved cameras of a right rig by half a pixel (docs/method.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.spatial.transform import Rotation
+
+from scas4d_core.cameras import Camera
+from scas4d_core.first_frame.calibration.matches import Matches
+from scas4d_core.first_frame.points.posed_pictures import Float
+
+BOUNDS = (16.0, 6.0, 2.0)
+"""Pixels that a feature may miss its point by, round after round: the first takes in cameras that are far off, the last
+leaves out what is no match."""
+NOISE = 0.5
+"""Pixels, scale of the Cauchy loss of features."""
+TRUST = 0.5
+"""Pixels, least scale of the Cauchy loss that draws a camera to its calibration: turns, shifts and the focal length are
+weighed by how far they move what it sees. After the first round it is the rig's median, where that is larger."""
+MIN_ANGLE_DEG = 1.0
+"""Rays that meet under less say little about depth."""
+MOST_STEPS = 40
+"""Of Levenberg-Marquardt in a round."""
+ENOUGH_GAIN = 1e-5
+"""A step that lowers the loss by a smaller share is the last one."""
+
+Track = tuple[NDArray[np.intp], Float]
+"""Indices of cameras [n], each once, and the pixel [n, 2] in each."""
+
+
+def tracks_of(matches: Matches) -> list[Track]:
+    """Features that match from camera to camera, a track each; those with two features in one picture are left out."""
+    label, offsets = matches.tracks()
+    order = np.argsort(label, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(order) else []
+    owner = np.repeat(np.arange(len(matches.pixels)), np.diff(offsets))
+    pixels = np.concatenate(matches.pixels) if len(owner) else np.zeros((0, 2))
+    return [
+        (owner[group], pixels[group])
+        for group in groups
+        if len(group) > 1 and len(np.unique(owner[group])) == len(group)
+    ]
+
+
+def adjusted(cameras: Sequence[Camera], tracks: Sequence[Track], *, focal: bool = False, seed: int = 0) -> list[Camera]:
+    """The cameras brought to agree with the tracks, in the world as calibrated; those that see none stay as they are.
+
+    Args:
+        cameras: of the tracks.
+        tracks: features of one point each, some of them wrong.
+        focal: each camera's focal length is adjusted too; the ratio of fx and fy stays.
+        seed: of RANSAC.
+    """
+    current, trust = list(cameras), TRUST
+    for bound in BOUNDS:
+        seen, points = _observed(current, tracks, bound, seed)
+        if len(points):
+            bundle = _Bundle(cameras, seen, focal, trust)
+            current = bundle.solved(current, points)
+            trust = max(TRUST, bundle.usual_pull(current, points))
+    return current
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """Features of points: index of the camera and of the point of each [M], and its pixel [M, 2]."""
+
+    camera: NDArray[np.intp]
+    point: NDArray[np.intp]
+    pixel: Float
+
+
+def _observed(cameras: Sequence[Camera], tracks: Sequence[Track], bound: float, seed: int) -> tuple[Observed, Float]:
+    """The right features of each track that gives a point, and the points [P, 3] (LO-RANSAC, pycolmap)."""
+    import pycolmap
+
+    options: Any = pycolmap.EstimateTriangulationOptions()
+    options.min_tri_angle = np.deg2rad(MIN_ANGLE_DEG)
+    options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
+    options.ransac.max_error = bound
+    options.ransac.random_seed = seed
+    options.ransac.max_num_trials = 100
+    lenses = [
+        pycolmap.Camera(model="PINHOLE", width=c.width, height=c.height, params=[c.fx, c.fy, c.cx, c.cy])
+        for c in cameras
+    ]
+    poses = [pycolmap.Rigid3d(pycolmap.Rotation3d(c.rotation), c.translation[:, None]) for c in cameras]
+    points, owner, pixels = [], [], []
+    for who, uv in tracks:
+        answer = pycolmap.estimate_triangulation(uv, [poses[i] for i in who], [lenses[i] for i in who], options)
+        if answer is None:
+            continue
+        right = np.asarray(answer["inlier_mask"] if "inlier_mask" in answer else answer["inliers"], dtype=bool)
+        if right.sum() >= 2:
+            points.append(np.asarray(answer["xyz"], np.float64).reshape(3))
+            owner.append(who[right])
+            pixels.append(uv[right])
+    index = np.repeat(np.arange(len(points)), [len(who) for who in owner])
+    none = np.zeros(0, np.intp)
+    seen = Observed(np.concatenate([*owner, none]), index, np.concatenate([*pixels, np.zeros((0, 2))]))
+    return seen, np.array(points).reshape(-1, 3)
+
+
+class _Bundle:
+    """Levenberg-Marquardt over poses and points; the points are eliminated (Schur complement)."""
+
+    def __init__(self, given: Sequence[Camera], seen: Observed, focal: bool, trust: float) -> None:
+        self.given, self.seen, self.focal, self.trust = given, seen, focal, trust
+        self.size = 7 if focal else 6
+        self.count = len(given)
+
+    def solved(self, cameras: list[Camera], points: Float) -> list[Camera]:
+        """The cameras after the last step that lowers the loss."""
+        depth = self._depths(cameras, points)
+        damping, loss = 1e-3, self._loss(cameras, points, depth)
+        for _ in range(MOST_STEPS):
+            moves, shifts = self._step(cameras, points, depth, damping)
+            trial, places = [_moved(c, move) for c, move in zip(cameras, moves, strict=True)], points + shifts
+            found = self._loss(trial, places, depth)
+            if found < loss:
+                gain, cameras, points, loss = (loss - found) / loss, trial, places, found
+                damping = max(damping / 5, 1e-9)
+                if gain < ENOUGH_GAIN:
+                    break
+            elif (damping := damping * 10) > 1e6:
+                break
+        return cameras
+
+    def usual_pull(self, cameras: list[Camera], points: Float) -> float:
+        """Median distance of the cameras that see something from their calibration, pixels."""
+        pulls = np.linalg.norm(self._pulls(cameras, self._depths(cameras, points))[0], axis=1)
+        return float(np.median(pulls[np.unique(self.seen.camera)]))
+
+    def _depths(self, cameras: Sequence[Camera], points: Float) -> Float:
+        """[V] median depth of what each camera sees; 1 where nothing."""
+        depths = np.ones(self.count)
+        for index, camera in enumerate(cameras):
+            own = points[self.seen.point[self.seen.camera == index]]
+            if len(own):
+                depths[index] = max(float(np.median(camera.to_camera(own)[:, 2])), 1e-9)
+        return depths
+
+    def _residuals(self, cameras: Sequence[Camera], points: Float) -> tuple[Float, Float, Float]:
+        """Misses of all features [M, 2] in pixels, and their derivatives by the camera [M, 2, 6 or 7] and point."""
+        seen = self.seen
+        rotation = np.array([c.rotation for c in cameras])[seen.camera]
+        shift = np.array([c.translation for c in cameras])[seen.camera]
+        lens = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras])[seen.camera]
+        place = np.einsum("mij,mj->mi", rotation, points[seen.point]) + shift
+        x, y, z = place.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            offset = np.stack([lens[:, 0] * x / z, lens[:, 1] * y / z], axis=1)
+            by_place = np.zeros((len(z), 2, 3))
+            by_place[:, 0, 0], by_place[:, 1, 1] = lens[:, 0] / z, lens[:, 1] / z
+            by_place[:, :, 2] = -offset / z[:, None]
+        miss = offset + lens[:, 2:] - seen.pixel
+        miss[z <= 0] = np.inf  # behind the camera: no such step is taken
+        columns = [by_place @ -_cross(place), by_place, *([offset[:, :, None]] if self.focal else [])]
+        return miss, np.concatenate(columns, axis=2), by_place @ rotation
+
+    def _pulls(self, cameras: Sequence[Camera], depth: Float) -> tuple[Float, Float]:
+        """Distances of each camera from its calibration [V, 6 or 7] in pixels, and the pixels of a unit of each."""
+        rows, units = np.zeros((self.count, self.size)), np.zeros((self.count, self.size))
+        for index, (before, now) in enumerate(zip(self.given, cameras, strict=True)):
+            units[index, :3], units[index, 3:6] = now.fx, now.fx / depth[index]
+            rows[index, :3] = Rotation.from_matrix(now.rotation @ before.rotation.T).as_rotvec()
+            rows[index, 3:6] = -now.rotation @ (now.centre - before.centre)
+            if self.focal:
+                units[index, 6] = now.width / 4  # a typical distance of what it sees from the middle of its picture
+                rows[index, 6] = np.log(now.fx / before.fx)
+        return rows * units, units
+
+    def _loss(self, cameras: Sequence[Camera], points: Float, depth: Float) -> float:
+        miss = (self._residuals(cameras, points)[0] ** 2).sum(1) / NOISE**2
+        pull = (self._pulls(cameras, depth)[0] ** 2).sum(1) / self.trust**2
+        return float(np.log1p(miss).sum() + np.log1p(pull).sum())
+
+    def _step(self, cameras: Sequence[Camera], points: Float, depth: Float, damping: float) -> tuple[Float, Float]:
+        """Moves of the cameras [V, 6 or 7] and shifts of the points [P, 3]."""
+        seen, size, count = self.seen, self.size, len(points)
+        miss, by_camera, by_point = self._residuals(cameras, points)
+        weight = 1 / (1 + (miss**2).sum(1) / NOISE**2) / NOISE**2
+        heavy = by_camera * weight[:, None, None]
+        blocks = np.zeros((self.count, size, size))
+        slope = np.zeros((self.count, size))
+        np.add.at(blocks, seen.camera, np.einsum("mki,mkj->mij", heavy, by_camera))
+        np.add.at(slope, seen.camera, np.einsum("mki,mk->mi", heavy, miss))
+        pull, units = self._pulls(cameras, depth)
+        trust = (1 / (1 + (pull**2).sum(1) / self.trust**2) / self.trust**2)[:, None]
+        diagonal = np.arange(size)
+        blocks[:, diagonal, diagonal] += trust * units**2
+        slope += trust * units * pull
+        own, point_slope = np.zeros((count, 3, 3)), np.zeros((count, 3))
+        np.add.at(own, seen.point, np.einsum("mki,mkj->mij", by_point * weight[:, None, None], by_point))
+        np.add.at(point_slope, seen.point, np.einsum("mki,mk->mi", by_point * weight[:, None, None], miss))
+        for array in (blocks, own):
+            corner = np.arange(array.shape[1])
+            array[:, corner, corner] *= 1 + damping
+        own += np.eye(3) * 1e-12 * np.trace(own, axis1=1, axis2=2).max()
+        inverse = np.linalg.inv(own)
+        cross = np.einsum("mki,mkj->mij", heavy, by_point)  # [M, 6 or 7, 3]
+        coupled = _sparse(cross, seen, self.count, count)
+        through = _sparse(cross @ inverse[seen.point], seen, self.count, count)
+        matrix = -(through @ coupled.T).toarray()
+        for index in range(self.count):
+            rows = slice(size * index, size * (index + 1))
+            matrix[rows, rows] += blocks[index]
+        right = -slope.reshape(-1) + through @ point_slope.reshape(-1)
+        moves = np.linalg.solve(matrix, right)
+        rest = -point_slope.reshape(-1) - coupled.T @ moves
+        shifts = np.einsum("pij,pj->pi", inverse, rest.reshape(-1, 3))
+        return moves.reshape(self.count, size), shifts
+
+
+def _sparse(blocks: Float, seen: Observed, cameras: int, points: int) -> csr_array:
+    """Blocks [M, s, 3] at (camera, point) as one matrix [s · cameras, 3 · points]."""
+    size = blocks.shape[1]
+    rows = np.broadcast_to(size * seen.camera[:, None, None] + np.arange(size)[:, None], blocks.shape)
+    columns = np.broadcast_to(3 * seen.point[:, None, None] + np.arange(3), blocks.shape)
+    return csr_array((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(size * cameras, 3 * points))
+
+
+def _cross(vectors: Float) -> Float:
+    """[M, 3, 3] with [v] w = v × w."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+
+
+def _moved(camera: Camera, move: Float) -> Camera:
+    """The camera turned about its axes, shifted along them, and its focal length multiplied by e to the last number."""
+    turn = Rotation.from_rotvec(move[:3]).as_matrix()
+    pose, intrinsics = np.eye(4), camera.intrinsics.copy()
+    pose[:3, :3], pose[:3, 3] = turn @ camera.rotation, turn @ camera.translation + move[3:6]
+    if len(move) > 6:
+        intrinsics[[0, 1], [0, 1]] *= np.exp(move[6])
+    return Camera(camera.name, intrinsics, pose, camera.width, camera.height)

@@ -1,0 +1,160 @@
+"""``scripts/bench calibration``: rigs with faults: what frame 0 tells of them, and what refining them is worth.
+
+Faults are put into the calibration; the pictures stay. Test cameras keep theirs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from client.cli.evaluate import Report, recorded
+from client.cli.scores import Column, Row, digest, markdown, read_row, write_row
+from client.importers.open_source import open_source
+from scas4d_core.cameras import Camera, Rig
+from scas4d_core.first_frame.calibration.matches import Matches, matches_by_appearance
+from scas4d_core.first_frame.calibration.refine import refined_rig
+from scas4d_core.first_frame.calibration.residuals import residuals
+from scas4d_core.first_frame.points.posed_pictures import collect_views
+from scas4d_core.metrics.evaluation import measure_pictures
+from scas4d_core.reconstruction import Reconstruction
+from studies.machine import core_version, machine
+from studies.quality.settings import settings_of
+
+FAULTS = (
+    ("across", 1.0), ("down", 1.0), ("across", 2.0), ("down", 2.0), ("across", 4.0), ("down", 4.0), ("centre", 2.0),
+    ("focal", 0.01),
+)  # fmt: skip
+"""Of one camera after the other: turns by pixels across and down, the principal point, the focal length."""
+TOLD = (
+    Column("capture", "capture"),
+    Column("fault", "fault"),
+    Column("residual, px", "residual"),
+    Column("named", "named"),
+    Column("others named", "others", "d"),
+)
+RIGS = (("right", 0.0), ("one", 2.0), ("one", 4.0), ("all", 1.0), ("all", 2.0), ("all", 4.0))
+"""Frame 0 is fitted to: one camera turned across by so many pixels; all turned at random, by about so many."""
+FITTED = (
+    Column("capture", "capture"),
+    Column("rig", "rig"),
+    Column("as given", "given", ".2f"),
+    Column("refined", "refined", ".2f"),
+    Column("accepted", "accepted"),
+    Column("seconds", "seconds", ".1f"),
+)
+
+
+def faulty(camera: Camera, kind: str, size: float) -> Camera:
+    """A camera with a fault in its calibration.
+
+    Args:
+        kind: "across" and "down": turned by ``size`` pixels; "centre": its principal point is off by so many; "focal":
+            its focal length by this share.
+    """
+    lens, pose = camera.intrinsics.copy(), camera.world_to_camera.copy()
+    if kind in ("across", "down"):
+        turn = [0.0, size / camera.fx, 0.0] if kind == "across" else [size / camera.fy, 0.0, 0.0]
+        pose[:3] = Rotation.from_rotvec(turn).as_matrix() @ pose[:3]
+    elif kind == "centre":
+        lens[0, 2] += size
+    else:
+        lens[[0, 1], [0, 1]] *= 1 + size
+    return Camera(camera.name, lens, pose, camera.width, camera.height)
+
+
+def faulty_rig(rig: Rig, way: str, pixels: float, seed: int = 7) -> Rig:
+    """A rig of which one camera, or each, is turned; see ``RIGS``."""
+    rng, cameras = np.random.default_rng(seed), []
+    for index, camera in enumerate(rig.cameras):
+        across, down = (
+            rng.normal(size=2) * pixels / 2**0.5 if way == "all" else (pixels * (way == "one" and index == 3), 0)
+        )
+        cameras.append(faulty(faulty(camera, "across", across), "down", down))
+    return Rig(tuple(cameras))
+
+
+def run(
+    captures: Sequence[Path],
+    out: Path,
+    *,
+    fit: bool = True,
+    changes: Sequence[str] = (),
+    again: bool = False,
+    report: Report = print,
+) -> list[Row]:
+    """Measures each capture, prints two tables and leaves them in ``out/calibration.md``.
+
+    Args:
+        captures: folders. out: a file a finished run goes here; run again to go on. fit: also frame 0 of faulty rigs.
+        changes: to the settings. again: measure anew. report: takes the printed lines.
+    """
+    told, fitted = [], []
+    for folder in captures:
+        capture = open_source(folder)
+        matches = matches_by_appearance(collect_views(capture.rig, dict(capture.frame(0).images), {}))
+        told += _told(capture.name, matches)
+        report(f"{capture.name}, as given: {refined_rig(capture.rig, matches).text}")
+        for way, pixels in RIGS if fit and capture.test_rig is not None else ():
+            settings = recorded(settings_of("scas4d", None, 0, list(changes)), ())
+            path = (
+                out / "calibration" / f"{folder.resolve().name}-{way}-{pixels:g}-{digest(settings, way, pixels)}.json"
+            )
+            row = None if again else read_row(path)
+            if row is None:
+                row = {"key": path.stem, "capture": capture.name, "rig": f"{way} {pixels:g}", "settings": settings}
+                row |= _fitted(folder, faulty_rig(capture.rig, way, pixels), changes)
+                write_row(path, row | {"core": core_version(), "machine": machine()})
+            report(f"{row['capture']}, {row['rig']}: {row['given']:.2f} dB, refined {row['refined']:.2f} dB")
+            fitted.append(row)
+    tables = "\n\n".join(markdown(rows, columns) for rows, columns in ((told, TOLD), (fitted, FITTED)) if rows)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "calibration.md").write_text(tables + "\n")
+    report(tables)
+    return [*told, *fitted]
+
+
+def _told(name: str, matches: Matches) -> list[Row]:
+    """Residuals of the rig as it is given, and of each camera in turn with each fault."""
+    given, off = residuals(matches)
+    known = np.array([found.pixels for found in given.values()])
+    rows: list[Row] = [_told_row(name, "none", known, f"{len(off)} of {len(known)}", 0)]
+    if np.isnan(known).all():
+        return rows
+    for kind, size in FAULTS:
+        own, named, others = [], 0, 0
+        for camera in matches.cameras:
+            cameras = [faulty(c, kind, size) if c is camera else c for c in matches.cameras]
+            found, off = residuals(matches.seen_by(cameras))
+            own.append(found[camera.name].pixels)
+            named += camera.name in off
+            others += len(set(off) - {camera.name})
+        rows.append(_told_row(name, f"{kind} {size:g}", np.array(own), f"{named} of {len(own)}", others))
+    return rows
+
+
+def _told_row(capture: str, fault: str, residual: NDArray[np.float64], named: str, others: int) -> Row:
+    known = residual[np.isfinite(residual)]
+    few = f", {len(residual) - len(known)} not told" if len(known) < len(residual) else ""
+    text = f"{known.min():.2f} to {known.max():.2f}, median {np.median(known):.2f}" if len(known) else "–"
+    return {"capture": capture, "fault": fault, "residual": text + few, "named": named, "others": others}
+
+
+def _fitted(folder: Path, rig: Rig, changes: Sequence[str]) -> Mapping[str, Any]:
+    """PSNR of the test cameras in frame 0, with the rig as it is and refined."""
+    capture, found = open_source(folder), dict[str, Any]()
+    for refine in (False, True):
+        settings = settings_of("scas4d", None, 0, [*changes, f"static.refine_calibration={str(refine).lower()}"])
+        scene = Reconstruction.start(rig, capture.frame(0), settings, points=capture.points)
+        tests = open_source(folder, image_scale=settings.scene.image_scale)
+        found["refined" if refine else "given"] = measure_pictures(scene, tests, 0)[0]["psnr"]
+        assert scene.report is not None
+        if scene.report.calibration is not None and (refined := scene.report.calibration.refined) is not None:
+            found |= {"accepted": "yes" if refined.accepted else "no", "said": refined.text}
+            found["seconds"] = scene.report.seconds["calibration"]
+    return found
