@@ -28,6 +28,7 @@ from client.wire.framing import (
     parse_head,
 )
 from client.wire.parts import PartsModel, part_colour, parts_model
+from client.wire.reconstructions import ReconstructionRequest
 from client.wire.rigs import CameraModel, RigModel
 from client.wire.scenes import (
     EffectStatus,
@@ -91,6 +92,7 @@ __all__ = [
     "PointsReceipt",
     "ProblemDetails",
     "ProgressModel",
+    "ReconstructionRequest",
     "RenderFormat",
     "RenderKind",
     "RenderRequest",

@@ -17,10 +17,11 @@ from server.ingest.acknowledge import Ingest, IngestRules, uncancelled
 from server.ingest.open_frames import OpenFrames
 from server.problems import Problem, of_rig
 from server.processes.messages import SceneSpec
-from server.processes.placement import Placement
+from server.processes.placement import STOP_SECONDS, Placement
 from server.processes.readers import Readers
 from server.repair.mending import DamageKind, DamageLog
 from server.repair.scrub import Scrub
+from server.scene.beginning import how_to_begin_again
 from server.scene.replays import Replays
 from server.scene.status import FrameReports, camera_of, effective_budget, effects_of, state_of
 from server.scene.supervision import Background
@@ -157,7 +158,9 @@ class Scene:
     @property
     def error(self) -> str | None:
         """Sentence that says why the scene is failed or degraded, or None."""
-        return self.ledger.fatal or self.updates.trouble or self.updates.mending.trouble
+        if self.ledger.fatal is not None:
+            return f"{self.ledger.fatal}; {how_to_begin_again(self.ledger)}"
+        return self.updates.trouble or self.updates.mending.trouble
 
     @property
     def state(self) -> SceneState:
@@ -182,6 +185,8 @@ class Scene:
             first_committed=ledger.committed[0] if ledger.committed else None,
             last_committed=ledger.committed[-1] if ledger.committed else None,
             gaussians=updates.gaussians,
+            reconstruction=ledger.reconstruction,
+            first_frame=ledger.frames.first,
             paused=ledger.paused,
             degraded=self.error is not None and ledger.fatal is None,
             open_frames=sorted(ledger.open),
@@ -295,12 +300,13 @@ class Scene:
         await uncancelled(change())
         self.updates.begin()
 
-    async def stop(self) -> None:
-        """Ends the processes of the scene; its folder stays."""
+    async def stop(self, seconds: float = STOP_SECONDS) -> None:
+        """Ends the processes of the scene; its folder stays. The worker has `seconds` to end by itself."""
         self.open_frames.stop()
         self.updates.stop()
         self._background.cancel()
-        await asyncio.gather(self.updates.stop_worker(), self.readers.stop(), self.replays.stop())
+        await asyncio.gather(self.updates.stop_worker(seconds), self.readers.stop(), self.replays.stop())
+        self._background.cancel()  # what the last messages of the processes began
         await self.log.journal.close()
 
     # Events.

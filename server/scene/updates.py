@@ -120,7 +120,8 @@ class Updates:
         """Gives the worker its next frame, if it is idle and one waits; to be called whenever that may have changed."""
         self.tell(SceneChanged())
         ledger = self._ledger
-        if not self._ready or self._index is not None or self._holding or self.mending.at_work is not None:
+        busy = self._index is not None or self._holding or self.mending.at_work is not None
+        if not self._ready or self._stopping or busy:
             return
         waiting = [] if ledger.paused or ledger.fatal is not None else ledger.waiting()
         if not waiting:
@@ -316,9 +317,9 @@ class Updates:
             self._restart.cancel()
         self.mending.stop()
 
-    async def stop_worker(self) -> None:
-        """Ends the worker; an unfinished frame is updated again after the next start."""
-        await self._worker.stop()
+    async def stop_worker(self, seconds: float) -> None:
+        """Ends the worker, which has `seconds` to do so itself; an unfinished frame is updated again after the next."""
+        await self._worker.stop(seconds)
 
 
 def trouble_of(report: FrameReportModel) -> str | None:
