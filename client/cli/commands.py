@@ -236,9 +236,8 @@ def begin_again(
         status = client.begin_again(
             scene, number, settings=settings, frame=frame, points=not no_points, discard=discard
         )
-    waiting = f"{status.queued} frames wait" if status.queued else "it waits for its pictures"
     console.print(
-        f"scene {scene} begins anew with frame {status.first_frame}, reconstruction {number}; {waiting}",
+        f"scene {scene} begins anew with frame {status.first_frame}, reconstruction {number}; {status.queued} queued",
         highlight=False,
     )
 

@@ -137,7 +137,7 @@ class FrameTable:
         states[~stay] = CODES[FrameState.SET_ASIDE]
         states[[i for i in self._files if i >= first and not stay[i]]] = CODES[FrameState.QUEUED]
         self.first, self._states = first, bytearray(states.tobytes())
-        self._flags = bytearray(flags & (TIME | RECEIPT) for flags in self._flags)
+        self._flags = bytearray(flags & (TIME | RECEIPT) if flags & RECEIPT else 0 for flags in self._flags)
         self.counts = {state: int((states == code).sum()) for state, code in CODES.items()}
         self.committed = array("q")
         self._records.clear()

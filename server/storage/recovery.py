@@ -225,7 +225,8 @@ def _events_of(folder: Path, index: int, names: list[str], ledger: Ledger, state
         return [event for event in found if event is not None]
     if accepted is None:
         return []
-    if index < states.last and index not in states.times and index not in states.damaged:
+    known = index in states.times or index in states.damaged
+    if ledger.frames.first <= index < states.last and not known:
         return [accepted, FrameSetAside(index=index, reason=NO_STATE)]
     return [accepted]
 
