@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import secrets
 import shutil
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NoReturn
@@ -117,7 +119,8 @@ class Scenes:
             if path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)
             else:
-                path.unlink(missing_ok=True)
+                with contextlib.suppress(OSError):
+                    path.unlink()
 
     def check_recovered(self, id: str | None = None) -> None:
         """Checks that the scenes found at the start, or one of them, are recovered.
@@ -138,7 +141,8 @@ class Scenes:
             recovering=missing,
         )
 
-    async def _restore(self, folder: SceneFolder) -> None:
+    async def _restore(self, folder: SceneFolder, said: Sequence[str] = ()) -> None:
+        """Recovers a scene from its folder; `said`: of damage found before."""
         try:
             definition, damage = await asyncio.to_thread(read_definition, folder)
             if definition.id != folder.name:
@@ -146,7 +150,8 @@ class Scenes:
             if damage is not None:
                 await asyncio.to_thread(write_definition, folder, definition)
             found = await asyncio.to_thread(recover, folder, definition.id, definition.as_json())
-            found.damage[:0] = [damage] if damage is not None else []
+            before = [*said, damage] if damage is not None else said
+            found.damage[:0] = [sentence for sentence in before if sentence not in found.damage]
             folder, definition = found.folder, await self._begun(found, definition)
             scene = Scene(definition, folder, found, self.server, self.placement, self.hub)
             scene.points_sha256 = await asyncio.to_thread(points_sha256, folder.points)
@@ -193,17 +198,21 @@ class Scenes:
     async def _begin_again(self, scene: Scene, beginning: Beginning) -> None:
         self.hub.restart(scene.id)
         await scene.stop(0)
-        folder = self._data.scene(scene.id)
+        folder, said = self._data.scene(scene.id), scene.status().damage
         try:
-            await self._journal_beginning(folder, beginning)
+            said += await self._journal_beginning(folder, beginning)
         finally:
-            await self._restore(folder)
+            await self._restore(folder, said)
             if self.by_id.get(scene.id) is scene:  # it cannot be read
                 del self.by_id[scene.id]
         self._sweeping = asyncio.create_task(asyncio.to_thread(self._sweep))
 
-    async def _journal_beginning(self, folder: SceneFolder, beginning: Beginning) -> None:
-        """Journals the beginning of a scene that is stopped, if it still may: a frame may have been committed since."""
+    async def _journal_beginning(self, folder: SceneFolder, beginning: Beginning) -> list[str]:
+        """Journals the beginning of a scene that is stopped, if it still may: a frame may have been committed since.
+
+        Returns:
+            Sentences about damage that was found.
+        """
         definition, _ = await asyncio.to_thread(read_definition, folder)
         found = await asyncio.to_thread(recover, folder, definition.id, definition.as_json())
         event = beginning.event(found.ledger, found.folder)
@@ -218,6 +227,7 @@ class Scenes:
         finally:
             await journal.close()
         log.warning("scene %s begins reconstruction %d with frame %d", folder.name, event.number, event.index)
+        return found.damage
 
     async def create(self, request: SceneCreate, settings: Settings) -> Scene:
         """Creates a scene and starts its processes; the scene is on disk when this returns.

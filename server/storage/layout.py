@@ -59,17 +59,13 @@ class SceneFolder:
         return replace(self, reconstruction=event.number, cloud=event.number if event.points is None else event.points)
 
     def leftovers(self, event: ReconstructionBegun | None) -> list[Path]:
-        """Lists what earlier reconstructions made, and points that none will begin from."""
+        """Lists what reconstructions before the one that was begun last left, and points that it does not use."""
         if event is None:
             return []
-        kept = {self.states.name, self.parts.name, self.points_of(event.number + 1).name}
-        kept |= set() if event.points is None else {self.points_of(event.points).name}
-        return [
-            path
-            for kind in ("states*", "parts*", "points*.npz")
-            for path in self.path.glob(kind)
-            if path.name not in kept
-        ]
+        made = [replace(self, reconstruction=number) for number in range(event.number)]
+        points = [self.points_of(number) for number in range(event.number + 1) if number != event.points]
+        paths = [path for folder in made for path in (folder.states, folder.parts)] + points
+        return [path for path in paths if path.exists()]
 
     @property
     def name(self) -> str:
