@@ -28,13 +28,13 @@ from client.wire.framing import (
     parse_head,
 )
 from client.wire.parts import PartsModel, part_colour, parts_model
-from client.wire.reconstructions import ReconstructionRequest
 from client.wire.rigs import CameraModel, RigModel
 from client.wire.scenes import (
     EffectStatus,
     IngestSettings,
     PointsReceipt,
     ProgressModel,
+    ReconstructionRequest,
     Retention,
     SceneCreate,
     SceneList,

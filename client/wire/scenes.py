@@ -75,6 +75,31 @@ class SceneCreate(Model):
     ingest: IngestSettings = IngestSettings()
 
 
+class ReconstructionRequest(Model):
+    """Another beginning of a scene's reconstruction, from its first frame on, in place of the one before."""
+
+    settings: dict[str, Any] = Field(
+        default_factory=dict, description="What changes of the scene's settings, nested, as when a scene is created."
+    )
+    frame: int | None = Field(
+        default=None,
+        strict=True,
+        ge=0,
+        le=1_000_000_000,
+        description="The frame to begin with, here or still to come; null: as before. Those before it are set aside.",
+    )
+    points: bool = Field(
+        default=True,
+        strict=True,
+        description="Begin from the scene's points, the newest that were sent; false: from the pictures alone.",
+    )
+    discard: bool = Field(
+        default=False,
+        strict=True,
+        description="Drop committed states; must be true where a frame after the first is committed.",
+    )
+
+
 class SceneState(StrEnum):
     """State of a scene."""
 

@@ -301,11 +301,11 @@ class Scene:
         self.updates.begin()
 
     async def stop(self, seconds: float = STOP_SECONDS) -> None:
-        """Ends the processes of the scene; its folder stays. The worker has `seconds` to end by itself."""
+        """Ends the processes of the scene; its folder stays. They have `seconds` to end by themselves."""
         self.open_frames.stop()
         self.updates.stop()
         self._background.cancel()
-        await asyncio.gather(self.updates.stop_worker(seconds), self.readers.stop(), self.replays.stop())
+        await asyncio.gather(self.updates.stop_worker(seconds), self.readers.stop(seconds), self.replays.stop())
         self._background.cancel()  # what the last messages of the processes began
         await self.log.journal.close()
 

@@ -151,7 +151,7 @@ class Scenes:
                 await asyncio.to_thread(write_definition, folder, definition)
             found = await asyncio.to_thread(recover, folder, definition.id, definition.as_json())
             before = [*said, damage] if damage is not None else said
-            found.damage[:0] = [sentence for sentence in before if sentence not in found.damage]
+            found.damage[:0] = [sentence for sentence in dict.fromkeys(before) if sentence not in found.damage]
             folder, definition = found.folder, await self._begun(found, definition)
             scene = Scene(definition, folder, found, self.server, self.placement, self.hub)
             scene.points_sha256 = await asyncio.to_thread(points_sha256, folder.points)

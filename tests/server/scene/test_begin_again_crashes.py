@@ -9,7 +9,7 @@ import shutil
 import fakes
 import pytest
 from running import pictures, problem
-from sending import create, put_form, serving, settled, status
+from sending import create, put_form, serving, settled, status, wait_for
 
 from client.wire import ReconstructionRequest
 from scas4d_core.storage.history import History
@@ -230,3 +230,23 @@ def test_what_happened_to_frames_before_is_forgotten_and_frames_of_old_states_ar
     assert "were deleted before" in ledger.frames[0].error
     ledger.reconcile([1, 2], {})
     assert (list(ledger.committed), ledger.waiting()) == ([1, 2], [3])
+
+
+def test_a_scene_whose_states_are_lost_begins_again(tmp_path):
+    with serving(tmp_path) as (http, sdk):
+        id = filled(http, sdk)
+        before = committed(tmp_path, id)["states"]
+    states = DataFolder(tmp_path).scene(id).states
+    for name in ("fixed.npz", "fixed.copy.npz"):
+        content = bytearray((states / name).read_bytes())
+        content[len(content) // 2] ^= 1
+        (states / name).write_bytes(content)
+    with serving(tmp_path) as (http, sdk):
+        wait_for(lambda: status(http, id)["state"] == "failed")
+        found = status(http, id)
+        assert "cannot be gone on from" in found["error"]
+        assert f"PUT /v1/scenes/{id}/reconstructions/1" in found["error"]
+        assert begin(http, id).status_code == 200
+        assert sdk.wait(id, FRAMES - 1).state == "committed"
+        assert committed(tmp_path, id) == {"states_1": before}
+        assert status(http, id)["damage"] == found["damage"] != []
