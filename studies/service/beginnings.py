@@ -11,14 +11,16 @@ from dataclasses import replace
 
 import httpx
 
+from server.storage.events import ReconstructionBegun
+from server.storage.journal import read_journal
 from server.storage.layout import DataFolder
 from studies.options import Echo
 from studies.service.outcome import ScenarioResult
 from studies.service.process import PATIENCE_S, Service, StudyError
 from studies.service.study import AGAIN_S, FrameSender, Study, compare, digests
 
-SPREAD_S = 1.0
-"""A kill comes within so many seconds after the request: before its event, after it, or in the first frame."""
+SPREADS_S = (0.1, 1.0)
+"""A kill comes within one of these seconds after the request: before its event, after it, or in the first frame."""
 
 
 def beginnings(study: Study, expected: Mapping[int, str], count: int, seed: int, echo: Echo) -> ScenarioResult:
@@ -44,10 +46,12 @@ def beginnings(study: Study, expected: Mapping[int, str], count: int, seed: int,
             if sent < len(study.frames):
                 sending.start()
                 sent += 1
-            time.sleep(random_.uniform(0, SPREAD_S))
+            time.sleep(random_.uniform(0, random_.choice(SPREADS_S)))
             service.kill()
+            events = read_journal(DataFolder(service.data).scene(scene).journal).events
+            known = max((event.number for event in events if isinstance(event, ReconstructionBegun)), default=0)
+            ended["after" if known == number else "before"] += 1
             service.start()
-            ended["after" if service.status(scene).reconstruction == number else "before"] += 1
             asking.join()
             if sending.ident is not None:
                 sending.join()
