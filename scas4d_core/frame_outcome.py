@@ -161,8 +161,8 @@ def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:
     if cloud is None or cloud.get("covered") is None:
         return []
     remedy = (
-        "give points, masks, more cameras that look at the same place, or a plain backdrop, and begin a new scene if "
-        "its views are poor"
+        "if its views are poor, begin the reconstruction again with points, masks, more cameras that look at the same "
+        "place, or a plain backdrop"
     )
     if cloud["covered"] == 0:
         return [f"frame 0 is a guess: no two cameras agree on any of its first points; {remedy}"]
@@ -170,3 +170,15 @@ def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:
         share = f"cover {100 * cloud['covered']:.0f} % of the pictures"
         return [f"frame 0 is in part a guess: the points on which cameras agree {share}; {remedy}"]
     return []
+
+
+def first_warnings(record: Mapping[str, Any]) -> list[str]:
+    """Warnings of the report of the first frame, a sentence each.
+
+    Args:
+        record: the report as JSON, or its ``cloud`` and ``calibration`` alone.
+
+    >>> first_warnings({"calibration": {"warnings": ["camera 'a' is off"]}})
+    ["camera 'a' is off"]
+    """
+    return [*cloud_warnings(record.get("cloud")), *(record.get("calibration") or {}).get("warnings", [])]

@@ -112,9 +112,21 @@ def preset(name: str, *changes: Mapping[str, Any]) -> Settings:
     if name not in PRESETS:
         known = ", ".join(sorted(PRESETS))
         raise SettingError("preset", name, "there is no preset of this name", f"give one of {known}")
+    return changed(PRESETS[name], *changes)
+
+
+def changed(settings: Settings, *changes: Mapping[str, Any]) -> Settings:
+    """The settings with changes given as nested mappings; later ones go over earlier ones.
+
+    Raises:
+        SettingError: no such setting, or a value out of its range.
+
+    >>> changed(preset("adaptive"), {"update": {"iterations": 20}}).update.iterations
+    20
+    """
     if not any(changes):
-        return PRESETS[name]
-    values = PRESETS[name].model_dump()
+        return settings
+    values = settings.model_dump()
     for change in changes:
         values = _merged(values, change)
     try:

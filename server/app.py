@@ -35,6 +35,7 @@ from server.routes import (
     metrics,
     parts,
     points,
+    reconstructions,
     render,
     scenes,
     stream,
@@ -97,7 +98,21 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         app.add_middleware(ClientLimit, guard=app.state.guard)
     app.add_middleware(AccessLog)
     resources = (
-        *(scenes, inspect, points, frames, ingest, render, tracks, parts, gaussians, stream, budget, tradeoff),
+        *(
+            scenes,
+            reconstructions,
+            inspect,
+            points,
+            frames,
+            ingest,
+            render,
+            tracks,
+            parts,
+            gaussians,
+            stream,
+            budget,
+            tradeoff,
+        ),
         *(estimate, tickets, health, metrics, viewer),
     )
     for resource in resources:

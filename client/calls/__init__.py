@@ -10,13 +10,25 @@ from client.calls.call import Call
 from client.calls.frames import close_frame, declare_missing, frame, frames, ply, put_camera, put_frame
 from client.calls.gaussians import gaussians
 from client.calls.parts import parts
-from client.calls.scenes import create_scene, delete_scene, estimate, pause, put_points, resume, rig, scene, scenes
+from client.calls.scenes import (
+    begin_again,
+    create_scene,
+    delete_scene,
+    estimate,
+    pause,
+    put_points,
+    resume,
+    rig,
+    scene,
+    scenes,
+)
 from client.calls.service import live, metrics, ready, ticket
 from client.calls.tracks import tracks, tracks_arrays
 from client.calls.views import render, render_arrays, render_file
 
 __all__ = [
     "Call",
+    "begin_again",
     "budget",
     "close_frame",
     "create_scene",

@@ -1,4 +1,4 @@
-"""Calls on scenes: create, read, pause, resume, delete; the initial points of frame 0."""
+"""Calls on scenes: create, read, pause, resume, begin again, delete; the initial points of frame 0."""
 
 from __future__ import annotations
 
@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.calls.call import NPZ, Call, body, nothing, path, reads
-from client.wire import IngestSettings, PointsReceipt, RigModel, SceneCreate, SceneList, SceneStatus
+from client.wire import (
+    IngestSettings,
+    PointsReceipt,
+    ReconstructionRequest,
+    RigModel,
+    SceneCreate,
+    SceneList,
+    SceneStatus,
+)
 from client.wire.estimate import SceneEstimate
 from scas4d_core.cameras import Rig
 from scas4d_core.captures import InitialPoints
@@ -120,8 +128,48 @@ def delete_scene(id: str) -> Call[None]:
     return Call("DELETE", path(id), nothing)
 
 
-def put_points(id: str, points: InitialPoints) -> Call[PointsReceipt]:
+def begin_again(
+    id: str,
+    n: int,
+    *,
+    settings: Mapping[str, Any] | None = None,
+    frame: int | None = None,
+    points: bool = True,
+    discard: bool = False,
+) -> Call[SceneStatus]:
+    """Begins the reconstruction of a scene anew, after a first frame that failed or came out poor.
+
+    Frames from the first one on are updated again, as far as their pictures are held; ids begin anew.
+
+    Args:
+        id: of the scene.
+        n: number of the new reconstruction, `scene(id).reconstruction + 1`: so it is begun once, however often this is
+            sent.
+        settings: what changes of the scene's settings, nested.
+        frame: to begin with, here or still to come; None: as before. Those before it are set aside.
+        points: begin from the scene's points (`put_points`), False: from the pictures alone.
+        discard: drop committed states; must be True where a frame after the first is committed.
+
+    >>> new = client.create_scene(rig)
+    >>> receipt = client.put_frame(new.id, 0, pictures)
+    >>> report = client.wait(new.id, 0)
+    >>> again = client.begin_again(new.id, 1, settings={"update": {"iterations": 50}})
+    >>> again.reconstruction, again.settings["update"]["iterations"]
+    (1, 50)
+    >>> client.wait(new.id, 0).state
+    <FrameState.COMMITTED: 'committed'>
+    >>> client.delete_scene(new.id)
+    """
+    request = ReconstructionRequest(settings=dict(settings or {}), frame=frame, points=points, discard=discard)
+    return Call("PUT", path(id, "reconstructions", n), reads(SceneStatus), arguments=body(request))
+
+
+def put_points(id: str, points: InitialPoints, *, reconstruction: int | None = None) -> Call[PointsReceipt]:
     """Sends the initial points of frame 0; to be sent before it.
+
+    Args:
+        id: of the scene. points: in the rig's world and units.
+        reconstruction: number of the one that is to begin from them (`begin_again`); None: the scene's own.
 
     >>> from scas4d_core.captures import InitialPoints
     >>> new = client.create_scene(rig)
@@ -135,5 +183,7 @@ def put_points(id: str, points: InitialPoints) -> Call[PointsReceipt]:
         arrays["foreground"] = points.foreground
     file = io.BytesIO()
     np.savez_compressed(file, allow_pickle=False, **arrays)
-    arguments = {"content": file.getvalue(), "headers": {"Content-Type": NPZ}}
+    arguments: dict[str, Any] = {"content": file.getvalue(), "headers": {"Content-Type": NPZ}}
+    if reconstruction is not None:
+        arguments["params"] = {"reconstruction": reconstruction}
     return Call("PUT", path(id, "points"), reads(PointsReceipt), arguments=arguments)

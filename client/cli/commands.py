@@ -1,4 +1,4 @@
-"""`scas4d push`, `import`, `scenes`, `watch`, `budget`: commands that talk to a service or prepare a capture for it."""
+"""Commands that talk to a service, or prepare a capture for it: `scas4d push`, `scenes`, `watch`, `begin-again` …"""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from client import rig
@@ -15,6 +16,7 @@ from client.cli.progress import Bars, console
 from client.importers.open_source import CaptureOptions
 from client.sdk import DEFAULT_URL, Client
 from client.wire import FINISHED, FrameReportModel, IngestSettings
+from scas4d_core.captures import InitialPoints
 from scas4d_core.frame_outcome import AlarmKind
 
 PUSH_OUTAGE_S = 600.0
@@ -197,6 +199,49 @@ def budget(
     console.print(f"{many} a frame{stops}; still {now.still:g}; from frame {found.since} on", highlight=False)
 
 
+def begin_again(
+    scene: Scene,
+    frame: Annotated[
+        int | None, typer.Option(min=0, help="The frame to begin with, here or still to come; as before without it.")
+    ] = None,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="NAME=VALUE", help="Change a setting, as static.iterations=3000. May be repeated."
+        ),
+    ] = None,
+    points: Annotated[
+        Path | None,
+        typer.Option(help="npz with positions and colours (and foreground) to begin from; the scene's own without it."),
+    ] = None,
+    no_points: Annotated[bool, typer.Option("--no-points", help="Begin from the pictures alone.")] = False,
+    discard: Annotated[bool, typer.Option("--discard", help="Drop the frames that are committed.")] = False,
+    url: Url = DEFAULT_URL,
+    token: Token = None,
+) -> None:
+    """Begins the reconstruction of a scene anew, after a first frame that failed or came out poor."""
+    if points is not None and no_points:
+        raise ValueError("--points and --no-points contradict each other; give one of them")
+    settings = parse_changes(changes)
+    with Client(url, token=token) as client:
+        number = client.scene(scene).reconstruction + 1
+        if points is not None:
+            with np.load(points, allow_pickle=False) as file:
+                given = {name: file[name] for name in ("positions", "colours", "foreground") if name in file}
+            if missing := {"positions", "colours"} - given.keys():
+                raise ValueError(
+                    f"{points} has no {' and no '.join(sorted(missing))}; write numpy.savez(positions=…, colours=…)"
+                )
+            client.put_points(scene, InitialPoints(**given), reconstruction=number)
+        status = client.begin_again(
+            scene, number, settings=settings, frame=frame, points=not no_points, discard=discard
+        )
+    console.print(
+        f"scene {scene} begins anew with frame {status.first_frame}, reconstruction {number}; {status.queued} queued",
+        highlight=False,
+    )
+
+
 @takes_capture
 def import_(
     capture: CaptureFolder,
@@ -247,3 +292,4 @@ def register(app: typer.Typer) -> None:
     app.command()(scenes)
     app.command()(watch)
     app.command()(budget)
+    app.command()(begin_again)

@@ -75,6 +75,31 @@ class SceneCreate(Model):
     ingest: IngestSettings = IngestSettings()
 
 
+class ReconstructionRequest(Model):
+    """Another beginning of a scene's reconstruction, from its first frame on, in place of the one before."""
+
+    settings: dict[str, Any] = Field(
+        default_factory=dict, description="What changes of the scene's settings, nested, as when a scene is created."
+    )
+    frame: int | None = Field(
+        default=None,
+        strict=True,
+        ge=0,
+        le=1_000_000_000,
+        description="The frame to begin with, here or still to come; null: as before. Those before it are set aside.",
+    )
+    points: bool = Field(
+        default=True,
+        strict=True,
+        description="Begin from the scene's points, the newest that were sent; false: from the pictures alone.",
+    )
+    discard: bool = Field(
+        default=False,
+        strict=True,
+        description="Drop committed states; must be true where a frame after the first is committed.",
+    )
+
+
 class SceneState(StrEnum):
     """State of a scene."""
 
@@ -119,7 +144,8 @@ class SceneStatus(Model):
         "awaiting_first_frame: nothing to do yet. initialising: frame 0 is being reconstructed. ready: "
         "idle, the last frame was committed whole. updating: a later frame is being reconstructed. paused: it takes "
         "frames and reconstructs none. degraded: the scene goes on, but its last frame lost a camera, was held or "
-        "was set aside, or its worker is being restarted; `error` says why. failed: it takes no more frames."
+        "was set aside, or its worker is being restarted; `error` says why. failed: it takes no more frames until its "
+        "reconstruction is begun anew (PUT …/reconstructions/{n})."
     )
     error: str | None = Field(default=None, description="Why the scene is failed or degraded.")
     progress: ProgressModel | None = Field(default=None, description="While initialising.")
@@ -132,6 +158,12 @@ class SceneStatus(Model):
     first_committed: int | None
     last_committed: int | None
     gaussians: int | None
+    reconstruction: int = Field(
+        default=0, description="Number of its reconstruction: one more each time that it was begun anew."
+    )
+    first_frame: int = Field(
+        default=0, description="The reconstruction begins with this frame; those before it are set aside."
+    )
     paused: bool = Field(
         default=False, description="It begins no further frame, whatever `state` says: one may still be at work."
     )
@@ -147,7 +179,7 @@ class SceneStatus(Model):
     set_aside: int = Field(default=0, description="Frames that were taken and could not be reconstructed.")
     missing: int = Field(default=0, description="Frames that were declared missing.")
     skipped: int = Field(default=0, description="Frames that were skipped because the queue was full.")
-    worker_deaths: int = Field(default=0, description="Since the service started.")
+    worker_deaths: int = Field(default=0, description="Since the service started or the reconstruction began.")
     frames_held: int = Field(default=0, description="Frames whose pictures are in the frame log.")
     frame_bytes: int = Field(default=0, description="Of the frame log on disk.")
     states_deleted: int = Field(default=0, description="Committed states that retention has deleted.")
@@ -182,3 +214,4 @@ class PointsReceipt(Model):
 
     points: int
     sha256: str
+    reconstruction: int = Field(default=0, description="The number of the reconstruction that begins from them.")

@@ -27,6 +27,8 @@ _PREFIX = struct.Struct("<4sI")
 
 SCENE_GONE = 4404
 """Close code: the scene was deleted."""
+SCENE_RESTARTS = 1012
+"""Close code: the scene's reconstruction is begun anew, or the service restarts; connect again."""
 TOO_BIG = 1009
 """Close code: a message larger than `StreamLimits.message_bytes`."""
 

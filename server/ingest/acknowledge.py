@@ -181,6 +181,8 @@ class Ingest:
         for index in (index for one in skipped for index in one.frames):
             self.ended(index)
         metrics.FRAMES.labels("acknowledged").inc()
+        if self.ledger.frames[event.index].finished:  # it comes before the first frame
+            self.ended(event.index)
         receipt = self.ledger.frames[event.index].receipt
         assert receipt is not None
         return receipt
@@ -223,7 +225,8 @@ class Ingest:
                 f"the scene has failed: {self.ledger.fatal}",
                 field="id",
                 value=self.ledger.scene,
-                remedy="delete the scene and create it anew",
+                remedy="begin its reconstruction anew: PUT …/reconstructions/"
+                f"{self.ledger.reconstruction + 1}, or delete the scene and create it anew",
                 state=SceneState.FAILED,
             )
 
@@ -255,7 +258,7 @@ class Ingest:
         """True where the queue accepts one more frame, if need be by skipping others."""
         if self.ledger.unfinished < self.rules.queue_frames:
             return True
-        return self.rules.when_full == "skip" and bool(self.ledger.waiting())
+        return self.rules.when_full == "skip" and bool(self._skippable())
 
     def full(self, index: int) -> Problem:
         """Makes the answer of a full queue: 429, with the predicted time until the frame at work ends.
@@ -284,7 +287,13 @@ class Ingest:
         """Returns the event that skips waiting frames to make room for a frame, where the queue is full."""
         if self.ledger.unfinished < self.rules.queue_frames:
             return []
-        return [FramesSkipped(frames=tuple(self.ledger.waiting()), by=index)]
+        return [FramesSkipped(frames=self._skippable(), by=index)]
+
+    def _skippable(self) -> tuple[int, ...]:
+        """Lists the waiting frames; not the one that somebody asked to begin with."""
+        ledger = self.ledger
+        asked_for = None if ledger.begun is None or ledger.committed else ledger.begun.index
+        return tuple(index for index in ledger.waiting() if index != asked_for)
 
     def _known(self, index: int, identity: str) -> FrameReceipt:
         """Returns the receipt of a known frame, if it has the same content.

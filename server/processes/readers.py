@@ -34,7 +34,7 @@ from server.processes.messages import (
     TracksQuery,
     asked,
 )
-from server.processes.placement import Entry, Placement, Process
+from server.processes.placement import STOP_SECONDS, Entry, Placement, Process
 
 GRACE_VIEWS_S, GRACE_BULK_S = 10.0, 1.0
 """A process may go on for so long with a cancelled query: a new process takes a second or two to start."""
@@ -156,8 +156,8 @@ class QueryQueue:
         else:
             self._stale.update(frames)
 
-    async def stop(self) -> None:
-        """Ends the process, at once if it is busy; queries that wait, and later ones, are refused."""
+    async def stop(self, seconds: float) -> None:
+        """Ends the process within `seconds`, at once if it is busy; queries that wait, and later ones, are refused."""
         self._closed = True
         if self._pause is not None:
             self._pause.cancel()
@@ -165,7 +165,7 @@ class QueryQueue:
         process, busy = self.process, self._at_work is not None
         self.process = self._at_work = None
         if process is not None:
-            await (process.stop(0) if busy else process.stop())
+            await process.stop(0 if busy else seconds)
         await asyncio.gather(*self._ending)
         for turn in turns:
             turn.end(Refused(turn.number, "the scene has ended", status=503))
@@ -285,11 +285,11 @@ class Readers:
         self.views.refresh(frames)
         self.bulk.refresh(frames)
 
-    async def stop(self) -> None:
-        """Ends the processes; queries that wait are refused."""
+    async def stop(self, seconds: float = STOP_SECONDS) -> None:
+        """Ends the processes within `seconds`; queries that wait are refused."""
         for task in self._finding.values():
             task.cancel()
-        await asyncio.gather(self.views.stop(), self.bulk.stop())
+        await asyncio.gather(self.views.stop(seconds), self.bulk.stop(seconds))
 
     async def _tracks(self, query: TracksQuery) -> Answer:
         """Answers a track query; a long one in pieces, so that others come in between."""

@@ -30,8 +30,7 @@ def _settings(request: Request) -> ServerSettings:
 
 
 def _scene(request: Request, id: Annotated[str, Path(max_length=64)]) -> Scene:
-    scenes = _scenes(request)
-    return scenes.by_id.get(id) or scenes.refuse(id)
+    return _scenes(request)[id]
 
 
 AllScenes = Annotated[Scenes, Depends(_scenes)]

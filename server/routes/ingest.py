@@ -18,6 +18,7 @@ from client.wire import (
     parse_head,
 )
 from client.wire.framing import PREFIX
+from client.wire.stream import SCENE_GONE, SCENE_RESTARTS
 from server import problems
 from server.connections.websocket import limit_messages
 from server.ingest.camera_files import receive_camera
@@ -32,7 +33,6 @@ router = APIRouter(prefix="/v1/scenes", tags=["frames"])
 
 log = logging.getLogger("scas4d.server")
 
-SCENE_GONE = 4404
 UNSUPPORTED = 1003
 AHEAD = 1
 """Messages that wait while one is being taken; one more is in the hands of uvicorn."""
@@ -83,7 +83,8 @@ async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:
             except Problem as problem:
                 await taking.join()
                 await socket.send_text(_refusal(None, problem).model_dump_json())
-                await socket.close(SCENE_GONE, "the scene is not here")
+                away = problem.status_code == 503
+                await socket.close(SCENE_RESTARTS if away else SCENE_GONE, "the scene is not here")
                 return
             head = _head(data)
             whole = isinstance(head, FrameHead) and not head.part

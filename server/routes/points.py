@@ -6,10 +6,10 @@ import asyncio
 import hashlib
 import io
 import zipfile
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Query, Request
 from numpy.typing import NDArray
 
 from client.wire import PointsReceipt
@@ -18,6 +18,7 @@ from scas4d_core.storage.npz import write_npz
 from server.problems import Problem, counted, of_rig
 from server.routes.access import TheScene
 from server.storage.disk import full_disk, no_room
+from server.storage.points import points_sha256
 
 MOST_POINTS = 2_000_000
 """Points of an initial cloud: twenty times the Gaussians that a scene can have, and 100 MB to check."""
@@ -33,11 +34,18 @@ BODY: dict[str, Any] = {
 
 
 @router.put("/{id}/points", openapi_extra=BODY)
-async def put(scene: TheScene, request: Request) -> PointsReceipt:
+async def put(
+    scene: TheScene,
+    request: Request,
+    reconstruction: Annotated[
+        int | None, Query(ge=0, description="Its number: the scene's, if not given, or the next one, to be begun.")
+    ] = None,
+) -> PointsReceipt:
     """Takes the cloud that frame 0 starts from; it has to come before frame 0.
 
     The body is an npz: `positions` [P, 3] in the rig's world and units, `colours` [P, 3] in 0…1, and optionally
-    `foreground` [P] in 0…1. The same body again gets the same answer.
+    `foreground` [P] in 0…1. The same body again gets the same answer. For a reconstruction that is to be begun anew
+    it comes before `PUT …/reconstructions/{n}`, with `reconstruction=n`.
     """
     body = await request.body()
     sha256 = hashlib.sha256(body).hexdigest()
@@ -46,27 +54,46 @@ async def put(scene: TheScene, request: Request) -> PointsReceipt:
         await asyncio.to_thread(check_points, scene.rig, arrays["positions"])
     except RigError as error:
         raise of_rig(error) from None
-    receipt = PointsReceipt(points=len(arrays["positions"]), sha256=sha256)
+    own = scene.ledger.reconstruction
+    number = own if reconstruction is None else reconstruction
+    receipt = PointsReceipt(points=len(arrays["positions"]), sha256=sha256, reconstruction=number)
     async with scene.log.lock:
-        if scene.points_sha256 == sha256:
+        file = scene.spec.folder.points if number == own else scene.spec.folder.points_of(number)
+        if number in (own, own + 1) and await asyncio.to_thread(points_sha256, file) == sha256:
             return receipt
-        if scene.next_frame > 0:
-            raise Problem(
-                409,
-                "the first frame is here already, and started without these points",
-                field="points",
-                remedy="create a new scene and give the points before frame 0",
-            )
+        check_number(number, own, scene.next_frame)
         stored = {**arrays, "sha256": np.frombuffer(bytes.fromhex(sha256), np.uint8)}
         try:
-            await asyncio.to_thread(write_npz, scene.spec.folder.points, stored)
+            await asyncio.to_thread(write_npz, file, stored)
         except Exception as error:
             if no_room(error):
                 raise full_disk(error) from None
             raise
-        scene.points_sha256 = sha256
-        scene.warnings = await asyncio.to_thread(pose_warnings, scene.rig, arrays["positions"])
+        if number == own:
+            scene.points_sha256 = sha256
+            scene.warnings = await asyncio.to_thread(pose_warnings, scene.rig, arrays["positions"])
     return receipt
+
+
+def check_number(number: int, own: int, next_frame: int) -> None:
+    """Refuses points of a reconstruction that has begun, or that is not the next.
+
+    Raises:
+        Problem: 409.
+    """
+    if number == own + 1 or (number == own == 0 and next_frame == 0):
+        return
+    fault = f"reconstruction {number} comes after another one: the scene's is {own}"
+    if number <= own:
+        fault = "the first frame is here already, and started without these points"
+    raise Problem(
+        409,
+        fault,
+        field="points" if number <= own else "reconstruction",
+        value=number,
+        remedy=f"send them with ?reconstruction={own + 1}, then begin anew from them: PUT …/reconstructions/{own + 1}",
+        expected=own + 1,
+    )
 
 
 def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:

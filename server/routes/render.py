@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
 
+from client import __version__
 from client.wire import MAX_PIXELS_A_SIDE, RenderFormat, RenderKind, RenderRequest
 from server.problems import Problem, counted
 from server.processes.messages import RenderQuery
@@ -64,10 +65,19 @@ async def render_by_name(
 
 async def _answer(scene: Scene, request: Request, view: RenderRequest) -> Response:
     """Checks the request and asks the reader."""
-    found = await ask(request, scene, query_of(scene, view))
-    # The last frame is another one in a moment; one that was named stays what it is.
-    caching = "no-store" if view.frame is None else "private, max-age=60"
-    return Response(found.body, media_type=found.media_type, headers={**found.headers, "Cache-Control": caching})
+    query = query_of(scene, view)
+    # The last frame is another one in a moment, and parts are found anew. A frame that was named stays what it is until
+    # the reconstruction is begun anew: it may be kept, but not shown before it was asked whether it still is.
+    keep = {"Cache-Control": "no-store"}
+    if view.frame is not None and RenderKind.PARTS not in view.kinds:
+        keep = {
+            "Cache-Control": "private, no-cache",
+            "ETag": f'W/"{__version__}-{scene.ledger.reconstruction}-{view.frame}"',
+        }
+        if request.method == "GET" and request.headers.get("if-none-match") == keep["ETag"]:
+            return Response(status_code=304, headers=keep)
+    found = await ask(request, scene, query)
+    return Response(found.body, media_type=found.media_type, headers={**found.headers, **keep})
 
 
 def query_of(scene: Scene, request: RenderRequest) -> RenderQuery:

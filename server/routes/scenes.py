@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from fastapi import APIRouter, Response
 
 from client.wire import SceneCreate, SceneList, SceneStatus
@@ -13,19 +16,27 @@ from server.health import devices, estimate
 from server.http import validation
 from server.problems import Problem, of_rig
 from server.routes.access import AllScenes, TheScene, TheSettings
+from server.settings import ServerSettings
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
 
 def scene_settings(request: SceneCreate) -> Settings:
     """The preset with the request's changes."""
-    try:
+    with setting_problems():
         return preset(request.preset, request.settings)
+
+
+@contextmanager
+def setting_problems() -> Iterator[None]:
+    """Answers wrong settings with a problem."""
+    try:
+        yield
     except SettingError as error:
         if error.validation is not None:
             raise validation.first_of(error.validation, model=Settings, prefix="settings") from None
         unknown = error.setting == "preset"
-        fault = f"there is no preset {request.preset!r}" if unknown else error.fault
+        fault = f"there is no preset {error.value!r}" if unknown else error.fault
         field = error.setting if unknown else f"settings.{error.setting}"
         raise Problem(422, fault, field=field, value=str(error.value), remedy=error.remedy) from None
 
@@ -43,6 +54,13 @@ def check_rig(request: SceneCreate, settings: Settings) -> None:
         raise Problem(422, error.fault, field=field, value=unit, remedy=error.remedy) from None
 
 
+async def check_settings(request: SceneCreate, settings: Settings, server: ServerSettings) -> None:
+    """Refuses settings that cannot work with the rig or on this machine."""
+    check_rig(request, settings)
+    estimate.check(request.rig, settings, server)
+    await devices.require(settings.device)
+
+
 @router.post("", status_code=201)
 async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, response: Response) -> SceneStatus:
     """Creates a scene from a rig; it waits for its first frame."""
@@ -57,9 +75,7 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
                 value=f"{camera.width}x{camera.height}",
                 remedy="send smaller pictures with the intrinsics to match, or raise SCAS4D_MAX_IMAGE_PIXELS",
             )
-    check_rig(request, settings)
-    estimate.check(request.rig, settings, server)
-    await devices.require(settings.device)
+    await check_settings(request, settings, server)
     scene = await scenes.create(request, settings)
     response.headers["Location"] = f"/v1/scenes/{scene.id}"
     return scene.status()

@@ -9,7 +9,7 @@ import logging
 from fastapi import APIRouter, WebSocket
 from starlette.websockets import WebSocketDisconnect, WebSocketState
 
-from client.wire.stream import SCENE_GONE, STREAM_PROTOCOL, TOO_BIG
+from client.wire.stream import STREAM_PROTOCOL, TOO_BIG
 from server import problems
 from server.connections.websocket import limit_messages
 from server.problems import Problem
@@ -93,4 +93,4 @@ async def _write(websocket: WebSocket, subscriber: Subscriber) -> None:
     await subscriber.outbox.empty_into(send)
     if websocket.application_state == WebSocketState.CONNECTED:
         with contextlib.suppress(RuntimeError):
-            await websocket.close(SCENE_GONE, "the scene was deleted")
+            await websocket.close(*subscriber.closing)

@@ -13,15 +13,17 @@ from client.wire import Budget, FrameReportModel, FrameState, SceneBudget, Scene
 from scas4d_core.cameras import Camera
 from scas4d_core.errors import message_of
 from scas4d_core.first_frame.calibration.record import in_use
+from scas4d_core.frame_outcome import first_warnings
 from scas4d_core.rig_checks import RigError, check_start, pose_warnings
 from server.ingest.acknowledge import Ingest, IngestRules, uncancelled
 from server.ingest.open_frames import OpenFrames
 from server.problems import Problem, of_rig
 from server.processes.messages import SceneSpec
-from server.processes.placement import Placement
+from server.processes.placement import STOP_SECONDS, Placement
 from server.processes.readers import Readers
 from server.repair.mending import DamageKind, DamageLog
 from server.repair.scrub import Scrub
+from server.scene.beginning import how_to_begin_again
 from server.scene.replays import Replays
 from server.scene.status import FrameReports, camera_of, effective_budget, effects_of, state_of
 from server.scene.supervision import Background
@@ -158,7 +160,9 @@ class Scene:
     @property
     def error(self) -> str | None:
         """Sentence that says why the scene is failed or degraded, or None."""
-        return self.ledger.fatal or self.updates.trouble or self.updates.mending.trouble
+        if self.ledger.fatal is not None:
+            return f"{self.ledger.fatal}; {how_to_begin_again(self.ledger)}"
+        return self.updates.trouble or self.updates.mending.trouble
 
     @property
     def state(self) -> SceneState:
@@ -183,6 +187,8 @@ class Scene:
             first_committed=ledger.committed[0] if ledger.committed else None,
             last_committed=ledger.committed[-1] if ledger.committed else None,
             gaussians=updates.gaussians,
+            reconstruction=ledger.reconstruction,
+            first_frame=ledger.frames.first,
             paused=ledger.paused,
             degraded=self.error is not None and ledger.fatal is None,
             open_frames=sorted(ledger.open),
@@ -195,7 +201,7 @@ class Scene:
             states_deleted=ledger.states_deleted,
             effects=effects_of(self.spec.settings, self._newest_record),
             damage=self._damage.sentences,
-            warnings=[*self.warnings, *updates.first_warnings],
+            warnings=[*self.warnings, *first_warnings(updates.first)],
             created=self.created.isoformat(),
             ingest=self.request.ingest,
             settings=self.spec.settings.model_dump(mode="json"),
@@ -296,12 +302,13 @@ class Scene:
         await uncancelled(change())
         self.updates.begin()
 
-    async def stop(self) -> None:
-        """Ends the processes of the scene; its folder stays."""
+    async def stop(self, seconds: float = STOP_SECONDS) -> None:
+        """Ends the processes of the scene; its folder stays. They have `seconds` to end by themselves."""
         self.open_frames.stop()
         self.updates.stop()
         self._background.cancel()
-        await asyncio.gather(self.updates.stop_worker(), self.readers.stop(), self.replays.stop())
+        await asyncio.gather(self.updates.stop_worker(seconds), self.readers.stop(seconds), self.replays.stop())
+        self._background.cancel()  # what the last messages of the processes began
         await self.log.journal.close()
 
     # Events.

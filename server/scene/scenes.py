@@ -1,25 +1,25 @@
-"""All scenes of the service: creates, recovers and deletes them, so that no power cut leaves half a scene."""
+"""All scenes of the service: creates, recovers, begins again and deletes them; no power cut leaves half a scene."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import secrets
 import shutil
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NoReturn
-
-import numpy as np
-from numpy.typing import NDArray
 
 from client.wire import SceneCreate
 from scas4d_core.errors import message_of
 from scas4d_core.rig_checks import pose_warnings
 from scas4d_core.settings import Settings
-from scas4d_core.storage.npz import read_npz, sync_folder
+from scas4d_core.storage.npz import sync_folder
 from server.problems import Problem, counted
 from server.processes.placement import Placement
+from server.scene.beginning import Beginning
 from server.scene.scene import Scene
 from server.settings import ServerSettings
 from server.storage.definition import (
@@ -33,7 +33,8 @@ from server.storage.disk import FolderLock, full_disk, no_room
 from server.storage.events import SceneCreated
 from server.storage.journal import Journal
 from server.storage.layout import DataFolder, SceneFolder
-from server.storage.recovery import recover
+from server.storage.points import points_positions, points_sha256
+from server.storage.recovery import Recovered, recover
 from server.stream.hub import Hub
 
 __all__ = ["Scene", "Scenes"]
@@ -75,6 +76,9 @@ class Scenes:
         self._found: list[str] = []
         """Folders found at the start; those in `by_id` or `unreadable` are recovered."""
         self._recovering: asyncio.Task[None] | None = None
+        self._beginning: dict[str, asyncio.Task[None]] = {}
+        """Scenes whose reconstruction is being begun anew."""
+        self._sweeping: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
         """Finds the scenes of the data folder; recovers them in the background, as a journal may be that of a day.
@@ -101,15 +105,22 @@ class Scenes:
 
     async def _recover(self) -> None:
         """Recovers the scenes that were found, one after the other, and finishes interrupted deletions."""
-        graves = list(self._data.deleted.iterdir())
         for name in self._found:
             try:
                 await self._restore(self._data.scene(name))
             except Exception as error:  # a fault of one scene is no fault of the others
                 self.unreadable[name] = f"the service failed: {type(error).__name__}: {message_of(error)}"
                 log.exception("scene %s cannot be recovered", name)
-        for path in graves:
-            await asyncio.to_thread(shutil.rmtree, path, ignore_errors=True)
+        await asyncio.to_thread(self._sweep)
+
+    def _sweep(self) -> None:
+        """Removes what was moved to the deleted ones."""
+        for path in self._data.deleted.iterdir():
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                with contextlib.suppress(OSError):
+                    path.unlink()
 
     def check_recovered(self, id: str | None = None) -> None:
         """Checks that the scenes found at the start, or one of them, are recovered.
@@ -130,7 +141,8 @@ class Scenes:
             recovering=missing,
         )
 
-    async def _restore(self, folder: SceneFolder) -> None:
+    async def _restore(self, folder: SceneFolder, said: Sequence[str] = ()) -> None:
+        """Recovers a scene from its folder; `said`: of damage found before."""
         try:
             definition, damage = await asyncio.to_thread(read_definition, folder)
             if definition.id != folder.name:
@@ -138,7 +150,9 @@ class Scenes:
             if damage is not None:
                 await asyncio.to_thread(write_definition, folder, definition)
             found = await asyncio.to_thread(recover, folder, definition.id, definition.as_json())
-            found.damage[:0] = [damage] if damage is not None else []
+            before = [*said, damage] if damage is not None else said
+            found.damage[:0] = [sentence for sentence in dict.fromkeys(before) if sentence not in found.damage]
+            folder, definition = found.folder, await self._begun(found, definition)
             scene = Scene(definition, folder, found, self.server, self.placement, self.hub)
             scene.points_sha256 = await asyncio.to_thread(points_sha256, folder.points)
             if (positions := await asyncio.to_thread(points_positions, folder.points)) is not None:
@@ -151,6 +165,70 @@ class Scenes:
         for sentence in found.damage:
             log.warning("scene %s: %s", definition.id, sentence)
         self.by_id = dict(sorted([*self.by_id.items(), (scene.id, scene)], key=lambda item: item[1].created))
+
+    async def _begun(self, found: Recovered, definition: Definition) -> Definition:
+        """Follows the reconstruction that was begun last: the definition, and the folder without what was before it."""
+        folder, event = found.folder, found.ledger.begun
+        if (now := definition.after(event)) is not definition:
+            try:
+                await asyncio.to_thread(write_definition, folder, now)
+            except OSError as error:  # the journal has it, and the next start writes it
+                if not no_room(error):
+                    raise
+        for path in await asyncio.to_thread(folder.leftovers, event):
+            await asyncio.to_thread(self._bury, path, f"{folder.name}-{path.name}")
+        return now
+
+    async def begin_again(self, id: str, beginning: Beginning) -> Scene:
+        """Begins the reconstruction of a scene anew; the same request again returns the scene as it is.
+
+        The scene is stopped, the event journalled, and the scene recovered from its folder, as after a crash; until
+        then it answers 503. A refusal leaves it as it was.
+
+        Raises:
+            Problem: see `Beginning.event`; 507, the disk is full.
+        """
+        scene = self[id]
+        if beginning.event(scene.ledger, scene.spec.folder) is None:
+            return scene
+        self._beginning[id] = task = asyncio.create_task(self._begin_again(scene, beginning))
+        task.add_done_callback(lambda _: self._beginning.pop(id))
+        await asyncio.shield(task)
+        return self.by_id.get(id) or self.refuse(id)
+
+    async def _begin_again(self, scene: Scene, beginning: Beginning) -> None:
+        self.hub.restart(scene.id)
+        await scene.stop(0)
+        folder, said = self._data.scene(scene.id), scene.status().damage
+        try:
+            said += await self._journal_beginning(folder, beginning)
+        finally:
+            await self._restore(folder, said)
+            if self.by_id.get(scene.id) is scene:  # it cannot be read
+                del self.by_id[scene.id]
+        self._sweeping = asyncio.create_task(asyncio.to_thread(self._sweep))
+
+    async def _journal_beginning(self, folder: SceneFolder, beginning: Beginning) -> list[str]:
+        """Journals the beginning of a scene that is stopped, if it still may: a frame may have been committed since.
+
+        Returns:
+            Sentences about damage that was found.
+        """
+        definition, _ = await asyncio.to_thread(read_definition, folder)
+        found = await asyncio.to_thread(recover, folder, definition.id, definition.as_json())
+        event = beginning.event(found.ledger, found.folder)
+        assert event is not None
+        journal = Journal(folder.journal, found.good)
+        try:
+            await journal.append(event)
+        except OSError as error:
+            if no_room(error):
+                raise full_disk(error) from None
+            raise
+        finally:
+            await journal.close()
+        log.warning("scene %s begins reconstruction %d with frame %d", folder.name, event.number, event.index)
+        return found.damage
 
     async def create(self, request: SceneCreate, settings: Settings) -> Scene:
         """Creates a scene and starts its processes; the scene is on disk when this returns.
@@ -198,6 +276,20 @@ class Scenes:
         await asyncio.to_thread(write_definition, folder, definition)
 
     def __getitem__(self, id: str) -> Scene:
+        """Returns a scene.
+
+        Raises:
+            Problem: see `refuse`; 503, its reconstruction is being begun anew.
+        """
+        if id in self._beginning:
+            raise Problem(
+                503,
+                "the reconstruction of this scene is being begun anew",
+                field="id",
+                value=id,
+                remedy="ask again",
+                headers={"Retry-After": "1"},
+            )
         if id not in self.by_id:
             self.refuse(id)
         return self.by_id[id]
@@ -222,35 +314,23 @@ class Scenes:
         await asyncio.to_thread(self._remove, scene.spec.folder.path)
 
     def _remove(self, folder: Path) -> None:
-        grave = self._data.deleted / f"{folder.name}-{secrets.token_hex(4)}"
-        folder.rename(grave)
+        shutil.rmtree(self._bury(folder, folder.name), ignore_errors=True)
+
+    def _bury(self, path: Path, name: str) -> Path:
+        """Moves a file or a folder to the deleted ones; returns its new path."""
+        grave = self._data.deleted / f"{name}-{secrets.token_hex(4)}"
+        path.rename(grave)
         sync_folder(self._data.deleted)
-        sync_folder(self._data.scenes)
-        shutil.rmtree(grave, ignore_errors=True)
+        sync_folder(path.parent)
+        return grave
 
     async def stop(self) -> None:
         """Ends all processes; the folders stay."""
         if self._recovering is not None:
             self._recovering.cancel()
             await asyncio.wait([self._recovering])
+        if self._beginning:
+            await asyncio.wait(self._beginning.values())
         await asyncio.gather(*(scene.stop() for scene in self.by_id.values()))
         if self._lock is not None:
             self._lock.release()
-
-
-def points_sha256(path: Path) -> str | None:
-    """Returns the SHA-256 of the request body that a scene's points arrived in, or None where it has no points."""
-    try:
-        return bytes(read_npz(path, ("sha256",))["sha256"]).hex()
-    except FileNotFoundError:
-        return None
-    except ValueError:
-        return ""
-
-
-def points_positions(path: Path) -> NDArray[np.float64] | None:
-    """Returns the positions [P, 3] of a scene's points, or None where it has none that can be read."""
-    try:
-        return np.asarray(read_npz(path, ("positions",))["positions"], np.float64)
-    except (FileNotFoundError, ValueError):
-        return None

@@ -29,7 +29,7 @@ def state_of(ledger: Ledger, *, at_work: bool, degraded: bool) -> SceneState:
         return SceneState.PAUSED
     if degraded:
         return SceneState.DEGRADED
-    if not ledger.frames and not ledger.open:
+    if ledger.next_frame <= ledger.frames.first and not ledger.open:
         return SceneState.AWAITING
     return SceneState.READY
 

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from typing import Any
 
 from client.wire import FrameReportModel, FrameState, ProgressModel, Retention
-from scas4d_core.frame_outcome import cloud_warnings
 from server.health import metrics
 from server.processes import worker
 from server.processes.messages import (
@@ -123,7 +122,8 @@ class Updates:
         """Gives the worker its next frame, if it is idle and one waits; to be called whenever that may have changed."""
         self.tell(SceneChanged())
         ledger = self._ledger
-        if not self._ready or self._index is not None or self._holding or self.mending.at_work is not None:
+        busy = self._index is not None or self._holding or self.mending.at_work is not None
+        if not self._ready or self._stopping or busy:
             return
         waiting = [] if ledger.paused or ledger.fatal is not None else ledger.waiting()
         if not waiting:
@@ -256,11 +256,6 @@ class Updates:
         if record.get("cloud") or record.get("calibration"):
             self.first = {"cloud": record.get("cloud"), "calibration": record.get("calibration") or {}}
 
-    @property
-    def first_warnings(self) -> list[str]:
-        """What the report of the first frame says to look at, a sentence each."""
-        return [*cloud_warnings(self.first.get("cloud")), *self.first.get("calibration", {}).get("warnings", [])]
-
     async def recall(self) -> None:
         """Reads the first report of a scene that is found again; to be called before anybody asks for it."""
         if self._ledger.committed:
@@ -335,9 +330,9 @@ class Updates:
             self._restart.cancel()
         self.mending.stop()
 
-    async def stop_worker(self) -> None:
-        """Ends the worker; an unfinished frame is updated again after the next start."""
-        await self._worker.stop()
+    async def stop_worker(self, seconds: float) -> None:
+        """Ends the worker, which has `seconds` to do so itself; an unfinished frame is updated again after the next."""
+        await self._worker.stop(seconds)
 
 
 def trouble_of(report: FrameReportModel) -> str | None:

@@ -1,10 +1,13 @@
-"""Definition of a scene: rig, settings, ingest rules. Written once, before the scene is acknowledged."""
+"""Definition of a scene: rig, settings, ingest rules. Written before the scene is acknowledged, and again when its
+reconstruction was begun anew: the journal has that first.
+"""
 
 from __future__ import annotations
 
 import copy
 import json
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -15,7 +18,7 @@ from client.wire import SceneCreate
 from scas4d_core.errors import message_of
 from scas4d_core.settings import Settings
 from scas4d_core.storage.npz import written_whole
-from server.storage.events import JournalEvent, SceneCreated
+from server.storage.events import JournalEvent, ReconstructionBegun, SceneCreated
 from server.storage.journal import replay
 from server.storage.layout import SceneFolder
 
@@ -28,12 +31,29 @@ class DefinitionError(ValueError):
 
 @dataclass(frozen=True)
 class Definition:
-    """A scene as it was created. `settings` are the preset's with the request's changes, as they were then."""
+    """A scene as it was created. `settings` are the preset's with the request's changes, as they were then.
+
+    Where the reconstruction was begun anew, they are the settings of that, and `begun` is its event.
+    """
 
     id: str
     created: datetime
     request: SceneCreate
     settings: Settings
+    begun: ReconstructionBegun | None = None
+
+    def after(self, event: ReconstructionBegun | None) -> Definition:
+        """The definition once the reconstruction was begun anew; the same one where it knows of the event.
+
+        Raises:
+            DefinitionError: this version does not accept its settings.
+        """
+        if event is None or (self.begun is not None and self.begun.number >= event.number):
+            return self
+        try:
+            return replace(self, settings=_within_limits(event.settings), begun=event)
+        except ValueError as error:
+            raise DefinitionError(f"the settings cannot be read: {message_of(error)}") from None
 
     def as_json(self) -> dict[str, Any]:
         """Returns the content of `scene.json`, and of the journal's first event."""
@@ -43,6 +63,7 @@ class Definition:
             "created": self.created.isoformat(),
             "request": self.request.model_dump(mode="json"),
             "settings": self.settings.model_dump(mode="json"),
+            **({} if self.begun is None else {"begun": self.begun.model_dump(mode="json")}),
         }
 
     @classmethod
@@ -60,9 +81,16 @@ class Definition:
                 datetime.fromisoformat(data["created"]).astimezone(UTC),
                 SceneCreate.model_validate(data["request"]),
                 _within_limits(data["settings"]),
+                begun_of(data),
             )
         except (KeyError, TypeError, ValueError) as error:  # pydantic's error is a ValueError
             raise DefinitionError(f"the definition cannot be read: {message_of(error)}") from None
+
+
+def begun_of(data: Mapping[str, Any]) -> ReconstructionBegun | None:
+    """The event in what `as_json` made; None: the reconstruction is that which came with the scene."""
+    begun = data.get("begun")
+    return None if begun is None else ReconstructionBegun.model_validate(begun)
 
 
 def _within_limits(stored: Any) -> Settings:

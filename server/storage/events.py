@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from client.wire import Budget, FileKind
+from client.wire import Budget, FileKind, ReconstructionRequest
 
 Hashes = dict[str, dict[FileKind, str]]
 """BLAKE3 of each file, by camera and kind."""
@@ -123,6 +123,23 @@ class BudgetChanged(_Event):
     budget: Budget
 
 
+class ReconstructionBegun(_Event):
+    """The reconstruction was begun anew, in place of the one before, whose states are read no more.
+
+    Attributes:
+        number: of the reconstruction; the one that came with the scene has 0. index: of its first frame.
+        points: number of the reconstruction whose points it begins from (`SceneFolder.points_of`); None: without.
+        settings: of the scene from now on, whole. asked: the request, to know it again.
+    """
+
+    fact: Literal["begun"] = "begun"
+    number: Annotated[int, Field(ge=1)]
+    index: int
+    points: int | None
+    settings: dict[str, Any]
+    asked: ReconstructionRequest
+
+
 @dataclass
 class OpenFrame:
     """A frame whose cameras send one by one: its `PartAccepted` events, gathered."""
@@ -145,6 +162,18 @@ class OpenFrame:
             self.files.append(part.file)
 
 
+@dataclass(slots=True)
+class Note:
+    """Properties that few frames have."""
+
+    error: str | None = None
+    dropped: dict[str, str] = field(default_factory=dict)
+    own_deaths: int = 0
+    other_deaths: int = 0
+    parts: OpenFrame | None = None
+    """The parts that the frame was closed from, while its pictures are held."""
+
+
 JournalEvent = Annotated[
     SceneCreated
     | FrameAccepted
@@ -157,7 +186,8 @@ JournalEvent = Annotated[
     | StatesDeleted
     | StateFound
     | PauseChanged
-    | BudgetChanged,
+    | BudgetChanged
+    | ReconstructionBegun,
     Field(discriminator="fact"),
 ]
 _adapter: TypeAdapter[JournalEvent] = TypeAdapter(JournalEvent)

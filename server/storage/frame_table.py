@@ -11,19 +11,19 @@ from array import array
 from bisect import bisect_left
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from client.wire import FINISHED, FrameReceipt, FrameReportModel, FrameState
-from scas4d_core.frame_outcome import outcome_of
-from server.storage.events import OpenFrame
+from server.storage.events import Note, OpenFrame
+from server.storage.report_fields import committed_fields
 
 RECORDS_KEPT = 512
 """Records of so many newest commits stay in memory."""
 LOST = "the journal's record of this frame is damaged, and so it is not known what was sent"
+BARE = "the reconstruction was begun anew, and the pictures of this frame were deleted before"
 STATES = tuple(FrameState)
 CODES = {state: code for code, state in enumerate(STATES)}
 TIME, RECEIPT, DELETED, UNREADABLE = 1, 2, 4, 8
@@ -33,47 +33,20 @@ IDENTITY = 32  # bytes
 FEW = 32
 """Up to so many states are removed from the list of committed ones one by one."""
 
-WIRE_NAMES = {"used": "used_cameras", "dropped": "dropped_cameras", "attempts": "tries", "held": "held_gaussians"}
-"""Fields of a commit's record with another name on the wire; all others have the same (a test checks that)."""
-NOT_SENT = frozenset({"index", "time", "publish_seconds", "resumed"})
-"""Fields of a commit's record that are not sent: the table has the first two, the third is added to ``seconds``."""
-
-
-def committed_fields(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of the report on the wire from the record of a commit (`scas4d_core.frame_report.FrameReport.record`)."""
-    sent = {WIRE_NAMES.get(name, name): value for name, value in record.items() if name not in NOT_SENT}
-    found = {name: sent[name] for name in FrameReportModel.model_fields if sent.get(name) is not None}
-    found["outcome"] = outcome_of(record)  # records of earlier versions have it in words alone
-    seconds = {name: float(value) for name, value in found.get("seconds", {}).items()}
-    if "report" in seconds:  # the report before this one was published after its commit
-        seconds["report"] += record.get("publish_seconds") or 0.0
-    seconds.setdefault("total", sum(seconds.values()))
-    return {**found, "seconds": seconds, "loss": [value for value in found.get("loss", []) if value is not None]}
-
-
-@dataclass(slots=True)
-class Note:
-    """Properties that few frames have."""
-
-    error: str | None = None
-    dropped: dict[str, str] = field(default_factory=dict)
-    own_deaths: int = 0
-    other_deaths: int = 0
-    parts: OpenFrame | None = None
-    """The parts that the frame was closed from, while its pictures are held."""
-
 
 class FrameTable:
     """Frames of one scene by index, without gaps.
 
     Attributes:
         counts: frames in each state. committed: rising indices whose state can be read.
+        first: the reconstruction begins with this frame; one before it is set aside, unless it never came.
     """
 
     def __init__(self, scene: str) -> None:
         self.scene = scene
         self.counts = dict.fromkeys(FrameState, 0)
         self.committed: array[int] = array("q")
+        self.first = 0
         self._states = bytearray()
         self._flags = bytearray()
         self._times = array("d")
@@ -115,7 +88,7 @@ class FrameTable:
 
     def states(self) -> NDArray[np.uint8]:
         """[N] places in `STATES`; a copy."""
-        return np.frombuffer(bytes(self._states), np.uint8)
+        return np.frombuffer(bytearray(self._states), np.uint8)
 
     def flagged(self, flag: int) -> NDArray[np.bool_]:
         """[N] true for frames with the flag; a copy."""
@@ -125,8 +98,9 @@ class FrameTable:
     def copy(self) -> FrameTable:
         """Copies the table without records of commits, for a thread to read."""
         new = FrameTable(self.scene)
-        for name in ("_states", "_flags", "_times", "_identities", "_skipped_by", "_files", "counts", "committed"):
-            setattr(new, name, copy.copy(getattr(self, name)))
+        for name, column in vars(self).items():
+            if name != "_records":
+                setattr(new, name, copy.copy(column))
         new._notes = copy.deepcopy(self._notes)
         return new
 
@@ -144,12 +118,36 @@ class FrameTable:
 
     def move(self, index: int, state: FrameState) -> None:
         """Puts the frame in another state."""
+        if index < self.first and state in (FrameState.QUEUED, FrameState.COMMITTED):
+            state = FrameState.SET_ASIDE
         before = STATES[self._states[index]]
         self.counts[before] -= 1
         self.counts[state] += 1
         self._states[index] = CODES[state]
         if FrameState.COMMITTED in (before, state):
             self._list(index, state == FrameState.COMMITTED and not self._flags[index] & (DELETED | UNREADABLE))
+
+    def begin_again(self, first: int) -> None:
+        """Queues all frames again whose pictures are held, from `first` on; what happened to frames is forgotten.
+
+        Frames that are missing or skipped stay so; all others are set aside.
+        """
+        states = self.states()
+        stay = (states == CODES[FrameState.MISSING]) | (states == CODES[FrameState.SKIPPED])
+        states[~stay] = CODES[FrameState.SET_ASIDE]
+        states[[i for i in self._files if i >= first and not stay[i]]] = CODES[FrameState.QUEUED]
+        self.first, self._states = first, bytearray(states.tobytes())
+        self._flags = bytearray(flags & (TIME | RECEIPT) if flags & RECEIPT else 0 for flags in self._flags)
+        self.counts = {state: int((states == code).sum()) for state, code in CODES.items()}
+        self.committed = array("q")
+        self._records.clear()
+        notes, self._notes = self._notes, {}
+        for index, note in notes.items():
+            if stay[index] or note.parts is not None:
+                self._notes[index] = Note(note.error if stay[index] else None, parts=note.parts)
+        bare = (states == CODES[FrameState.SET_ASIDE]) & self.flagged(RECEIPT)
+        for index in (np.flatnonzero(bare[first:]) + first).tolist():
+            self.note(index).error = BARE
 
     def found(self, index: int, time: float | None) -> None:
         """Notes a committed state of which nothing else is known."""
@@ -321,6 +319,8 @@ class FrameEntry:
             return error
         if self.state == FrameState.SKIPPED:
             return f"skipped: frame {self.skipped_by} came and the queue was full"
+        if self.state == FrameState.SET_ASIDE and self.index < self._table.first:
+            return f"the reconstruction begins with frame {self._table.first}"
         return LOST if self.state == FrameState.SET_ASIDE else None
 
     @property

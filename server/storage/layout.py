@@ -5,8 +5,10 @@ The committed states inside `states/` are laid out by `scas4d_core.storage.frame
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+from server.storage.events import ReconstructionBegun
 
 
 @dataclass(frozen=True)
@@ -37,9 +39,33 @@ class DataFolder:
 
 @dataclass(frozen=True)
 class SceneFolder:
-    """The folder of one scene."""
+    """The folder of one scene. Whatever a reconstruction makes has its number in its name, but for the first, 0.
+
+    Attributes:
+        reconstruction: its number. cloud: number of the reconstruction whose points it begins from.
+    """
 
     path: Path
+    reconstruction: int = 0
+    cloud: int = 0
+
+    def begun(self, event: ReconstructionBegun | None) -> SceneFolder:
+        """The folder with the names of the reconstruction that was begun last; None: the one that came with the scene.
+
+        Without points it is as if they were its own, and there are none (`leftovers`).
+        """
+        if event is None:
+            return self
+        return replace(self, reconstruction=event.number, cloud=event.number if event.points is None else event.points)
+
+    def leftovers(self, event: ReconstructionBegun | None) -> list[Path]:
+        """Lists what reconstructions before the one that was begun last left, and points that it does not use."""
+        if event is None:
+            return []
+        made = [replace(self, reconstruction=number) for number in range(event.number)]
+        points = [self.points_of(number) for number in range(event.number + 1) if number != event.points]
+        paths = [path for folder in made for path in (folder.states, folder.parts)] + points
+        return [path for path in paths if path.exists()]
 
     @property
     def name(self) -> str:
@@ -64,17 +90,24 @@ class SceneFolder:
     @property
     def states(self) -> Path:
         """Committed states (`scas4d_core.storage.history`)."""
-        return self.path / "states"
+        return self._of("states")
 
     @property
     def points(self) -> Path:
         """The initial cloud, where one was given."""
-        return self.path / "points.npz"
+        return self.points_of(self.cloud)
+
+    def points_of(self, reconstruction: int) -> Path:
+        """The initial cloud that was sent for a reconstruction."""
+        return self.path / f"points{_suffix(reconstruction)}.npz"
 
     @property
     def parts(self) -> Path:
         """Part labels, one file a number of parts (`server.processes.part_labels`)."""
-        return self.path / "parts"
+        return self._of("parts")
+
+    def _of(self, name: str) -> Path:
+        return self.path / f"{name}{_suffix(self.reconstruction)}"
 
     @property
     def worker_lock(self) -> Path:
@@ -85,3 +118,7 @@ class SceneFolder:
     def export(self) -> Path:
         """A 3DGS export while it is being answered."""
         return self.path / "splat.ply"
+
+
+def _suffix(reconstruction: int) -> str:
+    return f"_{reconstruction}" if reconstruction else ""

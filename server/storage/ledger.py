@@ -29,6 +29,7 @@ from server.storage.events import (
     PartAccepted,
     PauseChanged,
     PicturesDeleted,
+    ReconstructionBegun,
     StateFound,
     StatesDeleted,
     WorkerDied,
@@ -56,6 +57,7 @@ class Ledger:
     Attributes:
         frames: every index below `next_frame`. open: frames that cameras send one by one. fatal: reason why the scene
             cannot go on, or None. budgets: the first frame that each holds for, rising.
+        begun: the event that the present reconstruction was begun by; None: it came with the scene.
     """
 
     def __init__(self, scene: str) -> None:
@@ -66,6 +68,12 @@ class Ledger:
         self.fatal: str | None = None
         self.states_deleted = 0
         self.budgets: list[tuple[int, Budget]] = [(0, Budget())]
+        self.begun: ReconstructionBegun | None = None
+
+    @property
+    def reconstruction(self) -> int:
+        """Number of the reconstruction."""
+        return 0 if self.begun is None else self.begun.number
 
     @property
     def committed(self) -> Sequence[int]:
@@ -130,10 +138,13 @@ class Ledger:
                 self.frames.found(event.index, event.time)
             case PauseChanged():
                 self.paused = event.paused
+            case ReconstructionBegun() if event.number > self.reconstruction:
+                self.begun, self.fatal, self.states_deleted = event, None, 0
+                self.frames.begin_again(event.index)
             case BudgetChanged():
                 self.budgets = [one for one in self.budgets if one[0] < event.index] or [(0, Budget())]
                 self.budgets.append((event.index, event.budget))
-            case _:  # created: the scene's own; a part of a frame that is closed
+            case _:  # created: the scene's own; a part of a frame that is closed; a reconstruction that is known
                 pass
 
     def budget_of(self, index: int) -> Budget:
@@ -198,7 +209,7 @@ class Ledger:
         new = Ledger(self.scene)
         new.frames, new.open = self.frames.copy(), copy.deepcopy(self.open)
         new.paused, new.fatal, new.states_deleted = self.paused, self.fatal, self.states_deleted
-        new.budgets = list(self.budgets)
+        new.budgets, new.begun = list(self.budgets), self.begun
         return new
 
     def waiting(self) -> list[int]:
@@ -220,6 +231,7 @@ class Ledger:
     def last_tried(self) -> int | None:
         """Returns the newest frame that the worker has finished, committed or set aside."""
         states = self.frames.states()
+        states[: self.frames.first] = CODES[FrameState.SKIPPED]  # not tried: the reconstruction begins behind them
         tried = np.flatnonzero((states == CODES[FrameState.COMMITTED]) | (states == CODES[FrameState.SET_ASIDE]))
         return int(tried[-1]) if len(tried) else None
 

@@ -12,6 +12,7 @@ from typing import Any
 from client.wire import FileKind, FrameState
 from scas4d_core.storage.frame_files import FrameFiles
 from scas4d_core.storage.history import History, HistoryError
+from server.storage.definition import begun_of
 from server.storage.disk import no_room
 from server.storage.events import (
     FrameAccepted,
@@ -21,6 +22,8 @@ from server.storage.events import (
     PartAccepted,
     SceneCreated,
     StateFound,
+    StatesDeleted,
+    WorkerDied,
 )
 from server.storage.frame_store import FrameDamage, StoredPictures, frame_of, read_pictures, remove, stored
 from server.storage.journal import replay, write_journal
@@ -28,6 +31,8 @@ from server.storage.layout import SceneFolder
 from server.storage.ledger import Ledger, frame_identity
 from server.storage.snapshot import events_of
 
+OF_STATES = (FrameSetAside, StateFound, StatesDeleted, WorkerDied)
+"""Events of one reconstruction: another one tries the frame again, and has other states."""
 NO_STATE = "the journal was lost, and there is no committed state of this frame"
 
 
@@ -36,11 +41,13 @@ class Recovered:
     """A scene as found in its folder.
 
     Attributes:
+        folder: with the names of the reconstruction that was begun last.
         good: bytes of the journal that are whole. events: those that the journal lacks, applied already.
         sizes: bytes of each record of the frame log. damage: a sentence for each thing that was dropped.
         remake: frames whose states are damaged or gone, with the reason, and whose pictures are held.
     """
 
+    folder: SceneFolder
     ledger: Ledger
     good: int
     events: list[JournalEvent]
@@ -83,6 +90,14 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
     if not reading.begun:  # a scene is made with its journal, which begins with that
         damage.append(f"{journal.name} {'lacks its beginning' if journal.exists() else 'is gone'}")
     broken = reading.broken or not reading.begun
+    begun = begun_of(definition or {})
+    if begun is not None and begun.number > ledger.reconstruction:
+        # It is not known which events came before it: those of states may be of other states.
+        damage.append(f"{journal.name} does not have the beginning of reconstruction {begun.number} any more")
+        broken, ledger = True, Ledger(scene)
+        ledger.apply(begun)
+        replay(journal, lambda event: None if isinstance(event, OF_STATES) else ledger.apply(event))
+    folder = folder.begun(ledger.begun)
     sizes = stored(frames)
     in_states: list[str] = []
     states = _states(folder.states, in_states)
@@ -130,7 +145,7 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
         except OSError as error:
             if not no_room(error):
                 raise
-    return Recovered(ledger, good, events, sizes, damage, remake)
+    return Recovered(folder, ledger, good, events, sizes, damage, remake)
 
 
 def _unnamed(ledger: Ledger, sizes: dict[str, int]) -> set[str]:
@@ -210,7 +225,8 @@ def _events_of(folder: Path, index: int, names: list[str], ledger: Ledger, state
         return [event for event in found if event is not None]
     if accepted is None:
         return []
-    if index < states.last and index not in states.times and index not in states.damaged:
+    known = index in states.times or index in states.damaged
+    if ledger.frames.first <= index < states.last and not known:
         return [accepted, FrameSetAside(index=index, reason=NO_STATE)]
     return [accepted]
 

@@ -36,6 +36,8 @@ def events_of(ledger: Ledger) -> Iterator[JournalEvent]:
     A frame that is committed or at work is queued in it. The ways that frames were closed, and the reasons of deaths,
     are not kept.
     """
+    if ledger.begun is not None:
+        yield ledger.begun
     bare: list[int] = []
     deleted: list[int] = []
     count = len(ledger.frames)

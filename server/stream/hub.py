@@ -36,13 +36,16 @@ Event = SceneChanged | FrameFinished
 
 
 class Listener(Protocol):
-    """A subscriber, as the hub sees it. Both methods return at once."""
+    """A subscriber, as the hub sees it. All methods return at once."""
 
     def on_event(self, event: Event) -> None:
         """Something happened in the scene."""
 
     def on_close(self, reason: str) -> None:
         """The scene is no more."""
+
+    def on_restart(self) -> None:
+        """The scene is another one from here on: the listener may join it anew."""
 
 
 L = TypeVar("L", bound=Listener)
@@ -127,6 +130,14 @@ class Hub:
 
     def close(self, scene: str, reason: str) -> None:
         """Closes the channel of a scene that is gone, and tells its listeners."""
-        channel = self._channels.pop(scene, None)
-        for listener in () if channel is None else channel.listeners:
+        for listener in self._give_up(scene):
             listener.on_close(reason)
+
+    def restart(self, scene: str) -> None:
+        """Closes the channel of a scene that begins anew; its listeners join again by themselves."""
+        for listener in self._give_up(scene):
+            listener.on_restart()
+
+    def _give_up(self, scene: str) -> list[Listener]:
+        channel = self._channels.pop(scene, None)
+        return [] if channel is None else channel.listeners

@@ -41,12 +41,14 @@ class Outbox:
             await self._news.wait_for(lambda: len(self._replies) < UNSENT_REPLIES)
         self._reply(message)
 
-    def close_with(self, message: Model) -> None:
-        """Adds the last message; what else waits is forgotten."""
+    def close_with(self, message: Model | None) -> None:
+        """Adds the last message, if there is one; what else waits is forgotten."""
         self._replies.clear()
         self._slots.clear()
-        self._reply(message)
+        if message is not None:
+            self._reply(message)
         self._last = True
+        self._poster.set()
 
     def put(self, id: str, make: Make, *, missed: int = 0, weight: int = 1) -> None:
         """Sets the newest message of a subscription.

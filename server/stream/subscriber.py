@@ -14,6 +14,8 @@ from client.wire.base import Model
 from client.wire.stream import (
     CLIENT_MESSAGE,
     REQUESTS,
+    SCENE_GONE,
+    SCENE_RESTARTS,
     STREAM_PROTOCOL,
     Gone,
     Hello,
@@ -47,11 +49,16 @@ LIVE: dict[Topic, type[LiveQuery]] = {Topic.RENDER: LiveRender, Topic.TRACKS: Li
 
 
 class Subscriber:
-    """Listens to a scene for one client. The route that holds the connection empties its outbox."""
+    """Listens to a scene for one client. The route that holds the connection empties its outbox.
+
+    Attributes:
+        closing: code and reason of the connection's end, once the outbox has its last message.
+    """
 
     def __init__(self, scene: Scene, channel: Channel) -> None:
         self.scene = scene
         self.outbox = Outbox()
+        self.closing = (SCENE_GONE, "the scene was deleted")
         self._channel = channel
         self._topics: dict[str, Topic] = {}
         self._live: dict[str, tuple[LiveQuery, asyncio.Task[None]]] = {}
@@ -114,6 +121,11 @@ class Subscriber:
     def on_close(self, reason: str) -> None:
         """The scene is no more."""
         self.outbox.close_with(Gone(reason=reason))
+
+    def on_restart(self) -> None:
+        """The scene is another one from here on: the client connects anew, as after a restart of the service."""
+        self.closing = (SCENE_RESTARTS, "the reconstruction is begun anew")
+        self.outbox.close_with(None)
 
     # Subscriptions.
 

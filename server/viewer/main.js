@@ -155,6 +155,7 @@ function connection(state, wait) {
 // State and frames.
 
 function showStatus(status) {
+  if (page.status && status.reconstruction !== page.status.reconstruction) return openScene(status.id); // begun anew
   page.status = status;
   const chip = $("state");
   chip.hidden = false;
@@ -175,7 +176,7 @@ function showStatus(status) {
         `${progress.done} of ${progress.total}${loss === undefined ? "" : ` · loss ${loss.toFixed(4)}`}${when}`,
         progress.total ? progress.done / progress.total : null);
     } else if (status.state === "initialising") curtain("Reconstructing the first frame", "The pictures are being read");
-    else curtain("Waiting for the first frame", "The scene accepts frames.", `PUT ${scenePath(status.id)}/frames/0`);
+    else curtain("Waiting for the first frame", "The scene accepts frames.", `PUT ${scenePath(status.id)}/frames/${status.next_frame}`);
   }
   if (status.committed && !view.shown) curtain("Opening the scene", "The first picture is on its way.");
   showTimeline();

@@ -17,7 +17,9 @@ Repeated = Annotated[
 def faults(
     capture: Repeated,
     frames: Annotated[int, typer.Option(min=4, help="Frames sent in every scenario.")] = 20,
-    kills: Annotated[int, typer.Option(min=0, help="kill -9 of the worker or the service, at random moments.")] = 30,
+    kills: Annotated[
+        int, typer.Option(min=0, help="kill -9 of the worker or the service, at random moments; and beginnings.")
+    ] = 30,
     cuts: Annotated[int, typer.Option(min=0, help="Files of the log that are cut.")] = 20,
     flips: Annotated[int, typer.Option(min=0, help="Files of the log in which a bit is flipped.")] = 1,
     bits: Annotated[
@@ -27,7 +29,8 @@ def faults(
         int, typer.Option(min=1, help="Turns without strangers and with them, each with a token and without.")
     ] = 3,
     part: Annotated[
-        list[str] | None, typer.Option(help="Only this: kills, log, disk, bits or strangers. May be repeated.")
+        list[str] | None,
+        typer.Option(help="Only this: kills, beginnings, log, disk, bits or strangers. May be repeated."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random moments and places.")] = 0,
     work: Annotated[Path, typer.Option(help="Folder for data folders and logs; what is there goes.")] = Path(

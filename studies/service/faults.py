@@ -25,6 +25,7 @@ from server.storage.journal import read_journal
 from server.storage.layout import DataFolder, SceneFolder
 from studies.options import Echo
 from studies.service import damage
+from studies.service.beginnings import beginnings
 from studies.service.outcome import ScenarioResult
 from studies.service.process import PATIENCE_S, Service, StudyError
 from studies.service.strangers import Attack, strangers
@@ -35,7 +36,7 @@ TURN_S = 15.0
 KILLS_OF_A_WORKER_AT_A_FRAME = 4
 """The sixth sets a frame aside, as it should: the study stays below, and kills again when the next is at work."""
 
-PARTS = ("kills", "log", "disk", "bits", "strangers")
+PARTS = ("kills", "beginnings", "log", "disk", "bits", "strangers")
 """The scenarios by name."""
 
 
@@ -271,16 +272,18 @@ def run(
     """The scenarios of `parts`.
 
     Args:
-        study: what is sent, and where to. moments: kills. cuts, flips: damaged files.
+        study: what is sent, and where to. moments: kills, and beginnings. cuts, flips: damaged files.
         bits: flipped over everything on disk. seed: of the random moments.
         attack: of the strangers, the whole of it where not given. turns: without and with it.
     """
     outcomes = []
-    if set(parts) & {"kills", "log", "disk"}:
+    if set(parts) & {"kills", "beginnings", "log", "disk"}:
         expected, update_s = undisturbed(study)
         echo(f"undisturbed: {len(expected)} states, {update_s:.2f} s an update")
         if "kills" in parts:
             outcomes.append(kills(study, expected, update_s, moments, seed, echo))
+        if "beginnings" in parts:
+            outcomes.append(beginnings(study, expected, moments, seed, echo))
         if "log" in parts:
             outcomes.append(damaged_log(study, expected, cuts, flips, seed, echo))
         if "disk" in parts:

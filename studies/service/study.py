@@ -118,7 +118,7 @@ class FrameSender:
             if answer.status_code == 202:
                 self.receipts[index] = answer.json()
                 return
-            if answer.status_code not in (429, 507):
+            if answer.status_code not in (429, 503, 507):
                 self.faults.append(f"frame {index} was answered {answer.status_code}: {answer.text}")
                 return
             time.sleep(AGAIN_S)

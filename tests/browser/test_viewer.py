@@ -295,3 +295,19 @@ def test_nothing_comes_from_elsewhere(page, service, finished):
     shown(page)
     assert all(url.startswith((service.url, service.url.replace("http", "ws"), "blob:")) for url in asked)
     assert page.faults == []
+
+
+def test_a_scene_that_begins_again_is_shown_anew(page, service):
+    with Client(service.url, patience=30) as sdk:
+        id = start_scene(sdk)
+        for index in range(5):
+            push(sdk, id, index)
+        sdk.wait(id, 4)
+        opened(page, service, id)
+        shown(page, frame="4")
+        sdk.begin_again(id, 1, frame=3, discard=True)
+        sdk.wait(id, 4)
+        until(page, "document.querySelectorAll('#psnr .dot').length === 2")
+        shown(page, frame="4")
+        assert page.locator("#facts").inner_text().count("2 committed") == 1
+        sdk.delete_scene(id)

@@ -25,6 +25,7 @@ CALLS = [
     calls.rig("s"),
     calls.pause("s"),
     calls.resume("s"),
+    calls.begin_again("s", 3),
     calls.delete_scene("s"),
     calls.put_points("s", POINTS),
     calls.put_frame("s", 7, {"c0": b"x"}),
@@ -54,6 +55,7 @@ PAGES = ("/viewer", "/docs", "/openapi.json", "/redoc")
 
 def template(path):
     path = re.sub(r"^/v1/scenes/s\b", "/v1/scenes/{id}", path)
+    path = re.sub(r"/reconstructions/3$", "/reconstructions/{n}", path)
     return re.sub(r"/cameras/c0$", "/cameras/{c}", re.sub(r"/frames/7\b", "/frames/{n}", path))
 
 

@@ -48,7 +48,7 @@ ALIKE, HALF_ALIKE = 0.6, 0.3
 PAIRS = 2
 """Pairs of cameras that must agree on a cell, so at least three cameras."""
 BEYOND_CHANCE = 1.8
-"""How much more pictures must agree on a plane than mirrored pictures do, which agree by chance alone: 2.2 to 4.7 where
+"""Agreement on a plane, as a multiple of that of mirrored pictures, which agree by chance alone: 2.2 to 4.7 where
 there is a floor or a table (six rigs), 0.9 to 1.6 where there is none (three)."""
 FEWEST_CELLS = 40
 """Cells on which cameras agree, for a plane to be believed."""

@@ -14,7 +14,7 @@ from scas4d_core.first_frame.points.posed_pictures import Bool, Float, PosedPict
 ACROSS = 40
 """Points along the longer side of a picture; the fit refines them."""
 BEHIND = 2.0
-"""How far behind the middle of the stage they lie, times the largest distance of a camera to the middle."""
+"""Distance at which they lie behind the middle of the stage, times the largest distance of a camera to the middle."""
 STAGE = 1.5
 """Radius of the stage, times the same distance: all cameras and what they share lie within, surroundings beyond."""
 

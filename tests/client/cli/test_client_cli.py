@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from running import HEIGHT, WIDTH, make_rig
+from running import HEIGHT, WIDTH, make_rig, pictures
 
 from client.cli.changes import parse_changes
 from client.cli.commands import frame_line
@@ -167,6 +167,40 @@ def test_a_budget_is_told_set_and_taken_back(service):
             assert said("--as-made") == made
             refused = scas4d("budget", scene, "--as-made", "--iterations", "5", "--url", service.url)
             assert (refused.returncode, "leave it out" in refused.stderr) == (1, True)
+        finally:
+            client.delete_scene(scene)
+
+
+def test_a_scene_begins_again(service, tmp_path):
+    def said(*arguments, code=0):
+        done = scas4d("begin-again", scene, *arguments, "--url", service.url, COLUMNS="200")
+        assert done.returncode == code, done.stderr
+        return (done.stderr if code else done.stdout).strip()
+
+    np.savez(tmp_path / "cloud.npz", positions=np.zeros((4, 3)), colours=np.zeros((4, 3)))
+    np.savez(tmp_path / "bare.npz", positions=np.zeros((4, 3)))
+    with Client(service.url, patience=20) as client:
+        scene = client.create_scene(make_rig(2)).id
+        try:
+            for index in range(2):
+                client.put_frame(scene, index, pictures())
+            client.wait(scene, 1)
+            assert "discard" in said(code=1)
+            assert "has no colours" in said("--points", str(tmp_path / "bare.npz"), code=1)
+            assert "contradict" in said("--points", "x.npz", "--no-points", code=1)
+            given = (
+                "--discard",
+                "--frame",
+                "1",
+                "--set",
+                "update.iterations=9",
+                "--points",
+                str(tmp_path / "cloud.npz"),
+            )
+            assert said(*given) == f"scene {scene} begins anew with frame 1, reconstruction 1; 1 queued"
+            assert client.wait(scene, 1).state == "committed"
+            status = client.scene(scene)
+            assert (status.gaussians, status.settings["update"]["iterations"]) == (4, 9)
         finally:
             client.delete_scene(scene)
 

@@ -277,7 +277,11 @@ def test_what_is_wrong_with_an_address_is_named(still, query, field):
 def test_only_what_stays_may_be_kept_by_a_browser(still):
     id, _, http = still
     assert http.get(f"/v1/scenes/{id}/render").headers["cache-control"] == "no-store"
-    assert "max-age" in http.get(f"/v1/scenes/{id}/render?frame=0").headers["cache-control"]
+    named = http.get(f"/v1/scenes/{id}/render?frame=0")
+    assert named.headers["cache-control"] == "private, no-cache"
+    again = http.get(f"/v1/scenes/{id}/render?frame=0", headers={"If-None-Match": named.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    assert http.get(f"/v1/scenes/{id}/render?frame=0&kind=parts").headers["cache-control"] == "no-store"
 
 
 def test_a_state_that_went_missing_is_answered_from_a_copy_or_asked_for_later(scene, impatient):

@@ -79,7 +79,7 @@ def test_a_frame_0_that_is_a_guess_is_a_warning_and_is_one_again(tmp_path):
         sdk.wait(id, 0)
         (said,) = sdk.scene(id).warnings
         assert said.startswith("frame 0 is a guess")
-        assert "give points" in said
+        assert "begin the reconstruction again with points" in said
         assert sdk.frame(id, 0).shortened == ["no stereo"]
         put(http, id, 1)
         sdk.wait(id, 1)

@@ -20,8 +20,9 @@ from server.storage.events import (
     StatesDeleted,
     WorkerDied,
 )
-from server.storage.frame_table import LOST, NOT_SENT, RECORDS_KEPT, WIRE_NAMES, FrameTable
+from server.storage.frame_table import LOST, RECORDS_KEPT, FrameTable
 from server.storage.ledger import Ledger
+from server.storage.report_fields import NOT_SENT, WIRE_NAMES
 
 REPORT = {"iterations": 100, "psnr": 31.5, "gaussians": 2, "seconds": {"update": 0.5}, "dropped": {"c1": "dark"}}
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from client.wire import Budget, FileKind, FrameState
+from client.wire import Budget, FileKind, FrameState, ReconstructionRequest
 from server.storage.events import (
     BudgetChanged,
     FrameAccepted,
@@ -21,6 +21,7 @@ from server.storage.events import (
     PartAccepted,
     PauseChanged,
     PicturesDeleted,
+    ReconstructionBegun,
     SceneCreated,
     StateFound,
     StatesDeleted,
@@ -48,7 +49,8 @@ def state_of(ledger):
              note.own_deaths, note.other_deaths, parts)
         )  # fmt: skip
     opened = {index: (frame.time, frame.hashes, frame.files) for index, frame in ledger.open.items()}
-    return frames, opened, ledger.paused, ledger.fatal, ledger.states_deleted, ledger.budgets, dict(ledger.counts)
+    rest = (ledger.paused, ledger.fatal, ledger.states_deleted, ledger.budgets, dict(ledger.counts), ledger.begun)
+    return frames, opened, *rest
 
 
 def fold(events):
@@ -94,12 +96,22 @@ def lives(draw):
     if gone := [index for index in committed if draw(st.booleans())]:
         events.append(StatesDeleted(frames=tuple(gone), reason=draw(st.sampled_from(["retention", "damaged"]))))
     if draw(st.booleans()):
+        begun = draw(st.integers(0, 9))
+        events.insert(draw(st.integers(0, len(events))), begins(1, begun))
+        committed = [index for index in committed if index >= begun]
+    if draw(st.booleans()):
         events.append(PauseChanged(paused=True))
     for index in draw(st.lists(st.integers(0, 9), max_size=2, unique=True)):
         events.append(BudgetChanged(index=index, budget=Budget(iterations=10 + index)))
     if draw(st.booleans()):
         events += parts(20, draw(st.integers(1, 3)))
     return events, committed
+
+
+def begins(number, index):
+    return ReconstructionBegun(
+        number=number, index=index, points=None, settings={}, asked=ReconstructionRequest(frame=index)
+    )
 
 
 def parts(index, count):

@@ -10,6 +10,7 @@ import pytest
 from scas4d_core.captures import open_capture
 from studies.service import faults
 from studies.service import study as of
+from studies.service.beginnings import beginnings
 from studies.service.strangers import Attack, strangers
 
 ROOT = Path(__file__).parents[3]
@@ -40,6 +41,11 @@ def test_states_of_the_fake_depend_on_every_frame(expected):
 
 def test_kills(study, expected):
     outcome = faults.kills(study, *expected, count=4, seed=1, echo=lambda said: None)
+    assert outcome.faults == []
+
+
+def test_kills_while_reconstructions_are_begun_anew(study, expected):
+    outcome = beginnings(study, expected[0], count=3, seed=1, echo=lambda said: None)
     assert outcome.faults == []
 
 

@@ -1,0 +1,88 @@
+"""The reconstruction of a scene is begun anew again and again, and the service killed meanwhile: no bit may differ."""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+
+import httpx
+
+from server.storage.events import ReconstructionBegun
+from server.storage.journal import read_journal
+from server.storage.layout import DataFolder
+from studies.options import Echo
+from studies.service.outcome import ScenarioResult
+from studies.service.process import PATIENCE_S, Service, StudyError
+from studies.service.study import AGAIN_S, FrameSender, Study, compare, digests
+
+SPREADS_S = (0.1, 1.0)
+"""A kill comes within one of these seconds after the request: before its event, after it, or in the first frame."""
+
+
+def beginnings(study: Study, expected: Mapping[int, str], count: int, seed: int, echo: Echo) -> ScenarioResult:
+    """`kill -9` of the whole service, once in each of `count` beginnings, at random moments of them.
+
+    Half of the frames are here before the first beginning, one more comes with each.
+    """
+    random_ = random.Random(seed)
+    service = study.service("beginnings")
+    service.start()
+    scene = study.create(service)
+    sender = FrameSender(study, service, scene)
+    sent = len(study.frames) // 2
+    ended: Counter[str] = Counter()
+    try:
+        for index in range(sent):
+            sender.send(index)
+        service.finish(scene, sent)
+        for number in range(1, count + 1):
+            asking = threading.Thread(target=_begin, args=(service, scene, number))
+            sending = threading.Thread(target=sender.send, args=(sent,))
+            asking.start()
+            if sent < len(study.frames):
+                sending.start()
+                sent += 1
+            time.sleep(random_.uniform(0, random_.choice(SPREADS_S)))
+            service.kill()
+            events = read_journal(DataFolder(service.data).scene(scene).journal).events
+            known = max((event.number for event in events if isinstance(event, ReconstructionBegun)), default=0)
+            ended["after" if known == number else "before"] += 1
+            service.start()
+            asking.join()
+            if sending.ident is not None:
+                sending.join()
+            status = service.status(scene)
+            echo(f"killed in beginning {number} of {count}; the scene's reconstruction is {status.reconstruction}")
+            if status.reconstruction != number:
+                raise StudyError(
+                    f"reconstruction {number} was acknowledged, and the scene's is {status.reconstruction}"
+                )
+        for index in range(sent, len(study.frames)):
+            sender.send(index)
+        service.finish(scene, len(study.frames))
+        folder = replace(DataFolder(service.data).scene(scene), reconstruction=count)
+        faults = sender.check() + compare(digests(folder.states), expected)
+        faults += [f"{path.name} is left" for path in folder.path.glob("states*") if path != folder.states]
+        faults += [f"damage was said: {said}" for said in service.status(scene).damage]
+        found = f"{ended['before']} ended before, {ended['after']} after; {len(expected)} states compared"
+        target = "each ends wholly before or after; final state bit-identical to a run without any"
+        return ScenarioResult(f"kill -9 in {count} beginnings of a reconstruction", target, found, faults)
+    finally:
+        service.stop()
+
+
+def _begin(service: Service, scene: str, number: int) -> None:
+    """Asks until it is acknowledged, as a client does that gets no answer."""
+    until = time.monotonic() + PATIENCE_S
+    while time.monotonic() < until:
+        try:
+            address = f"/v1/scenes/{scene}/reconstructions/{number}"
+            if service.http.put(address, json={"discard": True}).status_code == 200:
+                return
+        except httpx.TransportError:
+            pass
+        time.sleep(AGAIN_S)
