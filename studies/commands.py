@@ -9,11 +9,22 @@ from studies.frontier.commands import frontier
 from studies.hard_cases.commands import stability
 from studies.kernels.commands import device, kernels, moving
 from studies.paper.commands import paper
-from studies.quality.commands import calibration, drift, effects, processors, quality, refit, switches, table, targets
+from studies.quality.commands import (
+    calibration,
+    drift,
+    effects,
+    processors,
+    quality,
+    refit,
+    rigs,
+    switches,
+    table,
+    targets,
+)
 from studies.service.commands import crossing, faults, ingest, memory, views
 
 STUDIES = {
-    "Quality": (quality, refit, effects, switches, drift, calibration, targets, table, processors),
+    "Quality": (quality, refit, rigs, effects, switches, drift, calibration, targets, table, processors),
     "Accuracy against time": (frontier, effort, paper),
     "Speed of the code": (kernels, device, moving),
     "Hard cases": (stability,),

@@ -1,4 +1,4 @@
-"""`scripts/bench quality`, `refit`, `effects`, `switches`, `drift`, `calibration`, `targets`, `table`, `processors`."""
+"""The studies of quality, as commands of `scripts/bench`: `quality`, `refit`, `rigs`, `effects`, and others."""
 
 from __future__ import annotations
 
@@ -98,6 +98,27 @@ def refit(
         again=again,
         options=options,
     )
+
+
+@takes_capture
+def rigs(
+    captures: Captures,
+    options: CaptureOptions,
+    out: Study = QUALITY,
+    frames: Annotated[int, typer.Option(min=1, help="At most so many.")] = 20,
+    longer: Annotated[int, typer.Option(min=64, help="Pixels along the longer side of the largest picture.")] = 480,
+    again: Again = False,
+    changes: Changes = None,
+) -> None:
+    """Reconstructs captures of other rigs with default settings: seconds of frame 0, and a camera held out.
+
+    Leaves rigs.md and a JSON file a row in the study's folder.
+
+    Example: scripts/bench rigs captures/fly --frames 15
+    """
+    from studies.quality.rigs import run
+
+    run(captures, out, frames=frames, longer=longer, changes=changes or (), again=again, options=options)
 
 
 @takes_capture

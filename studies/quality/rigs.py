@@ -1,0 +1,205 @@
+"""``scripts/bench rigs``: captures of other people's rigs, straight from their folders, with default settings.
+
+Frame 0 has its limit of time here, for its seconds are what is asked: run it on a machine that does nothing else. With
+five cameras or more one is held out, and its picture compared with the nearest training picture, shown in its place.
+A folder's ``joints.npz`` (``points3d`` [T, J, 3], in the world of the calibration) is followed by tracks from frame 0.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.cli.changes import parse_changes
+from client.cli.evaluate import Report, recorded
+from client.cli.scores import Column, Row, Store, digest, markdown, read_row, write_row
+from client.importers.open_source import CaptureOptions
+from scas4d_core import metrics
+from scas4d_core.cameras import Rig
+from scas4d_core.captures import Capture
+from scas4d_core.presets import preset
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.warm_up import warm_up_elsewhere
+from studies.machine import core_version, machine
+
+ENOUGH_TO_HOLD_OUT = 5
+"""Cameras from which one is held out: of fewer each one sees what no other does."""
+
+COLUMNS = (
+    Column("capture", "capture"),
+    Column("cameras", "cameras", "d"),
+    Column("pixels", "pixels"),
+    Column("frames", "frames", "d"),
+    Column("first points", "way"),
+    Column("covered", "covered", ".2f"),
+    Column("Gaussians", "gaussians", ",d"),
+    Column("frame 0 s", "seconds_first", ".0f"),
+    Column("update s", "seconds_update", ".1f"),
+    Column("held", "held", "d"),
+    Column("training dB", "psnr_training", ".1f"),
+    Column("last", "psnr_training_last", ".1f"),
+    Column("held out", "held_out"),
+    Column("its dB", "psnr_held_out", ".1f"),
+    Column("last", "psnr_held_out_last", ".1f"),
+    Column("nearest picture dB", "psnr_nearest", ".1f"),
+    Column("joints px", "joints_px", ".1f"),
+    Column("last", "joints_px_last", ".1f"),
+)
+
+
+def run(
+    captures: Sequence[Path],
+    out: Path,
+    *,
+    frames: int = 20,
+    longer: int = 480,
+    changes: Sequence[str] = (),
+    again: bool = False,
+    options: CaptureOptions,
+    report: Report = print,
+) -> list[Row]:
+    """Reconstructs captures; prints the table and leaves it in ``out/rigs.md``.
+
+    Args:
+        captures: folders. out: folder of the study. Run again to go on.
+        frames: at most so many. longer: pixels along the longer side of the largest picture, at most.
+        changes: settings as ``"static.seconds=60"``. again: measure anew what ``out`` holds.
+        options: how the captures are read; ``options.test`` holds these cameras out in place of the middle one.
+        report: takes the printed lines.
+    """
+    store, rows = Store(out), list[Row]()
+    warm_up_elsewhere()
+    for folder in captures:
+        key = f"{folder.resolve().name}-{digest(list(changes), frames, longer, *options.changed.items())}"
+        path = store.folder / "rigs" / f"{key}.json"
+        row = None if again else read_row(path)
+        if row is None:
+            row = measured(folder, options, frames, longer, changes)
+            write_row(path, row)
+        rows.append(row)
+        report(markdown([row], COLUMNS))
+    table = markdown(rows, COLUMNS)
+    (store.folder / "rigs.md").write_text(table + "\n")
+    report(table)
+    return rows
+
+
+def measured(
+    folder: Path, options: CaptureOptions, frames: int = 20, longer: int = 480, changes: Sequence[str] = ()
+) -> Row:
+    """The row of one capture."""
+    whole = options.open(folder)
+    names = whole.full_rig.names
+    if not options.test and len(names) >= ENOUGH_TO_HOLD_OUT:
+        options = replace(options, test=(names[len(names) // 2],))
+    given = options.open(folder)
+    size = max(max(camera.width, camera.height) for camera in given.full_rig.cameras)
+    settings = preset("scas4d", parse_changes(changes))
+    settings = settings.model_copy(
+        update={"scene": settings.scene.model_copy(update={"image_scale": min(1.0, longer / size)})}
+    )
+    truth = options.open(folder, image_scale=settings.scene.image_scale)
+    count = min(frames, given.frame_count)
+    began = time.perf_counter()
+    scene = Reconstruction.start(given.rig, given.frame(0), settings, points=given.points)
+    first = time.perf_counter() - began
+    assert scene.report is not None
+    cloud, trained = scene.report.cloud, [_training_psnr(scene, truth, 0)]
+    seconds, held = list[float](), 0
+    unseen = [_held_out_psnr(scene, truth, 0)]
+    for index in range(1, count):
+        began = time.perf_counter()
+        outcome = scene.step(given.frame(index)).outcome
+        seconds.append(time.perf_counter() - began)
+        held += outcome.name.startswith("HELD")
+        trained.append(_training_psnr(scene, truth, index))
+        unseen.append(_held_out_psnr(scene, truth, index))
+    row: Row = {
+        "capture": given.name,
+        "cameras": len(names),
+        "pixels": " and ".join(sorted({f"{camera.width}×{camera.height}" for camera in truth.rig.cameras})),
+        "frames": count,
+        "way": None if cloud is None else cloud.way,
+        "covered": None if cloud is None else cloud.covered,
+        "gaussians": len(scene.history.first),
+        "seconds_first": first,
+        "shortened": list(scene.history.report(0).get("shortened") or []),
+        "seconds_update": float(np.median(seconds)) if seconds else None,
+        "held": held,
+        "psnr_training": float(np.mean(trained)),
+        "psnr_training_last": trained[-1],
+        "settings": recorded(settings, ()),
+        "core": core_version(),
+        "machine": machine(),
+    }
+    if truth.test_rig is not None:
+        row |= {
+            "held_out": ", ".join(truth.test_rig.names),
+            "psnr_held_out": float(np.mean([one[0] for one in unseen])),
+            "psnr_held_out_last": unseen[-1][0],
+            "psnr_nearest": float(np.mean([one[1] for one in unseen])),
+        }
+    if (folder / "joints.npz").is_file():
+        row |= _joints(folder / "joints.npz", scene, given.full_rig, count)
+    return row
+
+
+def _training_psnr(scene: Reconstruction, truth: Capture, index: int) -> float:
+    """Mean dB of the training cameras, rendered without the gains that the scene found for them."""
+    images = truth.frame(index).images
+    found = [
+        metrics.psnr(scene.render(truth.rig[name], index).colour, image)
+        for name, image in images.items()
+        if name in truth.rig.names
+    ]
+    return float(np.mean(found))
+
+
+def _held_out_psnr(scene: Reconstruction, truth: Capture, index: int) -> tuple[float, float]:
+    """Mean dB of the cameras held out: of the render, and of the picture of the nearest training camera."""
+    rig = truth.test_rig
+    if rig is None:
+        return float("nan"), float("nan")
+    images, seen = truth.test_frame(index).images, truth.frame(index).images
+    rendered, nearest = [], []
+    for camera in rig.cameras:
+        true = images[camera.name]
+        rendered.append(metrics.psnr(scene.render(camera, index).colour, true))
+        other = min(
+            truth.rig.cameras,
+            key=lambda one, centre=camera.centre: float(np.linalg.norm(one.centre - centre)),  # type: ignore[misc]
+        )
+        nearest.append(metrics.psnr(_resized(seen[other.name], true.shape) / np.float32(255), true))
+    return float(np.mean(rendered)), float(np.mean(nearest))
+
+
+def _resized(image: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """The nearest pixels of a picture, as [H, W, 3] of another shape."""
+    lines, columns = (np.arange(want) * have // want for want, have in zip(shape[:2], image.shape[:2], strict=True))
+    found: NDArray[np.uint8] = image[lines[:, None], columns[None]]
+    return found
+
+
+def _joints(path: Path, scene: Reconstruction, rig: Rig, count: int) -> Row:
+    """Median pixels of the full pictures by which joints followed from frame 0 are off, over cameras and frames."""
+    with np.load(path) as file:
+        true = file["points3d"][:count].astype(np.float64)
+    tracks = scene.tracks_of_points(true[0], 0, list(range(count))).positions
+    error = np.stack(
+        [
+            np.linalg.norm(
+                camera.project(tracks.reshape(-1, 3))[0] - camera.project(true.reshape(-1, 3))[0], axis=1
+            ).reshape(true.shape[:2])
+            for camera in rig.cameras
+        ]
+    )
+    return {
+        "joints_px": float(np.median(error[:, 1:])),
+        "joints_px_last": float(np.median(error[:, -1])),
+        "joints_px_each": np.median(error[:, 1:], axis=(0, 1)).tolist(),
+    }
