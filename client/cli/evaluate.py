@@ -203,8 +203,9 @@ def measure(
             index = done.index
             line: Row = {"index": index, "seconds": done.seconds, "stages": {}}
             if index == 0:
-                for sentence in reconstruction.report.warnings if reconstruction.report is not None else ():
-                    report(f"    {sentence}")
+                if (first := reconstruction.report) is not None:
+                    for sentence in [*first.warnings, *(f"for want of time: {short}" for short in first.shortened)]:
+                        report(f"    {sentence}")
                 truth = truth if unseen else truth.measured_on_training(reconstruction.calibrated)
             if index == 0 and static is not None:
                 line["seconds"] = static[1]

@@ -105,8 +105,9 @@ class FirstCloudModel(Model):
 
     way: str = Field(
         description="given; else how the pictures gave them: agreement (of three cameras or more), backdrop "
-        "(silhouettes before a plain one), pairs (two cameras agree), volume (no camera confirms them: frame 0 is a "
-        "guess; give points, or more cameras); several are joined by +."
+        "(silhouettes before a plain one), pairs (two cameras agree), plane (a floor or a table on which pictures "
+        "agree), surroundings (what each camera sees, far behind), volume (no camera confirms them: a guess; "
+        "give points, or more cameras); several are joined by +."
     )
     points: int
     covered: float | None = Field(

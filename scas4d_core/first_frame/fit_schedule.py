@@ -75,7 +75,8 @@ class FitSchedule:
 
     Attributes:
         done: iterations made. at: how far these are in the full schedule. stride: by how much the next goes on.
-        again: whether another whole fit is to follow in the same time.
+        again: whether another whole fit is to follow in the same time. end: of this fit, in the full schedule.
+        shortened: whether an iteration has gone on by more than one.
         planned: (iteration, iterations in all) whenever what is planned changed.
 
     >>> schedule = FitSchedule(4, TimeLimit(None), lambda at: 100.0)
@@ -87,9 +88,10 @@ class FitSchedule:
         self.iterations = iterations
         self._limit, self._expected = limit, expected
         self.done, self.at, self.stride = 0, 0.0, 1.0
-        self.again = False
+        self.again = self.shortened = False
         self.planned: list[tuple[int, int]] = [(0, iterations)]
         self.seconds: float | None = None
+        self.end = float(iterations)
         self._began = 0.0
         self._times: list[float] = []
         self._counts: list[float] = []
@@ -99,6 +101,7 @@ class FitSchedule:
         """Begins the next iteration."""
         self._began = self._limit.clock()
         begun, self.at = self.at, min(float(self.iterations), self.at + self.stride)
+        self.shortened |= self.stride != 1
         return FitStep(begun, self.at)
 
     def took(self, count: int) -> None:
@@ -120,7 +123,7 @@ class FitSchedule:
 
     def _plan(self) -> None:
         """Sets the stride by the time that is left, and predicts the seconds that remain."""
-        whole = self._seconds(self.at) + (self._seconds(0.0) if self.again else 0.0)
+        whole = self._seconds(self.at, self.end) + (self._seconds(0.0, self.iterations) if self.again else 0.0)
         over = whole / max(self._limit.left_for_fit, 1e-3)
         longest = max(1.0, self.iterations / FEWEST)
         self.stride = 1.0 if over <= ENOUGH else min(over, longest)
@@ -128,8 +131,8 @@ class FitSchedule:
         if abs(self.total - self.planned[-1][1]) > NOTEWORTHY * self.planned[-1][1]:
             self.planned.append((self.done, self.total))
 
-    def _seconds(self, begin: float) -> float:
-        """Seconds of the iterations of the full schedule from ``begin`` on, with as many Gaussians as it will have."""
+    def _seconds(self, begin: float, end: float) -> float:
+        """Seconds of the iterations between two moments of the full schedule, with as many Gaussians as then."""
         times, counts = np.array(self._times), np.array(self._counts)
         each, more = times[-1], 0.0
         if counts.max() >= VARIED * counts.min():
@@ -137,8 +140,8 @@ class FitSchedule:
             # else ran beside it weighs little beside the many.
             more = max(0.0, float(np.polyfit(counts, times, 1)[0]))
             more = min(more, each / counts[-1])
-        moments = np.linspace(begin, self.iterations, 33)
+        moments = np.linspace(begin, end, 33)
         growth = [self._expected(float(moment)) - counts[-1] for moment in moments]
         cost = [max(0.0, each + more * gaussians) for gaussians in growth]
-        width = (self.iterations - begin) / (len(moments) - 1)
+        width = (end - begin) / (len(moments) - 1)
         return float(sum(width * (one + two) / 2 for one, two in pairwise(cost)))

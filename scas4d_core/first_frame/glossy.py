@@ -65,6 +65,7 @@ def fit_by_direction(
     if trial.on:
         before, trainer = trial.learnt(), make()
         losses = GlossyFit(trainer, before).train(progress)
+        trainer.schedule.shortened |= before.schedule.shortened
     found = {} if trial.evidence is None else {"direction": trial.evidence}
     shortened = ["no trial of colours that depend on direction"] if trial.untried else []
     return replace(trainer.result(losses), evidence=found, shortened=shortened)
@@ -141,6 +142,7 @@ class GlossTrial:
         trainer, whole, schedule = self._trainer, self._trainer.settings.iterations, self._trainer.schedule
         every, began = max(1, round(NORMALS_EVERY * whole)), schedule.at
         environment, estimates, schedule.again = None, 0, True
+        schedule.end = max(schedule.at, float(round(LEARNT * whole)))
         while environment is None or schedule.at < round(LEARNT * whole):
             now = schedule.next()
             if now.begun - began >= estimates * every:

@@ -179,6 +179,7 @@ def _joined(
     else:
         new = np.asarray(cKDTree(found.positions).query(cloud.positions)[0]) > spacing
         labels = [found.foreground, None if cloud.foreground is None else cloud.foreground[new]]
+        assert all(label is None for label in labels) or all(label is not None for label in labels)
         both = FoundPoints(
             np.concatenate([found.positions, cloud.positions[new]]),
             np.concatenate([found.colours, cloud.colours[new]]),

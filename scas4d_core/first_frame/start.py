@@ -178,7 +178,7 @@ def fit_first(
         settings.effects.get("direction", "auto") if settings.device == "cpu" else "off",
         lambda now: on_progress(Progress("fitting frame 0", now.done, now.planned, _figures(now, limit))),
     )
-    if len(result.planned) > 1:
+    if result.hurried:
         limit.shortened.append(f"{len(result.losses)} of {static.iterations} iterations, each phase as much shorter")
     return replace(result, cloud=made, shortened=[*limit.shortened, *result.shortened])
 

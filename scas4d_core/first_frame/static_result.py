@@ -40,6 +40,7 @@ class StaticResult:
         evidence: that was found for effects, by name.
         cloud: where the first cloud came from; None where it is not known.
         planned: (iteration, iterations in all) whenever the time that was left changed what was planned.
+        hurried: whether an iteration has gone on by more than one of the schedule.
         shortened: what the time of frame 0 was too short for, in words.
     """
 
@@ -51,4 +52,5 @@ class StaticResult:
     evidence: Mapping[str, Evidence] | None = None
     cloud: FirstCloud | None = None
     planned: Sequence[tuple[int, int]] = ()
+    hurried: bool = False
     shortened: Sequence[str] = ()

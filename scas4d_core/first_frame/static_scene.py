@@ -289,7 +289,9 @@ class StaticTrainer:
     def result(self, losses: list[float]) -> StaticResult:
         """Of the iterations so far."""
         found, planned = self.exposures.found(), self.schedule.planned
-        return StaticResult(self.gaussians(), found, losses, self.psnr, self.cameras, planned=planned)
+        return StaticResult(
+            self.gaussians(), found, losses, self.psnr, self.cameras, planned=planned, hurried=self.schedule.shortened
+        )
 
 
 def first_trainer(

@@ -16,7 +16,7 @@ from client.wire import PointsReceipt
 from scas4d_core.rig_checks import RigError, check_points, pose_warnings
 from scas4d_core.storage.npz import write_npz
 from server.problems import Problem, counted, of_rig
-from server.routes.access import TheScene
+from server.routes.access import AllScenes, TheScene
 from server.storage.disk import full_disk, no_room
 from server.storage.points import points_sha256
 
@@ -36,6 +36,7 @@ BODY: dict[str, Any] = {
 @router.put("/{id}/points", openapi_extra=BODY)
 async def put(
     scene: TheScene,
+    scenes: AllScenes,
     request: Request,
     reconstruction: Annotated[
         int | None, Query(ge=0, description="Its number: the scene's, if not given, or the next one, to be begun.")
@@ -58,6 +59,7 @@ async def put(
     number = own if reconstruction is None else reconstruction
     receipt = PointsReceipt(points=len(arrays["positions"]), sha256=sha256, reconstruction=number)
     async with scene.log.lock:
+        scenes.check_current(scene)
         file = scene.spec.folder.points if number == own else scene.spec.folder.points_of(number)
         if number in (own, own + 1) and await asyncio.to_thread(points_sha256, file) == sha256:
             return receipt
@@ -85,7 +87,7 @@ def check_number(number: int, own: int, next_frame: int) -> None:
         return
     fault = f"reconstruction {number} comes after another one: the scene's is {own}"
     if number <= own:
-        fault = "the first frame is here already, and started without these points"
+        fault = "this reconstruction has begun already, without these points"
     raise Problem(
         409,
         fault,

@@ -179,7 +179,17 @@ class Scenes:
             await asyncio.to_thread(self._bury, path, f"{folder.name}-{path.name}")
         return now
 
-    async def begin_again(self, id: str, beginning: Beginning) -> Scene:
+    def check_current(self, scene: Scene) -> None:
+        """Refuses what was meant for a scene as it was before its reconstruction was begun anew.
+
+        Raises:
+            Problem: 503, to send it again.
+        """
+        if self[scene.id] is not scene:
+            fault = "the reconstruction of this scene was begun anew while this request came"
+            raise Problem(503, fault, field="id", value=scene.id, remedy="send the request again")
+
+    async def begin_again(self, scene: Scene, beginning: Beginning) -> Scene:
         """Begins the reconstruction of a scene anew; the same request again returns the scene as it is.
 
         The scene is stopped, the event journalled, and the scene recovered from its folder, as after a crash; until
@@ -188,9 +198,10 @@ class Scenes:
         Raises:
             Problem: see `Beginning.event`; 507, the disk is full.
         """
-        scene = self[id]
-        if beginning.event(scene.ledger, scene.spec.folder) is None:
-            return scene
+        id, current = scene.id, self[scene.id]
+        if beginning.event(current.ledger, current.spec.folder) is None:
+            return current
+        self.check_current(scene)
         self._beginning[id] = task = asyncio.create_task(self._begin_again(scene, beginning))
         task.add_done_callback(lambda _: self._beginning.pop(id))
         await asyncio.shield(task)
@@ -198,6 +209,8 @@ class Scenes:
 
     async def _begin_again(self, scene: Scene, beginning: Beginning) -> None:
         self.hub.restart(scene.id)
+        async with scene.log.lock:  # points that are being written are whole, and later ones are refused
+            pass
         await scene.stop(0)
         folder, said = self._data.scene(scene.id), scene.status().damage
         try:
@@ -220,7 +233,7 @@ class Scenes:
         assert event is not None
         journal = Journal(folder.journal, found.good)
         try:
-            await journal.append(event)
+            await journal.append(*found.events, event)
         except OSError as error:
             if no_room(error):
                 raise full_disk(error) from None

@@ -25,7 +25,7 @@ from scas4d_core.settings import Settings
 VERSION = 4
 """Raise this when frame 0 comes out different from the same pictures and settings: what is kept is then fitted anew."""
 
-CLOUD_VERSION = 3
+CLOUD_VERSION = 4
 """The same, where the first cloud is made from the pictures."""
 
 ARRAYS = tuple(field.name for field in fields(Gaussians))
@@ -40,8 +40,9 @@ def first_frame_key(capture: Capture, settings: Settings) -> str:
     """
     hasher = hashlib.sha256()
     static = settings.static.model_dump(mode="json")
-    if static["seconds"] is None:  # those that were kept before there was a limit have the same name
-        del static["seconds"]
+    for name, off in (("seconds", None), ("refine_calibration", False)):
+        if static[name] == off:  # those that were kept before it was a setting have the same name
+            del static[name]
     described = [VERSION, settings.scene.model_dump(mode="json"), static]
     hasher.update(json.dumps(described, sort_keys=True).encode())
     for camera in capture.full_rig.cameras:

@@ -21,7 +21,7 @@ CAPTURE_CHANGES: Mapping[str, tuple[str, ...]] = {}
 """What a scene itself asks for in every run of it (its budget of Gaussians, its floor), never what tunes a method."""
 
 LATER: Mapping[str, Mapping[str, Any]] = {
-    "static": {"stop_gain": 0.0, "seconds": None},
+    "static": {"stop_gain": 0.0, "seconds": None, "refine_calibration": False},
     "update": {"budget_ms": None, "stop_gain": 0.0, "cold_longer": 1.0, "views": 1, "covariance": "entangled"},
 }
 """Settings that rows measured before do not name, by group, with the value that they had in effect."""

@@ -21,7 +21,7 @@ from studies.captures import open_measured
 from studies.service.process import Service
 
 PACKAGES = ("scas4d_core", "server", "client")
-MOST_OF_A_FRAME, MOST_OF_A_RENDER = 55, 22
+MOST_OF_A_FRAME, MOST_OF_A_RENDER = 56, 23
 LATER = 3
 """The frame that is followed: frame 0 and the first updates have work of their own."""
 SETTINGS = {

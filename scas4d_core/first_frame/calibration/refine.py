@@ -101,8 +101,9 @@ def refined_rig(rig: Rig, matches: Matches) -> Refinement:
         rig: as given, of the user's world. matches: of its cameras' pictures of one moment.
     """
     learnt, held = matches.split()
-    counts = [found.matches for found in residuals(matches)[0].values()]
-    fixed = [index for index, count in enumerate(counts) if count < FEWEST]
+    told = list(residuals(matches)[0].values())
+    counts = [found.matches for found in told]
+    fixed = [i for i, found in enumerate(told) if found.matches < FEWEST or not np.isfinite(found.pixels)]
     if len(counts) - len(fixed) < LEAST_CAMERAS:
         return _kept(f"only {len(counts) - len(fixed)} cameras have {FEWEST} matches or more")
     before = list(matches.cameras)

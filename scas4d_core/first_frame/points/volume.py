@@ -72,7 +72,10 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
         )
     seen = observe(views, points[shared], inside[:, shared])
     best = np.argsort(seen.spread, kind="stable")[: int(KEPT * shared.sum())]
-    return InitialPoints(points[shared][best], seen.colours[best])
+    # Points off any mask are gone, so those that are left are in all that see them.
+    masked = any(view.mask is not None for view in views)
+    labels = np.ones(len(best), np.float32) if masked else None
+    return InitialPoints(points[shared][best], seen.colours[best], labels)
 
 
 def _seen(view: PosedPicture, points: Float) -> tuple[Bool, Bool]:

@@ -149,3 +149,14 @@ def test_surroundings_that_one_camera_sees_are_kept_and_floaters_are_not(views, 
         return int((~cloud.stage.holds(means)).sum())
 
     assert kept(cloud.stage) > 4 * kept(None)
+
+
+def test_with_masks_every_point_has_a_label(views):
+    """Where next to nothing in the masks is confirmed the volume is filled: its points are labelled like all others."""
+    rig = Rig(tuple(view.camera for view in views))
+    corner = np.zeros((SIZE, SIZE), np.uint8)
+    corner[:30, :30] = 1  # shows the room, on which cameras do not agree
+    images = {view.camera.name: view.image for view in views}
+    found = initial_points(rig, images, dict.fromkeys(rig.names, corner), stereo=False)
+    assert found.foreground is not None
+    assert len(found.foreground) == len(found.positions)

@@ -86,12 +86,35 @@ def test_a_few_iterations_are_made_whatever_the_time() -> None:
 def test_time_for_another_fit_is_kept() -> None:
     clock = Clock()
     schedule = FitSchedule(1000, TimeLimit(100.0, clock=clock), lambda at: 1000.0)
-    schedule.again = True
+    schedule.again, schedule.end = True, 500.0
     while schedule.at < 500:
         schedule.next()
         clock.now += 0.1
         schedule.took(1000)
-    assert clock.now == pytest.approx(25, rel=0.15)  # 1500 of 2000 iterations of the full schedule are to come
+    assert clock.now == pytest.approx(33, rel=0.15)  # 500 of this fit and 1000 of the next
+    assert schedule.shortened
+
+
+def test_a_fit_that_is_slow_at_its_end_alone_is_shortened_too() -> None:
+    clock = Clock()
+    schedule = FitSchedule(3000, TimeLimit(60.0, clock=clock), lambda at: 1000.0)
+    while schedule.at < 3000:
+        schedule.next()
+        clock.now += 0.0195 if schedule.at < 2900 else 0.2
+        schedule.took(1000)
+    assert len(schedule.planned) == 1  # hardly fewer iterations
+    assert schedule.shortened
+
+
+def test_a_fit_that_has_time_is_not_shortened() -> None:
+    clock = Clock()
+    schedule = FitSchedule(300, TimeLimit(60.0, clock=clock), lambda at: 1000.0)
+    while schedule.at < 300:
+        schedule.next()
+        clock.now += 0.01
+        schedule.took(1000)
+    assert schedule.done == 300
+    assert not schedule.shortened
 
 
 @pytest.fixture

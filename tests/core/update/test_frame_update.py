@@ -204,7 +204,7 @@ def twin_iteration(fused: Iteration, settings: UpdateSettings, masks: bool) -> t
     """Loss and gradients of the same parameters and views in float64 torch."""
     rows, weights = fused.hierarchy.rows, settings.weights
     terms = {"image": schedule.IMAGE_WEIGHT, "soft_colour": schedule.SOFT_COLOUR_WEIGHT, **weights.model_dump()}
-    del terms["mask_alone"], terms["floor"]
+    del terms["mask_alone"]
     update_of_twin = update_torch.TorchUpdate(
         moving=rows,
         labels=[labels.astype(np.int64) for labels in fused.hierarchy.labels],

@@ -250,3 +250,19 @@ def test_a_scene_whose_states_are_lost_begins_again(tmp_path):
         assert sdk.wait(id, FRAMES - 1).state == "committed"
         assert committed(tmp_path, id) == {"states_1": before}
         assert status(http, id)["damage"] == found["damage"] != []
+
+
+def test_a_frame_whose_event_is_damaged_is_not_lost_by_a_beginning(tmp_path):
+    with serving(tmp_path) as (http, sdk):
+        id = filled(http, sdk)
+        http.post(f"/v1/scenes/{id}/pause")
+        put_form(http, id, FRAMES, pictures(33))
+        journal = DataFolder(tmp_path).scene(id).journal
+        content = bytearray(journal.read_bytes())
+        (last,) = (e for e in read_journal(journal).events if isinstance(e, FrameAccepted) and e.index == FRAMES)
+        content[content.rindex(bytes_of([last])) + 2] ^= 1
+        journal.write_bytes(content)
+        assert begin(http, id).status_code == 200
+        assert status(http, id)["next_frame"] == FRAMES + 1
+        http.post(f"/v1/scenes/{id}/resume")
+        assert sdk.wait(id, FRAMES).state == "committed"

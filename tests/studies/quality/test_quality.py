@@ -110,6 +110,7 @@ class Perfect:
 
     speed = 1.0
     brightness = 1.0
+    report = None
     fitted = 0
 
     @classmethod
