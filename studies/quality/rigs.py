@@ -198,8 +198,11 @@ def _joints(path: Path, scene: Reconstruction, rig: Rig, count: int) -> Row:
             for camera in rig.cameras
         ]
     )
+    lost = np.isnan(error)  # what carried it has left the scene
+    error = np.where(lost, np.inf, error)
     return {
         "joints_px": float(np.median(error[:, 1:])),
         "joints_px_last": float(np.median(error[:, -1])),
         "joints_px_each": np.median(error[:, 1:], axis=(0, 1)).tolist(),
+        "joints_lost": float(lost.mean()),
     }
