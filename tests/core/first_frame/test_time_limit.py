@@ -100,7 +100,7 @@ def test_a_fit_that_is_slow_at_its_end_alone_is_shortened_too() -> None:
     schedule = FitSchedule(3000, TimeLimit(60.0, clock=clock), lambda at: 1000.0)
     while schedule.at < 3000:
         schedule.next()
-        clock.now += 0.0195 if schedule.at < 2900 else 0.2
+        clock.now += 0.017 if schedule.at < 2950 else 0.3
         schedule.took(1000)
     assert len(schedule.planned) == 1  # hardly fewer iterations
     assert schedule.shortened
