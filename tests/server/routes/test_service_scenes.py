@@ -178,7 +178,7 @@ def test_points_come_before_the_first_frame(http, sdk, scene):
     sdk.put_frame(scene, 0, pictures())
     assert sdk.wait(scene, 0).gaussians == 3  # the fake starts one Gaussian a point
     assert sdk.put_points(scene, points) == receipt
-    with pytest.raises(ServiceError, match="started without these points"):
+    with pytest.raises(ServiceError, match="begun already, without these points"):
         sdk.put_points(scene, InitialPoints(points.positions + 1, points.colours))
 
 
