@@ -143,8 +143,8 @@ def outcome_of(record: Mapping[str, Any]) -> FrameOutcome | None:
 
 
 COVERS_LITTLE = 0.25
-"""Share of the pictures up to which the points of frame 0 that cameras agree on cover little: as
-``first_frame.initial_points.ENOUGH``, from which no other way to points is tried."""
+"""Share of the pictures up to which the points of frame 0 that cameras agree on cover little: from
+it on the surest ways to points are enough (``first_frame.initial_points``)."""
 
 
 def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:

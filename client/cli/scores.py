@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,15 @@ def read_row(path: Path) -> Row | None:
     if not path.exists():
         return None
     row: Row = json.loads(path.read_text())
+    return row
+
+
+def kept_row(path: Path, measured: Callable[[], Row], *, again: bool = False) -> Row:
+    """The row on disk; where there is none, or ``again``, the one that is measured now and written there."""
+    row = None if again else read_row(path)
+    if row is None:
+        row = measured()
+        write_row(path, row)
     return row
 
 

@@ -29,6 +29,7 @@ from scas4d_core.first_frame.points.triangulation import matched_tracks, triangu
 from scas4d_core.first_frame.points.visual_hull import pixel_at
 from scas4d_core.first_frame.points.volume import shared_volume, stage_distances
 from scas4d_core.first_frame.time_limit import TimeLimit
+from scas4d_core.frame_outcome import COVERS_LITTLE
 
 OnProgress = Callable[[str, int, int], None]
 """Called with a stage, the steps done and the steps in all."""
@@ -39,7 +40,7 @@ MIN_VIEWS = 3
 """Cameras that must agree on a point: two always meet somewhere on an epipolar line."""
 CELLS = 32
 """Cells along the longer side of a picture, in which points are looked for."""
-ENOUGH = 0.25
+ENOUGH = COVERS_LITTLE
 """Share of the cells of most pictures that hold a point, from which a cloud is enough and no other way is tried.
 Captures of eighteen cameras and more have 0.99 to 1, rigs of four to seven, wide apart, 0 to 0.4 without other ways."""
 LITTLE = 0.05

@@ -75,13 +75,14 @@ class StaticTrainer:
         scene: SceneSettings,
         settings: StaticSettings,
         limit: TimeLimit | None = None,
+        stage: Stage | None = None,
     ) -> None:
         self.settings = settings
         self.views = views
         self.parameters = parameters
         self.budget = budget(views, scene, settings)
         self.shading: Shading | None = None
-        self.stage: Stage | None = None
+        self.stage = stage
         self.radius = factory.rig.radius
         limits = scene_limits(scene.near, self.radius)
         self.loss = PictureLoss(factory, scene.behind, 1.0, WEIGHT_MASK, False, limits)
@@ -314,6 +315,4 @@ def first_trainer(
     rng = np.random.default_rng(settings.seed)
     most = max(1, int(INITIAL_SHARE * budget(views, scene, settings)))
     parameters = initial_parameters(positions, colours, foreground, most, rng)
-    trainer = StaticTrainer(factory, views, parameters, scene, settings, limit)
-    trainer.stage = stage
-    return trainer
+    return StaticTrainer(factory, views, parameters, scene, settings, limit, stage)

@@ -171,7 +171,8 @@ class Updates:
                 self._background.run(self._set_aside(event))
             case Mended():
                 self.mending.mended(message)
-                self._background.run(self.recall())
+                if not self.first:  # it could not be read before
+                    self._background.run(self.recall())
             case Stalled():
                 self.trouble = f"frame {message.index} waits for room on the disk: {message.reason}"
                 self.clock.stall(message.seconds)

@@ -6,6 +6,7 @@ Faults are put into the calibration; the pictures stay. Test cameras keep theirs
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from client.cli.evaluate import Report, recorded
-from client.cli.scores import Column, Row, digest, markdown, read_row, write_row
+from client.cli.scores import Column, Row, digest, kept_row, markdown
 from client.importers.open_source import open_source
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.first_frame.calibration.matches import Matches, matches_by_appearance
@@ -105,11 +106,9 @@ def run(
             path = (
                 out / "calibration" / f"{folder.resolve().name}-{way}-{pixels:g}-{digest(settings, way, pixels)}.json"
             )
-            row = None if again else read_row(path)
-            if row is None:
-                row = {"key": path.stem, "capture": capture.name, "rig": f"{way} {pixels:g}", "settings": settings}
-                row |= _fitted(folder, faulty_rig(capture.rig, way, pixels), changes)
-                write_row(path, row | {"core": core_version(), "machine": machine()})
+            known = {"key": path.stem, "capture": capture.name, "rig": f"{way} {pixels:g}", "settings": settings}
+            rig = faulty_rig(capture.rig, way, pixels)
+            row = kept_row(path, partial(_row, known, folder, rig, changes), again=again)
             report(f"{row['capture']}, {row['rig']}: {row['given']:.2f} dB, refined {row['refined']:.2f} dB")
             fitted.append(row)
     tables = "\n\n".join(markdown(rows, columns) for rows, columns in ((told, TOLD), (fitted, FITTED)) if rows)
@@ -117,6 +116,10 @@ def run(
     (out / "calibration.md").write_text(tables + "\n")
     report(tables)
     return [*told, *fitted]
+
+
+def _row(known: Row, folder: Path, rig: Rig, changes: Sequence[str]) -> Row:
+    return {**known, **_fitted(folder, rig, changes), "core": core_version(), "machine": machine()}
 
 
 def _told(name: str, matches: Matches) -> list[Row]:

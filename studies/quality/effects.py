@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from client.cli.evaluate import DEFAULT_OPTIONS, Report, recorded
-from client.cli.scores import Column, Row, digest, markdown, read_row, write_row
+from client.cli.scores import Column, Row, digest, kept_row, markdown
 from client.importers.open_source import CaptureOptions
 from scas4d_core import metrics
 from scas4d_core.captures import Capture
@@ -165,14 +165,9 @@ def _row(
     seed = settings.update.seed
     file = "-".join([capture.name, f"s{seed}", *(f"{name}-{mode}" for name, mode in pins.items())])
     path = out / "effects" / f"{file}-{digest(recorded(settings, ()), count, *options.changed.items())}.json"
-    found = None if again else read_row(path)
-    if found is not None:
-        return found
     known: Row = {"key": path.stem, "capture": capture.name, "seed": seed, "pinned": words, "frames": count}
     of = {"settings": recorded(settings, ()), "core": core_version(), "machine": machine()}
-    row = known | _compared(capture, out, settings, pins, count) | of
-    write_row(path, row)
-    return row
+    return kept_row(path, lambda: known | _compared(capture, out, settings, pins, count) | of, again=again)
 
 
 def _compared(capture: Capture, out: Path, settings: Settings, pins: Pins, count: int) -> Row:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from client.cli.evaluate import Report, recorded
-from client.cli.scores import Column, Row, digest, markdown, read_row, write_row
+from client.cli.scores import Column, Row, digest, kept_row, markdown
 from client.importers.open_source import open_source
 from scas4d_core.cameras import Camera
 from scas4d_core.captures import Capture
@@ -71,23 +72,20 @@ def run(
             settings = settings_of("scas4d", None, 0, [*changes, f"effects.{NAME}={mode}"])
             key = digest(recorded(settings, ()), updates, way, pixels, most)
             path = out / "drift" / f"{folder.resolve().name}-{way}-{mode}-{key}.json"
-            row = None if again else read_row(path)
-            if row is None:
-                drift = (pixels, most) if way == "drift" else (0.0, 0.0)
-                row = {
-                    "key": path.stem,
-                    "cameras": way,
-                    "poses": mode,
-                    **_played(folder, out, settings, updates, drift),
-                }
-                row |= {"settings": recorded(settings, ()), "core": core_version(), "machine": machine()}
-                write_row(path, row)
+            drift = (pixels, most) if way == "drift" else (0.0, 0.0)
+            known = {"key": path.stem, "cameras": way, "poses": mode}
+            row = kept_row(path, partial(_row, known, folder, out, settings, updates, drift), again=again)
             report(f"{row['capture']}, cameras {way}, {NAME} {mode}: {row['psnr']:.2f} dB")
             rows.append(row)
     table = markdown(rows, COLUMNS)
     (out / "drift.md").write_text(table + "\n")
     report(table)
     return rows
+
+
+def _row(known: Row, folder: Path, out: Path, settings: Settings, updates: int, drift: tuple[float, float]) -> Row:
+    found = _played(folder, out, settings, updates, drift)
+    return {**known, **found, "settings": recorded(settings, ()), "core": core_version(), "machine": machine()}
 
 
 def _played(folder: Path, out: Path, settings: Settings, updates: int, drift: tuple[float, float]) -> Row:

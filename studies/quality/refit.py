@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from client.cli.evaluate import DEFAULT_OPTIONS, Report, recorded
-from client.cli.scores import Column, Row, Store, digest, markdown, read_row, write_row
+from client.cli.scores import Column, Row, Store, digest, kept_row, markdown
 from client.importers.open_source import CaptureOptions
+from scas4d_core.captures import Capture
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from scas4d_core.warm_up import warm_up_elsewhere
@@ -90,19 +91,21 @@ def _refitted(
     if index is None:
         raise ValueError(f"{capture.name} has no frame {frame}; give one of 0 to {capture.frame_count - 1}")
     key = f"{capture.name}-{index}-s{seed}-{digest(recorded(settings, ()), points, *options.changed.items())}"
-    found = None if again else read_row(rows / f"{key}.json")
-    if found is not None:
-        return found
+    return kept_row(
+        rows / f"{key}.json", lambda: {"key": key, "seed": seed, **_measured(capture, index, settings)}, again=again
+    )
+
+
+def _measured(capture: Capture, index: int, settings: Settings) -> Row:
+    """The row of a frame that is fitted alone."""
     from scas4d_core.metrics.evaluation import measure_pictures
 
     scene = Reconstruction.start(capture.rig, capture.frame(index), settings, points=capture.points)
     scores, _ = measure_pictures(scene, capture.scaled(settings.scene.image_scale), index)
     assert scene.report is not None
-    row: Row = {
-        "key": key,
+    return {
         "capture": capture.name,
         "frame": index,
-        "seed": seed,
         "cloud": "given" if capture.points is not None else "from the pictures",
         "gaussians": len(scene.history.first),
         "seconds": sum(scene.report.seconds.values()),
@@ -111,8 +114,6 @@ def _refitted(
         "core": core_version(),
         "machine": machine(),
     }
-    write_row(rows / f"{key}.json", row)
-    return row
 
 
 def _beside(row: Row, settings: Settings, preset: str, store: Store) -> Row:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +18,11 @@ from numpy.typing import NDArray
 
 from client.cli.changes import parse_changes
 from client.cli.evaluate import Report, recorded
-from client.cli.scores import Column, Row, Store, digest, markdown, read_row, write_row
+from client.cli.scores import Column, Row, Store, digest, kept_row, markdown
 from client.importers.open_source import CaptureOptions
 from scas4d_core import metrics
 from scas4d_core.cameras import Rig
-from scas4d_core.captures import Capture
+from scas4d_core.captures import Capture, Frame
 from scas4d_core.presets import preset
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.warm_up import warm_up_elsewhere
@@ -77,10 +78,7 @@ def run(
     for folder in captures:
         key = f"{folder.resolve().name}-{digest(list(changes), frames, longer, *options.changed.items())}"
         path = store.folder / "rigs" / f"{key}.json"
-        row = None if again else read_row(path)
-        if row is None:
-            row = measured(folder, options, frames, longer, changes)
-            write_row(path, row)
+        row = kept_row(path, partial(measured, folder, options, frames, longer, changes), again=again)
         rows.append(row)
         report(markdown([row], COLUMNS))
     table = markdown(rows, COLUMNS)
@@ -89,36 +87,27 @@ def run(
     return rows
 
 
-def measured(
-    folder: Path, options: CaptureOptions, frames: int = 20, longer: int = 480, changes: Sequence[str] = ()
-) -> Row:
-    """The row of one capture."""
-    whole = options.open(folder)
-    names = whole.full_rig.names
+def measured(folder: Path, options: CaptureOptions, frames: int, longer: int, changes: Sequence[str]) -> Row:
+    """The row of one capture; the arguments are those of ``run``."""
+    names = options.open(folder).full_rig.names
     if not options.test and len(names) >= ENOUGH_TO_HOLD_OUT:
         options = replace(options, test=(names[len(names) // 2],))
     given = options.open(folder)
     size = max(max(camera.width, camera.height) for camera in given.full_rig.cameras)
-    settings = preset("scas4d", parse_changes(changes))
-    settings = settings.model_copy(
-        update={"scene": settings.scene.model_copy(update={"image_scale": min(1.0, longer / size)})}
-    )
+    settings = preset("scas4d", parse_changes(changes), {"scene": {"image_scale": min(1.0, longer / size)}})
     truth = options.open(folder, image_scale=settings.scene.image_scale)
     count = min(frames, given.frame_count)
     began = time.perf_counter()
     scene = Reconstruction.start(given.rig, given.frame(0), settings, points=given.points)
     first = time.perf_counter() - began
     assert scene.report is not None
-    cloud, trained = scene.report.cloud, [_training_psnr(scene, truth, 0)]
-    seconds, held = list[float](), 0
-    unseen = [_held_out_psnr(scene, truth, 0)]
+    cloud, seconds, held = scene.report.cloud, list[float](), 0
     for index in range(1, count):
         began = time.perf_counter()
         outcome = scene.step(given.frame(index)).outcome
         seconds.append(time.perf_counter() - began)
-        held += outcome.name.startswith("HELD")
-        trained.append(_training_psnr(scene, truth, index))
-        unseen.append(_held_out_psnr(scene, truth, index))
+        held += outcome.held
+    trained = [_psnr(scene, truth.rig, truth.frame(index)) for index in range(count)]
     row: Row = {
         "capture": given.name,
         "cameras": len(names),
@@ -137,45 +126,35 @@ def measured(
         "core": core_version(),
         "machine": machine(),
     }
-    if truth.test_rig is not None:
+    if (unseen := truth.test_rig) is not None:
+        found = [_psnr(scene, unseen, truth.test_frame(index)) for index in range(count)]
         row |= {
-            "held_out": ", ".join(truth.test_rig.names),
-            "psnr_held_out": float(np.mean([one[0] for one in unseen])),
-            "psnr_held_out_last": unseen[-1][0],
-            "psnr_nearest": float(np.mean([one[1] for one in unseen])),
+            "held_out": ", ".join(unseen.names),
+            "psnr_held_out": float(np.mean(found)),
+            "psnr_held_out_last": found[-1],
+            "psnr_nearest": float(np.mean([_nearest_psnr(truth, unseen, index) for index in range(count)])),
         }
     if (folder / "joints.npz").is_file():
         row |= _joints(folder / "joints.npz", scene, given.full_rig, count)
     return row
 
 
-def _training_psnr(scene: Reconstruction, truth: Capture, index: int) -> float:
-    """Mean dB of the training cameras, rendered without the gains that the scene found for them."""
-    images = truth.frame(index).images
-    found = [
-        metrics.psnr(scene.render(truth.rig[name], index).colour, image)
-        for name, image in images.items()
-        if name in truth.rig.names
-    ]
+def _psnr(scene: Reconstruction, rig: Rig, frame: Frame) -> float:
+    """Mean dB of a rig's cameras, rendered without the gains that the scene found for them."""
+    return float(
+        np.mean([metrics.psnr(scene.render(rig[n], frame.index).colour, image) for n, image in frame.images.items()])
+    )
+
+
+def _nearest_psnr(truth: Capture, unseen: Rig, index: int) -> float:
+    """Mean dB of the pictures of the training cameras nearest to those held out, each shown in their place."""
+    pictures, seen, found = truth.test_frame(index).images, truth.frame(index).images, []
+    centres = np.array([camera.centre for camera in truth.rig.cameras])
+    for camera in unseen.cameras:
+        nearest = truth.rig.cameras[int(np.linalg.norm(centres - camera.centre, axis=1).argmin())]
+        true = pictures[camera.name]
+        found.append(metrics.psnr(_resized(seen[nearest.name], true.shape) / np.float32(255), true))
     return float(np.mean(found))
-
-
-def _held_out_psnr(scene: Reconstruction, truth: Capture, index: int) -> tuple[float, float]:
-    """Mean dB of the cameras held out: of the render, and of the picture of the nearest training camera."""
-    rig = truth.test_rig
-    if rig is None:
-        return float("nan"), float("nan")
-    images, seen = truth.test_frame(index).images, truth.frame(index).images
-    rendered, nearest = [], []
-    for camera in rig.cameras:
-        true = images[camera.name]
-        rendered.append(metrics.psnr(scene.render(camera, index).colour, true))
-        other = min(
-            truth.rig.cameras,
-            key=lambda one, centre=camera.centre: float(np.linalg.norm(one.centre - centre)),  # type: ignore[misc]
-        )
-        nearest.append(metrics.psnr(_resized(seen[other.name], true.shape) / np.float32(255), true))
-    return float(np.mean(rendered)), float(np.mean(nearest))
 
 
 def _resized(image: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uint8]:

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from client.cli.evaluate import Report, recorded
-from client.cli.scores import Column, Row, digest, markdown, read_row, write_row
+from client.cli.scores import Column, Row, digest, kept_row, markdown
 from client.importers.open_source import open_source
 from scas4d_core.captures import Capture
 from scas4d_core.captures.frame import Frame
@@ -55,17 +56,24 @@ def run(
         for seed in seeds:
             settings = settings_of(preset, None, seed, changes)
             path = out / "switches" / f"{folder.resolve().name}-s{seed}-{digest(recorded(settings, ()), updates)}.json"
-            row = None if again else read_row(path)
-            if row is None:
-                row = {"key": path.stem, "seed": seed, **_played(open_source(folder), out, settings, updates)}
-                row |= {"settings": recorded(settings, ()), "core": core_version(), "machine": machine()}
-                write_row(path, row)
+            row = kept_row(path, partial(_row, folder, out, path.stem, settings, seed, updates), again=again)
             report(f"{row['capture']}, seed {seed}: {row['switches']}")
             rows.append(row)
     table = markdown(rows, COLUMNS)
     (out / "switches.md").write_text(table + "\n")
     report(table)
     return rows
+
+
+def _row(folder: Path, out: Path, key: str, settings: Settings, seed: int, updates: int) -> Row:
+    return {
+        "key": key,
+        "seed": seed,
+        **_played(open_source(folder), out, settings, updates),
+        "settings": recorded(settings, ()),
+        "core": core_version(),
+        "machine": machine(),
+    }
 
 
 def _played(capture: Capture, out: Path, settings: Settings, updates: int) -> Row:

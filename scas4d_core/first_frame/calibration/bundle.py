@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from scas4d_core.cameras import Camera
 from scas4d_core.first_frame.calibration.matches import Matches
 from scas4d_core.first_frame.points.posed_pictures import Float
+from scas4d_core.first_frame.points.triangulation import grouped, triangulator
 
 BOUNDS = (16.0, 6.0, 2.0)
 """Pixels that a feature may miss its point by, round after round: the first takes in cameras that are far off, the last
@@ -43,13 +43,11 @@ Track = tuple[NDArray[np.intp], Float]
 def tracks_of(matches: Matches) -> list[Track]:
     """Features that match from camera to camera, a track each; those with two features in one picture are left out."""
     label, offsets = matches.tracks()
-    order = np.argsort(label, kind="stable")
-    groups = np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(order) else []
     owner = np.repeat(np.arange(len(matches.pixels)), np.diff(offsets))
     pixels = np.concatenate(matches.pixels) if len(owner) else np.zeros((0, 2))
     return [
         (owner[group], pixels[group])
-        for group in groups
+        for group in grouped(label)
         if len(group) > 1 and len(np.unique(owner[group])) == len(group)
     ]
 
@@ -84,27 +82,15 @@ class Observed:
 
 def _observed(cameras: Sequence[Camera], tracks: Sequence[Track], bound: float, seed: int) -> tuple[Observed, Float]:
     """The right features of each track that gives a point, and the points [P, 3] (LO-RANSAC, pycolmap)."""
-    import pycolmap
-
-    options: Any = pycolmap.EstimateTriangulationOptions()
-    options.min_tri_angle = np.deg2rad(MIN_ANGLE_DEG)
-    options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
-    options.ransac.max_error = bound
-    options.ransac.random_seed = seed
-    options.ransac.max_num_trials = 100
-    lenses = [
-        pycolmap.Camera(model="PINHOLE", width=c.width, height=c.height, params=[c.fx, c.fy, c.cx, c.cy])
-        for c in cameras
-    ]
-    poses = [pycolmap.Rigid3d(pycolmap.Rotation3d(c.rotation), c.translation[:, None]) for c in cameras]
+    point_of = triangulator(cameras, angle=MIN_ANGLE_DEG, error=bound, trials=100, seed=seed)
     points, owner, pixels = [], [], []
     for who, uv in tracks:
-        answer = pycolmap.estimate_triangulation(uv, [poses[i] for i in who], [lenses[i] for i in who], options)
+        answer = point_of(who, uv)
         if answer is None:
             continue
-        right = np.asarray(answer["inlier_mask"] if "inlier_mask" in answer else answer["inliers"], dtype=bool)
+        point, right = answer
         if right.sum() >= 2:
-            points.append(np.asarray(answer["xyz"], np.float64).reshape(3))
+            points.append(point)
             owner.append(who[right])
             pixels.append(uv[right])
     index = np.repeat(np.arange(len(points)), [len(who) for who in owner])

@@ -11,17 +11,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures.images import resize_area
 from scas4d_core.first_frame.points.posed_pictures import Float, PosedPicture
 from scas4d_core.first_frame.points.triangulation import (
-    MAX_DESCRIPTOR_DISTANCE,
-    RATIO,
+    descriptor_distances,
     features,
     fundamental_matrix,
+    joined,
+    mutual_best,
 )
 
 LONGEST_SIDE = 800
@@ -66,9 +65,8 @@ class Matches:
         """The track of each feature, those of all cameras in a row, and the first place of each camera in it."""
         offsets = np.concatenate([[0], np.cumsum([len(uv) for uv in self.pixels])])
         edges = [rows + offsets[list(pair)] for pair, rows in self.pairs.items()]
-        joined = np.concatenate(edges) if edges else np.zeros((0, 2), np.intp)
-        graph = coo_array((np.ones(len(joined)), (joined[:, 0], joined[:, 1])), shape=(offsets[-1], offsets[-1]))
-        return np.asarray(connected_components(graph, directed=False)[1]), offsets
+        all_edges = np.concatenate(edges) if edges else np.zeros((0, 2), np.intp)
+        return joined(all_edges, int(offsets[-1])), offsets
 
     def split(self) -> tuple[Matches, Matches]:
         """Those to learn from, and those held out: no feature is in both."""
@@ -136,14 +134,7 @@ def _mutual(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[
     """[M, 2] rows of two sets of unit descriptors that are each other's nearest, and much nearer than any other."""
     if min(len(first), len(second)) < 2:
         return np.zeros((0, 2), np.intp)
-    distance = np.sqrt(np.maximum(2.0 - 2.0 * (first @ second.T), 0.0))
-    forth, back = distance.argmin(1), distance.argmin(0)
-    rows = np.arange(len(first))
-    value = distance[rows, forth]
-    good = (back[forth] == rows) & (value < MAX_DESCRIPTOR_DISTANCE)
-    good &= value < RATIO * np.partition(distance, 1, axis=1)[:, 1]
-    good &= value < RATIO * np.partition(distance, 1, axis=0)[1][forth]
-    return np.stack([rows[good], forth[good]], axis=1)
+    return mutual_best(descriptor_distances(first, second))
 
 
 def epipolar_distances(matches: Matches, pair: Pair) -> Float:

@@ -57,6 +57,8 @@ MOST_VIEWS = 6
 CLOSED = 15
 """Cells across of a gap between agreeing cells that belongs to the plane all the same."""
 
+NO_PLANE = "images: cameras agree on no plane; start from a point cloud"
+
 
 @dataclass(frozen=True, eq=False)
 class Plane:
@@ -115,17 +117,14 @@ def plane_points(labelled: Sequence[PosedPicture]) -> InitialPoints:
     plane = agreed_plane(views)
     count = min(MOST_CELLS, max(CELLS, int(2 * plane.half / (SPACING * pixel_at(views, plane.middle)))))
     points = plane.cells(count)
-    smooth = _smooth(views, plane, count)
-    sure = _agreement(views, smooth, points[None])[1][0] >= min(PAIRS, len(views) - 1)
-    within = binary_opening(
-        binary_closing(np.pad(sure, CLOSED), np.ones((CLOSED, CLOSED), bool)), np.ones((5, 5), bool)
-    )
+    closed = binary_closing(np.pad(_agreed_cells(views, plane, count), CLOSED), np.ones((CLOSED, CLOSED), bool))
+    within = binary_opening(closed, np.ones((5, 5), bool))
     flat = points[within[CLOSED:-CLOSED, CLOSED:-CLOSED]]
     inside = np.array([pixels_inside(view.camera, flat)[3] for view in labelled])
-    shared = inside.sum(axis=0) >= min(PAIRS, len(views))
+    shared = inside.sum(axis=0) >= 2
     flat, inside = flat[shared], inside[:, shared]
     if not len(flat):
-        raise InitialPointsError("images: cameras agree on no plane; start from a point cloud")
+        raise InitialPointsError(NO_PLANE)
     return InitialPoints(flat, observe(labelled, flat, inside).colours, labelled_share(labelled, flat, inside))
 
 
@@ -138,11 +137,17 @@ def agreed_plane(views: Sequence[PosedPicture]) -> Plane:
     found = [(_best(views, start), start) for start in _starts(views)]
     (score, plane), start = max(found, key=lambda one: one[0][0])
     mirrored = [replace(view, image=np.ascontiguousarray(view.image[:, ::-1])) for view in views]
-    smooth = _smooth(views, plane, CELLS)
-    cells = int((_agreement(views, smooth, plane.cells(CELLS)[None])[1][0] >= min(PAIRS, len(views) - 1)).sum())
-    if cells < FEWEST_CELLS or score < BEYOND_CHANCE * _best(mirrored, start, refine=False)[0]:
-        raise InitialPointsError("images: cameras agree on no plane; start from a point cloud")
+    cells = _agreed_cells(views, plane, CELLS)
+    if cells.sum() < FEWEST_CELLS or score < BEYOND_CHANCE * _best(mirrored, start, refine=False)[0]:
+        raise InitialPointsError(NO_PLANE)
     return plane
+
+
+def _agreed_cells(views: Sequence[PosedPicture], plane: Plane, count: int) -> Bool:
+    """[count, count] the cells of a plane on which enough pairs of cameras agree."""
+    pairs = _agreement(views, _smooth(views, plane, count), plane.cells(count)[None])[1][0]
+    agreed: Bool = pairs >= min(PAIRS, len(views) - 1)
+    return agreed
 
 
 def _starts(views: Sequence[PosedPicture]) -> list[Plane]:
@@ -167,18 +172,22 @@ def _starts(views: Sequence[PosedPicture]) -> list[Plane]:
 def _best(views: Sequence[PosedPicture], start: Plane, refine: bool = True) -> tuple[float, Plane]:
     """The score of the best plane about a start, and that plane."""
     smooth = _smooth(views, start, CELLS)
+
+    def scores_of(moves: Float) -> Float:
+        return _agreement(views, smooth, np.stack([_moved(start, move).cells(CELLS) for move in moves]))[0]
+
     tilts = np.linspace(-TILT, TILT, TILTS)
     tried = np.stack(np.meshgrid(tilts, tilts), axis=-1).reshape(-1, 2)
     best, at = -1.0, np.zeros(3)
     for offset in np.linspace(-REACH, REACH, OFFSETS):
         moves = np.column_stack([np.full(len(tried), offset), tried])
-        scores = _agreement(views, smooth, np.stack([_moved(start, move).cells(CELLS) for move in moves]))[0]
+        scores = scores_of(moves)
         if scores.max() > best:
             best, at = float(scores.max()), moves[int(scores.argmax())]
     steps = np.array([REACH / OFFSETS, TILT / TILTS, TILT / TILTS])
     for _ in range(ROUNDS if refine else 0):
         moves = at + np.concatenate([np.diag(steps), -np.diag(steps)])
-        scores = _agreement(views, smooth, np.stack([_moved(start, move).cells(CELLS) for move in moves]))[0]
+        scores = scores_of(moves)
         if scores.max() > best:
             best, at = float(scores.max()), moves[int(scores.argmax())]
         else:

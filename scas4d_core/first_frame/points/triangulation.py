@@ -16,7 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from scas4d_core.cameras import Camera
-from scas4d_core.first_frame.points.posed_pictures import Float, PosedPicture, halved
+from scas4d_core.first_frame.points.posed_pictures import Bool, Float, PosedPicture, halved
 from scas4d_core.first_frame.time_limit import FEATURES, MATCHES, TimeLimit
 
 RATIO = 0.8
@@ -133,10 +133,28 @@ def guided_matches(
     lines_a = np.hstack([uv_b, ones_b]) @ matrix
     residual = np.abs(lines_b @ np.hstack([uv_b, ones_b]).T).astype(np.float32)
     slope = np.minimum(np.linalg.norm(lines_b[:, :2], axis=1)[:, None], np.linalg.norm(lines_a[:, :2], axis=1)[None, :])
-    distance = np.sqrt(np.maximum(2.0 - 2.0 * (descriptors_a @ descriptors_b.T), 0.0))
+    distance = descriptor_distances(descriptors_a, descriptors_b)
     distance[residual > EPIPOLAR_ERROR * slope] = 2.0
+    return mutual_best(distance)
+
+
+def descriptor_distances(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[A, B] distances of unit descriptors."""
+    found: NDArray[np.float32] = np.sqrt(np.maximum(2.0 - 2.0 * (first @ second.T), 0.0))
+    return found
+
+
+def mutual_best(distance: NDArray[np.float32]) -> NDArray[np.intp]:
+    """[M, 2] rows and columns that are each other's nearest, and much nearer than any other (Lowe's ratio).
+
+    Args:
+        distance: [A, B] of descriptors; neither A nor B is 0.
+
+    >>> mutual_best(np.float32([[0.1, 0.6, 0.6], [0.6, 0.5, 0.51]])).tolist()  # the second row has two alike
+    [[0, 0]]
+    """
     best_b, best_a = distance.argmin(1), distance.argmin(0)
-    rows = np.arange(len(uv_a))
+    rows = np.arange(len(distance))
     value = distance[rows, best_b]
 
     def runner_up(block: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -177,11 +195,27 @@ def matched_tracks(views: Sequence[PosedPicture], limit: TimeLimit | None = None
     chosen = _pairs_in_time(found, limit)
     pairs = [guided_matches(found[a], found[b]) + offsets[[a, b]] for a, b in chosen]
     edges = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.intp)
-    graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(owner), len(owner)))
-    _, track = connected_components(graph, directed=False)
+    return Tracks(pixels, owner, grouped(joined(edges, len(owner))))
+
+
+def joined(edges: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    """[F] the track of each of ``count`` features, of which those of an edge [E, 2] are in one.
+
+    >>> joined(np.array([[0, 3], [3, 1]]), 4).tolist()
+    [0, 0, 1, 0]
+    """
+    graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1])
+
+
+def grouped(track: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Indices of the features of each track, in the order of the tracks' numbers.
+
+    >>> [group.tolist() for group in grouped(np.array([0, 0, 1, 0]))]
+    [[0, 1, 3], [2]]
+    """
     order = np.argsort(track, kind="stable")
-    groups = np.split(order, np.flatnonzero(np.diff(track[order])) + 1) if len(order) else []
-    return Tracks(pixels, owner, groups)
+    return np.split(order, np.flatnonzero(np.diff(track[order])) + 1) if len(order) else []
 
 
 def _pairs_in_time(
@@ -205,6 +239,42 @@ def _pairs_in_time(
     return sorted(pairs[:most])
 
 
+def triangulator(
+    cameras: Sequence[Camera], *, angle: float, error: float, trials: int, seed: int
+) -> Callable[[NDArray[np.intp], Float], tuple[Float, Bool] | None]:
+    """A function that finds the point of one track (LO-RANSAC, pycolmap), poses fixed.
+
+    Args:
+        cameras: calibrated. angle: degrees that rays have to meet under. error: bound of reprojection, pixels.
+        trials: of RANSAC at most. seed: of it.
+
+    Returns:
+        Of cameras' indices [n] and the pixel [n, 2] in each: the point [3] and which features are right [n], or None.
+    """
+    import pycolmap
+
+    lenses = [
+        pycolmap.Camera(model="PINHOLE", width=c.width, height=c.height, params=[c.fx, c.fy, c.cx, c.cy])
+        for c in cameras
+    ]
+    poses = [pycolmap.Rigid3d(pycolmap.Rotation3d(c.rotation), c.translation[:, None]) for c in cameras]
+    options: Any = pycolmap.EstimateTriangulationOptions()
+    options.min_tri_angle = np.deg2rad(angle)
+    options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
+    options.ransac.max_error = error
+    options.ransac.random_seed = seed
+    options.ransac.max_num_trials = trials
+
+    def point_of(who: NDArray[np.intp], pixels: Float) -> tuple[Float, Bool] | None:
+        answer = pycolmap.estimate_triangulation(pixels, [poses[i] for i in who], [lenses[i] for i in who], options)
+        if answer is None:
+            return None
+        right = np.asarray(answer["inlier_mask"] if "inlier_mask" in answer else answer["inliers"], dtype=bool)
+        return np.asarray(answer["xyz"], dtype=np.float64).reshape(3), right
+
+    return point_of
+
+
 def triangulate(
     views: Sequence[PosedPicture], tracks: Tracks | None = None, *, min_views: int = 3, seed: int = 0
 ) -> Triangulation:
@@ -216,45 +286,24 @@ def triangulate(
         min_views: inlier views a point needs.
         seed: of RANSAC.
     """
-    import pycolmap
-
     tracks = tracks or matched_tracks(views)
     pixels, owner = tracks.pixels, tracks.owner
-    cameras = [
-        pycolmap.Camera(
-            model="PINHOLE",
-            width=view.camera.width,
-            height=view.camera.height,
-            params=[view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy],
-        )
-        for view in views
-    ]
-    poses = [
-        pycolmap.Rigid3d(pycolmap.Rotation3d(view.camera.rotation), view.camera.translation[:, None]) for view in views
-    ]
-    options: Any = pycolmap.EstimateTriangulationOptions()
-    options.min_tri_angle = np.deg2rad(MIN_ANGLE_DEG)
-    options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
-    options.ransac.max_error = EPIPOLAR_ERROR
-    options.ransac.random_seed = seed
-    options.ransac.max_num_trials = 500
-
+    point_of = triangulator(
+        [view.camera for view in views], angle=MIN_ANGLE_DEG, error=EPIPOLAR_ERROR, trials=500, seed=seed
+    )
     positions, seen, errors = [], [], []
     for group in tracks.groups:
         if len(np.unique(owner[group])) < min_views:
             continue
         who = owner[group]
-        answer = pycolmap.estimate_triangulation(
-            pixels[group], [poses[w] for w in who], [cameras[w] for w in who], options
-        )
+        answer = point_of(who, pixels[group])
         if answer is None:
             continue
-        inlier = np.asarray(answer["inlier_mask"] if "inlier_mask" in answer else answer["inliers"], dtype=bool)
+        point, inlier = answer
         row = np.zeros(len(views), dtype=bool)
         row[who[inlier]] = True
         if row.sum() < min_views:
             continue
-        point = np.asarray(answer["xyz"], dtype=np.float64).reshape(3)
         residuals = [
             np.linalg.norm(views[w].camera.project(point)[0] - uv)
             for w, uv in zip(who[inlier], pixels[group][inlier], strict=True)

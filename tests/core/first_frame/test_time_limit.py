@@ -96,23 +96,13 @@ def test_time_for_another_fit_is_kept() -> None:
 
 
 def test_a_fit_that_is_slow_at_its_end_alone_is_shortened_too() -> None:
-    clock = Clock()
-    schedule = FitSchedule(3000, TimeLimit(60.0, clock=clock), lambda at: 1000.0)
-    while schedule.at < 3000:
-        schedule.next()
-        clock.now += 0.017 if schedule.at < 2950 else 0.3
-        schedule.took(1000)
+    schedule, _, _ = run(3000, 60.0, lambda at: 0.017 if at < 2950 else 0.3, lambda at: 1000.0)
     assert len(schedule.planned) == 1  # hardly fewer iterations
     assert schedule.shortened
 
 
 def test_a_fit_that_has_time_is_not_shortened() -> None:
-    clock = Clock()
-    schedule = FitSchedule(300, TimeLimit(60.0, clock=clock), lambda at: 1000.0)
-    while schedule.at < 300:
-        schedule.next()
-        clock.now += 0.01
-        schedule.took(1000)
+    schedule, _, _ = run(300, 60.0, lambda at: 0.01, lambda at: 1000.0)
     assert schedule.done == 300
     assert not schedule.shortened
 
