@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, TypedDict
 
 HELD_TEXT = "held as it was: "
 """The beginning of the text for a frame whose state is the one before."""
@@ -98,6 +98,17 @@ class Alarm:
     evidence: str
 
 
+class CameraTiming(TypedDict):
+    """The moment at which a camera's pictures seem to be taken; a row of the report, as it is on disk.
+
+    Keys:
+        frames: after the others' (+) or before them (−), whose median is 0. error: of that, a standard error.
+    """
+
+    frames: float
+    error: float
+
+
 def degraded_text(outcome: FrameOutcome, reason: str) -> str | None:
     """The sentence of a report for people; None of a frame that went as it should.
 
@@ -182,3 +193,29 @@ def first_warnings(record: Mapping[str, Any]) -> list[str]:
     ["camera 'a' is off"]
     """
     return [*cloud_warnings(record.get("cloud")), *(record.get("calibration") or {}).get("warnings", [])]
+
+
+OFF, SURE = 0.15, 4.0
+"""Frames, and times its error, by which a camera is clearly off; docs/calibration.md has the distributions."""
+
+
+def timing_warnings(timing: Mapping[str, CameraTiming] | None) -> list[str]:
+    """A sentence on the cameras whose pictures are clearly taken before or after the others'; none where all are near.
+
+    It is a lasting fault of a rig, and no news in each frame: the status of a scene has it for as long as it is so.
+
+    Args:
+        timing: of the newest report; None: it has none.
+
+    >>> timing_warnings({"a": {"frames": 0.41, "error": 0.03}, "b": {"frames": 0.02, "error": 0.03}})
+    ["cameras are not in step: the pictures of 'a' 0.41 frames after the others'; check their trigger or genlock"]
+    """
+    off = {
+        name: one["frames"]
+        for name, one in sorted((timing or {}).items())
+        if abs(one["frames"]) >= max(OFF, SURE * one["error"])
+    }
+    if not off:
+        return []
+    told = [f"of {name!r} {abs(way):.2f} frames {'after' if way > 0 else 'before'}" for name, way in off.items()]
+    return [f"cameras are not in step: the pictures {', '.join(told)} the others'; check their trigger or genlock"]

@@ -15,7 +15,7 @@ import numpy as np
 from scas4d_core.captures.frame import Frame
 from scas4d_core.first_frame.calibration.record import Calibration
 from scas4d_core.first_frame.static_result import FirstCloud, StaticResult
-from scas4d_core.frame_outcome import Alarm, Candidate, FrameOutcome, degraded_text
+from scas4d_core.frame_outcome import Alarm, CameraTiming, Candidate, FrameOutcome, degraded_text
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust.alarms import left_out_alarms
 from scas4d_core.update.best_state import mean_error
@@ -68,6 +68,8 @@ class FrameReport:
         moving, gaussians: how many Gaussians move, and are there. born, retired, revived: how many were, in this frame.
         put_off: what the budget left no time for, in words; the next frame has some for it.
         alarms: what a person should look at (``robust/alarms.py``).
+        timing: by camera, frames after the others at which its pictures seem to be taken, by all frames so far; only
+            of cameras of which motion tells it well enough (``robust/timing.py``).
         cloud: of frame 0: where its first points came from. calibration: of frame 0, against its pictures.
         cameras: by name, how well each camera's picture was met when it was last rendered: a bumped camera shows.
         used: cameras whose pictures were learnt from; none of a frame that was held or stood. dropped: cameras left
@@ -110,6 +112,7 @@ class FrameReport:
     revived: int = 0
     put_off: list[str] = field(default_factory=list)
     alarms: list[Alarm] = field(default_factory=list)
+    timing: dict[str, CameraTiming] = field(default_factory=dict)
     cloud: FirstCloud | None = None
     shortened: list[str] = field(default_factory=list)
     calibration: Calibration | None = None
@@ -228,6 +231,7 @@ def report_of_update(
         revived=int((gaussians.present[: len(before)] & before.retired).sum()),
         put_off=list(put_off),
         alarms=[*left_out_alarms(names, frame.images, missing), *result.alarms],
+        timing=dict(result.timing),
     )
     stages[REPORT] = watch.seconds[REPORT] + trace.seconds.get(REPORT, 0.0) + perf_counter() - began
     return report

@@ -6,7 +6,7 @@ import typer
 
 from studies.effort.commands import effort
 from studies.frontier.commands import frontier
-from studies.hard_cases.commands import stability
+from studies.hard_cases.commands import stability, timing
 from studies.kernels.commands import device, kernels, moving
 from studies.paper.commands import paper
 from studies.quality.commands import (
@@ -27,7 +27,7 @@ STUDIES = {
     "Quality": (quality, refit, rigs, effects, switches, drift, calibration, targets, table, processors),
     "Accuracy against time": (frontier, effort, paper),
     "Speed of the code": (kernels, device, moving),
-    "Hard cases": (stability,),
+    "Hard cases": (stability, timing),
     "The running service": (faults, ingest, views, memory, crossing),
 }
 """The commands by the heading under which `scripts/bench --help` lists them."""

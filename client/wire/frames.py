@@ -81,6 +81,13 @@ class AlarmModel(Model):
     evidence: str = Field(description="For people, with figures.")
 
 
+class CameraTimingModel(Model):
+    """Moment at which a camera's pictures seem to be taken, by the motion in all frames so far."""
+
+    frames: float = Field(description="After the others' (+) or before them (-); their median is 0.")
+    error: float = Field(description="Of that, a standard error.")
+
+
 class CurvePointModel(Model):
     """One point of an update's progress."""
 
@@ -225,6 +232,9 @@ class FrameReportModel(Model):
     cameras: dict[str, CameraFitModel] = Field(default_factory=dict, description="By camera that the update saw.")
     alarms: list[AlarmModel] = Field(
         default_factory=list, description="What a person should look at; frames of earlier versions have none."
+    )
+    timing: dict[str, CameraTimingModel] = Field(
+        default_factory=dict, description="By camera; only where motion tells it well enough. Never on a GPU."
     )
     moving: int | None = None
     gaussians: int | None = Field(default=None, description="That are there; those retired are not counted.")

@@ -195,7 +195,7 @@ class SceneStatus(Model):
         default_factory=list,
         description="What looks wrong and may be right, a sentence each: poses that seem to be the wrong way round; "
         "after frame 0, cameras that its pictures show to be off, what came of refining them, and first points that "
-        "no camera confirms, or that cover little of the pictures.",
+        "no camera confirms, or that cover little of the pictures; and cameras that motion shows to be out of step.",
     )
     created: str = Field(description="UTC, ISO 8601.")
     ingest: IngestSettings = IngestSettings()

@@ -46,8 +46,8 @@ OTHER_EFFORT = 1.5
 PLACE_RATE, LEVEL_RATE = 0.2, 0.3
 """How fast a camera's usual place and the usual level follow."""
 
-WATCHED = 9
-"""Figures of ``alarms.Watch`` by camera."""
+WATCHED, TIMED = 9, 6
+"""Figures of ``alarms.Watch`` and of ``timing.Looks`` by camera."""
 
 Fault = TypeVar("Fault")
 
@@ -70,6 +70,7 @@ class Past:
         last: by camera, mean of its picture in the last frame, in whatever light. step: times that the last frame was
             brighter than the one before it.
         watch: by camera, what its alarms are told from, see ``alarms.Watch``.
+        timing: by camera, the moments of its pictures, see ``timing.Looks``.
     """
 
     places: Mapping[str, float] = field(default_factory=dict)
@@ -87,6 +88,7 @@ class Past:
     last: Mapping[str, float] = field(default_factory=dict)
     step: float = 1.0
     watch: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    timing: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     @classmethod
     def of_first(cls, psnr: Mapping[str, float], bright: Mapping[str, float]) -> Past:
@@ -111,6 +113,8 @@ class Past:
             "last": np.array(list(self.last.values()), np.float64),
             "watched": np.array(list(self.watch), np.str_),
             "watch": np.array(list(self.watch.values()), np.float64).reshape(-1, WATCHED),
+            "timed": np.array(list(self.timing), np.str_),
+            "timing": np.array(list(self.timing.values()), np.float64).reshape(-1, TIMED),
         }
 
     @classmethod
@@ -131,12 +135,11 @@ class Past:
         level, updates, held, fitted, behind, iterations, light, lit, step = scene
         error = dict(zip(arrays["witnesses"].tolist(), arrays["error"].tolist(), strict=True))
         last = dict(zip(arrays["shown"].tolist(), arrays["last"].tolist(), strict=True)) if "last" in arrays else {}
-        rows_of = zip(arrays["watched"].tolist(), arrays["watch"].tolist(), strict=True) if "watch" in arrays else ()
-        watch = {name: tuple(row) for name, row in rows_of}
+        watch, timing = _rows(arrays, "watched", "watch"), _rows(arrays, "timed", "timing")
         return cls(
             places, bright, outs, level,
             int(updates), int(held), fitted, int(behind), int(iterations), error, light, int(lit), last, step,
-            watch,
+            watch, timing,
         )  # fmt: skip
 
     def place(self, name: str) -> float:
@@ -146,6 +149,13 @@ class Past:
     def is_out(self, name: str) -> bool:
         """True for a camera that is left out."""
         return self.out.get(name, 0) > 0
+
+
+def _rows(arrays: Mapping[str, NDArray[Any]], names: str, rows: str) -> dict[str, tuple[float, ...]]:
+    """Figures by camera; none from an older checkpoint, which does not know them."""
+    if rows not in arrays:
+        return {}
+    return {name: tuple(row) for name, row in zip(arrays[names].tolist(), arrays[rows].tolist(), strict=True)}
 
 
 def relit(past: Past, gain: float) -> Past:

@@ -19,7 +19,7 @@ from scas4d_core.effects.parts import Arrays
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.rasterize.shading import features_seen
-from scas4d_core.robust import outliers
+from scas4d_core.robust import outliers, timing
 from scas4d_core.robust.alarms import alarms_of, colours_by_camera
 from scas4d_core.robust.attempt_results import joined, met, retold, usual_errors
 from scas4d_core.robust.checks import EXPOSURE, evened, gain_of, relit, validated
@@ -109,7 +109,9 @@ class FrameSolver:
             return self._alarmed(given, result, past)
 
     def _alarmed(self, given: UpdateInput, result: UpdateResult, past: Past) -> Solved:
-        """With the health of the cameras, and the alarms."""
+        """With the health of the cameras, the alarms, and when the pictures were taken."""
+        if self._settings.judge:
+            past = timing.noted(past, given.state, result, self._picture, given.seconds, given.step, given.seed)
         means = {view.name: view.mean for view in result.views or given.views}
         alarms, past = alarms_of(
             given.past, past, outcome=result.outcome, reason=result.reason, exposure=result.exposure, sharp=given.sharp,
@@ -117,7 +119,8 @@ class FrameSolver:
             left_out={*given.left_out, *result.trace.left_out},
         )  # fmt: skip
         fits = {name: outliers.health(given.past, off) for name, off in result.offsets.items()}
-        return replace(result, health=fits, alarms=alarms if self._settings.judge else []), past
+        alarms = alarms if self._settings.judge else []
+        return replace(result, health=fits, alarms=alarms, timing=timing.timings(past)), past
 
     def _solved(self, given: UpdateInput) -> Solved:
         repeated = given.same and len(given.same) == len(given.brightness)

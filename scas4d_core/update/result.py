@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.effects.parts import Array, Arrays
-from scas4d_core.frame_outcome import Alarm, Candidate, FrameOutcome
+from scas4d_core.frame_outcome import Alarm, CameraTiming, Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView
 from scas4d_core.update.schedule import Stopping
@@ -200,6 +200,7 @@ class UpdateResult:
         exposure: times that the frame is brighter than usual.
         offsets: dB by camera above (+) or below its usual place among the cameras; empty where nothing was rendered.
         health: 0…1 by camera of ``offsets``. alarms: but for the cameras that were left out (``robust/alarms.py``).
+        timing: by camera, when its pictures seem to be taken (``robust/timing.py``).
         carried: arrays for the next update, by effect. views: that were learnt from, with the exposures of the end.
         joins: [B] int64 of the Gaussians born in this frame, which are the last rows: the row of the founder that each
             joins in the hierarchy and the graph, or −1 where it starts a structure of its own. None: none is born.
@@ -217,6 +218,7 @@ class UpdateResult:
     offsets: Mapping[str, float] = field(default_factory=dict)
     health: Mapping[str, float] = field(default_factory=dict)
     alarms: Sequence[Alarm] = ()
+    timing: Mapping[str, CameraTiming] = field(default_factory=dict)
     carried: Mapping[str, Arrays] = field(default_factory=dict)
     views: Sequence[TrainingView] = ()
     joins: NDArray[np.int64] | None = None

@@ -13,7 +13,7 @@ from client.wire import Budget, FrameReportModel, FrameState, SceneBudget, Scene
 from scas4d_core.cameras import Camera
 from scas4d_core.errors import message_of
 from scas4d_core.first_frame.calibration.record import in_use
-from scas4d_core.frame_outcome import first_warnings
+from scas4d_core.frame_outcome import first_warnings, timing_warnings
 from scas4d_core.rig_checks import RigError, check_start, pose_warnings
 from server.ingest.acknowledge import Ingest, IngestRules, uncancelled
 from server.ingest.open_frames import OpenFrames
@@ -172,6 +172,7 @@ class Scene:
     def status(self) -> SceneStatus:
         """Describes the scene as it is now."""
         ledger, updates = self.ledger, self.updates
+        newest = self._newest_record or {}
         return SceneStatus(
             id=self.id,
             name=self.request.name,
@@ -201,7 +202,7 @@ class Scene:
             states_deleted=ledger.states_deleted,
             effects=effects_of(self.spec.settings, self._newest_record),
             damage=self._damage.sentences,
-            warnings=[*self.warnings, *first_warnings(updates.first)],
+            warnings=[*self.warnings, *first_warnings(updates.first), *timing_warnings(newest.get("timing"))],
             created=self.created.isoformat(),
             ingest=self.request.ingest,
             settings=self.spec.settings.model_dump(mode="json"),

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from studies.options import QUALITY
+from studies.options import QUALITY, Again, Captures, Changes
 
 
 def stability(
@@ -54,6 +54,23 @@ def stability(
         run.write_page(out, run.page(lines, failing, *run.here()))
     if any(line.violations for line in lines) or (mutate and not all((failing or {}).values())):
         raise typer.Exit(1)
+
+
+def timing(
+    captures: Captures,
+    out: Annotated[Path, typer.Option(help="Folder of the study of quality: rows, frames 0.")] = QUALITY,
+    updates: Annotated[int, typer.Option(min=1, help="Of each capture, which is played there and back.")] = 24,
+    masks: Annotated[bool, typer.Option(help="Use the masks of the captures.")] = True,
+    again: Again = False,
+    changes: Changes = None,
+) -> None:
+    """Gives two cameras of a capture pictures from between the frames, and tells what is found of it.
+
+    Leaves timing.md in the study's folder; a run that was measured is not measured again.
+    """
+    from studies.hard_frames.out_of_step import run
+
+    run(captures, out, updates=updates, masks=masks, changes=changes or (), again=again)
 
 
 def _frame_studies(

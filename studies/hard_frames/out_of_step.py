@@ -1,0 +1,186 @@
+"""``scripts/bench timing``: cameras that take their pictures before or after the others, and what is found of it.
+
+A capture is played there and back, as a stream of every second, third or fourth of its frames; two cameras get the
+pictures of the frames between, one after the others', one before them: their offsets are exact. The stream moves twice
+as fast as the capture, or faster. The synthetic footage is rendered at any moment, for as long as one likes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
+from unittest import mock
+
+import numpy as np
+
+from client.cli.evaluate import Report, recorded
+from client.cli.scores import Column, Row, digest, kept_row, markdown
+from client.importers.open_source import open_source
+from scas4d_core.cameras import Rig
+from scas4d_core.captures import Capture
+from scas4d_core.captures.frame import Frame
+from scas4d_core.frame_outcome import timing_warnings
+from scas4d_core.frame_report import FrameReport
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.robust import timing
+from scas4d_core.settings import Settings
+from studies.hard_frames.footage import ANGLE, NOISE, SyntheticFootage
+from studies.hard_frames.scene import first_state, gone
+from studies.kernels.synthetic import photograph
+from studies.machine import core_version, machine
+from studies.quality.first_frame import first_of
+from studies.quality.settings import settings_of
+
+COLUMNS = (
+    Column("capture", "capture"),
+    Column("frames taken", "step", "d"),
+    Column("updates", "updates", "d"),
+    Column("true", "true"),
+    Column("found", "found"),
+    Column("known", "known", "d"),
+    Column("others, largest", "others", ".3f"),
+    Column("named since update", "since"),
+    Column("named wrongly", "wrong", "d"),
+    Column("ms an update", "milliseconds", ".1f"),
+    Column("of it", "share", ".1%"),
+)
+
+
+_TRUE = first_state(resting_may_move=False)
+"""The synthetic footage's."""
+
+
+class Case(NamedTuple):
+    """Every so many frames of a capture, and by how many of its frames two cameras are late and early; 0: none is."""
+
+    step: int
+    shift: int
+
+
+CASES = (Case(1, 0), Case(2, 0), Case(2, 1), Case(3, 1), Case(4, 1))
+
+
+def run(
+    captures: Sequence[Path],
+    out: Path,
+    *,
+    updates: int = 24,
+    masks: bool = True,
+    changes: Sequence[str] = (),
+    again: bool = False,
+    report: Report = print,
+) -> list[Row]:
+    """Updates each capture in each case, prints the table and leaves it in ``out/timing.md``.
+
+    Args:
+        captures: folders. out: a file a finished run goes here; run again to go on. updates: of each.
+        masks: whether they are used. changes: to the settings. again: measure anew. report: takes the printed lines.
+    """
+    settings, rows = settings_of("scas4d", None, 0, changes), []
+    for folder in captures:
+        for case in CASES:
+            key = digest(recorded(settings, ()), updates, case, masks)
+            path = out / "timing" / f"{folder.resolve().name}-{case.step}-{case.shift}-{key}.json"
+            row = kept_row(path, partial(_row, path.stem, folder, out, settings, updates, case, masks), again=again)
+            report(
+                f"{row['capture']}, every {case.step}: {row['true'] or 'in step'}, found {row['found'] or 'none off'}"
+            )
+            rows.append(row)
+    table = markdown(rows, COLUMNS)
+    (out / "timing.md").write_text(table + "\n")
+    report(table)
+    return rows
+
+
+def _row(key: str, folder: Path, out: Path, settings: Settings, updates: int, case: Case, masks: bool) -> Row:
+    capture = open_source(folder, use_masks=masks)
+    names = capture.rig.names
+    shifts = {names[2]: case.shift, names[len(names) // 2 - 1]: -case.shift} if case.shift else {}
+    first = first_of(capture, out, settings)
+    scene = Reconstruction.start(capture.rig, capture.frame(0), settings, points=capture.points, static=first)
+    with clocked() as spent:
+        reports = [scene.step(played(capture, index, case.step, shifts)) for index in range(1, updates + 1)]
+    found = summary(reports, {name: shift / case.step for name, shift in shifts.items()})
+    whole = float(np.median([sum(report.seconds.values()) for report in reports]))
+    found |= {"milliseconds": 1000 * float(np.median(spent)), "share": float(np.median(spent)) / whole}
+    told = {"capture": capture.name, "step": case.step, "settings": recorded(settings, ()), "masks": masks}
+    return {"key": key, **told, **found, "core": core_version(), "machine": machine()}
+
+
+def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -> Frame:
+    """Frame ``index`` of a stream of every so many frames of a capture, there and back.
+
+    Args:
+        shifts: by camera, frames of the capture after the others'.
+    """
+    frame = capture.frame(_there_and_back(step * index, capture.frame_count))
+    images, masks = dict(frame.images), dict(frame.masks)
+    for name, shift in shifts.items():
+        other = capture.frame(_there_and_back(step * index + shift, capture.frame_count))
+        images[name] = other.images[name]
+        if name in masks:
+            masks[name] = other.masks[name]
+    return replace(frame, index=index, time=index / 30, images=images, masks=masks)
+
+
+@contextmanager
+def clocked() -> Iterator[list[float]]:
+    """Seconds that the looks of each frame take, while this lasts."""
+    spent, looked = list[float](), timing.noted
+
+    def noted(*given: Any) -> Any:
+        began = perf_counter()
+        found = looked(*given)
+        spent.append(perf_counter() - began)
+        return found
+
+    with mock.patch.object(timing, "noted", noted):
+        yield spent
+
+
+def _there_and_back(place: int, count: int) -> int:
+    place = abs(place) % (2 * count - 2)
+    return place if place < count else 2 * count - 2 - place
+
+
+def shown_out_of_step(footage: SyntheticFootage, index: int, offsets: Mapping[str, float]) -> Frame:
+    """A frame of the synthetic footage in which some cameras are so many frames after the others (+) or before (−)."""
+    frame, rng = footage.frame(index), np.random.default_rng([index, 1])
+    images, masks = dict(frame.images), dict(frame.masks)
+    for name, offset in offsets.items():
+        shown = photograph(gone(_TRUE, ANGLE * (index + offset)), Rig((footage.rig[name],)))
+        noisy = shown.images[name] + rng.normal(0, NOISE, shown.images[name].shape)
+        images[name], masks[name] = noisy.round().clip(0, 255).astype(np.uint8), shown.masks[name]
+    return replace(frame, images=images, masks=masks)
+
+
+def summary(reports: Sequence[FrameReport], true: Mapping[str, float]) -> Row:
+    """What the reports of a run tell.
+
+    Args:
+        true: frames by which cameras are off; the others are in step.
+    """
+    last, named = reports[-1].timing, [_named(report) for report in reports]
+    others = [abs(one["frames"]) for report in reports for name, one in report.timing.items() if name not in true]
+    since = {name: next((k + 1 for k, names in enumerate(named) if name in names), None) for name in true}
+    return {
+        "updates": len(reports),
+        "true": "; ".join(f"{name}: {offset:+.2f}" for name, offset in true.items()),
+        "found": "; ".join(
+            f"{name}: {last[name]['frames']:+.2f} ± {last[name]['error']:.2f}" if name in last else f"{name}: not known"
+            for name in true
+        ),
+        "known": len(last),
+        "others": max(others, default=float("nan")),
+        "since": "; ".join("–" if at is None else str(at) for at in since.values()),
+        "wrong": len({name for names in named for name in names} - set(true)),
+    }
+
+
+def _named(report: FrameReport) -> set[str]:
+    return {name for name, one in report.timing.items() if timing_warnings({name: one})}
