@@ -103,10 +103,12 @@ class CameraTiming(TypedDict):
 
     Keys:
         frames: after the others' (+) or before them (−), whose median is 0. error: of that, a standard error.
+        off: whether the camera is clearly out of step.
     """
 
     frames: float
     error: float
+    off: bool
 
 
 def degraded_text(outcome: FrameOutcome, reason: str) -> str | None:
@@ -195,27 +197,20 @@ def first_warnings(record: Mapping[str, Any]) -> list[str]:
     return [*cloud_warnings(record.get("cloud")), *(record.get("calibration") or {}).get("warnings", [])]
 
 
-OFF, SURE = 0.15, 4.0
-"""Frames, and times its error, by which a camera is clearly off; docs/calibration.md has the distributions."""
-
-
 def timing_warnings(timing: Mapping[str, CameraTiming] | None) -> list[str]:
-    """A sentence on the cameras whose pictures are clearly taken before or after the others'; none where all are near.
+    """A sentence on the cameras that are clearly out of step; none where none is.
 
     It is a lasting fault of a rig, and no news in each frame: the status of a scene has it for as long as it is so.
 
     Args:
         timing: of the newest report; None: it has none.
 
-    >>> timing_warnings({"a": {"frames": 0.41, "error": 0.03}, "b": {"frames": 0.02, "error": 0.03}})
-    ["cameras are not in step: the pictures of 'a' 0.41 frames after the others'; check their trigger or genlock"]
+    >>> in_step, late = {"frames": 0.02, "error": 0.03, "off": False}, {"frames": 0.41, "error": 0.03, "off": True}
+    >>> timing_warnings({"a": late, "b": in_step})
+    ["cameras are out of step: the pictures of 'a' 0.41 frames after the others'; check their trigger or genlock"]
     """
-    off = {
-        name: one["frames"]
-        for name, one in sorted((timing or {}).items())
-        if abs(one["frames"]) >= max(OFF, SURE * one["error"])
-    }
+    off = {name: one["frames"] for name, one in sorted((timing or {}).items()) if one["off"]}
     if not off:
         return []
     told = [f"of {name!r} {abs(way):.2f} frames {'after' if way > 0 else 'before'}" for name, way in off.items()]
-    return [f"cameras are not in step: the pictures {', '.join(told)} the others'; check their trigger or genlock"]
+    return [f"cameras are out of step: the pictures {', '.join(told)} the others'; check their trigger or genlock"]

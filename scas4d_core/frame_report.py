@@ -15,7 +15,7 @@ import numpy as np
 from scas4d_core.captures.frame import Frame
 from scas4d_core.first_frame.calibration.record import Calibration
 from scas4d_core.first_frame.static_result import FirstCloud, StaticResult
-from scas4d_core.frame_outcome import Alarm, CameraTiming, Candidate, FrameOutcome, degraded_text
+from scas4d_core.frame_outcome import Alarm, CameraTiming, Candidate, FrameOutcome, degraded_text, timing_warnings
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust.alarms import left_out_alarms
 from scas4d_core.update.best_state import mean_error
@@ -120,7 +120,8 @@ class FrameReport:
     @property
     def warnings(self) -> list[str]:
         """Sentences on what looks wrong with the rig."""
-        return [] if self.calibration is None else self.calibration.warnings
+        found = [] if self.calibration is None else self.calibration.warnings
+        return [*found, *timing_warnings(self.timing)]
 
     def record(self) -> dict[str, Any]:
         """The report as JSON: numbers that are not finite are None."""

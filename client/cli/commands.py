@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +16,7 @@ from client.cli.changes import parse_changes
 from client.cli.progress import Bars, console
 from client.importers.open_source import CaptureOptions
 from client.sdk import DEFAULT_URL, Client
-from client.wire import FINISHED, FrameReportModel, IngestSettings
+from client.wire import FINISHED, FrameReportModel, FrameState, IngestSettings
 from scas4d_core.captures import InitialPoints
 from scas4d_core.frame_outcome import AlarmKind
 
@@ -138,6 +139,7 @@ def watch(scene: Scene, url: Url = DEFAULT_URL, token: Token = None) -> None:
     from client.wire.stream import FrameMessage, SceneMessage
 
     state: str | None = None
+    off = set[str]()
     with Client(url, token=token, outage=0) as client:
         client.scene(scene)  # a wrong id is said at once
     try:
@@ -146,7 +148,8 @@ def watch(scene: Scene, url: Url = DEFAULT_URL, token: Token = None) -> None:
             stream.subscribe("scene", scene_changes())
             for event in stream:
                 if isinstance(event, FrameMessage) and event.report.state in FINISHED:
-                    console.print(frame_line(event.report, event.missed), highlight=False, soft_wrap=True)
+                    console.print(frame_line(event.report, event.missed, off), highlight=False, soft_wrap=True)
+                    off = out_of_step(event.report) if event.report.state == FrameState.COMMITTED else off
                 elif isinstance(event, SceneMessage) and event.status.state != state:
                     state = event.status.state
                     console.print(f"scene is {state}" + (f": {event.status.error}" if event.status.error else ""))
@@ -264,8 +267,17 @@ TOLD = frozenset({AlarmKind.CAMERA_LEFT_OUT, AlarmKind.FRAME_HELD, AlarmKind.FRA
 """Alarms that the line of a frame tells without."""
 
 
-def frame_line(report: FrameReportModel, missed: int = 0) -> str:
-    """A finished frame's report as one line."""
+def out_of_step(report: FrameReportModel) -> set[str]:
+    """The cameras that are clearly out of step, as a frame's report has them."""
+    return {name for name, one in report.timing.items() if one.off}
+
+
+def frame_line(report: FrameReportModel, missed: int = 0, off: Collection[str] = ()) -> str:
+    """A finished frame's report as one line.
+
+    Args:
+        missed: frames before it that are not shown. off: cameras that are known to be out of step; others are named.
+    """
     parts = [f"frame {report.index}: {report.state}"]
     if report.psnr is not None:
         parts.append(f"{report.psnr:.1f} dB")
@@ -278,6 +290,8 @@ def frame_line(report: FrameReportModel, missed: int = 0) -> str:
     for alarm in report.alarms:
         if alarm.what not in TOLD:
             parts.append(alarm.evidence if alarm.camera is None else f"camera {alarm.camera}: {alarm.evidence}")
+    for name in sorted(out_of_step(report).difference(off)):
+        parts.append(f"camera {name}: out of step by {report.timing[name].frames:+.2f} frames")
     if report.error:
         parts.append(report.error)
     if missed:

@@ -86,6 +86,7 @@ class CameraTimingModel(Model):
 
     frames: float = Field(description="After the others' (+) or before them (-); their median is 0.")
     error: float = Field(description="Of that, a standard error.")
+    off: bool = Field(description="It is clearly out of step: the scene's `warnings` name it.")
 
 
 class CurvePointModel(Model):

@@ -55,6 +55,8 @@ APART = 0.02
 these: added to each error."""
 TOLD = 0.1
 """Error, of a frame, from which a camera's mean is too little known to be reported."""
+OFF, SURE = 0.15, 4.0
+"""Frames, and times its error, by which a camera is clearly out of step; clean: 0.05. docs/calibration.md has more."""
 
 Array = NDArray[np.float32]
 Row = tuple[float, ...]
@@ -207,4 +209,8 @@ def timings(past: Past) -> dict[str, CameraTiming]:
     if len(known) < CAMERAS:
         return {}
     common = median(one.mean for one in known.values())
-    return {name: CameraTiming(frames=one.mean - common, error=one.error) for name, one in known.items()}
+    return {name: _timing(one.mean - common, one.error) for name, one in known.items()}
+
+
+def _timing(frames: float, error: float) -> CameraTiming:
+    return {"frames": frames, "error": error, "off": abs(frames) >= max(OFF, SURE * error)}

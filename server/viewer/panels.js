@@ -84,8 +84,12 @@ export function showQueue(box, words, status) {
   box.classList.toggle("full", full);
 }
 
+/** Words on a camera that is clearly out of step; a lasting fault, that the row of the camera has. */
+const outOfStep = (one) => (one?.off ? [`its pictures are taken ${Math.abs(one.frames).toFixed(2)} frames ${one.frames > 0 ? "after" : "before"} the others'`] : []);
+
 /** Evidence of the alarms about a camera; they are made where the frame was reconstructed, and only shown here. */
-export const complaints = (name, report) => (report?.alarms ?? []).filter((one) => one.camera === name).map((one) => one.evidence);
+export const complaints = (name, report) => [
+  ...(report?.alarms ?? []).filter((one) => one.camera === name).map((one) => one.evidence), ...outOfStep(report?.timing?.[name])];
 
 const TOLD = ["frame_held", "frame_in_part"];
 

@@ -24,7 +24,6 @@ from client.importers.open_source import open_source
 from scas4d_core.cameras import Rig
 from scas4d_core.captures import Capture
 from scas4d_core.captures.frame import Frame
-from scas4d_core.frame_outcome import timing_warnings
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.robust import timing
@@ -165,7 +164,8 @@ def summary(reports: Sequence[FrameReport], true: Mapping[str, float]) -> Row:
     Args:
         true: frames by which cameras are off; the others are in step.
     """
-    last, named = reports[-1].timing, [_named(report) for report in reports]
+    last = reports[-1].timing
+    named = [{name for name, one in report.timing.items() if one["off"]} for report in reports]
     others = [abs(one["frames"]) for report in reports for name, one in report.timing.items() if name not in true]
     since = {name: next((k + 1 for k, names in enumerate(named) if name in names), None) for name in true}
     return {
@@ -180,7 +180,3 @@ def summary(reports: Sequence[FrameReport], true: Mapping[str, float]) -> Row:
         "since": "; ".join("–" if at is None else str(at) for at in since.values()),
         "wrong": len({name for names in named for name in names} - set(true)),
     }
-
-
-def _named(report: FrameReport) -> set[str]:
-    return {name for name, one in report.timing.items() if timing_warnings({name: one})}

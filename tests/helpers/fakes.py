@@ -20,7 +20,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.storage.history import History, HistoryError
 
 SLOW, SLOW_RAISES, RAISES, DIES = 200, 201, 250, 251
-HELD, LEAVES_OUT, STANDS, GUESSED, REFINES = 240, 241, 242, 243, 244
+HELD, LEAVES_OUT, STANDS, GUESSED, REFINES, LATE = 240, 241, 242, 243, 244, 245
 PICKY, PICKED = 249, 77
 """A first frame with that red fails, unless static.iterations are those."""
 ITERATIONS = 100
@@ -159,6 +159,9 @@ class FakeReconstruction:
             record["dropped"] = {**record["dropped"], "c1": "it shows nothing"}
             out = {"what": "camera_left_out", "camera": "c1", "evidence": "left out of this frame: it shows nothing"}
             record["alarms"] = [*record.get("alarms", []), out]
+        if red == LATE:
+            record["timing"] = {"c0": {"frames": 0.0, "error": 0.02, "off": False}}
+            record["timing"]["c1"] = {"frames": 0.4, "error": 0.02, "off": True}
         if red == GUESSED and not known:
             record |= {"cloud": {"way": "volume", "points": count, "covered": 0.0}, "shortened": ["no stereo"]}
         first = self.iterations // 2

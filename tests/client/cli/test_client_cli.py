@@ -13,7 +13,7 @@ from PIL import Image
 from running import HEIGHT, WIDTH, make_rig, pictures
 
 from client.cli.changes import parse_changes
-from client.cli.commands import frame_line
+from client.cli.commands import frame_line, out_of_step
 from client.cli.pictures import coloured, comparison, psnr
 from client.rig import push
 from client.sdk import Client
@@ -266,3 +266,12 @@ def test_the_line_of_a_frame_names_alarms_that_it_does_not_tell_already():
     line = frame_line(FrameReportModel.model_validate({**report, "alarms": alarms}))
     assert line == "frame 3: committed  without c2  camera c1: its colours are off  the pictures are brighter"
     assert frame_line(FrameReportModel.model_validate(report)) == "frame 3: committed  without c2"
+
+
+def test_the_line_of_a_frame_names_a_camera_out_of_step_once():
+    timing = {name: {"frames": way, "error": 0.02, "off": abs(way) > 0.2} for name, way in (("c1", -0.4), ("c2", 0.1))}
+    report = {"scene": "s", "index": 3, "time": 0.1, "state": "committed", "timing": timing}
+    model = FrameReportModel.model_validate(report)
+    assert frame_line(model) == "frame 3: committed  camera c1: out of step by -0.40 frames"
+    assert out_of_step(model) == {"c1"}
+    assert frame_line(model, off=out_of_step(model)) == "frame 3: committed"

@@ -15,14 +15,14 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.robust import timing
 from scas4d_core.robust.outliers import Past
-from scas4d_core.robust.timing import APART, CAMERAS, FARTHEST, TOLD, Look, Looks, astuple, told
+from scas4d_core.robust.timing import APART, CAMERAS, FARTHEST, OFF, TOLD, Look, Looks, astuple, told
 from scas4d_core.storage.history import History
 from studies.constants import all_varied
 from studies.hard_frames.footage import SyntheticFootage
 from studies.hard_frames.out_of_step import shown_out_of_step
 
 FOOTAGE = SyntheticFootage()
-OFF = {"c3": 0.5, "c7": -0.5}
+APART_BY = {"c3": 0.5, "c7": -0.5}
 SIZE = 48
 
 
@@ -117,12 +117,15 @@ def test_the_median_of_the_cameras_is_0_and_those_little_known_are_not_told() ->
     assert timing.timings(past_of(few)) == {}
 
 
-def test_a_warning_names_who_is_clearly_off() -> None:
+def test_who_is_clearly_off_is_named() -> None:
+    steady = {name: {0.0: 6} for name in "abcd"}
+    wild = {0.0: 6, 0.6: 6}
+    found = timing.timings(past_of({**steady, "near": {0.14: 6}, "late": {0.3: 6}, "early": {-0.4: 6}, "wild": wild}))
+    assert found["wild"]["frames"] > OFF
+    assert {name for name, one in found.items() if one["off"]} == {"late", "early"}
+    (told,) = timing_warnings(found)
+    assert "of 'early' 0.40 frames before, of 'late' 0.30 frames after the others'" in told
     assert timing_warnings(None) == []
-    assert timing_warnings({"a": {"frames": 0.14, "error": 0.02}, "b": {"frames": -0.3, "error": 0.08}}) == []
-    told = timing_warnings({"a": {"frames": 0.3, "error": 0.02}, "b": {"frames": -0.4, "error": 0.02}})
-    assert len(told) == 1
-    assert "of 'a' 0.30 frames after, of 'b' 0.40 frames before the others'" in told[0]
 
 
 def test_looks_go_through_arrays_and_older_checkpoints_have_none() -> None:
@@ -142,14 +145,14 @@ def play(scene: Reconstruction, indices: range, offsets: Mapping[str, float]) ->
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Reconstruction, list[FrameReport]]:
     """Cameras out of step, to the end."""
     scene = FOOTAGE.start(tmp_path_factory.mktemp("timing") / "scene")
-    return scene, play(scene, range(1, 19), OFF)
+    return scene, play(scene, range(1, 19), APART_BY)
 
 
 def test_cameras_out_of_step_are_found_and_named(undisturbed: tuple[Reconstruction, list[FrameReport]]) -> None:
     found = undisturbed[1][-1].timing
     assert found["c3"]["frames"] > 0.3
     assert found["c7"]["frames"] < -0.3
-    assert all(abs(one["frames"]) < 0.1 for name, one in found.items() if name not in OFF)
+    assert all(abs(one["frames"]) < 0.1 for name, one in found.items() if name not in APART_BY)
     assert undisturbed[1][0].timing == {}  # a look or two say nothing
     (told,) = timing_warnings(undisturbed[0].history.report(18)["timing"])
     assert "'c3'" in told
@@ -158,13 +161,13 @@ def test_cameras_out_of_step_are_found_and_named(undisturbed: tuple[Reconstructi
 
 
 def test_a_scene_goes_on_with_its_looks(undisturbed: tuple[Reconstruction, list[FrameReport]], tmp_path: Path) -> None:
-    play(FOOTAGE.start(tmp_path / "scene"), range(1, 9), OFF)
+    play(FOOTAGE.start(tmp_path / "scene"), range(1, 9), APART_BY)
     with all_varied(FOOTAGE.constants):
         again = Reconstruction.resume(FOOTAGE.rig, FOOTAGE.settings, History.open(tmp_path / "scene"))
     assert again.resumed is not None
     assert not again.resumed.cold
     assert again._carried.past.timing
-    assert play(again, range(9, 19), OFF)[-1].timing == undisturbed[1][-1].timing
+    assert play(again, range(9, 19), APART_BY)[-1].timing == undisturbed[1][-1].timing
 
 
 def test_no_state_hangs_on_it(
@@ -172,7 +175,7 @@ def test_no_state_hangs_on_it(
 ) -> None:
     monkeypatch.setattr(timing, "noted", lambda past, *_: past)
     without = FOOTAGE.start(tmp_path / "scene")
-    assert play(without, range(1, 6), OFF)[-1].timing == {}
+    assert play(without, range(1, 6), APART_BY)[-1].timing == {}
     here, there = (scene.history.gaussians(5).arrays() for scene in (without, undisturbed[0]))
     assert all(np.array_equal(here[name], there[name]) for name in here)
 

@@ -93,6 +93,23 @@ def test_a_frame_0_that_is_a_guess_is_a_warning_and_is_one_again(tmp_path):
         assert sdk.scene(id).warnings == [said]
 
 
+def test_a_camera_out_of_step_is_a_warning_for_as_long_as_it_is(tmp_path):
+    with serving(tmp_path) as (http, sdk):
+        id = create(http)
+        for index, red in enumerate((0, fakes.LATE)):
+            put(http, id, index, pictures(red))
+            sdk.wait(id, index)
+        (said,) = sdk.scene(id).warnings
+        assert said.startswith("cameras are out of step: the pictures of 'c1' 0.40 frames after the others'")
+        assert [name for name, one in sdk.frame(id, 1).timing.items() if one.off] == ["c1"]
+        assert sdk.frame(id, 1).alarms == []
+    with serving(tmp_path) as (http, sdk):
+        assert sdk.scene(id).warnings == [said]
+        put(http, id, 2)
+        sdk.wait(id, 2)
+        assert sdk.scene(id).warnings == []
+
+
 def test_a_first_frame_that_failed_stays_failed(tmp_path):
     with serving(tmp_path) as (http, sdk):
         id = create(http)
