@@ -259,10 +259,9 @@ class Updates:
             self.first = {"cloud": record.get("cloud"), "calibration": record.get("calibration") or {}}
 
     async def recall(self) -> None:
-        """Reads the first and the newest report of a scene that is found again; to be called before anybody asks."""
-        if committed := self._ledger.committed:
-            self._recall(await self._reports.record(committed[0]))
-            self._ledger.frames.remember(committed[-1], await self._reports.record(committed[-1]))
+        """Reads the first report of a scene that is found again; to be called before anybody asks for it."""
+        if self._ledger.committed:
+            self._recall(await self._reports.record(self._ledger.committed[0]))
 
     def _last_trouble(self) -> str | None:
         """Returns what went wrong with the newest frame that was tried, or None."""

@@ -159,7 +159,7 @@ def shown_out_of_step(footage: SyntheticFootage, index: int, offsets: Mapping[st
 
 
 def summary(reports: Sequence[FrameReport], true: Mapping[str, float]) -> Row:
-    """What the reports of a run tell.
+    """Row of a run, from its reports.
 
     Args:
         true: frames by which cameras are off; the others are in step.

@@ -104,6 +104,9 @@ def test_a_camera_out_of_step_is_a_warning_for_as_long_as_it_is(tmp_path):
         assert [name for name, one in sdk.frame(id, 1).timing.items() if one.off] == ["c1"]
         assert sdk.frame(id, 1).alarms == []
     with serving(tmp_path) as (http, sdk):
+        deadline = time.monotonic() + 30
+        while sdk.scene(id).warnings != [said] and time.monotonic() < deadline:
+            time.sleep(0.02)  # the worker says what it found
         assert sdk.scene(id).warnings == [said]
         put(http, id, 2)
         sdk.wait(id, 2)
