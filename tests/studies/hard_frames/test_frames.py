@@ -10,10 +10,10 @@ import pytest
 from studies.hard_frames import frames
 from studies.hard_frames.footage import SyntheticFootage
 from studies.hard_frames.frames import Footage, FrameCase, Sent
-from studies.hard_frames.study import FrameCaseResult, FrameStudy, table
+from studies.hard_frames.study import FrameCaseResult, FrameStudy, cases_of, table
 
 FOOTAGE = SyntheticFootage()
-CASES = [(case, size) for case in frames.named(FOOTAGE) for size in case.sizes]
+CASES = [(case, size) for case in cases_of(FOOTAGE) for size in case.sizes]
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,9 @@ def unjudged() -> SyntheticFootage:
     return SyntheticFootage(settings.model_copy(update={"update": settings.update.model_copy(update={"judge": False})}))
 
 
-@pytest.mark.parametrize("name", ["all black", "two cameras swapped", "a camera is bumped", "saturated noise"])
+@pytest.mark.parametrize(
+    "name", ["all black", "two cameras swapped", "a camera is bumped", "saturated noise", "a lens is dirty"]
+)
 def test_without_the_judge_the_cases_do_not_hold(name: str, tmp_path_factory: pytest.TempPathFactory) -> None:
     bare = FrameStudy(unjudged(), tmp_path_factory.mktemp("bare") / "study")
     case = next(case for case in bare.cases if case.name == name)
