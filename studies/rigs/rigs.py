@@ -82,9 +82,8 @@ def run(
     for folder in captures:
         key = f"{folder.resolve().name}-{digest(list(changes), frames, longer, *options.changed.items())}"
         path = store.folder / "rigs" / f"{key}.json"
-        row = kept_row(
-            path, partial(measured, folder, options, frames, longer, changes, store.folder / "rigs"), again=again
-        )
+        pictures = store.folder / "pictures"
+        row = kept_row(path, partial(measured, folder, options, frames, longer, changes, pictures), again=again)
         rows.append(row)
         report(markdown([row], COLUMNS))
     table = markdown(rows, COLUMNS)
