@@ -31,10 +31,6 @@ DROP_DB = 6.0
 """Of the cameras' median below its usual, from which an update has not met its frame."""
 DROPS_DB = (14.0, 9.0, 9.0)
 """The same in the first updates: what is usual is known from frame 0 alone, or from an update that took longer."""
-ANY_DB = 18.0
-"""From which the first update of a scene is taken however far it is below frame 0, once a search was in vain: a fit to
-a few cameras, of which each sees what no other does, is met by 15 to 20 dB better than any update can be. Noise and
-pictures of another scene are met at 5 to 12 dB."""
 HALVED_DB = 3.0
 """More is allowed for each halving of the iterations: 100 to 50 cost 1.7 dB on the captures, 50 to 25 3.2."""
 BEHIND_DB = 1.5
@@ -211,15 +207,6 @@ def unmet(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | N
     if level > past.level - drop - _shorter(past, iterations):
         return None
     return f"the pictures are met at {level:.1f} dB, {past.level - level:.1f} dB less than usual"
-
-
-def begins(past: Past, psnr: Mapping[str, float]) -> bool:
-    """True for a first update that has met its frame at all: it tells what is usual from then on, not frame 0.
-
-    Args:
-        past: before the update. psnr: dB by camera when last rendered.
-    """
-    return past.updates == 0 and level_of(past, psnr) >= ANY_DB
 
 
 def behind(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | None:

@@ -155,8 +155,6 @@ class FrameSolver:
             again = self._search(given, result, attempts)
             if again is not None:
                 result, outcome, reason = again, FrameOutcome.RELOCATED, f"{why}; {attempts[-1]}"
-            elif outliers.begins(given.past, met(result)):
-                outcome, reason = FrameOutcome.ACCEPTED, f"{why}, which frame 0 told alone: taken as it is"
             elif lost.held < settings.patience:
                 outcome = FrameOutcome.HELD_UNMET
                 return self._held(given, outcome, result.trace, lost, attempts, why, exposure)

@@ -238,18 +238,3 @@ def test_a_place_that_is_hardly_known_follows_all_the_same(updates: int) -> None
     past = replace(PAST, updates=updates)
     after = outliers.settle(past, {**USUAL, "c4": USUAL["c4"] - 4.5}, BRIGHT, 1.0)
     assert after.places["c4"] < PLACES["c4"] - 0.5
-
-
-@pytest.mark.parametrize(("updates", "db", "begins"), [(0, 19.0, True), (0, 12.0, False), (1, 19.0, False)])
-def test_what_is_usual_begins_with_a_first_update_that_met_its_frame_at_all(
-    updates: int, db: float, begins: bool
-) -> None:
-    """A fit to a few cameras is met by 15 to 20 dB better than any update can be."""
-    past = replace(PAST, updates=updates, level=40.0)
-    met = {name: db + place for name, place in PLACES.items()}
-    assert outliers.unmet(past, met) is not None
-    assert outliers.begins(past, met) is begins
-    if begins:
-        after = outliers.settle(past, met, BRIGHT, 1.0)
-        assert after.level == pytest.approx(db)
-        assert outliers.unmet(after, met) is None

@@ -395,17 +395,3 @@ def _shown(view: TrainingView) -> float:
     features = np.concatenate([FITTED.colours, FITTED.foreground[:, None]], axis=1)
     PICTURE.measure(FITTED.means, FITTED.factors, FITTED.opacities, features, view)
     return PICTURE.psnr
-
-
-@pytest.mark.parametrize(("off", "outcome"), [(14.5, FrameOutcome.ACCEPTED), (16.0, FrameOutcome.HELD_UNMET)])
-def test_a_first_update_that_met_its_frame_at_all_is_taken_after_a_search_in_vain(
-    off: float, outcome: FrameOutcome
-) -> None:
-    fake = Fake(met(LEVEL - off))
-    found, after = solve(fake, given(replace(PAST, updates=0)))
-    assert len(fake.options) > 1  # it was sought
-    assert found.outcome is outcome
-    assert "less than usual" in found.reason
-    if not outcome.held:
-        assert found.gaussians is AFTER
-        assert (after.updates, after.held, after.level) == (1, 0, pytest.approx(LEVEL - off))
