@@ -2,7 +2,7 @@
 
 import { Chart } from "./charts.js";
 import { TRACKS } from "./colours.js";
-import { isHeld, node, reasonOf, showCameras, showEffects, showFacts, showQueue, stateWords } from "./panels.js";
+import { isHeld, node, reasonOf, showCameras, showEffects, showFacts, showQueue, showWarnings, stateWords } from "./panels.js";
 import { call, scenePath, token } from "./service.js";
 import { Stream } from "./stream.js";
 import { Tradeoff } from "./tradeoff.js";
@@ -122,6 +122,7 @@ function closeScene() {
   redraw();
   $("state").hidden = $("trouble").hidden = true;
   $("facts").replaceChildren();
+  showWarnings($("warnings"), $("to-check"), []);
   $("queue").replaceChildren();
   $("queue-words").textContent = $("note").textContent = "";
   $("cameras").replaceChildren();
@@ -165,6 +166,7 @@ function showStatus(status) {
   $("trouble").textContent = status.error ? status.error[0].toUpperCase() + status.error.slice(1) + "." : "";
   showFacts($("facts"), status);
   showQueue($("queue"), $("queue-words"), status);
+  showWarnings($("warnings"), $("to-check"), status.warnings);
   showEffects($("effects"), $("effects-words"), status.effects);
   if (!status.committed) {
     const progress = status.progress;
@@ -491,6 +493,10 @@ $("live").addEventListener("click", () => {
   if (page.frame !== null) choose(null);
   else stepBy(0);
 });
+$("to-check").addEventListener("click", () => {
+  $("warnings").scrollIntoView({ block: "nearest" });
+  $("warnings-title").focus({ preventScroll: true });
+});
 $("clear").addEventListener("click", () => [...page.tracks].forEach(forget));
 document.addEventListener("keydown", (event) => {
   if (event.target.matches("input:not([type=checkbox]), select, dialog *") || event.ctrlKey || event.altKey || event.metaKey || !page.stream) return;
@@ -500,7 +506,7 @@ document.addEventListener("keydown", (event) => {
   else if (event.key === ".") stopPlaying(), stepBy(1);
   else if (event.key.toLowerCase() === "l") stopPlaying(), choose(null);
   else if (event.key.toLowerCase() === "c") lookFrom((Number($("from").value) + 1) % page.rig.cameras.length);
-  else if (event.key === " " && !event.target.matches("button, input")) play();
+  else if (event.key === " " && !event.target.matches("button, input, summary")) play();
   else return;
   event.preventDefault();
 });
