@@ -24,6 +24,7 @@ const page = {
   tracks: [],
   picks: 0,
   playing: null,
+  opened: 0, // times that a scene was opened or closed; one that begins anew is the same scene, and its answers are others
 };
 
 const view = new LiveView($("picture"), $("overlay"), {
@@ -81,18 +82,19 @@ async function openScene(id) {
   page.gone = false;
   const hash = wanted();
   page.frame = hash.scene === id && hash.frame ? Number(hash.frame) : null;
+  const opened = page.opened;
   remember();
   curtain("Opening the scene", "");
   let rig;
   try {
     rig = await call("GET", `${scenePath(id)}/rig`);
   } catch (error) {
-    if (page.scene !== id) return;
+    if (page.opened !== opened) return;
     page.scene = null;
     curtain("The scene cannot be opened", error.message);
     return;
   }
-  if (page.scene !== id) return;
+  if (page.opened !== opened) return;
   page.rig = rig;
   $("from").replaceChildren(...rig.cameras.map((camera, index) => node("option", { value: index }, camera.name)));
   page.stream = new Stream(id, {
@@ -112,6 +114,7 @@ async function openScene(id) {
 }
 
 function closeScene() {
+  page.opened++;
   page.stream?.close();
   view.close();
   tradeoff.close();
@@ -185,17 +188,18 @@ function showStatus(status) {
 }
 
 async function loadReports() {
-  const id = page.scene;
+  const { scene: id, opened } = page;
   try {
     for (let from = 0; ;) {
       const { frames, next } = await call("GET", `${scenePath(id)}/frames?first=${from}`);
-      if (page.scene !== id) return;
+      if (page.opened !== opened) return;
       for (const report of frames) keep(report);
       if (next === null) break;
       from = next;
     }
   } catch (error) {
-    if (page.scene === id) note(error.message);
+    if (page.opened !== opened) return;
+    note(error.message);
   }
   redraw();
 }
