@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -172,13 +172,29 @@ def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:
     return []
 
 
+def time_warnings(shortened: Sequence[str]) -> list[str]:
+    """The sentence on what the time of frame 0 was too short for; none where it was enough.
+
+    >>> time_warnings(["no stereo", "1500 of 3000 iterations"])[0][:75]
+    'frame 0 had too little time: no stereo; 1500 of 3000 iterations; if its vie'
+    """
+    if not shortened:
+        return []
+    remedy = "if its views are poor, begin the reconstruction again with more static.seconds, or with points"
+    return [f"frame 0 had too little time: {'; '.join(shortened)}; {remedy}"]
+
+
 def first_warnings(record: Mapping[str, Any]) -> list[str]:
     """Warnings of the report of the first frame, a sentence each.
 
     Args:
-        record: the report as JSON, or its ``cloud`` and ``calibration`` alone.
+        record: the report as JSON, or its ``cloud``, ``calibration`` and ``shortened`` alone.
 
     >>> first_warnings({"calibration": {"warnings": ["camera 'a' is off"]}})
     ["camera 'a' is off"]
     """
-    return [*cloud_warnings(record.get("cloud")), *(record.get("calibration") or {}).get("warnings", [])]
+    return [
+        *cloud_warnings(record.get("cloud")),
+        *time_warnings(record.get("shortened") or ()),
+        *(record.get("calibration") or {}).get("warnings", []),
+    ]

@@ -204,7 +204,7 @@ def measure(
             line: Row = {"index": index, "seconds": done.seconds, "stages": {}}
             if index == 0:
                 if (first := reconstruction.report) is not None:
-                    for sentence in [*first.warnings, *(f"for want of time: {short}" for short in first.shortened)]:
+                    for sentence in first.warnings:
                         report(f"    {sentence}")
                 truth = truth if unseen else truth.measured_on_training(reconstruction.calibrated)
             if index == 0 and static is not None:

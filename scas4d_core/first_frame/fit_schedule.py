@@ -27,6 +27,8 @@ ENOUGH = 1.03
 """Predicted time over the time left, up to which nothing is shortened: predictions are not better."""
 NOTEWORTHY = 0.02
 """Relative change of the number of iterations from which a plan is noted as another one."""
+FEWER = 0.05
+"""Share of the iterations from which on a report says that they were too few: up to there a fit is as good as whole."""
 VARIED = 1.3
 """Ratio of numbers of Gaussians from which the cost of one can be told from that of the pixels."""
 
@@ -115,6 +117,15 @@ class FitSchedule:
             self._counts.append(float(count))
             self._spent.clear()
             self._plan()
+
+    @property
+    def record(self) -> list[tuple[int, int]]:
+        """``planned``, and what came of it at last where an iteration went on by more than one.
+
+        A fit whose record has one entry has the bits of a fit without a limit.
+        """
+        last = (self.done, self.done)
+        return self.planned + [last] * (self.shortened and self.planned[-1] != last)
 
     @property
     def total(self) -> int:
