@@ -219,6 +219,7 @@ def measure(
             line |= scores
             store.put_frame(job.key, {**line, "cameras": by_camera})
             lines.append(line)
+            reconstruction.history.put_aside(store.folder)
             report(f"    frame {index:3d}/{count - 1}  {line['psnr']:6.2f} dB  {line['seconds']:6.2f} s")
 
     indices = list(range(count))
