@@ -184,11 +184,28 @@ def time_warnings(shortened: Sequence[str]) -> list[str]:
     return [f"frame 0 had too little time: {'; '.join(shortened)}; {remedy}"]
 
 
+def grey_warnings(grey: Sequence[str]) -> list[str]:
+    """The sentence on grey cameras beside colour ones; none where there are none.
+
+    Args:
+        grey: names of them.
+
+    >>> grey_warnings(["left"])[0][:41]
+    'grey cameras beside colour ones: left; th'
+    """
+    if not grey:
+        return []
+    return [
+        f"grey cameras beside colour ones: {', '.join(grey)}; their grey stands for all three channels, which dulls "
+        "colours; hold them out (--test, or leave their pictures out) where the others are enough"
+    ]
+
+
 def first_warnings(record: Mapping[str, Any]) -> list[str]:
     """Warnings of the report of the first frame, a sentence each.
 
     Args:
-        record: the report as JSON, or its ``cloud``, ``calibration`` and ``shortened`` alone.
+        record: the report as JSON, or its ``cloud``, ``calibration``, ``shortened`` and ``grey`` alone.
 
     >>> first_warnings({"calibration": {"warnings": ["camera 'a' is off"]}})
     ["camera 'a' is off"]
@@ -196,5 +213,6 @@ def first_warnings(record: Mapping[str, Any]) -> list[str]:
     return [
         *cloud_warnings(record.get("cloud")),
         *time_warnings(record.get("shortened") or ()),
+        *grey_warnings(record.get("grey") or ()),
         *(record.get("calibration") or {}).get("warnings", []),
     ]

@@ -205,7 +205,8 @@ def measure(
             if index == 0:
                 if (first := reconstruction.report) is not None:
                     for sentence in first.warnings:
-                        report(f"    {sentence}")
+                        if sentence not in given.remarks:
+                            report(f"    {sentence}")
                 truth = truth if unseen else truth.measured_on_training(reconstruction.calibrated)
             if index == 0 and static is not None:
                 line["seconds"] = static[1]

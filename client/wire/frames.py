@@ -193,6 +193,9 @@ class FrameReportModel(Model):
     tries: list[str] = Field(
         default_factory=list, description="In which manner the update was tried, and what came of each."
     )
+    grey: list[str] = Field(
+        default_factory=list, description="Of frame 0, the cameras whose pictures are grey, where others have colours."
+    )
     exposure: float | None = Field(default=None, description="Times brighter than the light that the colours are in.")
     held_gaussians: int | None = Field(default=None, description="That stayed as they were before, one by one.")
     guards: dict[str, int] = Field(default_factory=dict, description="How often each guard acted.")

@@ -195,7 +195,8 @@ class SceneStatus(Model):
         default_factory=list,
         description="What looks wrong and may be right, a sentence each: poses that seem to be the wrong way round; "
         "after frame 0, cameras that its pictures show to be off, what came of refining them, first points that "
-        "no camera confirms, or that cover little of the pictures, and what its time was too short for.",
+        "no camera confirms, or that cover little of the pictures, what its time was too short for, and grey cameras "
+        "beside colour ones.",
     )
     created: str = Field(description="UTC, ISO 8601.")
     ingest: IngestSettings = IngestSettings()

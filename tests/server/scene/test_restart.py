@@ -81,7 +81,9 @@ def test_a_frame_0_that_is_a_guess_is_a_warning_and_is_one_again(tmp_path):
         assert said[0].startswith("frame 0 is a guess")
         assert "begin the reconstruction again with points" in said[0]
         assert said[1].startswith("frame 0 had too little time: no stereo; ")
-        assert len(said) == 2
+        assert said[2].startswith("grey cameras beside colour ones: c1; ")
+        assert len(said) == 3
+        assert sdk.frame(id, 0).grey == ["c1"]
         assert sdk.frame(id, 0).shortened == ["no stereo"]
         put(http, id, 1)
         sdk.wait(id, 1)
