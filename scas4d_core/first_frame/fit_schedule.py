@@ -28,7 +28,9 @@ ENOUGH = 1.03
 NOTEWORTHY = 0.02
 """Relative change of the number of iterations from which a plan is noted as another one."""
 FEWER = 0.05
-"""Share of the iterations from which on a report says that they were too few: up to there a fit is as good as whole."""
+"""Share of the iterations from which on a report says that they were too few: fewer are lost
+in what the seed does. The sample at half size, two seeds each: 35.33 dB, with 5, 10 and 20 % fewer 35.20, 35.29 and
+35.24, with half of them 35.03."""
 VARIED = 1.3
 """Ratio of numbers of Gaussians from which the cost of one can be told from that of the pixels."""
 
