@@ -23,8 +23,7 @@ class FrameAside(Mapping[str, NDArray[Any]]):
     Raises:
         OSError: it cannot be written; nothing is left of it then.
 
-    >>> from shutil import rmtree
-    from tempfile import mkdtemp
+    >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
     ...     frame = FrameAside(Path(folder) / "0", {"means": np.arange(6.0).reshape(2, 3), "weights": np.ones(2, "f4")})
     ...     dict(frame)
