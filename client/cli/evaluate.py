@@ -204,8 +204,9 @@ def measure(
             line: Row = {"index": index, "seconds": done.seconds, "stages": {}}
             if index == 0:
                 if (first := reconstruction.report) is not None:
-                    for sentence in [*first.warnings, *(f"for want of time: {short}" for short in first.shortened)]:
-                        report(f"    {sentence}")
+                    for sentence in first.warnings:
+                        if sentence not in given.remarks:
+                            report(f"    {sentence}")
                 truth = truth if unseen else truth.measured_on_training(reconstruction.calibrated)
             if index == 0 and static is not None:
                 line["seconds"] = static[1]
@@ -222,6 +223,7 @@ def measure(
             line |= scores
             store.put_frame(job.key, {**line, "cameras": by_camera})
             lines.append(line)
+            reconstruction.history.put_aside(store.folder)
             report(f"    frame {index:3d}/{count - 1}  {line['psnr']:6.2f} dB  {line['seconds']:6.2f} s")
             for alarm in line.get("alarms", ()):
                 report(f"      ! {alarm['camera'] or 'all cameras'}: {alarm['evidence']}")

@@ -160,7 +160,11 @@ class FakeReconstruction:
             out = {"what": "camera_left_out", "camera": "c1", "evidence": "left out of this frame: it shows nothing"}
             record["alarms"] = [*record.get("alarms", []), out]
         if red == GUESSED and not known:
-            record |= {"cloud": {"way": "volume", "points": count, "covered": 0.0}, "shortened": ["no stereo"]}
+            record |= {
+                "cloud": {"way": "volume", "points": count, "covered": 0.0},
+                "shortened": ["no stereo"],
+                "grey": ["c1"],
+            }
         first = self.iterations // 2
         record["curve"] = [
             {"iterations": first, "milliseconds": MS_EACH * first, "loss": 0.5},
