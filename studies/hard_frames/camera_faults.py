@@ -21,7 +21,7 @@ SOON = 2
 """Of them, by which the alarm must have come; a picture that stands is known by its third frame."""
 SMEARED, VEIL = 0.02, 0.35
 """Of dirt on a lens: blur, of the picture's width, and the share of white that the light scattered in it adds."""
-FIELD = "issue 12"
+FIELD = "operators of rigs: lenses, gains and frame grabbers"
 
 Fault = Callable[[Picture, Any], Picture]
 """The faulty picture, in a size."""

@@ -340,7 +340,7 @@ def two_cameras(footage: Footage) -> tuple[str, str]:
     return names[1], names[len(names) // 2 + 1]
 
 
-FIELD = "issue 4; field.md section 4"
+FIELD = "users' reports of capture systems: caps, triggers, cables and light"
 CASES = (
     FrameCase(
         "all black", "lens caps, or a lost trigger: finite, and learnt it would paint the scene black; size: frames",

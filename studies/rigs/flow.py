@@ -41,7 +41,8 @@ def flow_consistency(scene: Reconstruction, capture: Capture, count: int) -> Row
         scene: has committed ``count`` frames. capture: as rendered; its training cameras are asked.
 
     Returns:
-        ``flow_px``, ``epipolar_px`` (pixels of the pictures of ``capture``; None of too few) and ``flow_points``.
+        ``flow_px``, ``epipolar_px`` (pixels of the pictures of ``capture``; None of too few, or where
+        most are lost) and ``flow_points``.
     """
     rig, indices = capture.rig, list(range(count))
     films: dict[str, list[NDArray[np.uint8]]] = {name: [] for name in rig.names}
@@ -133,4 +134,5 @@ def _from_lines(scene: Reconstruction, pair: tuple[Camera, Camera], points: Floa
 
 def _median(parts: Sequence[Float]) -> float | None:
     values = np.concatenate(parts) if parts else np.zeros(0)
-    return float(np.median(values)) if len(values) >= FEWEST else None
+    found = float(np.median(values)) if len(values) >= FEWEST else np.inf
+    return found if np.isfinite(found) else None

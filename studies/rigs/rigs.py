@@ -82,7 +82,7 @@ def run(
     for folder in captures:
         key = f"{folder.resolve().name}-{digest(list(changes), frames, longer, *options.changed.items())}"
         path = store.folder / "rigs" / f"{key}.json"
-        pictures = store.folder / "pictures"
+        pictures = store.folder / "pictures" / key
         row = kept_row(path, partial(measured, folder, options, frames, longer, changes, pictures), again=again)
         rows.append(row)
         report(markdown([row], COLUMNS))
@@ -145,7 +145,7 @@ def measured(
         row |= flow_consistency(scene, truth, count)
     seen = truth if truth.test_rig is not None else truth.measured_on_training()
     for index in sorted({0, count - 1}):
-        save_comparisons(scene, seen, index, pictures / given.name)
+        save_comparisons(scene, seen, index, pictures)
     if (folder / "joints.npz").is_file():
         row |= _joints(folder / "joints.npz", scene, given.full_rig, count)
     return row
