@@ -44,11 +44,7 @@ INSIDE_CAMERAS = 3
 """Such cameras there have to be at least: the silhouettes of two hold much that is empty."""
 
 NEW_LABELS = 0.01
-"""Share of all Gaussians that must be found moving anew before the hierarchy is built again;"""
-NEW_OF_MOVING = 0.1
-"""or, where little moves, of those that are known to move: an animal is a hundredth of its room;"""
-FEWEST_NEW = 64
-"""but so many at least: fewer are noise."""
+"""Share of all Gaussians that must be found moving anew before the hierarchy is built again."""
 
 
 def first_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, NDArray[np.uint8]]) -> Gaussians:
@@ -161,8 +157,7 @@ def labels_learnt(
     """
     found = moving_between(gaussians, before, now, picture)
     known = np.zeros(len(gaussians), np.bool_) if known is None else known
-    enough = min(NEW_LABELS * len(gaussians), max(FEWEST_NEW, NEW_OF_MOVING * int(known.sum())))
-    return None if (found & ~known).sum() <= enough else found | known
+    return None if (found & ~known).sum() <= NEW_LABELS * len(gaussians) else found | known
 
 
 def labelled(gaussians: Gaussians, labels: NDArray[np.bool_] | None) -> Gaussians:
