@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, TypedDict
@@ -185,16 +185,50 @@ def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:
     return []
 
 
+def time_warnings(shortened: Sequence[str]) -> list[str]:
+    """The sentence on what the time of frame 0 was too short for; none where it was enough.
+
+    >>> time_warnings(["no stereo", "1500 of 3000 iterations"])[0][:75]
+    'frame 0 had too little time: no stereo; 1500 of 3000 iterations; if its vie'
+    """
+    if not shortened:
+        return []
+    remedy = "if its views are poor, begin the reconstruction again with more static.seconds, or with points"
+    return [f"frame 0 had too little time: {'; '.join(shortened)}; {remedy}"]
+
+
+def grey_warnings(grey: Sequence[str]) -> list[str]:
+    """The sentence on grey cameras beside colour ones; none where there are none.
+
+    Args:
+        grey: names of them.
+
+    >>> grey_warnings(["left"])[0][:41]
+    'grey cameras beside colour ones: left; th'
+    """
+    if not grey:
+        return []
+    return [
+        f"grey cameras beside colour ones: {', '.join(grey)}; their grey stands for all three channels, which dulls "
+        "colours; hold them out (--test, or leave their pictures out) where the others are enough"
+    ]
+
+
 def first_warnings(record: Mapping[str, Any]) -> list[str]:
     """Warnings of the report of the first frame, a sentence each.
 
     Args:
-        record: the report as JSON, or its ``cloud`` and ``calibration`` alone.
+        record: the report as JSON, or its ``cloud``, ``calibration``, ``shortened`` and ``grey`` alone.
 
     >>> first_warnings({"calibration": {"warnings": ["camera 'a' is off"]}})
     ["camera 'a' is off"]
     """
-    return [*cloud_warnings(record.get("cloud")), *(record.get("calibration") or {}).get("warnings", [])]
+    return [
+        *cloud_warnings(record.get("cloud")),
+        *time_warnings(record.get("shortened") or ()),
+        *grey_warnings(record.get("grey") or ()),
+        *(record.get("calibration") or {}).get("warnings", []),
+    ]
 
 
 def timing_warnings(timing: Mapping[str, CameraTiming] | None) -> list[str]:

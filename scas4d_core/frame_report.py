@@ -13,9 +13,18 @@ from typing import Any, TypedDict
 import numpy as np
 
 from scas4d_core.captures.frame import Frame
+from scas4d_core.captures.images import grey_among
 from scas4d_core.first_frame.calibration.record import Calibration
 from scas4d_core.first_frame.static_result import FirstCloud, StaticResult
-from scas4d_core.frame_outcome import Alarm, CameraTiming, Candidate, FrameOutcome, degraded_text, timing_warnings
+from scas4d_core.frame_outcome import (
+    Alarm,
+    CameraTiming,
+    Candidate,
+    FrameOutcome,
+    degraded_text,
+    first_warnings,
+    timing_warnings,
+)
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust.alarms import left_out_alarms
 from scas4d_core.update.best_state import mean_error
@@ -80,7 +89,8 @@ class FrameReport:
             was not tried, as the mean brightness of its pictures says. A light that stays becomes that of the colours.
         held: Gaussians held one by one as they were before. guards: by name, how often each guard acted.
         planned: (iteration, iterations in all) whenever the stopping rule, or the time of frame 0, planned otherwise.
-        shortened: of frame 0: what its time (``StaticSettings.seconds``) was too short for, in words.
+        shortened: of frame 0: what its time (``StaticSettings.seconds``) was too short for, in words; a few iterations
+            fewer are in ``planned`` alone. grey: of frame 0: grey cameras, where others have colours.
         curve: of the last attempt.
         errors: mean image loss on the probe views by candidate, in pictures without the gain of ``exposure``.
             kept: the candidate that the state is; "still" where the frame was held.
@@ -116,12 +126,15 @@ class FrameReport:
     cloud: FirstCloud | None = None
     shortened: list[str] = field(default_factory=list)
     calibration: Calibration | None = None
+    grey: list[str] = field(default_factory=list)
 
     @property
     def warnings(self) -> list[str]:
-        """Sentences on what looks wrong with the rig."""
-        found = [] if self.calibration is None else self.calibration.warnings
-        return [*found, *timing_warnings(self.timing)]
+        """Sentences on what looks wrong, or was too much for its time (``first_warnings``, ``timing_warnings``)."""
+        named = {"cloud": self.cloud, "calibration": self.calibration}
+        told = {name: asdict(found) for name, found in named.items() if found is not None}
+        first = first_warnings({**told, "shortened": self.shortened, "grey": self.grey})
+        return [*first, *timing_warnings(self.timing)]
 
     def record(self) -> dict[str, Any]:
         """The report as JSON: numbers that are not finite are None."""
@@ -171,6 +184,7 @@ def report_of_first(
         cloud=result.cloud,
         planned=list(result.planned),
         shortened=list(result.shortened),
+        grey=grey_among(frame.images),
         calibration=calibration,
     )
 

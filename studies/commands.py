@@ -10,21 +10,20 @@ from studies.hard_cases.commands import stability, timing
 from studies.kernels.commands import device, kernels, moving
 from studies.paper.commands import paper
 from studies.quality.commands import (
-    calibration,
-    drift,
     effects,
     processors,
     quality,
     refit,
-    rigs,
     switches,
     table,
     targets,
 )
+from studies.rigs.commands import calibration, drift, rigs
 from studies.service.commands import crossing, faults, ingest, memory, views
 
 STUDIES = {
-    "Quality": (quality, refit, rigs, effects, switches, drift, calibration, targets, table, processors),
+    "Quality": (quality, refit, effects, switches, targets, table, processors),
+    "Rigs": (rigs, calibration, drift),
     "Accuracy against time": (frontier, effort, paper),
     "Speed of the code": (kernels, device, moving),
     "Hard cases": (stability, timing),

@@ -28,7 +28,8 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "scas4d_core.metrics.image": ("flip", "lpips", "psnr", "ssim"),
     "scas4d_core.metrics.parts": ("adjusted_rand_index",),
     "scas4d_core.metrics.tracks": (
-        "error_by_confidence", "median_trajectory_error", "oracle_tracks", "track_error_3d", "visibility_accuracy",
+        "error_by_confidence", "lost_parts", "median_trajectory_error", "oracle_tracks", "track_error_3d",
+        "visibility_accuracy",
     ),
     "scas4d_core.query.carriers": ("carriers", "geometric_median"),
     "scas4d_core.query.committed": ("CommittedScene", "View"),

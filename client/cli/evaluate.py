@@ -204,8 +204,9 @@ def measure(
             line: Row = {"index": index, "seconds": done.seconds, "stages": {}}
             if index == 0:
                 if (first := reconstruction.report) is not None:
-                    for sentence in [*first.warnings, *(f"for want of time: {short}" for short in first.shortened)]:
-                        report(f"    {sentence}")
+                    for sentence in first.warnings:
+                        if sentence not in given.remarks:
+                            report(f"    {sentence}")
                 truth = truth if unseen else truth.measured_on_training(reconstruction.calibrated)
             if index == 0 and static is not None:
                 line["seconds"] = static[1]
@@ -215,11 +216,17 @@ def measure(
                 line["cpu_seconds"] = done.cpu_seconds
                 line["stages"] = {name: float(value) for name, value in done.report.seconds.items()}
                 line["moving"], line["gaussians"] = int(done.report.moving), int(done.report.gaussians)
+                line["alarms"] = [
+                    {"what": a.what.value, "camera": a.camera, "evidence": a.evidence} for a in done.report.alarms
+                ]
             scores, by_camera = measure_pictures(reconstruction, truth, index, with_lpips=job.lpips)
             line |= scores
             store.put_frame(job.key, {**line, "cameras": by_camera})
             lines.append(line)
+            reconstruction.history.put_aside(store.folder)
             report(f"    frame {index:3d}/{count - 1}  {line['psnr']:6.2f} dB  {line['seconds']:6.2f} s")
+            for alarm in line.get("alarms", ()):
+                report(f"      ! {alarm['camera'] or 'all cameras'}: {alarm['evidence']}")
 
     indices = list(range(count))
     row: Row = {
@@ -269,6 +276,7 @@ def summary(lines: Sequence[Row]) -> Row:
         **mean_scores({name: line.get(name) for name in names} for line in updates),
         "psnr_worst": min(line["psnr"] for line in updates),
         "psnr_last": updates[-1]["psnr"],
+        "alarms": sum(len(line.get("alarms", ())) for line in updates),
         "psnr_by_frame": [round(line["psnr"], 3) for line in lines],
         # The first update compiles or loads kernels; medians do not see it.
         "seconds_update": float(np.median([line["seconds"] for line in updates])),

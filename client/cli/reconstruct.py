@@ -110,13 +110,12 @@ def reconstruct(given: Capture, out: Path, *, frames: int | None, preset: str, c
     with Bars() as bars:
         for reconstruction, done in reconstruct_frames(given, settings, count, history=history, progress=bars):
             index = done.index
-            if index == 0 and reconstruction.report is not None and reconstruction.report.shortened:
-                console.print(f"frame 0, for want of time: {'; '.join(reconstruction.report.shortened)}")
             truth = capture.test_frame(index) if capture.test_rig is not None else capture.frame(index)
             scores = []
             if index in (0, count - 1) and reconstruction.report is not None:
                 for sentence in reconstruction.report.warnings:
-                    console.print(sentence)
+                    if sentence not in given.remarks:
+                        console.print(sentence)
             if capture.test_rig is None:
                 cameras = reconstruction.calibrated.scaled(settings.scene.image_scale).cameras[:1]
             for camera in cameras:

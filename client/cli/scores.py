@@ -112,10 +112,12 @@ QUALITY = (
     Column("SSIM", "ssim", ".4f"),
     Column("FLIP", "flip", ".4f"),
     Column("3D %", "track_3d_median"),
+    Column("lost parts", "parts_lost", ".0f"),
     Column("2D %", "mte_2d"),
     Column("2D % (oracle)", "mte_2d_oracle"),
     Column("visibility", "visibility_accuracy", ".3f"),
     Column("parts ARI", "parts_ari", ".3f"),
+    Column("alarms", "alarms", "d"),
     Column("s/update", "seconds_update"),
     Column("MB", "peak_mb", ".0f"),
 )

@@ -201,6 +201,9 @@ class FrameReportModel(Model):
     tries: list[str] = Field(
         default_factory=list, description="In which manner the update was tried, and what came of each."
     )
+    grey: list[str] = Field(
+        default_factory=list, description="Of frame 0, the cameras whose pictures are grey, where others have colours."
+    )
     exposure: float | None = Field(default=None, description="Times brighter than the light that the colours are in.")
     held_gaussians: int | None = Field(default=None, description="That stayed as they were before, one by one.")
     guards: dict[str, int] = Field(default_factory=dict, description="How often each guard acted.")
@@ -210,7 +213,9 @@ class FrameReportModel(Model):
     budget: Budget | None = Field(default=None, description="Budget of the update; nulls: as the scene was made.")
     iterations: int | None = None
     planned: list[tuple[int, int]] = Field(
-        default_factory=list, description="(iteration, iterations in all) whenever that was planned otherwise."
+        default_factory=list,
+        description="(iteration, iterations in all) whenever that was planned otherwise; "
+        "of a frame 0 that was shortened, however little, two or more.",
     )
     seconds: dict[str, float] = Field(default_factory=dict, description="By stage.")
     write_seconds: float | None = Field(
@@ -245,8 +250,8 @@ class FrameReportModel(Model):
     cloud: FirstCloudModel | None = Field(default=None, description="Of frame 0, where its first points came from.")
     shortened: list[str] = Field(
         default_factory=list,
-        description="Of frame 0: what its time (setting `static.seconds`) was too short for. With none, frame 0 does "
-        "not depend on the machine.",
+        description="Of frame 0: what its time (setting `static.seconds`) was too short for, of iterations from 5 % "
+        "fewer on. With none, and one entry in `planned`, frame 0 does not depend on the machine.",
     )
     calibration: CalibrationModel | None = Field(
         default=None, description="Of frame 0, the calibration against its pictures."

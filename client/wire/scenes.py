@@ -194,8 +194,9 @@ class SceneStatus(Model):
     warnings: list[str] = Field(
         default_factory=list,
         description="What looks wrong and may be right, a sentence each: poses that seem to be the wrong way round; "
-        "after frame 0, cameras that its pictures show to be off, what came of refining them, and first points that "
-        "no camera confirms, or that cover little of the pictures; and cameras that motion shows to be out of step.",
+        "after frame 0, cameras that its pictures show to be off, what came of refining them, first points that "
+        "no camera confirms, or that cover little of the pictures, what its time was too short for, and grey cameras "
+        "beside colour ones; and cameras that motion shows to be out of step.",
     )
     created: str = Field(description="UTC, ISO 8601.")
     ingest: IngestSettings = IngestSettings()

@@ -29,6 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
+from scas4d_core.frame_outcome import grey_warnings
+
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP")
 MASK_FORMATS = ("PNG", "BMP")
 EXIF_ORIENTATION = 0x0112
@@ -229,11 +231,24 @@ def mixed_colours(grey: Mapping[str, bool]) -> list[str]:
     """The remark on a rig of grey and colour cameras, by camera name; none where all are alike."""
     if len(set(grey.values())) < 2:
         return []
-    listed = ", ".join(name for name, is_grey in grey.items() if is_grey)
-    return [
-        f"grey cameras beside colour ones: {listed}; their grey stands for all three channels, which dulls colours; "
-        "hold them out (--test) where the others are enough"
-    ]
+    return grey_warnings([name for name, is_grey in grey.items() if is_grey])
+
+
+def grey_among(images: Mapping[str, NDArray[np.uint8]]) -> list[str]:
+    """Names of the grey pictures, where others have colours; a picture without any contrast tells nothing.
+
+    Args:
+        images: [H, W, 3] by camera. Sensors of colour cameras have noise: no picture of theirs is grey in every pixel.
+
+    >>> grey = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)[..., :1].repeat(3, axis=2)
+    >>> red = grey + np.uint8([1, 0, 0])
+    >>> grey_among({"a": red, "b": grey}), grey_among({"b": grey}), grey_among({"a": red, "dark": 0 * grey})
+    (['b'], [], [])
+    """
+    colour = {name: bool((image != image[..., :1]).any()) for name, image in images.items() if image.ndim == 3}
+    if not any(colour.values()):
+        return []
+    return [name for name, coloured in colour.items() if not coloured and images[name].min() < images[name].max()]
 
 
 def area_average(picture: NDArray[np.float64], size: Size) -> NDArray[np.float64]:

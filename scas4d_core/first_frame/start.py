@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures.frame import Frame, InitialPoints
-from scas4d_core.first_frame.fit_schedule import FitProgress
+from scas4d_core.first_frame.fit_schedule import FEWER, FitProgress
 from scas4d_core.first_frame.glossy import fit_by_direction
 from scas4d_core.first_frame.initial_points import initial_points
 from scas4d_core.first_frame.points.silhouettes import EVERY, backdrop, mean_colour
@@ -178,7 +178,7 @@ def fit_first(
         settings.effects.get("direction", "auto") if settings.device == "cpu" else "off",
         lambda now: on_progress(Progress("fitting frame 0", now.done, now.planned, _figures(now, limit))),
     )
-    if result.hurried:
+    if result.hurried and len(result.losses) <= (1 - FEWER) * static.iterations:
         limit.shortened.append(f"{len(result.losses)} of {static.iterations} iterations, each phase as much shorter")
     return replace(result, cloud=made, shortened=[*limit.shortened, *result.shortened])
 

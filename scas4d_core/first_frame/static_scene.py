@@ -289,7 +289,7 @@ class StaticTrainer:
 
     def result(self, losses: list[float]) -> StaticResult:
         """Of the iterations so far."""
-        found, planned = self.exposures.found(), self.schedule.planned
+        found, planned = self.exposures.found(), self.schedule.record
         return StaticResult(
             self.gaussians(), found, losses, self.psnr, self.cameras, planned=planned, hurried=self.schedule.shortened
         )

@@ -5,6 +5,7 @@ from scas4d_core.metrics.parts import adjusted_rand_index
 from scas4d_core.metrics.tracks import (
     TrackError,
     error_by_confidence,
+    lost_parts,
     median_trajectory_error,
     oracle_tracks,
     track_error_3d,
@@ -17,6 +18,7 @@ __all__ = [
     "adjusted_rand_index",
     "error_by_confidence",
     "flip",
+    "lost_parts",
     "lpips",
     "median_trajectory_error",
     "oracle_tracks",

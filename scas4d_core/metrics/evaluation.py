@@ -111,6 +111,7 @@ def measure_tracks(reconstruction: Reconstruction, capture: Capture, indices: Se
         "track_3d_p90": _finite(error.percentile_90),
         "track_3d_last": _finite(at_last.median),
         "track_points": float(moving.sum()),
+        "parts_lost": float(len(metrics.lost_parts(tracks.positions, points, truth.part_id, moving, extent))),
         **{f"track_3d_confidence_{k}": _finite(error) for k, error in enumerate(sorted_errors, 1)},
         **mean_scores(by_camera),
     }

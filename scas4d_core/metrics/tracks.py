@@ -17,6 +17,9 @@ from scipy.spatial import cKDTree
 ORACLE_RADIUS_PX = 10.0
 """The paper's radius about the ground-truth point in the first frame (section "Point-Tracking")."""
 
+LOST_PERCENT = 2.0
+"""Of the extent: a part is lost whose points are farther off, in the median."""
+
 
 @dataclass(frozen=True)
 class TrackError:
@@ -155,6 +158,31 @@ def track_error_3d(
     # Inverted CDF: no interpolation, which would make NaN of two infinities.
     ninety = np.quantile(pooled, 0.9, method="inverted_cdf")
     return TrackError(float(np.median(pooled)), float(ninety), int(pooled.size))
+
+
+def lost_parts(
+    tracks: NDArray[Any], truth: NDArray[Any], part_id: NDArray[Any], moving: NDArray[np.bool_], extent: float
+) -> list[int]:
+    """Ids of the parts that are lost in the last frame: their moving points are off by more than ``LOST_PERCENT``.
+
+    Args:
+        tracks: [T, P, 3] predicted, not finite where lost. truth: [T, P, 3]. Both in the user's units.
+        part_id: [P], the part of each point. moving: [P] bool, the points that count.
+        extent: user's units.
+
+    Raises:
+        ValueError: as ``track_error_3d``.
+
+    >>> truth = np.zeros((2, 4, 3))
+    >>> tracks = truth + np.array([0.1, 0.0, 0.5, 0.4])[:, None]
+    >>> lost_parts(tracks, truth, np.array([1, 1, 2, 2]), np.ones(4, bool), extent=10.0)
+    [2]
+    """
+    return [
+        int(part)
+        for part in np.unique(part_id[moving])
+        if track_error_3d(tracks[-1:], truth[-1:], moving & (part_id == part), extent, query=-1).median > LOST_PERCENT
+    ]
 
 
 def error_by_confidence(

@@ -15,12 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.frame_outcome import Alarm, AlarmKind, FrameOutcome, degraded_text
-from scas4d_core.robust.outliers import LAST_DB, MOST_OUT, Past, allowed, few
+from scas4d_core.robust.outliers import LAST_DB, MOST_OUT, Past, allowed, few, in_doubt
 from scas4d_core.update.result import CameraFit
 
-NEAR_DB = -4.0
-"""Against its usual place among the cameras when last rendered, from which two frames in a row are an alarm; clean
-captures: -3.7. Below ``LAST_DB``, where the camera is left out from the next frame on, one is."""
 TINT = (0.05, 0.1)
 """By how much more than its past and the others a camera's red, green or blue may differ from what is rendered, beside
 its two other colours: two frames in a row, and one. Clean: 0.03."""
@@ -112,7 +109,7 @@ def alarms_of(
     spread = _half(tint_of(change) for change in moved.values()), _half(gain_of(change) for change in moved.values())
     for name, before in told.items():
         now, alarms = _judged(
-            name, before, allowed(past), offsets.get(name), beside.get(name), sharp[name], changes[name] - common,
+            name, before, past, offsets.get(name), beside.get(name), sharp[name], changes[name] - common,
             few_same and name in same, spread,
         )  # fmt: skip
         watch[name] = now.row()
@@ -126,7 +123,7 @@ def alarms_of(
 def _judged(
     name: str,
     before: Watch,
-    new: float,
+    past: Past,
     offset: float | None,
     colours: Numbers | None,
     sharp: float,
@@ -137,7 +134,7 @@ def _judged(
     """A camera's figures for the next frame, and its alarms.
 
     Args:
-        before: its figures. new: ``outliers.allowed``. offset: dB; None: not rendered. colours: beside the others'.
+        before: its figures. past: of all. offset: dB; None: not rendered. colours: beside the others'.
         sharp: of its picture; ``sharper``: than usual, beside the others. same: as in the frame before, and others not.
         spread: tint and gain that half of the cameras differ by.
     """
@@ -146,8 +143,8 @@ def _judged(
         text = f"its picture is the same, bit by bit, for {now.same + 1} frames, and those of the others are not"
         alarms.append(Alarm(AlarmKind.CAMERA_FROZEN, name, text))
     if offset is not None:
-        now = replace(now, misfit=before.misfit + 1 if offset < NEAR_DB + new else 0)
-        if offset < LAST_DB + new or now.misfit >= ROW:
+        now = replace(now, misfit=before.misfit + 1 if in_doubt(past, offset) else 0)
+        if offset < LAST_DB + allowed(past) or now.misfit >= ROW:
             text = f"its picture fits {-offset:.1f} dB worse than usual beside the others: moved, dirty or late?"
             alarms.append(Alarm(AlarmKind.CAMERA_MISFIT, name, text))
     if colours is not None:

@@ -20,6 +20,9 @@ FIRST_DB = -9.0
 """Against its usual place among the cameras when first rendered: such a camera is left out at once; clean: -6.1."""
 LAST_DB = -5.0
 """The same when last rendered: left out from the next frame on. Clean: -3.7; moved by one or two pixels: -6 to -15."""
+NEAR_DB = -4.0
+"""The same, from which a camera is in doubt: its usual place does not follow, so that what lasts is seen to last; two
+frames in a row are an alarm. Clean: -3.7."""
 FITS_DB = -3.0
 """From which a camera that was left out is believed again."""
 NEW_DB = (-4.0, -2.0, -2.0)
@@ -195,6 +198,11 @@ def allowed(past: Past) -> float:
     return NEW_DB[past.updates] if past.updates < len(NEW_DB) else 0.0
 
 
+def in_doubt(past: Past, offset: float) -> bool:
+    """True where a camera is met so much worse than usual, dB, that one more such frame is an alarm."""
+    return offset < NEAR_DB + allowed(past)
+
+
 def unmet(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | None:
     """Why an update has not met its frame, or None.
 
@@ -263,7 +271,10 @@ def settle(
         elif name in psnr:
             here = psnr[name] - level
             known = place == place and past.updates > 0
-            places[name] = place + PLACE_RATE * (here - place) if known else here
+            if not known:
+                places[name] = here
+            elif not in_doubt(past, off[name]):
+                places[name] = place + PLACE_RATE * (here - place)
             brightness[name] = value / exposure
     known = past.updates > 0
     later = past.behind + 1 if behind(past, believed, iterations) and past.behind < CATCH_UP else 0

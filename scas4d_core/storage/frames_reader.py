@@ -54,7 +54,7 @@ class FramesReader:
         """Reports on disk of the frames that are in memory."""
         self._packed: dict[int, NDArray[np.uint8]] = {}
         """What effects left of the frames that were written here and are in memory, packed."""
-        self._frames: OrderedDict[int, Arrays] = OrderedDict()
+        self._frames: OrderedDict[int, Mapping[str, NDArray[Any]]] = OrderedDict()
         self._births: dict[int, Arrays] = {}
         """What is known of the born, by frame; those of frames that were taken back stay."""
         self._log: tuple[int, Int] = (-1, NO_EVENTS)
@@ -328,7 +328,9 @@ def unpacked(given: NDArray[np.uint8] | None) -> dict[str, Arrays]:
     return found
 
 
-def as_written(frame: Arrays, time: float, report: bytes, log: Int, left: NDArray[np.uint8] | None) -> dict[str, Any]:
+def as_written(
+    frame: Mapping[str, NDArray[Any]], time: float, report: bytes, log: Int, left: NDArray[np.uint8] | None
+) -> dict[str, Any]:
     """The arrays of a frame's file.
 
     Args:

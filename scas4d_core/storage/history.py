@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.gaussians import FIXED, PER_FRAME, UNBORN, WHOLES, Gaussians
 from scas4d_core.storage.births import FOUNDERLESS, Event, Int, births_in, events_of, retired_after
+from scas4d_core.storage.frame_aside import ScratchFile
 from scas4d_core.storage.frame_files import Arrays, DamagedFrameError, FrameFiles, HistoryError, UnreadableFrameError
 from scas4d_core.storage.frames_reader import FRAMES_KEPT, EffectArrays, as_written, packed
 from scas4d_core.storage.history_reader import ROOT, ROOTS, HistoryReader
@@ -66,6 +67,7 @@ class History(HistoryReader):
     def __init__(self, directory: Path | str | None = None) -> None:
         super().__init__(None if directory is None else Path(directory))
         self.record_seconds = 0.0
+        self._scratch: ScratchFile | None = None
         if self._files is not None:
             self._files.directory.mkdir(parents=True, exist_ok=True)
             if self._files.listed():
@@ -259,6 +261,17 @@ class History(HistoryReader):
             self._forget(index)
             deleted.append(index)
         return deleted
+
+    def put_aside(self, folder: Path) -> None:
+        """Moves states from memory to a scratch file, but for the first and the newest; their bits stay the same.
+
+        Args:
+            folder: on whose disk the file is; it has no name, and goes with this history. Without room in it the
+                states stay in memory.
+        """
+        self._scratch = self._scratch or ScratchFile(folder)
+        for index in self.indices[1:-1] if self._files is None else ():
+            self._frames[index] = self._scratch.moved(self._frames[index])
 
     def cut(self, after: int) -> list[int]:
         """Takes back every commit after frame ``after``.

@@ -37,8 +37,10 @@ HEADERS = {
     "X-Frame-Options": "DENY",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
 }
-"""Headers of every answer: no site shows the service in a frame, and no browser guesses another kind of file."""
+"""Headers of every answer that has no others: no site shows the service in a frame, no browser guesses another kind of
+file, no cache answers with what was true a frame ago."""
 DEFAULT_PORTS = {"http": 80, "https": 443, "ws": 80, "wss": 443}
 
 access = logging.getLogger("scas4d.access")

@@ -256,7 +256,7 @@ class Updates:
     def _recall(self, record: Mapping[str, Any]) -> None:
         """Keeps what the report of the first frame alone has."""
         if record.get("cloud") or record.get("calibration"):
-            self.first = {"cloud": record.get("cloud"), "calibration": record.get("calibration") or {}}
+            self.first = {name: record.get(name) for name in ("cloud", "calibration", "shortened", "grey")}
 
     async def recall(self) -> None:
         """Reads the first report of a scene that is found again; to be called before anybody asks for it."""

@@ -2,7 +2,7 @@
 
 import { Chart } from "./charts.js";
 import { TRACKS } from "./colours.js";
-import { isHeld, node, reasonOf, showCameras, showEffects, showFacts, showQueue, stateWords } from "./panels.js";
+import { isHeld, node, reasonOf, showCameras, showEffects, showFacts, showQueue, showWarnings, stateWords } from "./panels.js";
 import { call, scenePath, token } from "./service.js";
 import { Stream } from "./stream.js";
 import { Tradeoff } from "./tradeoff.js";
@@ -24,6 +24,7 @@ const page = {
   tracks: [],
   picks: 0,
   playing: null,
+  opened: 0, // times that a scene was opened or closed; one that begins anew is the same scene, and its answers are others
 };
 
 const view = new LiveView($("picture"), $("overlay"), {
@@ -81,18 +82,19 @@ async function openScene(id) {
   page.gone = false;
   const hash = wanted();
   page.frame = hash.scene === id && hash.frame ? Number(hash.frame) : null;
+  const opened = page.opened;
   remember();
   curtain("Opening the scene", "");
   let rig;
   try {
     rig = await call("GET", `${scenePath(id)}/rig`);
   } catch (error) {
-    if (page.scene !== id) return;
+    if (page.opened !== opened) return;
     page.scene = null;
     curtain("The scene cannot be opened", error.message);
     return;
   }
-  if (page.scene !== id) return;
+  if (page.opened !== opened) return;
   page.rig = rig;
   $("from").replaceChildren(...rig.cameras.map((camera, index) => node("option", { value: index }, camera.name)));
   page.stream = new Stream(id, {
@@ -112,6 +114,7 @@ async function openScene(id) {
 }
 
 function closeScene() {
+  page.opened++;
   page.stream?.close();
   view.close();
   tradeoff.close();
@@ -122,6 +125,7 @@ function closeScene() {
   redraw();
   $("state").hidden = $("trouble").hidden = true;
   $("facts").replaceChildren();
+  showWarnings($("warnings"), $("to-check"), []);
   $("queue").replaceChildren();
   $("queue-words").textContent = $("note").textContent = "";
   $("cameras").replaceChildren();
@@ -165,6 +169,7 @@ function showStatus(status) {
   $("trouble").textContent = status.error ? status.error[0].toUpperCase() + status.error.slice(1) + "." : "";
   showFacts($("facts"), status);
   showQueue($("queue"), $("queue-words"), status);
+  showWarnings($("warnings"), $("to-check"), status.warnings);
   showEffects($("effects"), $("effects-words"), status.effects);
   if (!status.committed) {
     const progress = status.progress;
@@ -183,17 +188,18 @@ function showStatus(status) {
 }
 
 async function loadReports() {
-  const id = page.scene;
+  const { scene: id, opened } = page;
   try {
     for (let from = 0; ;) {
       const { frames, next } = await call("GET", `${scenePath(id)}/frames?first=${from}`);
-      if (page.scene !== id) return;
+      if (page.opened !== opened) return;
       for (const report of frames) keep(report);
       if (next === null) break;
       from = next;
     }
   } catch (error) {
-    if (page.scene === id) note(error.message);
+    if (page.opened !== opened) return;
+    note(error.message);
   }
   redraw();
 }
@@ -491,6 +497,10 @@ $("live").addEventListener("click", () => {
   if (page.frame !== null) choose(null);
   else stepBy(0);
 });
+$("to-check").addEventListener("click", () => {
+  $("warnings").scrollIntoView({ block: "nearest" });
+  $("warnings-title").focus({ preventScroll: true });
+});
 $("clear").addEventListener("click", () => [...page.tracks].forEach(forget));
 document.addEventListener("keydown", (event) => {
   if (event.target.matches("input:not([type=checkbox]), select, dialog *") || event.ctrlKey || event.altKey || event.metaKey || !page.stream) return;
@@ -500,7 +510,7 @@ document.addEventListener("keydown", (event) => {
   else if (event.key === ".") stopPlaying(), stepBy(1);
   else if (event.key.toLowerCase() === "l") stopPlaying(), choose(null);
   else if (event.key.toLowerCase() === "c") lookFrom((Number($("from").value) + 1) % page.rig.cameras.length);
-  else if (event.key === " " && !event.target.matches("button, input")) play();
+  else if (event.key === " " && !event.target.matches("button, input, summary")) play();
   else return;
   event.preventDefault();
 });

@@ -18,6 +18,9 @@ export function stateWords(status) {
   return words.join(" · ");
 }
 
+/** The same with a capital letter and a full stop. */
+export const sentence = (text) => text && text[0].toUpperCase() + text.slice(1) + (/[.?!]$/.test(text) ? "" : ".");
+
 const number = new Intl.NumberFormat("en");
 
 export function node(name, attributes = {}, ...children) {
@@ -51,6 +54,28 @@ export function showFacts(list, status) {
   }
   if (status.worker_deaths) facts.push(["Worker restarts", number.format(status.worker_deaths)]);
   list.replaceChildren(...facts.flatMap(([name, value]) => [node("dt", {}, name), node("dd", {}, value)]));
+}
+
+const WARNINGS_SHOWN = 3;
+
+/**
+ * Lists the warnings of the scene, which stay until its reconstruction begins again; the button says how many there are.
+ * They are in another place than the alarms of a frame, and not in their colour: nothing of a frame is wrong by them.
+ */
+export function showWarnings(box, button, warnings) {
+  const said = JSON.stringify(warnings);
+  if (box.dataset.said === said) return; // status comes several times a second: nothing is read out again, and what is open stays so
+  box.dataset.said = said;
+  box.hidden = button.hidden = !warnings.length;
+  button.textContent = `${number.format(warnings.length)} to check`;
+  const items = warnings.map((one) => node("li", {}, sentence(one)));
+  const [first, rest] = box.querySelectorAll("ul");
+  const more = box.querySelector("details");
+  first.replaceChildren(...items.splice(0, WARNINGS_SHOWN));
+  more.hidden = !items.length;
+  more.open = false;
+  more.querySelector("summary").textContent = `${number.format(items.length)} more`;
+  rest.replaceChildren(...items);
 }
 
 const called = (name) => name[0].toUpperCase() + name.slice(1).replaceAll("_", " ");

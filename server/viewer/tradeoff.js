@@ -55,7 +55,7 @@ function grouped(points) {
 export class Tradeoff {
   /** @param $ finds an element by its id */
   constructor($) {
-    Object.assign(this, { $, scene: null, model: null, asked: null, effective: null, timer: null, due: 0, moving: false, putting: false, updates: [] });
+    Object.assign(this, { $, opened: 0, scene: null, model: null, asked: null, effective: null, timer: null, due: 0, moving: false, putting: false, updates: [] });
     $("budget-kind").addEventListener("change", () => this.place(true));
     $("budget").addEventListener("input", () => {
       this.moving = true;
@@ -77,6 +77,7 @@ export class Tradeoff {
 
   close() {
     clearTimeout(this.timer);
+    this.opened++; // what was asked before is not shown: a scene that begins anew has the same id
     Object.assign(this, { scene: null, model: null, asked: null, effective: null, timer: null, moving: false, updates: [] });
     this.say("");
     this.draw();
@@ -96,16 +97,16 @@ export class Tradeoff {
   }
 
   async load() {
-    const scene = this.scene;
+    const { scene, opened } = this;
     this.due = performance.now() + EVERY_MS;
     try {
       const model = await call("GET", `${scenePath(scene)}/tradeoff`);
       const budget = await call("GET", `${scenePath(scene)}/budget`);
-      if (this.scene !== scene) return;
+      if (this.opened !== opened) return;
       this.timer = null;
       this.show(model, budget);
     } catch {
-      if (this.scene === scene) this.timer = null; // the page says elsewhere that the service does not answer
+      if (this.opened === opened) this.timer = null; // the page says elsewhere that the service does not answer
     }
   }
 
@@ -213,13 +214,13 @@ export class Tradeoff {
   }
 
   async put() {
-    const scene = this.scene;
+    const { scene, opened } = this;
     this.putting = true;
     const body = { ...this.asked, iterations: null, budget_ms: null };
     if (this.kind) body[this.kind] = this.value;
     try {
       const budget = await call("PUT", `${scenePath(scene)}/budget`, body);
-      if (this.scene !== scene) return;
+      if (this.opened !== opened) return;
       Object.assign(this, { asked: budget.asked, effective: budget.effective, since: budget.since });
       this.rest();
     } catch (error) {
@@ -232,10 +233,12 @@ export class Tradeoff {
 
   /** Begins a replay, or ends the one that is running. */
   async measure() {
+    const { opened } = this;
     const running = this.model?.replay.state === "running";
     const path = `${scenePath(this.scene)}/tradeoff`;
     try {
       const model = await (running ? call("DELETE", path) : call("POST", path, { iterations: REPLAYED }));
+      if (this.opened !== opened) return;
       this.show(model, { asked: this.asked, effective: this.effective, since: this.since });
     } catch (error) {
       this.say(error.message, true);

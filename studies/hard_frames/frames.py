@@ -234,7 +234,7 @@ def brighter(factors: Callable[[Any, int], float], count: Callable[[Any], int]) 
 
 def swapped(footage: Footage, at: int, size: Any) -> list[Sent]:
     """The pictures of two cameras, each in the other's place."""
-    one, two = _two(footage)
+    one, two = two_cameras(footage)
 
     def change(number: int, frame: Frame) -> Frame:
         images, masks = dict(frame.images), dict(frame.masks)
@@ -248,7 +248,7 @@ def swapped(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 def bumped(footage: Footage, at: int, size: Any) -> list[Sent]:
     """One camera's pictures shifted by so many pixels, for good: four frames are sent."""
-    name = _two(footage)[0]
+    name = two_cameras(footage)[0]
 
     def change(number: int, frame: Frame) -> Frame:
         images = {**frame.images, name: np.roll(np.asarray(frame.images[name]), size, axis=1)}
@@ -334,13 +334,13 @@ def teleported(footage: Footage, at: int, size: Any) -> list[Sent] | None:
     return sent
 
 
-def _two(footage: Footage) -> tuple[str, str]:
+def two_cameras(footage: Footage) -> tuple[str, str]:
     """A camera, and one that sees the object from elsewhere."""
     names = sorted(footage.frame(0).images)
     return names[1], names[len(names) // 2 + 1]
 
 
-FIELD = "issue 4; field.md section 4"
+FIELD = "users' reports of capture systems: caps, triggers, cables and light"
 CASES = (
     FrameCase(
         "all black", "lens caps, or a lost trigger: finite, and learnt it would paint the scene black; size: frames",
@@ -362,7 +362,7 @@ CASES = (
 
 def named(footage: Footage) -> tuple[FrameCase, ...]:
     """All cases; some name cameras of the footage."""
-    one, two = _two(footage)
+    one, two = two_cameras(footage)
     return (
         *CASES,
         FrameCase(

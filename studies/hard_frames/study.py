@@ -15,6 +15,7 @@ from scas4d_core.metrics import psnr
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.storage.history import History
 from studies.constants import all_varied
+from studies.hard_frames.camera_faults import camera_faults
 from studies.hard_frames.footage import AnyFootage
 from studies.hard_frames.frames import FrameCase, FrameStep, Pictures, Sent, named, violations
 
@@ -40,6 +41,11 @@ class FrameCaseResult:
     violations: list[str] = field(default_factory=list)
 
 
+def cases_of(footage: AnyFootage) -> tuple[FrameCase, ...]:
+    """All cases: faults of frames, and of one camera."""
+    return (*named(footage), *camera_faults(footage))
+
+
 class FrameStudy:
     """Runs cases on a footage.
 
@@ -49,7 +55,7 @@ class FrameStudy:
 
     def __init__(self, footage: AnyFootage, folder: Path) -> None:
         self.footage, self.folder = footage, folder
-        self.cases = named(footage)
+        self.cases = cases_of(footage)
         shutil.rmtree(folder, ignore_errors=True)
         scene = footage.start(folder / "before")
         self._interval = footage.frame(1).time - footage.frame(0).time

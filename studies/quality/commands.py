@@ -1,4 +1,4 @@
-"""The studies of quality, as commands of `scripts/bench`: `quality`, `refit`, `rigs`, `effects`, and others."""
+"""The studies of quality, as commands of `scripts/bench`: `quality`, `refit`, `effects`, and others."""
 
 from __future__ import annotations
 
@@ -101,27 +101,6 @@ def refit(
 
 
 @takes_capture
-def rigs(
-    captures: Captures,
-    options: CaptureOptions,
-    out: Study = QUALITY,
-    frames: Annotated[int, typer.Option(min=1, help="At most so many.")] = 20,
-    longer: Annotated[int, typer.Option(min=64, help="Pixels along the longer side of the largest picture.")] = 480,
-    again: Again = False,
-    changes: Changes = None,
-) -> None:
-    """Reconstructs captures of other rigs with default settings: seconds of frame 0, and a camera held out.
-
-    Leaves rigs.md and a JSON file a row in the study's folder.
-
-    Example: scripts/bench rigs captures/fly --frames 15
-    """
-    from studies.quality.rigs import run
-
-    run(captures, out, frames=frames, longer=longer, changes=changes or (), again=again, options=options)
-
-
-@takes_capture
 def effects(
     captures: Captures,
     options: CaptureOptions,
@@ -178,40 +157,6 @@ def switches(
     from studies.quality.switches import run
 
     run(captures, out, updates=updates, seeds=seed or (0,), changes=changes or (), again=again)
-
-
-def drift(
-    captures: Captures,
-    out: Study = QUALITY,
-    updates: Annotated[int, typer.Option(min=1, help="Of each capture.")] = 14,
-    pixels: Annotated[float, typer.Option(min=0, help="Of the files, that a camera drifts by in a frame.")] = 0.3,
-    most: Annotated[float, typer.Option(min=0, help="Of the files, that it drifts by in all.")] = 4.0,
-    again: Again = False,
-    changes: Changes = None,
-) -> None:
-    """Updates captures of which two cameras drift, or none, with the effect pose_drift and without.
-
-    Leaves drift.md in the study's folder; a run that was measured is not measured again.
-    """
-    from studies.quality.pose_drift import run
-
-    run(captures, out, updates=updates, pixels=pixels, most=most, changes=changes or (), again=again)
-
-
-def calibration(
-    captures: Captures,
-    out: Study = QUALITY,
-    fit: Annotated[bool, typer.Option(help="Fit frame 0 to rigs with faults, as given and refined.")] = True,
-    again: Again = False,
-    changes: Changes = None,
-) -> None:
-    """Puts faults into calibrations: what frame 0 tells of each, and what refining them is worth.
-
-    Leaves calibration.md in the study's folder; a fit that was measured is not measured again.
-    """
-    from studies.quality.calibration import run
-
-    run(captures, out, fit=fit, changes=changes or (), again=again)
 
 
 def targets(

@@ -12,6 +12,13 @@ from scas4d_core.cameras import Camera, Rig
 COUNT = 24
 BUMPED_FROM = 5
 """Frame from which the reports say that camera c2 was bumped."""
+OFF = tuple(
+    f"the calibration of camera 'c{number}' seems to be off: its matching features miss their epipolar lines by "
+    f"{number + 3}.4 px, median of 212, usual in the rig is 0.6 px; static.refine_calibration has it refined from the "
+    "pictures of frame 0"
+    for number in range(4)
+)
+"""Warnings of a frame 0 that is a guess (``fakes.GUESSED``), beside the one that says so."""
 
 
 def make_rig():
@@ -53,6 +60,9 @@ class DrawnReconstruction(fakes.FakeReconstruction):
             alarms.append({"what": "light", "camera": None, "evidence": "the pictures are 1.3 times as bright"})
         seconds = {"total": (0.8 + 0.1 * (frame.index % 3)) * self.iterations / fakes.ITERATIONS}
         more = {"cameras": fits, "psnr": 31.0 + np.sin(frame.index), "seconds": seconds, "alarms": alarms}
+        if not self.history.indices and next(iter(frame.images.values()))[0, 0, 0] == fakes.GUESSED:
+            off = {"off": list(make_rig().names[:4]), "warnings": list(OFF)}
+            more["calibration"] = {"cameras": {}, **off, "refined": None}
         return super().commit(frame, dropped, {**(notes or {}), **more})
 
 

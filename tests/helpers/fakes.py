@@ -163,7 +163,11 @@ class FakeReconstruction:
             record["timing"] = {"c0": {"frames": 0.0, "error": 0.02, "off": False}}
             record["timing"]["c1"] = {"frames": 0.4, "error": 0.02, "off": True}
         if red == GUESSED and not known:
-            record |= {"cloud": {"way": "volume", "points": count, "covered": 0.0}, "shortened": ["no stereo"]}
+            record |= {
+                "cloud": {"way": "volume", "points": count, "covered": 0.0},
+                "shortened": ["no stereo"],
+                "grey": ["c1"],
+            }
         first = self.iterations // 2
         record["curve"] = [
             {"iterations": first, "milliseconds": MS_EACH * first, "loss": 0.5},

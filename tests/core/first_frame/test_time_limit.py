@@ -15,6 +15,7 @@ from scas4d_core.first_frame.fit_schedule import FEWEST, FitSchedule
 from scas4d_core.first_frame.initial_gaussians import initial_parameters
 from scas4d_core.first_frame.static_scene import StaticTrainer
 from scas4d_core.first_frame.time_limit import STEREO, TimeLimit
+from scas4d_core.frame_outcome import first_warnings
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings
 from scas4d_core.update.picture_loss import ViewFactory
@@ -99,12 +100,14 @@ def test_a_fit_that_is_slow_at_its_end_alone_is_shortened_too() -> None:
     schedule, _, _ = run(3000, 60.0, lambda at: 0.017 if at < 2950 else 0.3, lambda at: 1000.0)
     assert len(schedule.planned) == 1  # hardly fewer iterations
     assert schedule.shortened
+    assert schedule.record == [(0, 3000), (schedule.done, schedule.done)]
 
 
 def test_a_fit_that_has_time_is_not_shortened() -> None:
     schedule, _, _ = run(300, 60.0, lambda at: 0.01, lambda at: 1000.0)
     assert schedule.done == 300
     assert not schedule.shortened
+    assert schedule.record == [(0, 300)]
 
 
 @pytest.fixture
@@ -174,6 +177,32 @@ def test_a_report_says_what_was_shortened(monkeypatch: pytest.MonkeyPatch) -> No
     assert told[-1].detail["seconds_left"] == pytest.approx(0, abs=1)
     assert "seconds_at_most" in told[-1].detail
     assert "seconds_at_most" not in told[0].detail
+
+
+@pytest.mark.parametrize(("made", "said"), [(199, False), (191, False), (190, True), (120, True)])
+def test_a_few_iterations_fewer_are_figures_and_no_warning(
+    monkeypatch: pytest.MonkeyPatch, made: int, said: bool
+) -> None:
+    """A limit that hardly binds: the report has the figure, and nobody is told to mend anything."""
+    began = fit_schedule.FitSchedule.next
+
+    def hurried(self: FitSchedule) -> fit_schedule.FitStep:
+        self.stride = 200 / made if self.done < made - 1 else 200.0
+        return began(self)
+
+    monkeypatch.setattr(fit_schedule.FitSchedule, "next", hurried)
+    settings = Settings(static=StaticSettings(iterations=200, max_gaussians=300, seconds=1e6))
+    points = InitialPoints(BOX.means.astype(np.float64), BOX.colours, None)
+    scene = Reconstruction.start(RIG, take_frame(0, 0.0, BOX, RIG), settings, points=points)
+    report = scene.history.report(0)
+    assert report["iterations"] == made
+    assert report["planned"][0] == [0, 200]
+    assert report["planned"][-1] == [made, made]
+    assert [f"{made} of 200 iterations" in text for text in report["shortened"]] == [True] * said
+    assert scene.report is not None
+    told = [text for text in scene.report.warnings if "too little time" in text]
+    assert len(told) == said
+    assert first_warnings(report) == scene.report.warnings
 
 
 def test_of_several_ways_the_best_that_ends_in_time_is_chosen() -> None:

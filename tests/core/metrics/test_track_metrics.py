@@ -5,6 +5,7 @@ import pytest
 
 from scas4d_core.metrics import (
     error_by_confidence,
+    lost_parts,
     median_trajectory_error,
     oracle_tracks,
     track_error_3d,
@@ -114,3 +115,16 @@ def test_faults_are_named():
         track_error_3d(np.zeros((3, 2, 3)), np.zeros((3, 2, 3)), np.ones(2, bool), 0.0)
     with pytest.raises(ValueError, match="no point moves"):
         track_error_3d(np.zeros((3, 2, 3)), np.zeros((3, 2, 3)), np.zeros(2, bool), 1.0)
+
+
+def test_a_part_is_lost_by_its_own_moving_points_in_the_last_frame() -> None:
+    truth = np.zeros((3, 6, 3))
+    parts, moving = np.array([1, 1, 1, 2, 2, 3]), np.array([True, True, True, True, False, False])
+    off = np.array([0.0, 0.1, 0.9, 0.3, 0.0, 9.0])  # of an extent of 10: 2 % are 0.2
+    tracks = truth.copy()
+    tracks[2, :, 0] = off
+    assert lost_parts(tracks, truth, parts, moving, 10.0) == [2]  # of part 1 most are near; part 3 stands
+    tracks[1, :, 0], tracks[2, :, 0] = off, 0.0
+    assert lost_parts(tracks, truth, parts, moving, 10.0) == []  # found again
+    tracks[2, 0:2] = np.nan
+    assert lost_parts(tracks, truth, parts, moving, 10.0) == [1]

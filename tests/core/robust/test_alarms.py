@@ -14,8 +14,8 @@ import pytest
 from scas4d_core.captures.frame import Frame
 from scas4d_core.frame_outcome import Alarm, AlarmKind, FrameOutcome
 from scas4d_core.robust import alarms, outliers
-from scas4d_core.robust.alarms import GAIN, NEAR_DB, SHARPNESS, TINT, Numbers, Watch, alarms_of, left_out_alarms
-from scas4d_core.robust.outliers import LAST_DB, NEW_DB, Past
+from scas4d_core.robust.alarms import GAIN, SHARPNESS, TINT, Numbers, Watch, alarms_of, left_out_alarms
+from scas4d_core.robust.outliers import LAST_DB, NEAR_DB, NEW_DB, Past
 from studies.hard_frames.footage import SyntheticFootage
 
 NAMES = [f"c{k}" for k in range(10)]

@@ -222,3 +222,19 @@ def test_the_past_goes_through_arrays_unchanged() -> None:
     broken = {**past.arrays(), "names": np.array(["c0"])}
     with pytest.raises(ValueError, match=r"zip|argument"):
         Past.of_arrays(broken)
+
+
+@pytest.mark.parametrize(("off", "follows"), [(-3.9, True), (-4.1, False)])
+def test_the_usual_place_of_a_camera_does_not_follow_what_is_in_doubt(off: float, follows: bool) -> None:
+    """Else a fault that lasts is usual before two frames in a row have told of it."""
+    after = outliers.settle(PAST, {**USUAL, "c4": USUAL["c4"] + off}, BRIGHT, 1.0)
+    wanted = PLACES["c4"] + (outliers.PLACE_RATE * off if follows else 0.0)
+    assert after.places["c4"] == pytest.approx(wanted)
+    assert after.out["c4"] == 0
+
+
+@pytest.mark.parametrize("updates", [0, 1])
+def test_a_place_that_is_hardly_known_follows_all_the_same(updates: int) -> None:
+    past = replace(PAST, updates=updates)
+    after = outliers.settle(past, {**USUAL, "c4": USUAL["c4"] - 4.5}, BRIGHT, 1.0)
+    assert after.places["c4"] < PLACES["c4"] - 0.5

@@ -326,6 +326,56 @@ def test_a_view_that_a_browser_kept_is_not_shown_for_another_one(http, sdk, make
     assert http.get(address, headers=kept).status_code == 200
 
 
+ADDRESSES = {
+    "": [""],
+    "/rig": ["/rig"],
+    "/budget": ["/budget"],
+    "/tradeoff": ["/tradeoff"],
+    "/frames": ["/frames"],
+    "/frames/{n}": ["/frames/0"],
+    "/frames/{n}/splat.ply": ["/frames/0/splat.ply"],
+    "/gaussians": ["/gaussians?ids=0"],
+    "/parts": ["/parts", "/parts?count=2"],
+    "/render": [
+        "/render",
+        "/render?frame=0",
+        "/render?frame=0&kind=depth&format=npz",
+        "/render?frame=0&kind=alpha&width=8&camera=c1",
+        "/render?frame=0&kind=parts",
+    ],
+    "/tracks": ["/tracks?ids=0&from=0&to=0", "/tracks?point=0,0,0&format=npz"],
+}
+"""All addresses of a scene that are read, by route."""
+
+
+def test_no_answer_that_a_cache_kept_is_shown_for_another_reconstruction(http, sdk, make):
+    """A cache shows what it may keep again, unasked or where its tag still holds."""
+    paths = http.get("/openapi.json").json()["paths"]
+    read = [path for path, verbs in paths.items() if path.startswith("/v1/scenes/{id}") and "get" in verbs]
+    routes = {path.removeprefix("/v1/scenes/{id}") for path in read}
+    assert routes == ADDRESSES.keys()  # a new one is looked at here, too
+    id = make()
+    put_form(http, id, 0)
+    sdk.wait(id, 0)
+    tags = {}
+    for address in (one for addresses in ADDRESSES.values() for one in addresses):
+        answer = http.get(f"/v1/scenes/{id}{address}")
+        assert answer.status_code == 200, address
+        allowed = {word.strip() for word in answer.headers.get("cache-control", "").split(",")}
+        assert allowed & {"no-store", "no-cache"}, address
+        if "no-store" not in allowed:
+            tags[address] = answer.headers["etag"]
+    assert len(tags) == 3
+    for number in (1, 2):
+        begun(http, id, number)
+        sdk.wait(id, 0)
+        for address, tag in tags.items():
+            answer = http.get(f"/v1/scenes/{id}{address}", headers={"If-None-Match": tag})
+            assert answer.status_code == 200, address
+            assert answer.headers["etag"] != tag
+            tags[address] = answer.headers["etag"]
+
+
 def test_replays_work_on_the_new_states(http, sdk, make):
     id = make()
     for index in range(4):

@@ -77,20 +77,24 @@ def test_a_frame_0_that_is_a_guess_is_a_warning_and_is_one_again(tmp_path):
         id = create(http)
         put(http, id, 0, pictures(fakes.GUESSED))
         sdk.wait(id, 0)
-        (said,) = sdk.scene(id).warnings
-        assert said.startswith("frame 0 is a guess")
-        assert "begin the reconstruction again with points" in said
+        said = sdk.scene(id).warnings
+        assert said[0].startswith("frame 0 is a guess")
+        assert "begin the reconstruction again with points" in said[0]
+        assert said[1].startswith("frame 0 had too little time: no stereo; ")
+        assert said[2].startswith("grey cameras beside colour ones: c1; ")
+        assert len(said) == 3
+        assert sdk.frame(id, 0).grey == ["c1"]
         assert sdk.frame(id, 0).shortened == ["no stereo"]
         put(http, id, 1)
         sdk.wait(id, 1)
-        assert sdk.scene(id).warnings == [said]
+        assert sdk.scene(id).warnings == said
     with serving(tmp_path) as (http, sdk):
         put(http, id, 2)
         sdk.wait(id, 2)  # the worker has said by then what it found
         deadline = time.monotonic() + 30
-        while sdk.scene(id).warnings != [said] and time.monotonic() < deadline:
+        while sdk.scene(id).warnings != said and time.monotonic() < deadline:
             time.sleep(0.02)
-        assert sdk.scene(id).warnings == [said]
+        assert sdk.scene(id).warnings == said
 
 
 def test_a_camera_out_of_step_is_a_warning_for_as_long_as_it_is(tmp_path):

@@ -10,10 +10,10 @@ import pytest
 from studies.hard_frames import frames
 from studies.hard_frames.footage import SyntheticFootage
 from studies.hard_frames.frames import Footage, FrameCase, Sent
-from studies.hard_frames.study import FrameCaseResult, FrameStudy, table
+from studies.hard_frames.study import FrameCaseResult, FrameStudy, cases_of, table
 
 FOOTAGE = SyntheticFootage()
-CASES = [(case, size) for case in frames.named(FOOTAGE) for size in case.sizes]
+CASES = [(case, size) for case in cases_of(FOOTAGE) for size in case.sizes]
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 
 from client.importers.open_source import CaptureOptions
 from scas4d_core.captures import open_capture
-from studies.quality import rigs
+from studies.rigs import rigs
 
 SAMPLE = Path(__file__).parents[3] / "samples" / "robot"
 QUICK = ("static.iterations=20", "static.max_gaussians=500", "update.iterations=4")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scas4d_core.captures import open_capture
-from studies.quality import calibration
+from studies.rigs import calibration
 
 SAMPLE = Path(__file__).parents[3] / "samples" / "robot"
 QUICK = ("scene.image_scale=0.25", "static.iterations=5", "static.max_gaussians=300")

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from scas4d_core.captures import open_capture
-from studies.quality import pose_drift
+from studies.rigs import pose_drift
 
 SAMPLE = Path(__file__).parents[3] / "samples" / "robot"
 QUICK = ("scene.image_scale=0.25", "static.iterations=20", "static.max_gaussians=500", "update.iterations=8")

@@ -2,6 +2,7 @@
 
 Frame 0 has its limit of time here, for its seconds are what is asked: run it on a machine that does nothing else. With
 five cameras or more one is held out, and its picture compared with the nearest training picture, shown in its place.
+Of all, tracks are held against optical flow (``flow.py``).
 A folder's ``joints.npz`` (``points3d`` [T, J, 3], in the world of the calibration) is followed by tracks from frame 0.
 """
 
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.cli.changes import parse_changes
-from client.cli.evaluate import Report, recorded
+from client.cli.evaluate import Report, recorded, save_comparisons
 from client.cli.scores import Column, Row, Store, digest, kept_row, markdown
 from client.importers.open_source import CaptureOptions
 from scas4d_core import metrics
@@ -27,6 +28,7 @@ from scas4d_core.presets import preset
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.warm_up import warm_up_elsewhere
 from studies.machine import core_version, machine
+from studies.rigs.flow import flow_consistency
 
 ENOUGH_TO_HOLD_OUT = 5
 """Cameras from which one is held out: of fewer each one sees what no other does."""
@@ -48,6 +50,8 @@ COLUMNS = (
     Column("its dB", "psnr_held_out", ".1f"),
     Column("last", "psnr_held_out_last", ".1f"),
     Column("nearest picture dB", "psnr_nearest", ".1f"),
+    Column("flow px", "flow_px", ".1f"),
+    Column("epipolar px", "epipolar_px", ".1f"),
     Column("joints px", "joints_px", ".1f"),
     Column("last", "joints_px_last", ".1f"),
 )
@@ -78,7 +82,8 @@ def run(
     for folder in captures:
         key = f"{folder.resolve().name}-{digest(list(changes), frames, longer, *options.changed.items())}"
         path = store.folder / "rigs" / f"{key}.json"
-        row = kept_row(path, partial(measured, folder, options, frames, longer, changes), again=again)
+        pictures = store.folder / "pictures" / key
+        row = kept_row(path, partial(measured, folder, options, frames, longer, changes, pictures), again=again)
         rows.append(row)
         report(markdown([row], COLUMNS))
     table = markdown(rows, COLUMNS)
@@ -87,8 +92,10 @@ def run(
     return rows
 
 
-def measured(folder: Path, options: CaptureOptions, frames: int, longer: int, changes: Sequence[str]) -> Row:
-    """The row of one capture; the arguments are those of ``run``."""
+def measured(
+    folder: Path, options: CaptureOptions, frames: int, longer: int, changes: Sequence[str], pictures: Path
+) -> Row:
+    """The row of one capture; the arguments are those of ``run``, ``pictures`` takes truth, render and difference."""
     names = options.open(folder).full_rig.names
     if not options.test and len(names) >= ENOUGH_TO_HOLD_OUT:
         options = replace(options, test=(names[len(names) // 2],))
@@ -134,6 +141,11 @@ def measured(folder: Path, options: CaptureOptions, frames: int, longer: int, ch
             "psnr_held_out_last": found[-1],
             "psnr_nearest": float(np.mean([_nearest_psnr(truth, unseen, index) for index in range(count)])),
         }
+    if count > 1:
+        row |= flow_consistency(scene, truth, count)
+    seen = truth if truth.test_rig is not None else truth.measured_on_training()
+    for index in sorted({0, count - 1}):
+        save_comparisons(scene, seen, index, pictures)
     if (folder / "joints.npz").is_file():
         row |= _joints(folder / "joints.npz", scene, given.full_rig, count)
     return row

@@ -1,0 +1,118 @@
+"""Faults of one camera among good ones: what is sent, and that an alarm names the camera.
+
+Lenses lose their focus and get dirty, gains and white balances jump, a grabber repeats its last picture. The update
+need not suffer much by it; a person must hear of it while the recording can still be saved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from scas4d_core.captures.frame import Frame
+from studies.hard_frames.frames import Footage, FrameCase, FrameStep, Holds, Picture, Sent, near, replaced, two_cameras
+
+FRAMES = 3
+"""Faulty frames that are sent."""
+SOON = 2
+"""Of them, by which the alarm must have come; a picture that stands is known by its third frame."""
+SMEARED, VEIL = 0.02, 0.35
+"""Of dirt on a lens: blur, of the picture's width, and the share of white that the light scattered in it adds."""
+FIELD = "operators of rigs: lenses, gains and frame grabbers"
+
+Fault = Callable[[Picture, Any], Picture]
+"""The faulty picture, in a size."""
+
+
+def camera_faults(footage: Footage) -> tuple[FrameCase, ...]:
+    """The faults, all of the same camera of a footage."""
+    name = two_cameras(footage)[0]
+
+    def case(title: str, what: str, sizes: tuple[Any, ...], fault: Fault) -> FrameCase:
+        return FrameCase(
+            title, what, FIELD, sizes, lambda shown, at, size: _faulty(shown, at, name, size, fault), told(name, SOON)
+        )
+
+    return (
+        case("a camera out of focus", "blurred by so many pixels", (1.5, 3.0), blurred),
+        case("a camera's gain jumps", "its pixels times the size", (0.7, 0.3), scaled),
+        case(
+            "a camera's white balance jumps", "its red times the size", (1.1, 1.25),
+            lambda picture, size: scaled(picture, (size, 1.0, 1.0)),
+        ),
+        case("a camera is noisy", "noise of so many levels of 255", (10, 25), noisy),
+        case("a lens is dirty", "blurred and bright in a ninth of the picture; size: which of nine", (0, 4), dirty),
+        FrameCase(
+            "a camera's picture stands", "as it was before, while the others go on; size: frames", FIELD, (FRAMES,),
+            lambda shown, at, size: _standing(shown, at, name, size), told(name, FRAMES),
+        ),
+    )  # fmt: skip
+
+
+def told(name: str, soon: int) -> Holds:
+    """An alarm names the camera by frame ``soon`` of the fault, none names another, and no damage is done."""
+
+    def holds(steps: Sequence[FrameStep], size: Any) -> list[str]:
+        found = [] if any(_names(step, name) for step in steps[:soon]) else [f"no alarm of it within {soon} frames"]
+        for step in steps:
+            others = {alarm.camera for alarm in step.report.alarms} - {name}
+            found += [
+                f"frame {step.report.index}: an alarm of {other or 'the frame'}" for other in sorted(others, key=str)
+            ]
+        return found + near(steps, size)
+
+    return holds
+
+
+def _names(step: FrameStep, name: str) -> bool:
+    return any(alarm.camera == name for alarm in step.report.alarms)
+
+
+def blurred(picture: Picture, pixels: float) -> Picture:
+    """Out of focus: blurred by so many pixels, standard deviation."""
+    found: Picture = gaussian_filter(picture.astype(np.float32), (pixels, pixels, 0)).round().astype(np.uint8)
+    return found
+
+
+def scaled(picture: Picture, factor: Any) -> Picture:
+    """Times a factor, or one of each colour; saturated at 255."""
+    found: Picture = (picture * np.asarray(factor)).round().clip(0, 255).astype(np.uint8)
+    return found
+
+
+def noisy(picture: Picture, levels: float) -> Picture:
+    """With noise of so many levels, standard deviation; another in each picture."""
+    rng = np.random.default_rng(int(picture.sum()))
+    return (picture + rng.normal(0, levels, picture.shape)).round().clip(0, 255).astype(np.uint8)
+
+
+def dirty(picture: Picture, ninth: int) -> Picture:
+    """With dirt on the lens before one of its nine parts, numbered by rows."""
+    height, width = picture.shape[:2]
+    row, column = divmod(ninth, 3)
+    part = slice(row * height // 3, (row + 1) * height // 3), slice(column * width // 3, (column + 1) * width // 3)
+    found = picture.copy()
+    smeared = gaussian_filter(picture[part].astype(np.float32), (SMEARED * width, SMEARED * width, 0))
+    found[part] = (smeared + VEIL * (255 - smeared)).round().astype(np.uint8)
+    return found
+
+
+def _faulty(footage: Footage, at: int, name: str, size: Any, fault: Fault) -> list[Sent]:
+    def change(number: int, frame: Frame) -> Frame:
+        images = {**frame.images, name: fault(np.asarray(frame.images[name]), size)}
+        return Frame(frame.index, frame.time, images, frame.masks)
+
+    return replaced(footage, at, FRAMES, change)
+
+
+def _standing(footage: Footage, at: int, name: str, count: int) -> list[Sent]:
+    before = footage.frame(at - 1)
+
+    def change(number: int, frame: Frame) -> Frame:
+        masks = {**frame.masks, name: before.masks[name]} if name in before.masks else frame.masks
+        return Frame(frame.index, frame.time, {**frame.images, name: before.images[name]}, masks)
+
+    return replaced(footage, at, count, change)

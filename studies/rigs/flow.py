@@ -1,0 +1,138 @@
+"""Tracks against optical flow, for captures without truth: does what a track says stay under the same pixels?
+
+Corners of frame 0 are followed in each camera by themselves (Lucas-Kanade, kept where following them back leads to
+where they came from), and as tracks of the scene. A track that is right stays on its corner; and where a second camera
+sees the same point, its own corner stays on the epipolar line of the first one's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from client.cli.scores import Row
+from scas4d_core.cameras import Camera
+from scas4d_core.captures import Capture
+from scas4d_core.first_frame.points.triangulation import fundamental_matrix
+from scas4d_core.reconstruction import Reconstruction
+
+Float = NDArray[np.float64]
+Grey = Sequence[NDArray[np.uint8]]
+
+CORNERS, APART = 400, 4
+"""Corners of a picture at most, and pixels between them."""
+MOVING = 2.0
+"""Pixels from frame 0 to the last that a corner must go: one that stands tells nothing of tracks."""
+BACK = 0.5
+"""Pixels by which a corner may miss where it came from, followed back frame by frame."""
+SAME = 0.01
+"""Of the distance: what two cameras see at a pixel is one point where it is no farther apart."""
+FEWEST = 20
+"""Positions, over points and frames, from which a median is told."""
+
+
+def flow_consistency(scene: Reconstruction, capture: Capture, count: int) -> Row:
+    """Median pixels by which tracks leave moving corners, and moving corners their epipolar lines; and how many count.
+
+    Args:
+        scene: has committed ``count`` frames. capture: as rendered; its training cameras are asked.
+
+    Returns:
+        ``flow_px``, ``epipolar_px`` (pixels of the pictures of ``capture``; None of too few, or where
+        most are lost) and ``flow_points``.
+    """
+    rig, indices = capture.rig, list(range(count))
+    films: dict[str, list[NDArray[np.uint8]]] = {name: [] for name in rig.names}
+    for index in indices:
+        for name, image in capture.frame(index).images.items():
+            if name in films:
+                films[name].append(cv2.cvtColor(np.asarray(image), cv2.COLOR_RGB2GRAY).astype(np.uint8))
+    away, beside, points = list[Float](), list[Float](), 0
+    cameras = [camera for camera in rig.cameras if len(films[camera.name]) == count]
+    for camera in cameras:
+        flow = _corners(films[camera.name])
+        if not flow.shape[1]:
+            continue
+        tracks = scene.tracks_of_pixels(camera, flow[0], 0, indices)
+        known = np.isfinite(tracks.positions[0]).all(axis=1)
+        flow, positions = flow[:, known], tracks.positions[:, known]
+        points += int(known.sum())
+        off = np.linalg.norm(camera.project(positions)[0] - flow, axis=-1)[1:]
+        away.append(np.where(np.isfinite(off), off, np.inf).ravel())
+        for other in cameras:
+            if other is not camera:
+                beside.append(_from_lines(scene, (camera, other), positions[0], flow, films[other.name]))
+    return {
+        "flow_px": _median(away),
+        "epipolar_px": _median(beside),
+        "flow_points": points,
+    }
+
+
+def followed(film: Grey, start: Float) -> Float:
+    """[T, Q, 2] pixels of points followed through the pictures [T] of a camera; NaN once one is lost.
+
+    Args:
+        film: grey pictures [H, W]. start: [Q, 2] pixels in the first, in which the middle of the first pixel is 0.5.
+    """
+    found = np.full((len(film), len(start), 2), np.nan)
+    found[0] = start
+    for index in range(1, len(film)):
+        here = (found[index - 1] - 0.5).astype(np.float32)
+        there = np.isfinite(here).all(axis=1)
+        if not there.any():
+            break
+        ahead, seen = _flow(film[index - 1], film[index], here[there])
+        back, seen_back = _flow(film[index], film[index - 1], ahead)
+        good = seen & seen_back & (np.linalg.norm(back - here[there], axis=1) < BACK)
+        found[index, np.flatnonzero(there)[good]] = ahead[good] + 0.5
+    return found
+
+
+def _flow(
+    picture: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """[Q, 2] the places in the next picture of points of this one, and [Q] those that were found."""
+    where, found, _ = cv2.calcOpticalFlowPyrLK(picture, after, points, points.copy())
+    return np.asarray(where, np.float32), np.asarray(found).ravel() > 0
+
+
+def _corners(film: Grey) -> Float:
+    """[T, Q, 2] corners of the first picture that move and are followed to the last."""
+    start = np.asarray(cv2.goodFeaturesToTrack(film[0], CORNERS, 0.01, APART), np.float64)  # of None, NaN
+    found = followed(film, start.reshape(-1, 2) + 0.5 if start.ndim else np.zeros((0, 2)))
+    moves = np.linalg.norm(found[-1] - found[0], axis=1) >= MOVING  # False for NaN
+    return found[:, moves]
+
+
+def _from_lines(scene: Reconstruction, pair: tuple[Camera, Camera], points: Float, flow: Float, film: Grey) -> Float:
+    """Pixels by which corners of a second camera leave the epipolar lines of the first one's, frame by frame.
+
+    Args:
+        points: [Q, 3] in frame 0. flow: [T, Q, 2] in the first camera. film: of the second.
+    """
+    first, second = pair
+    uv, depth = second.project(points)
+    inside = (depth > 0) & (uv >= 0).all(axis=1) & (uv < (second.width, second.height)).all(axis=1)
+    if not inside.any():
+        return np.zeros(0)
+    shown = scene.tracks_of_pixels(second, uv[inside], 0, [0]).positions[0]
+    near = np.linalg.norm(shown - points[inside], axis=1) < SAME * depth[inside]  # False for NaN: nothing is met there
+    rows = np.flatnonzero(inside)[near]
+    other = followed(film, uv[rows])[1:]
+    ones = np.ones((*flow.shape[:2], 1))[1:, rows]
+    lines = np.concatenate([flow[1:, rows], ones], axis=-1) @ fundamental_matrix(first, second).T
+    distance = np.abs((np.concatenate([other, ones], axis=-1) * lines).sum(-1)) / np.linalg.norm(
+        lines[..., :2], axis=-1
+    )
+    found: Float = distance[np.isfinite(distance)]
+    return found
+
+
+def _median(parts: Sequence[Float]) -> float | None:
+    values = np.concatenate(parts) if parts else np.zeros(0)
+    found = float(np.median(values)) if len(values) >= FEWEST else np.inf
+    return found if np.isfinite(found) else None

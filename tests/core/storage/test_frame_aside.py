@@ -1,0 +1,97 @@
+"""States of a history in memory that are moved to scratch files: the same bits, and no memory."""
+
+from __future__ import annotations
+
+import gc
+import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from histories import filled, same, state
+
+from scas4d_core.gaussians import PER_FRAME
+from scas4d_core.storage import frame_aside
+from scas4d_core.storage.history import History
+
+FRAME_BYTES = 4 * (3 + 9 + 4 + 3 + 1)
+"""Of a Gaussian in a frame: place, factors, rotation, colour, label."""
+
+
+def test_states_are_the_same_bits_and_the_history_goes_on(tmp_path: Path) -> None:
+    history = filled(History())
+    history.put_aside(tmp_path)
+    assert list(tmp_path.iterdir()) == []  # it has no name: nothing is left, however the process ends
+    history.append(40, 2.0, state(40))
+    history.put_aside(tmp_path)
+    for t in (0, 3, 8, 3, 7):
+        assert same(history.gaussians(2 * t), state(t))
+    assert same(history.newest, state(40))
+    for name in PER_FRAME:
+        stack = history.stacked(name, [4, 0, 16, 40])
+        assert np.array_equal(stack, np.stack([state(t).arrays()[name] for t in (2, 0, 8, 40)]))
+    history.save(tmp_path / "copy")
+    assert same(History.load(tmp_path / "copy").gaussians(6), state(3))
+    assert history.cut(12) == [14, 16, 40]
+    assert same(history.newest, state(6))
+
+
+def test_a_frame_costs_no_memory_any_more(tmp_path: Path) -> None:
+    count, frames = 20_000, 12
+    one = state(0, count)
+    tracemalloc.start()
+    try:
+        peaks = []
+        for aside in (False, True):
+            history = History()
+            tracemalloc.reset_peak()
+            before = tracemalloc.get_traced_memory()[0]
+            for index in range(frames):
+                history.append(index, index / 30, one)
+                if aside:
+                    history.put_aside(tmp_path)
+            peaks.append((tracemalloc.get_traced_memory()[0] - before) / (count * FRAME_BYTES))
+            del history
+            gc.collect()
+    finally:
+        tracemalloc.stop()
+    assert peaks[0] == pytest.approx(frames, abs=0.5)
+    assert peaks[1] == pytest.approx(2, abs=0.5)
+
+
+def test_without_room_states_stay_in_memory_and_room_is_asked_for_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    history, asked = filled(History()), []
+
+    def full(**_: object) -> None:
+        asked.append(1)
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(frame_aside, "TemporaryFile", full)
+    for _ in range(3):
+        history.put_aside(tmp_path)
+    assert same(history.gaussians(6), state(3))
+    assert asked == [1]
+
+
+def test_empty_arrays_and_many_readers(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    frames = [
+        {"a": rng.normal(size=(50, 3)), "none": np.zeros((0, 4), np.float32), "one": np.array(k)} for k in range(40)
+    ]
+    scratch = frame_aside.ScratchFile(tmp_path)
+    aside = [scratch.moved(frame) for frame in frames]
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda k: dict(aside[k % 40]), range(400)))
+    for k, one in enumerate(found):
+        assert all(np.array_equal(one[name], frames[k % 40][name]) for name in one)
+        assert one["none"].shape == (0, 4)
+
+
+def test_a_history_on_disk_has_no_use_for_it(tmp_path: Path) -> None:
+    history = filled(History(tmp_path / "states"))
+    history.put_aside(tmp_path)
+    assert same(history.gaussians(6), state(3))
+    assert [path.name for path in tmp_path.iterdir()] == ["states"]
