@@ -234,17 +234,18 @@ def first_warnings(record: Mapping[str, Any]) -> list[str]:
 def timing_warnings(timing: Mapping[str, CameraTiming] | None) -> list[str]:
     """A sentence on the cameras that are clearly out of step; none where none is.
 
-    It is a lasting fault of a rig, and no news in each frame: the status of a scene has it for as long as it is so.
+    It is a lasting fault of a rig, and no news in each frame: the status of a scene has it for as long as it is so, in
+    the same words; the figures, which change from frame to frame, are in the report.
 
     Args:
         timing: of the newest report; None: it has none.
 
     >>> in_step, late = {"frames": 0.02, "error": 0.03, "off": False}, {"frames": 0.41, "error": 0.03, "off": True}
     >>> timing_warnings({"a": late, "b": in_step})
-    ["cameras are out of step: the pictures of 'a' 0.41 frames after the others'; check their trigger or genlock"]
+    ["cameras are out of step: 'a' is late; check their trigger or genlock"]
     """
     off = {name: one["frames"] for name, one in sorted((timing or {}).items()) if one["off"]}
     if not off:
         return []
-    told = [f"of {name!r} {abs(way):.2f} frames {'after' if way > 0 else 'before'}" for name, way in off.items()]
-    return [f"cameras are out of step: the pictures {', '.join(told)} the others'; check their trigger or genlock"]
+    told = ", ".join(f"{name!r} is {'late' if way > 0 else 'early'}" for name, way in off.items())
+    return [f"cameras are out of step: {told}; check their trigger or genlock"]

@@ -266,8 +266,7 @@ class History(HistoryReader):
         """Moves states from memory to a scratch file, but for the first and the newest; their bits stay the same.
 
         Args:
-            folder: on whose disk the file is; it has no name, and goes with this history. Without room in it the
-                states stay in memory.
+            folder: on the disk of the file, which goes with this history; without room states stay in memory.
         """
         self._scratch = self._scratch or ScratchFile(folder)
         for index in self.indices[1:-1] if self._files is None else ():

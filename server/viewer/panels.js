@@ -59,7 +59,8 @@ export function showFacts(list, status) {
 const WARNINGS_SHOWN = 3;
 
 /**
- * Lists the warnings of the scene, which stay until its reconstruction begins again; the button says how many there are.
+ * Lists the warnings of the scene: they are the same in each frame, or for as long as cameras are out of step; the button says
+ * how many there are.
  * They are in another place than the alarms of a frame, and not in their colour: nothing of a frame is wrong by them.
  */
 export function showWarnings(box, button, warnings) {
@@ -109,12 +110,11 @@ export function showQueue(box, words, status) {
   box.classList.toggle("full", full);
 }
 
-/** Words on a camera that is clearly out of step; a lasting fault, that the row of the camera has. */
-const outOfStep = (one) => (one?.off ? [`its pictures are taken ${Math.abs(one.frames).toFixed(2)} frames ${one.frames > 0 ? "after" : "before"} the others'`] : []);
+/** When a camera takes its pictures, where it is clearly out of step: a lasting fault, which the scene's warnings name. */
+const outOfStep = (one) => (one?.off ? `, whose pictures are taken ${Math.abs(one.frames).toFixed(2)} frames ${one.frames > 0 ? "after" : "before"} the others'` : "");
 
 /** Evidence of the alarms about a camera; they are made where the frame was reconstructed, and only shown here. */
-export const complaints = (name, report) => [
-  ...(report?.alarms ?? []).filter((one) => one.camera === name).map((one) => one.evidence), ...outOfStep(report?.timing?.[name])];
+export const complaints = (name, report) => (report?.alarms ?? []).filter((one) => one.camera === name).map((one) => one.evidence);
 
 const TOLD = ["frame_held", "frame_in_part"];
 
@@ -143,7 +143,7 @@ export function showCameras(body, summary, names, report, lookFrom) {
     if (shift) swatch.style.background = `rgb(${shift.map((v) => Math.round(128 + 1280 * v)).join(" ")})`;
     const words = found.length ? found.join("; ") : "";
     return node("tr", { class: found.length ? "bad" : null },
-      node("th", { scope: "row" }, node("button", { type: "button", class: "link", title: `Look through camera ${name}`, onclick: () => lookFrom(index) }, name)),
+      node("th", { scope: "row" }, node("button", { type: "button", class: "link", title: `Look through camera ${name}${outOfStep(report?.timing?.[name])}`, onclick: () => lookFrom(index) }, name)),
       node("td", {}, meter),
       node("td", { class: "figure" }, fit && fit.psnr !== null ? fit.psnr.toFixed(1) : "–"),
       node("td", {}, swatch),

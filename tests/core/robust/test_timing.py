@@ -124,7 +124,7 @@ def test_who_is_clearly_off_is_named() -> None:
     assert found["wild"]["frames"] > OFF
     assert {name for name, one in found.items() if one["off"]} == {"late", "early"}
     (told,) = timing_warnings(found)
-    assert "of 'early' 0.40 frames before, of 'late' 0.30 frames after the others'" in told
+    assert "'early' is early, 'late' is late;" in told  # no figures: they change from frame to frame, and it does not
     assert timing_warnings(None) == []
 
 
@@ -155,9 +155,7 @@ def test_cameras_out_of_step_are_found_and_named(undisturbed: tuple[Reconstructi
     assert all(abs(one["frames"]) < 0.1 for name, one in found.items() if name not in APART_BY)
     assert undisturbed[1][0].timing == {}  # a look or two say nothing
     (told,) = timing_warnings(undisturbed[0].history.report(18)["timing"])
-    assert "'c3'" in told
-    assert "'c7'" in told
-    assert told.count("frames") == 2
+    assert "'c3' is late, 'c7' is early;" in told
 
 
 def test_a_scene_goes_on_with_its_looks(undisturbed: tuple[Reconstruction, list[FrameReport]], tmp_path: Path) -> None:
