@@ -19,8 +19,8 @@ FRAMES = 3
 """Faulty frames that are sent."""
 SOON = 2
 """Of them, by which the alarm must have come; a picture that stands is known by its third frame."""
-SMEARED, VEIL = 0.02, 0.35
-"""Of dirt on a lens: blur, of the picture's width, and the share of white that the light scattered in it adds."""
+SMEARED = 0.02
+"""Blur by dirt on a lens, of the picture's width."""
 FIELD = "operators of rigs: lenses, gains and frame grabbers"
 
 Fault = Callable[[Picture, Any], Picture]
@@ -44,7 +44,7 @@ def camera_faults(footage: Footage) -> tuple[FrameCase, ...]:
             lambda picture, size: scaled(picture, (size, 1.0, 1.0)),
         ),
         case("a camera is noisy", "noise of so many levels of 255", (10, 25), noisy),
-        case("a lens is dirty", "blurred and bright in a ninth of the picture; size: which of nine", (0, 4), dirty),
+        case("a lens is dirty", "the middle ninth of its picture blurred, and so much white added", (0.2, 0.35), dirty),
         FrameCase(
             "a camera's picture stands", "as it was before, while the others go on; size: frames", FIELD, (FRAMES,),
             lambda shown, at, size: _standing(shown, at, name, size), told(name, FRAMES),
@@ -89,14 +89,13 @@ def noisy(picture: Picture, levels: float) -> Picture:
     return (picture + rng.normal(0, levels, picture.shape)).round().clip(0, 255).astype(np.uint8)
 
 
-def dirty(picture: Picture, ninth: int) -> Picture:
-    """With dirt on the lens before one of its nine parts, numbered by rows."""
+def dirty(picture: Picture, white: float) -> Picture:
+    """With dirt on the lens before the middle ninth: blurred, with a share of white by light that is scattered."""
     height, width = picture.shape[:2]
-    row, column = divmod(ninth, 3)
-    part = slice(row * height // 3, (row + 1) * height // 3), slice(column * width // 3, (column + 1) * width // 3)
+    middle = slice(height // 3, 2 * height // 3), slice(width // 3, 2 * width // 3)
+    smeared = gaussian_filter(picture[middle].astype(np.float32), (SMEARED * width, SMEARED * width, 0))
     found = picture.copy()
-    smeared = gaussian_filter(picture[part].astype(np.float32), (SMEARED * width, SMEARED * width, 0))
-    found[part] = (smeared + VEIL * (255 - smeared)).round().astype(np.uint8)
+    found[middle] = (smeared + white * (255 - smeared)).round().astype(np.uint8)
     return found
 
 
