@@ -1,7 +1,7 @@
 """Solves one frame: the update as set, retries where it fails, a search for what jumped; else Θ_{t−1} stays.
 
 Whatever fails, the next attempt starts from the committed state. Where no attempt gives a state that is plausible
-(``validation``) and shows the frame (``outliers``), the state of the frame before stays, and the report says so.
+(``checks``) and shows the frame (``outliers``), the state of the frame before stays, and the report says so.
 """
 
 from __future__ import annotations
