@@ -16,7 +16,7 @@ from client.cli.changes import parse_changes
 from client.cli.progress import Bars, console
 from client.importers.open_source import CaptureOptions
 from client.sdk import DEFAULT_URL, Client
-from client.wire import FINISHED, FrameReportModel, FrameState, IngestSettings
+from client.wire import FINISHED, FrameReportModel, IngestSettings
 from scas4d_core.captures import InitialPoints
 from scas4d_core.frame_outcome import AlarmKind
 
@@ -149,7 +149,7 @@ def watch(scene: Scene, url: Url = DEFAULT_URL, token: Token = None) -> None:
             for event in stream:
                 if isinstance(event, FrameMessage) and event.report.state in FINISHED:
                     console.print(frame_line(event.report, event.missed, off), highlight=False, soft_wrap=True)
-                    off = out_of_step(event.report) if event.report.state == FrameState.COMMITTED else off
+                    off |= out_of_step(event.report)  # each is named once, also where it comes and goes at the limit
                 elif isinstance(event, SceneMessage) and event.status.state != state:
                     state = event.status.state
                     console.print(f"scene is {state}" + (f": {event.status.error}" if event.status.error else ""))
