@@ -124,7 +124,7 @@ class Perfect:
 
     def step(self, frame):
         self._commit(frame.index)
-        return types.SimpleNamespace(seconds={"render": 0.5, "losses": 0.25}, moving=2, gaussians=3)
+        return types.SimpleNamespace(seconds={"render": 0.5, "losses": 0.25}, moving=2, gaussians=3, alarms=[])
 
     def _commit(self, t):
         n = len(plates(0))
