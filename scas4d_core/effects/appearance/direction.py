@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from scas4d_core.update.picture_loss import PictureLoss, TrainingView
 
 RATE_GLOSS, RATE_ENVIRONMENT, RATE_NEARNESS = 2e-3, 1e-2, 1e-3
-"""Adam rates in an update, falling to a tenth. On `gloss`, ten frames: 29.5 dB; a quarter of them 29.2, twice 29.6."""
+"""Adam rates in an update, falling to a tenth; of the gloss see ``shading.gloss_rate``."""
 SMOOTH_EVERY = 10
 """Iterations between two averages of the changes over neighbours."""
 FEW = 4
@@ -46,13 +46,13 @@ class DirectionPart(Part):
 
     def start(self, work: Work) -> None:
         """Takes both from Θ_{t−1}; the gloss is kept as it was turned there."""
-        from scas4d_core.rasterize.shading import Shading, neighbourhoods, without_turn
+        from scas4d_core.rasterize.shading import Shading, gloss_rate, neighbourhoods, without_turn
 
         state = work.previous
         self._shading = None
         if state.gloss is None or state.environment is None:
             return
-        rates = (RATE_GLOSS, RATE_ENVIRONMENT, RATE_NEARNESS)
+        rates = (gloss_rate(RATE_GLOSS, state.gloss), RATE_ENVIRONMENT, RATE_NEARNESS)
         self._shading = Shading(state.gloss.copy(), state.environment.copy(), rates)
         work.gloss, work.environment = self._shading.gloss, self._shading.environment
         if self._near is None:

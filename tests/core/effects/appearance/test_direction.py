@@ -29,7 +29,15 @@ from scas4d_core.query.committed import CommittedScene
 from scas4d_core.query.harmonics import basis_of
 from scas4d_core.query.ply import write_ply
 from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
-from scas4d_core.rasterize.shading import Shading, colours_seen, neighbourhood_turns, neighbourhoods, without_turn
+from scas4d_core.rasterize.shading import (
+    GLOSS,
+    Shading,
+    colours_seen,
+    gloss_rate,
+    neighbourhood_turns,
+    neighbourhoods,
+    without_turn,
+)
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings
 from scas4d_core.storage.history import History
 from scas4d_core.structure.hierarchy import build_hierarchy
@@ -131,6 +139,29 @@ def test_strengths_tell_what_is_glossy_from_what_is_dull() -> None:
     assert np.median(found[dull & far]) < 0.15
     assert 0.3 < np.median(found[~dull & far]) < 0.7
     assert np.isfinite(found).all()
+    # Three cameras see few places in the light of a lamp and out of it: the rest has the strength of what is about it.
+    found = strengths_seen(normals, truth.environment, *shape, views[:3], CpuRasterizer())[:, 0]
+    assert np.median(found[dull & far]) < 0.05
+    assert 0.3 < np.median(found[~dull & far]) < 0.7
+
+
+def test_normals_turn_as_fast_whatever_the_strength_that_frame_0_came_out_with() -> None:
+    state, camera = sphere(), CameraArrays.of(rig().cameras[0])
+    assert state.gloss is not None
+    assert state.environment is not None
+    pull = np.random.default_rng(0).normal(0, 1, (COUNT, 4)).astype(np.float32)
+    turned = []
+    for factor in (0.2, 1.0):
+        gloss, environment = np.float32(factor) * state.gloss, state.environment.copy()
+        environment[: CELLS + 1] /= np.float32(factor)  # the sheen as well
+        shading = Shading.fresh(gloss.copy(), state.means, environment)
+        shading.saw(state.means, without_turn(COUNT), 0 * state.colours, camera, pull.copy())
+        shading.step()
+        turned.append((shading.gloss - gloss) / factor)
+    assert gloss_rate(1e-3, GLOSS * state.means / RADIUS) == pytest.approx(1e-3)
+    moved = np.linalg.norm(turned[1], axis=1) > 0
+    assert moved.sum() > COUNT / 10
+    np.testing.assert_allclose(turned[0][moved], turned[1][moved], rtol=0.01, atol=1e-6)
 
 
 def test_what_is_seen_from_everywhere_is_colour_and_not_environment() -> None:
