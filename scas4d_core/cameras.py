@@ -210,6 +210,9 @@ AUTO_RIG_RADIUS_M = 3.0
 ONE_PLACE = 1e-8
 """User's units, or metres: a rig with a smaller radius is at one place; what is left is rounding of the poses."""
 
+LONG_LENS = 2.0
+"""Focal length over the longer side of the picture, from which a lens is long: one of 72 mm before film of 36 mm."""
+
 
 @dataclass(frozen=True, eq=False)
 class Rig:
@@ -265,6 +268,15 @@ class Rig:
         the radius is ``AUTO_RIG_RADIUS_M`` then, in the unit of the cameras.
         """
         return AUTO_RIG_RADIUS_M if self.at_one_place else self._spread
+
+    @property
+    def reach(self) -> float:
+        """The radius, less where most lenses are longer than ``LONG_LENS``: what they show is a part of the scene.
+
+        Rates of positions go by it: a step that is a pixel before a usual lens is ten before one ten times as long.
+        """
+        lens = float(np.median([camera.intrinsics[0, 0] / max(camera.width, camera.height) for camera in self.cameras]))
+        return self.radius * min(1.0, LONG_LENS / lens)
 
     @property
     def at_one_place(self) -> bool:

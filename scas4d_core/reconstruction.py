@@ -33,7 +33,8 @@ from scas4d_core.rig_checks import check_rig
 from scas4d_core.robust.alarms import first_watched, sharpness
 from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness, fingerprints, goes_on, lit, noted
 from scas4d_core.robust.outliers import Past
-from scas4d_core.robust.solve_frame import FrameSolver, UpdateInput
+from scas4d_core.robust.solve_frame import FrameSolver
+from scas4d_core.robust.update_input import UpdateInput
 from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.storage.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, cold_start, find_commit
 from scas4d_core.storage.history import History, HistoryError
@@ -246,8 +247,8 @@ class Reconstruction(CommittedScene):
         watch.lap("judge")
         believed = [view for view in views if view.name not in left_out]
         steady = unusable is None and exposure == 1.0  # else nothing can be told from differences of the pictures
-        updater, carried = self._updater, self._carried
-        if steady and carried.seen and self._learns_labels:
+        updater, carried, learns = self._updater, self._carried, steady and self._learns_labels
+        if learns and carried.seen:
             newest = self.history.newest
             updater, carried = self._preparation.relabelled(updater, carried, newest, self._roots, believed)
         given = UpdateInput(
@@ -259,7 +260,7 @@ class Reconstruction(CommittedScene):
             brightness=bright, seed=frame.index, past=past, lengths=self._fixed.lengths, exposure=exposure,
             light_moves=moves, left_out=left_out, unusable=unusable, carried=carried.effects,
             same=[name for name in shown if shown[name] == carried.shown.get(name)], sharp=sharpness(frame.images),
-            end=self._budget.end(watch.began), each=self._budget.each,
+            end=self._budget.end(watch.began), each=self._budget.each, rests=learns and carried.labels is None,
         )  # fmt: skip
         solver = FrameSolver(updater, self._factory, self._picture, self._update)
         result, past = solver.run(given)

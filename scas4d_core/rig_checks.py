@@ -38,6 +38,9 @@ LEAST_DEPTH = 0.05
 MOST_POINTS = 2000
 """Points of a cloud that are looked at, evenly out of all."""
 
+USUAL_RADII = (0.1, 60.0)
+"""Metres: a rig that is smaller or larger than that was probably measured in another unit."""
+
 
 class RigError(CameraError):
     """A rig, or settings for it, with which a scene cannot work.
@@ -168,6 +171,38 @@ def check_points(rig: Rig, positions: Float) -> None:
         "points",
         f"{len(positions)} points",
     )
+
+
+def rig_warnings(rig: Rig, scene: SceneSettings, positions: Float | None = None) -> list[str]:
+    """Sentences on what may be wrong with a rig that can work: its unit, its poses (``pose_warnings``).
+
+    Args:
+        rig: in the user's world. scene: its unit. positions: [P, 3] of the cloud in the same world, or None.
+    """
+    return [*unit_warnings(rig, scene), *pose_warnings(rig, positions)]
+
+
+def unit_warnings(rig: Rig, scene: SceneSettings) -> list[str]:
+    """A sentence where the rig is of an unusual size, as if its unit were not the metre; else none.
+
+    >>> lens, there = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
+    >>> there[0, 3] = 4000
+    >>> rig = Rig((Camera("0", lens, np.eye(4), 64, 48), Camera("1", lens, there, 64, 48)))
+    >>> unit_warnings(rig, SceneSettings())[0][:81]
+    'the cameras are up to 2e+03 m from their middle with scene.metres_per_unit 1: for '
+    >>> unit_warnings(rig, SceneSettings(metres_per_unit=0.001))
+    []
+    """
+    unit = scene.metres_per_unit
+    if unit == "auto" or rig.at_one_place:
+        return []
+    radius = rig.radius * unit / 1.1
+    if USUAL_RADII[0] <= radius <= USUAL_RADII[1]:
+        return []
+    return [
+        f"the cameras are up to {radius:.3g} m from their middle with scene.metres_per_unit {unit:g}: "
+        "for a calibration in millimetres give 0.001, in centimetres 0.01, or 'auto'; some limits are in metres"
+    ]
 
 
 def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:

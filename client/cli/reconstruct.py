@@ -14,8 +14,9 @@ import numpy as np
 from client.cli import pictures
 from client.cli.progress import Bars, console
 from scas4d_core.captures import Capture
+from scas4d_core.frame_outcome import AlarmKind
 from scas4d_core.presets import preset as named
-from scas4d_core.rig_checks import check_rig
+from scas4d_core.rig_checks import check_rig, rig_warnings
 from scas4d_core.settings import Settings
 
 if TYPE_CHECKING:
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
     from scas4d_core.frame_report import FrameReport
     from scas4d_core.reconstruction import Reconstruction
     from scas4d_core.storage.history import History
+
+FRAME_ALARMS = (AlarmKind.FRAME_HELD, AlarmKind.FRAME_IN_PART)
+"""Alarms whose evidence is the report's ``degraded``."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +102,10 @@ def reconstruct(given: Capture, out: Path, *, frames: int | None, preset: str, c
     from scas4d_core.storage.history import History
 
     settings = named(preset, changes)
-    check_rig(given.full_rig, settings.scene, None if given.points is None else given.points.positions)
+    positions = None if given.points is None else given.points.positions
+    check_rig(given.full_rig, settings.scene, positions)
+    for sentence in rig_warnings(given.full_rig, settings.scene, positions):
+        console.print(sentence)
     capture = given.scaled(settings.scene.image_scale)
     count = min(frames or capture.frame_count, capture.frame_count)
     rig = capture.test_rig or capture.rig
@@ -125,12 +132,27 @@ def reconstruct(given: Capture, out: Path, *, frames: int | None, preset: str, c
                 )
                 scores.append(pictures.psnr(true, render))
                 pictures.save(out / f"camera_{camera.name}" / f"{index:06d}.png", pictures.comparison(true, render))
-            console.print(f"frame {index}: {np.mean(scores):.2f} dB")
+            console.print(f"frame {index}: {np.mean(scores):.2f} dB{told(done.report)}")
     write_ply(out / "last.ply", history.gaussians(history.indices[-1]), reconstruction.world)
     seen = (
         "" if capture.test_rig is not None else f" (dB of training camera {cameras[0].name}; --test holds out others)"
     )
     console.print(f"pictures, states and last.ply: {out}{seen}")
+
+
+def told(report: FrameReport | None) -> str:
+    """The lines on a frame that a person should read beside its figure: that it was held, and its alarms.
+
+    >>> told(None)
+    ''
+    """
+    if report is None:
+        return ""
+    parts = [] if report.degraded is None else [report.degraded]
+    for alarm in report.alarms:
+        if alarm.what not in FRAME_ALARMS:  # the sentence before says as much
+            parts.append(alarm.evidence if alarm.camera is None else f"camera {alarm.camera}: {alarm.evidence}")
+    return "".join(f"\n  ! {part}" for part in parts)
 
 
 def compile_kernels(settings: Settings) -> None:

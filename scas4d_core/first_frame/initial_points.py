@@ -137,9 +137,9 @@ def initial_points(
     distances = stage_distances(before, known, rig.radius)
     confirmed = 0.0 if found is None else found.covered
     if found is None or confirmed <= LITTLE:
-        found = _joined(found, shared_volume(before, distances, seed), "volume", before, 4 * spacing)
+        found = joined(found, shared_volume(before, distances, seed), "volume", before, 4 * spacing)
     if before is views and not first.backdrop:  # else the backdrop's colour is what lies behind
-        found = _joined(found, surroundings(before, distances), "surroundings", before, 0.0)
+        found = joined(found, surroundings(before, distances), "surroundings", before, 0.0)
         found = replace(found, stage=Stage.of(before, distances))
     return replace(found, covered=confirmed)
 
@@ -153,7 +153,7 @@ def _found(
 ) -> FoundPoints | None:
     """The points found before with those of a way; alone where it finds none."""
     try:
-        return _joined(found, search(), way, views, spacing)
+        return joined(found, search(), way, views, spacing)
     except InitialPointsError:
         return found
 
@@ -171,7 +171,7 @@ def _ways(first: Search, masked: bool) -> list[tuple[str, Search]]:
     return ways
 
 
-def _joined(
+def joined(
     found: FoundPoints | None, cloud: InitialPoints, way: str, views: Sequence[PosedPicture], spacing: float
 ) -> FoundPoints:
     """The points found before, and those of a cloud that are farther from them than ``spacing``, world units."""
@@ -180,11 +180,11 @@ def _joined(
     else:
         new = np.asarray(cKDTree(found.positions).query(cloud.positions)[0]) > spacing
         labels = [found.foreground, None if cloud.foreground is None else cloud.foreground[new]]
-        assert all(label is None for label in labels) or all(label is not None for label in labels)
         both = FoundPoints(
             np.concatenate([found.positions, cloud.positions[new]]),
             np.concatenate([found.colours, cloud.colours[new]]),
-            None if labels[0] is None else np.concatenate([label for label in labels if label is not None]),
+            # Silhouettes that one way found for itself label its points alone: then nothing is known of what moves.
+            None if any(label is None for label in labels) else np.concatenate(labels),  # type: ignore[arg-type]
             f"{found.way} + {way}",
         )
     return replace(both, covered=covered(views, both))

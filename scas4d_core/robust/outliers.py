@@ -35,6 +35,8 @@ HALVED_DB = 3.0
 """More is allowed for each halving of the iterations: 100 to 50 cost 1.7 dB on the captures, 50 to 25 3.2."""
 BEHIND_DB = 1.5
 """The same, from which the first frames after held ones are sought longer: what moved on unseen is further away."""
+RESTS_DB = 3.0
+"""The same, up to which a scene in which nothing is seen to move may stand: noise that frame 0 fits costs 1 to 2 dB."""
 CATCH_UP = 3
 """Frames that are, at most."""
 MOST_OUT = 0.5

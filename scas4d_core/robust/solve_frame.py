@@ -6,16 +6,14 @@ Whatever fails, the next attempt starts from the committed state. Where no attem
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from math import nan
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
 
-from scas4d_core.effects.parts import Arrays
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.rasterize.shading import features_seen
@@ -25,6 +23,7 @@ from scas4d_core.robust.attempt_results import joined, met, retold, usual_errors
 from scas4d_core.robust.checks import EXPOSURE, evened, gain_of, relit, validated
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.relocation import find_jump, shifted
+from scas4d_core.robust.update_input import UpdateInput
 from scas4d_core.settings import UpdateSettings
 from scas4d_core.update.frame_update import Updater
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
@@ -41,42 +40,6 @@ LADDER = (
 SEARCH = AttemptOptions("sought again", cold=True, longer=5.0)
 """From where the silhouettes say that the object is, or from where an update ended. Two of three frames of robot lost,
 the next is met at 33.5 dB with five times the iterations, at 32.1 dB with twice."""
-
-
-@dataclass(frozen=True, eq=False)
-class UpdateInput:
-    """All that the update of one frame starts from.
-
-    Attributes:
-        state: Θ_{t−1}. motion: that was found last, or None. seconds: since then. step: since the frame before.
-        views: of the frame, to learn from. suspects: views of cameras that are left out. seed: of the update.
-        brightness: mean of each camera's picture. past: the usual figures. carried: arrays of the effects.
-        lengths: [N, 3] metres, of the axes in frame 0.
-        exposure, left_out, unusable: by the brightness of the pictures, see ``checks.check_brightness``.
-        light_moves: whether it goes on from frame to frame, see ``checks.goes_on``.
-        same: cameras whose picture is that of the last frame that was believed. sharp: ``alarms.sharpness`` of each.
-        end: moment by which the last iteration has to be over. each: seconds of an iteration in the updates before.
-    """
-
-    state: Gaussians
-    motion: Motion | None
-    seconds: float
-    step: float
-    views: list[TrainingView]
-    suspects: list[TrainingView]
-    brightness: Mapping[str, float]
-    seed: int
-    past: Past
-    lengths: NDArray[np.float32]
-    exposure: float = 1.0
-    light_moves: bool = False
-    same: Collection[str] = ()
-    sharp: Mapping[str, float] = field(default_factory=dict)
-    left_out: Mapping[str, str] = field(default_factory=dict)
-    unusable: str | None = None
-    carried: Mapping[str, Arrays] = field(default_factory=dict)
-    end: float | None = None
-    each: float | None = None
 
 
 Solved = tuple[UpdateResult, Past]
@@ -123,9 +86,8 @@ class FrameSolver:
         return replace(result, health=fits, alarms=alarms, timing=timing.timings(past)), past
 
     def _solved(self, given: UpdateInput) -> Solved:
-        repeated = given.same and len(given.same) == len(given.brightness)
-        if repeated and self._settings.still > -1 and given.unusable is None:
-            return _standing(given, UpdateTrace(kept=Candidate.STILL), given.exposure, "the same pictures again")
+        if self._settings.still > -1 and given.unusable is None and (why := self._rests(given)) is not None:
+            return _standing(given, UpdateTrace(kept=Candidate.STILL), given.exposure, why)
         stays = given.light_moves or given.past.lit >= self._settings.patience
         if stays and (solved := self._relit(given)) is not None:
             return solved
@@ -173,6 +135,16 @@ class FrameSolver:
             result = self._go_on(other, result, attempts, longer=1.0)
         result = replace(result, outcome=outcome, reason=reason, attempts=attempts, exposure=exposure)
         return self._committed(given, result)
+
+    def _rests(self, given: UpdateInput) -> str | None:
+        """Why nothing has to be updated, as the pictures alone say, or None."""
+        if given.same and len(given.same) == len(given.brightness):
+            return "the same pictures again"
+        if not given.rests:
+            return None
+        with self._timed():  # what most cameras do not agree on may still have moved
+            met_still = outliers.level_of(given.past, self._measured(given.views, given.state))
+        return "nothing is seen to move" if met_still > given.past.level - outliers.RESTS_DB else None
 
     def _relit(self, given: UpdateInput) -> Solved | None:
         """A frame in a light that stays or moves: the colours take it on; None where the cameras tell of no other.

@@ -24,6 +24,7 @@ from scas4d_core.captures.frame import Frame
 from scas4d_core.effects.parts import Arrays
 from scas4d_core.effects.switches import Switches, switches_of, switches_record
 from scas4d_core.errors import message_of
+from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.robust.outliers import Past
 from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
 from scas4d_core.storage.history import NEWEST_KEPT, History, HistoryError
@@ -48,6 +49,7 @@ class CarryOver:
         motion: the motion found, or None where the next update starts cold.
         labels: [N] the Gaussians that have been seen to move, in scenes without masks; None until some have.
         seen: views of the last frame that was not held, in scenes without masks; the next are compared with them.
+            Until something is seen to move, of the first.
         structure: digest of the clusters and neighbours that the motion belongs to.
         past: usual values of the scene and its cameras.
         shown: fingerprint of each picture of the last frame that was not held (``checks``).
@@ -85,7 +87,9 @@ class CarryOver:
         )
         if result.outcome.held:
             return carried
-        if views is not None and result.exposure == 1.0:  # a change of another light has not moved
+        # A change of another light has not moved; and what is too little to be seen from frame to frame adds up.
+        stands = self.labels is None and result.outcome is FrameOutcome.STOOD and bool(self.seen)
+        if views is not None and result.exposure == 1.0 and not stands:
             carried = replace(carried, seen=[view for view in views if view.name not in result.trace.left_out])
         return replace(carried, shown=shown)
 

@@ -43,8 +43,13 @@ within what moves. Automatic masks are ragged: with 0.7 to 0.9 the ghosts of `ba
 INSIDE_CAMERAS = 3
 """Such cameras there have to be at least: the silhouettes of two hold much that is empty."""
 
+FIRST_LABELS = 32
+"""Gaussians that must be found moving before the first labels are learnt: a mouse in a room is a few hundredths of a
+percent of it. Before, nothing moves."""
 NEW_LABELS = 0.01
-"""Share of all Gaussians that must be found moving anew before the hierarchy is built again."""
+"""Share of all Gaussians, and ..."""
+MORE_LABELS = 0.2
+"""... share of those that move, the smaller of which must be found moving anew before the hierarchy is built again."""
 
 
 def first_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, NDArray[np.uint8]]) -> Gaussians:
@@ -149,15 +154,17 @@ def labels_learnt(
     now: Sequence[TrainingView],
     picture: PictureLoss,
 ) -> NDArray[np.bool_] | None:
-    """[N] bool: Gaussians that have been seen to move by now; None where hardly any are new.
+    """[N] bool: Gaussians that have been seen to move by now; None where hardly any are new, or too few moved ever.
 
     Args:
         gaussians: Θ_{t−1}. known: [N] those that had been seen to move before, or None.
         before, now: see ``moving_between``.
     """
     found = moving_between(gaussians, before, now, picture)
-    known = np.zeros(len(gaussians), np.bool_) if known is None else known
-    return None if (found & ~known).sum() <= NEW_LABELS * len(gaussians) else found | known
+    if known is None:
+        return found if found.sum() >= FIRST_LABELS else None
+    enough = min(NEW_LABELS * len(gaussians), max(FIRST_LABELS, MORE_LABELS * known.sum()))
+    return None if (found & ~known).sum() <= enough else found | known
 
 
 def labelled(gaussians: Gaussians, labels: NDArray[np.bool_] | None) -> Gaussians:

@@ -93,7 +93,7 @@ class DeviceUpdate:
             labels=[labels.astype(np.int64) for labels in hierarchy.labels],
             graph=_graph(neighbours, len(hierarchy.rows)),
             first_lengths=first_lengths(hierarchy, first),
-            rates=_rates(Rates.of(settings, len(hierarchy.sizes), factory.rig.radius), parts),
+            rates=_rates(Rates.of(settings, len(hierarchy.sizes), factory.rig.reach), parts),
             weights=_weights(parts, neighbours is not None),
             terms=tuple(part.twin for part in parts.parts),
             max_scale=deformation.MAX_SCALE,

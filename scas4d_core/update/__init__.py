@@ -11,7 +11,7 @@ The values that one update passes through, from ``Reconstruction.step`` to the c
 2. ``storage.checkpoint.CarryOver``: all that the update before left beside Θ_{t−1}; in the end, that of this one.
 3. ``robust.outliers.Past``: the usual figures of the scene and its cameras; a part of the carry-over.
 4. ``warm_start.Motion``: the motion that was found; a part of the carry-over.
-5. ``robust.solve_frame.UpdateInput``: the above, and the limits in time, for one frame.
+5. ``robust.update_input.UpdateInput``: the above, and the limits in time, for one frame.
 6. ``result.AttemptOptions``: how one attempt at the frame is made.
 7. ``result.UpdateTrace``: the record of an attempt, filled while it runs.
 8. ``result.UpdateResult``: the state that it ends with, its motion and trace.

@@ -25,7 +25,10 @@ Array = NDArray[np.float32]
 VIEWS = 4
 """Probe views of a frame."""
 SCALE = 0.5
-"""Of their pictures: a quarter of the pixels tells as much about which state is better."""
+"""Of their pictures: a quarter of the pixels tells as much about which state is better, ..."""
+ALIASED = 2.0
+"""... unless the state before is met so many times worse in small pictures than in whole ones: then they show Gaussians
+smaller than their pixels, and no motion, and whole pictures are compared."""
 
 
 def spread(rig: Rig, names: Sequence[str], count: int = VIEWS) -> list[str]:
@@ -57,8 +60,9 @@ class ProbeViews:
 
     def __init__(self, factory: ViewFactory, picture: PictureLoss, views: Sequence[TrainingView]) -> None:
         chosen = set(spread(factory.rig, [view.name for view in views]))
-        self._views = [factory.coarser(view, SCALE) for view in views if view.name in chosen]
-        self._picture = picture
+        self._whole = [view for view in views if view.name in chosen]
+        self._views = [factory.coarser(view, SCALE) for view in self._whole]
+        self._picture, self._looked = picture, False
 
     def errors(self, state: Gaussians, turns: Array | None = None) -> dict[str, float]:
         """The image loss (``losses.image_loss``) of a state in each view, by the camera's name.
@@ -66,12 +70,17 @@ class ProbeViews:
         Args:
             turns: since its gloss was known, see ``shading.colours_seen``.
         """
-        found = {}
-        for view in self._views:
-            features = features_seen(state, view.camera, turns)
-            self._picture.measure(state.means, state.factors, state.opacities, features, view)
-            found[view.name] = self._picture.image_part
-        return found
+        if not self._looked and self._views:  # the first state that is asked for is that of the frame before
+            self._looked = True
+            small, whole = (self._error(views[0], state, turns) for views in (self._views, self._whole))
+            if small > ALIASED * whole:
+                self._views = self._whole
+        return {view.name: self._error(view, state, turns) for view in self._views}
+
+    def _error(self, view: TrainingView, state: Gaussians, turns: Array | None) -> float:
+        features = features_seen(state, view.camera, turns)
+        self._picture.measure(state.means, state.factors, state.opacities, features, view)
+        return self._picture.image_part
 
 
 class BestState:

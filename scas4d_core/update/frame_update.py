@@ -84,7 +84,7 @@ class FrameUpdate:
         parts = parts or joined(PartsBuilder(scene, settings, factory, hierarchy, first))
         self._hooks, self._length, self._freedom = Hooks(parts.parts), parts.length, parts.freedom
         self._exposes, self._follows = parts.exposes, parts.follows
-        self._rates = freed(Rates.of(settings, len(hierarchy.sizes), factory.rig.radius), parts.freedom)
+        self._rates = freed(Rates.of(settings, len(hierarchy.sizes), factory.rig.reach), parts.freedom)
         limits = scene_limits(scene.near, factory.rig.radius)
         given = (factory, scene.behind, schedule.IMAGE_WEIGHT, parts.mask)
         self._picture = PictureLoss(*given, limits=limits)

@@ -102,7 +102,7 @@ class Rates:
 
     @classmethod
     def of(cls, settings: UpdateSettings, layers: int, radius: float) -> Rates:
-        """The rates of a scene of ``radius`` metres whose hierarchy has so many layers."""
+        """The rates of a scene whose cameras reach ``radius`` metres (``Rig.reach``), for so many layers."""
         named = [settings.layer_rates[min(k, len(settings.layer_rates) - 1)] for k in range(layers)]
         return cls(
             layers=tuple((r.rotation, r.translation * radius / STANDARD_RADIUS_M, r.scaling) for r in named),

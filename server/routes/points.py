@@ -13,7 +13,7 @@ from fastapi import APIRouter, Query, Request
 from numpy.typing import NDArray
 
 from client.wire import PointsReceipt
-from scas4d_core.rig_checks import RigError, check_points, pose_warnings
+from scas4d_core.rig_checks import RigError, check_points, rig_warnings
 from scas4d_core.storage.npz import write_npz
 from server.problems import Problem, counted, of_rig
 from server.routes.access import AllScenes, TheScene
@@ -73,7 +73,8 @@ async def put(
             raise
         if number == own:
             scene.points_sha256 = sha256
-            scene.warnings = await asyncio.to_thread(pose_warnings, scene.rig, arrays["positions"])
+            given = scene.rig, scene.spec.settings.scene, arrays["positions"]
+            scene.warnings = await asyncio.to_thread(rig_warnings, *given)
     return receipt
 
 

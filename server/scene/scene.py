@@ -14,7 +14,7 @@ from scas4d_core.cameras import Camera
 from scas4d_core.errors import message_of
 from scas4d_core.first_frame.calibration.record import in_use
 from scas4d_core.frame_outcome import first_warnings, timing_warnings
-from scas4d_core.rig_checks import RigError, check_start, pose_warnings
+from scas4d_core.rig_checks import RigError, check_start, rig_warnings
 from server.ingest.acknowledge import Ingest, IngestRules, uncancelled
 from server.ingest.open_frames import OpenFrames
 from server.problems import Problem, of_rig
@@ -82,7 +82,7 @@ class Scene:
         )
         self.spec = SceneSpec(folder, rig, definition.settings, self.rules.minimum_cameras, asked.keep_states)
         self.points_sha256: str | None = None
-        self.warnings = pose_warnings(rig)
+        self.warnings = rig_warnings(rig, definition.settings.scene)
         self._definition = definition
         self._hub = hub
         self._background = Background(self._failed)

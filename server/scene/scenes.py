@@ -14,7 +14,7 @@ from typing import NoReturn
 
 from client.wire import SceneCreate
 from scas4d_core.errors import message_of
-from scas4d_core.rig_checks import pose_warnings
+from scas4d_core.rig_checks import rig_warnings
 from scas4d_core.settings import Settings
 from scas4d_core.storage.npz import sync_folder
 from server.problems import Problem, counted
@@ -156,7 +156,7 @@ class Scenes:
             scene = Scene(definition, folder, found, self.server, self.placement, self.hub)
             scene.points_sha256 = await asyncio.to_thread(points_sha256, folder.points)
             if (positions := await asyncio.to_thread(points_positions, folder.points)) is not None:
-                scene.warnings = pose_warnings(scene.rig, positions)
+                scene.warnings = rig_warnings(scene.rig, scene.spec.settings.scene, positions)
             await scene.updates.recall()
         except (DefinitionError, OSError) as error:
             self.unreadable[folder.name] = message_of(error)

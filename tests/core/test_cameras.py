@@ -78,6 +78,15 @@ def test_auto_takes_the_radius_for_three_metres():
     assert rig.world_frame("auto").metres_per_unit == pytest.approx(3 / 110)
 
 
+@pytest.mark.parametrize(("focal", "share"), [(40, 1.0), (128, 1.0), (256, 0.5), (1280, 0.1)])
+def test_long_lenses_reach_a_part_of_the_scene(focal, share):
+    there = np.eye(4)
+    there[0, 3] = -2
+    lens = [[focal, 0, 32], [0, focal, 24], [0, 0, 1]]
+    rig = Rig((Camera("0", lens, np.eye(4), 64, 48), Camera("1", lens, there, 64, 48)))
+    assert rig.reach == pytest.approx(share * rig.radius)
+
+
 @pytest.mark.parametrize("count", [1, 3])
 def test_cameras_at_one_place_take_a_scene_of_three_metres(count):
     rig = Rig(tuple(camera(seed, str(seed), (7000.0, 0.1, -70.0)) for seed in range(count)))

@@ -19,7 +19,8 @@ from scas4d_core.effects.evidence import Seen
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.remake import remake
-from scas4d_core.robust.solve_frame import FrameSolver, Solved, UpdateInput
+from scas4d_core.robust.solve_frame import FrameSolver, Solved
+from scas4d_core.robust.update_input import UpdateInput
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings
 from scas4d_core.storage.births import Life
 from scas4d_core.storage.history import History

@@ -9,7 +9,15 @@ from scas4d_core.cameras import Camera, CameraError, Rig
 from scas4d_core.captures import InitialPoints
 from scas4d_core.captures.frame import Frame
 from scas4d_core.reconstruction import Reconstruction
-from scas4d_core.rig_checks import RigError, check_points, check_rig, check_scene, check_start, pose_warnings
+from scas4d_core.rig_checks import (
+    RigError,
+    check_points,
+    check_rig,
+    check_scene,
+    check_start,
+    pose_warnings,
+    rig_warnings,
+)
 from scas4d_core.settings import SceneSettings, Settings
 
 
@@ -68,6 +76,13 @@ def test_poses_the_wrong_way_round_are_suspected(origin):
     assert "invert them" in said
     (said,) = pose_warnings(rig, origin + CLOUD)
     assert "of the points are in view of a camera on average, inverted" in said
+
+
+@pytest.mark.parametrize(("unit", "warned"), [(1.0, False), (1000.0, True), (0.01, True), ("auto", False)])
+def test_an_unusual_unit_is_named(unit, warned):
+    said = rig_warnings(rig_of(RIGS["inward"](np.zeros(3))), SceneSettings(metres_per_unit=unit))
+    assert len(said) == warned
+    assert not warned or ("scene.metres_per_unit" in said[0] and "millimetres" in said[0])
 
 
 def test_points_speak_for_two_cameras_too():

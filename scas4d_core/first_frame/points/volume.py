@@ -68,7 +68,7 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
     else:
         raise InitialPointsError(
             "images: no two cameras look at one place; check that the calibration belongs to the pictures, and that "
-            "poses are world-to-camera, or start from a point cloud"
+            "its poses are the way round that its format has them (world to camera; transforms.json: camera to world)"
         )
     seen = observe(views, points[shared], inside[:, shared])
     best = np.argsort(seen.spread, kind="stable")[: int(KEPT * shared.sum())]

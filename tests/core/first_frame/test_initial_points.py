@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import InitialPoints
-from scas4d_core.first_frame.initial_points import ENOUGH, covered, initial_points
+from scas4d_core.first_frame.initial_points import ENOUGH, covered, initial_points, joined
 from scas4d_core.first_frame.points.posed_pictures import (
     InitialPointsError,
     PosedPicture,
@@ -275,6 +275,19 @@ def test_cameras_that_see_nothing_in_common_are_refused(scene):
     images = {name: np.full((128, 128, 3), 9, np.uint8) for name in rig.names}
     with pytest.raises(InitialPointsError, match="no two cameras look at one place"):
         initial_points(rig, images, {}, stereo=False)
+
+
+def test_points_that_one_way_labels_and_another_does_not_have_no_labels():
+    lens = np.array([[64.0, 0, 32], [0, 64.0, 32], [0, 0, 1]])
+    view = PosedPicture(Camera("front", lens, np.eye(4), 64, 64), np.zeros((64, 64, 3), np.uint8))
+    near, far = (np.array([[x, 0.0, 1.0]]) for x in (0.0, 0.2))
+    grey, label = np.full((1, 3), 0.5, np.float32), np.ones(1, np.float32)
+    labelled, plain = InitialPoints(near, grey, label), InitialPoints(far, grey)
+    for first, second, known in ((labelled, plain, False), (plain, labelled, False), (labelled, labelled, True)):
+        found = joined(joined(None, first, "backdrop", [view], 0.1), second, "volume", [view], 0.1)
+        assert found.way == "backdrop + volume"
+        assert (found.foreground is not None) == known
+        assert len(found.positions) == (1 if known else 2)  # the same place twice is one point
 
 
 def test_cells_that_hold_points_are_covered():

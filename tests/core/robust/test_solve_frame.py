@@ -19,7 +19,8 @@ from scas4d_core.robust.attempt_results import ERROR_RISE
 from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness
 from scas4d_core.robust.checks import lit as with_light
 from scas4d_core.robust.outliers import Past
-from scas4d_core.robust.solve_frame import FrameSolver, UpdateInput
+from scas4d_core.robust.solve_frame import FrameSolver
+from scas4d_core.robust.update_input import UpdateInput
 from scas4d_core.settings import UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory

@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from box_scene import MOVING, make_box, make_rig, moved, take_frame
+from scipy.spatial.transform import Rotation
 
 from scas4d_core.first_frame.static_result import StaticResult
+from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings, UpdateSettings
+from scas4d_core.structure import motion_mask
 from scas4d_core.structure.motion_mask import INSIDE_SHARE, changed_pixels, first_labels, with_reliable_labels
+from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
+from scas4d_core.update.result import camera_fit
 
 RIG = make_rig()
 BOX = make_box()
 SETTINGS = Settings(update=UpdateSettings(iterations=20, clusters=(2, 12, 48)))
 
 
-def start() -> Reconstruction:
+def start(iterations: int = 20) -> Reconstruction:
     everything: Gaussians = BOX.replace(foreground=np.ones(len(BOX), np.float32))
     frame = take_frame(0, 0.0, BOX, RIG, False)
-    return Reconstruction.start(RIG, frame, SETTINGS, static=StaticResult(everything, {}, []))
+    cameras = {name: camera_fit(35.0) for name in RIG.names}
+    settings = SETTINGS.model_copy(update={"update": SETTINGS.update.model_copy(update={"iterations": iterations})})
+    return Reconstruction.start(RIG, frame, settings, static=StaticResult(everything, {}, [], cameras=cameras))
 
 
 def test_what_moves_is_found_and_committed() -> None:
@@ -43,6 +52,51 @@ def test_nothing_is_decided_while_nothing_moves() -> None:
     assert scene.history.gaussians(1).moving.all()
     scene.step(take_frame(2, 2.0, moved(BOX), RIG, False))
     assert scene.history.gaussians(2).moving[MOVING:].mean() < 0.1
+
+
+def test_until_something_is_seen_to_move_nothing_does() -> None:
+    scene = start()
+    reports = [scene.step(take_frame(index, float(index), BOX, RIG, False)) for index in (1, 2)]
+    assert [report.outcome for report in reports] == 2 * [FrameOutcome.STOOD]
+    np.testing.assert_array_equal(scene.history.newest.means, BOX.means)
+    assert len(scene._carried.seen) == len(RIG)
+
+
+def test_what_is_too_slow_to_be_seen_from_frame_to_frame_adds_up() -> None:
+    scene, seen = start(iterations=80), []
+    for index in range(1, 11):
+        creep = moved(BOX, Rotation.identity(), np.array([0.002 * index, 0.0, 0.0]))
+        seen.append(scene.step(take_frame(index, float(index), creep, RIG, False)).outcome)
+    assert seen[0] is FrameOutcome.STOOD
+    assert seen[-1] is FrameOutcome.UPDATED
+    assert scene.history.newest.moving[MOVING:].mean() < 0.1
+    went = (scene.history.newest.means - BOX.means)[scene.history.newest.moving]
+    np.testing.assert_allclose(np.median(went, axis=0), [0.02, 0, 0], atol=0.005)
+
+
+def test_pictures_that_are_met_much_worse_are_no_rest() -> None:
+    scene = start()
+    # What each camera has changed in another place than the others: no two agree on a Gaussian that moves.
+    frame = take_frame(1, 1.0, BOX, RIG, False)
+    images = {}
+    for number, (name, image) in enumerate(frame.images.items()):
+        images[name] = image.copy()
+        images[name][number * 3 : number * 3 + 14] = 255 - images[name][number * 3 : number * 3 + 14]
+    assert scene.step(replace(frame, images=images)).outcome is not FrameOutcome.STOOD
+
+
+@pytest.mark.parametrize(
+    ("moving", "new", "learnt"), [(0, 31, False), (0, 32, True), (100, 32, False), (100, 33, True)]
+)
+def test_labels_are_learnt_of_enough(moving: int, new: int, learnt: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = np.zeros(10_000, np.bool_)
+    found[moving : moving + new] = True
+    monkeypatch.setattr(motion_mask, "moving_between", lambda *_: found)
+    many = Gaussians.of_points(np.zeros((10_000, 3)), radius=0.1)
+    known = np.arange(10_000) < moving if moving else None
+    labels = motion_mask.labels_learnt(many, known, (), (), PictureLoss(ViewFactory(RIG), (0, 0, 0), 1, 0))
+    assert (labels is not None) == learnt
+    assert labels is None or labels.sum() == moving + new
 
 
 def test_what_has_moved_stays_in_the_hierarchy() -> None:

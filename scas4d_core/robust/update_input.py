@@ -1,0 +1,53 @@
+"""All that the update of one frame starts from: the state, the pictures, and what the frames before have told."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.effects.parts import Arrays
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.robust.outliers import Past
+from scas4d_core.update.picture_loss import TrainingView
+from scas4d_core.update.warm_start import Motion
+
+
+@dataclass(frozen=True, eq=False)
+class UpdateInput:
+    """All that the update of one frame starts from.
+
+    Attributes:
+        state: Θ_{t−1}. motion: that was found last, or None. seconds: since then. step: since the frame before.
+        views: of the frame, to learn from. suspects: views of cameras that are left out. seed: of the update.
+        brightness: mean of each camera's picture. past: the usual figures. carried: arrays of the effects.
+        lengths: [N, 3] metres, of the axes in frame 0.
+        exposure, left_out, unusable: by the brightness of the pictures, see ``checks.check_brightness``.
+        light_moves: whether it goes on from frame to frame, see ``checks.goes_on``.
+        rests: whether the pictures have shown nothing to move yet, where they tell what moves.
+        same: cameras whose picture is that of the last frame that was believed. sharp: ``alarms.sharpness`` of each.
+        end: moment by which the last iteration has to be over. each: seconds of an iteration in the updates before.
+    """
+
+    state: Gaussians
+    motion: Motion | None
+    seconds: float
+    step: float
+    views: list[TrainingView]
+    suspects: list[TrainingView]
+    brightness: Mapping[str, float]
+    seed: int
+    past: Past
+    lengths: NDArray[np.float32]
+    exposure: float = 1.0
+    light_moves: bool = False
+    rests: bool = False
+    same: Collection[str] = ()
+    sharp: Mapping[str, float] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    unusable: str | None = None
+    carried: Mapping[str, Arrays] = field(default_factory=dict)
+    end: float | None = None
+    each: float | None = None
