@@ -113,7 +113,8 @@ def push(
         status = client.scene(delivery.scene)
     console.print(delivery.lateness.summary(fps), highlight=False, soft_wrap=True)
     for sentence in status.warnings:
-        console.print(sentence, style="yellow", highlight=False)
+        if sentence not in source.remarks:  # those were told when it was opened
+            console.print(sentence, style="yellow", highlight=False)
     console.print(f"scene {status.id}: {status.committed} of {status.next_frame} frames committed, {status.state}")
     console.print(f"{url.rstrip('/')}/#scene={status.id}", soft_wrap=True)
     if status.error:

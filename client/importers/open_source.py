@@ -12,7 +12,7 @@ from client.importers.formats.find import READ, found_in, is_calibration, only, 
 from client.importers.formats.nerfstudio import FILE, read_transforms
 from client.importers.pictures import PictureFiles, folders_of, named_files
 from client.importers.source import Encoding, ImportedPictures, RawReader, check_times, fitted
-from client.importers.videos import Videos, find_videos
+from client.importers.videos import ENDS, Videos, find_videos
 from scas4d_core.captures import Capture, CaptureError, Fit, open_capture
 from scas4d_core.captures.dynamic3dgs import TRAIN_META
 from scas4d_core.rig_checks import pose_warnings
@@ -137,7 +137,7 @@ def _imported(
         reader,
         fps=fps or raw.fps or found.fps or 30.0,
         points=found.points,
-        remarks=(*found.remarks, *resized, *reader.remarks),
+        remarks=(*found.remarks, *resized, *uncalibrated(folder, found), *reader.remarks),
     )
     check_times(capture.name, [capture.time(index) for index in range(capture.frame_count)])
     return capture
@@ -181,6 +181,19 @@ def _instead_of(others: list[Path], folder: Path, found: Calibration) -> Calibra
     listed = ", ".join(str(path.relative_to(folder)) for path in others)
     remark = f"calibration: {found.source.relative_to(folder)}, not {listed}; --calibration FILE takes another"
     return replace(found, remarks=(*found.remarks, remark))
+
+
+def uncalibrated(folder: Path, calibration: Calibration) -> list[str]:
+    """A remark on cameras that have pictures or a video, and are not in the calibration; none where all are."""
+    images, videos = folder / "images", folder / "videos"
+    there = {path.name for path in images.iterdir() if path.is_dir()} if images.is_dir() else set[str]()
+    if not there and videos.is_dir():
+        there = {path.stem for path in videos.iterdir() if path.suffix.lower() in ENDS}
+    told = " ".join(calibration.remarks)
+    left = sorted(name for name in there.difference(calibration.names) if name not in told)
+    if not left or not there.intersection(calibration.names):  # else these are no folders of cameras
+        return []
+    return [f"left out, {calibration.source.name} has no such camera: {', '.join(left)}"]
 
 
 def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | None) -> RawReader:

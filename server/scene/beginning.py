@@ -57,7 +57,7 @@ class Beginning:
                 f"the states of {counted(count, 'committed frame')} would be dropped",
                 field="discard",
                 value=False,
-                remedy="set discard to true to drop them, or create another scene beside this one",
+                remedy="set discard to true (begin-again --discard) to drop them, or create another scene",
                 committed=count,
             )
         cloud: int | None = None

@@ -257,7 +257,7 @@ class Scenes:
                 f"{counted(len(self.by_id), 'scene')} of at most {self.server.max_scenes} are here already",
                 field="SCAS4D_MAX_SCENES",
                 value=self.server.max_scenes,
-                remedy="delete a scene, or raise the limit",
+                remedy="delete a scene (DELETE /v1/scenes/ID), or raise SCAS4D_MAX_SCENES",
                 headers={"Retry-After": "60"},
             )
         definition = Definition(secrets.token_hex(6), datetime.now(UTC), request, settings)

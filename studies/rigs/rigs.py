@@ -24,6 +24,7 @@ from client.importers.open_source import CaptureOptions
 from scas4d_core import metrics
 from scas4d_core.cameras import Rig
 from scas4d_core.captures import Capture, Frame
+from scas4d_core.frame_outcome import Candidate
 from scas4d_core.presets import preset
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.warm_up import warm_up_elsewhere
@@ -44,6 +45,7 @@ COLUMNS = (
     Column("frame 0 s", "seconds_first", ".0f"),
     Column("update s", "seconds_update", ".1f"),
     Column("held", "held", "d"),
+    Column("unmoved", "unmoved", "d"),
     Column("training dB", "psnr_training", ".1f"),
     Column("last", "psnr_training_last", ".1f"),
     Column("held out", "held_out"),
@@ -108,12 +110,13 @@ def measured(
     scene = Reconstruction.start(given.rig, given.frame(0), settings, points=given.points)
     first = time.perf_counter() - began
     assert scene.report is not None
-    cloud, seconds, held = scene.report.cloud, list[float](), 0
+    cloud, seconds, held, unmoved = scene.report.cloud, list[float](), 0, 0
     for index in range(1, count):
         began = time.perf_counter()
-        outcome = scene.step(given.frame(index)).outcome
+        report = scene.step(given.frame(index))
         seconds.append(time.perf_counter() - began)
-        held += outcome.held
+        held += report.outcome.held
+        unmoved += report.kept is Candidate.STILL
     trained = [_psnr(scene, truth.rig, truth.frame(index)) for index in range(count)]
     row: Row = {
         "capture": given.name,
@@ -127,6 +130,7 @@ def measured(
         "shortened": list(scene.history.report(0).get("shortened") or []),
         "seconds_update": float(np.median(seconds)) if seconds else None,
         "held": held,
+        "unmoved": unmoved,
         "psnr_training": float(np.mean(trained)),
         "psnr_training_last": trained[-1],
         "settings": recorded(settings, ()),

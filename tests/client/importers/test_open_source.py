@@ -33,6 +33,13 @@ def test_pictures_of_straight_lenses_go_as_they_are(straight):
     assert open_source(straight, fps=50).time(1) == 1 / 50
 
 
+def test_pictures_of_a_camera_without_a_calibration_are_named(straight):
+    assert open_source(straight).remarks == ()
+    (straight / "images" / "cam7").mkdir()
+    assert open_source(straight).remarks == ("left out, transforms.json has no such camera: cam7",)
+    assert open_source(straight).rig.names == ("cam1", "cam2", "cam10")
+
+
 def test_frames_are_in_natural_order_and_one_name_is_one_frame(straight):
     names = ("f1", "f2", "f10", "f9")
     for camera in NAMES:
