@@ -38,8 +38,8 @@ LEAST_DEPTH = 0.05
 MOST_POINTS = 2000
 """Points of a cloud that are looked at, evenly out of all."""
 
-USUAL_RADII = (0.1, 60.0)
-"""Metres: a rig that is smaller or larger than that was probably measured in another unit."""
+USUAL_RADIUS = 60.0
+"""Metres: a larger rig was probably measured in another unit. Small ones stand before small things."""
 
 
 class RigError(CameraError):
@@ -183,7 +183,7 @@ def rig_warnings(rig: Rig, scene: SceneSettings, positions: Float | None = None)
 
 
 def unit_warnings(rig: Rig, scene: SceneSettings) -> list[str]:
-    """A sentence where the rig is of an unusual size, as if its unit were not the metre; else none.
+    """A sentence where the rig is as large as if its unit were not the metre; else none.
 
     >>> lens, there = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
     >>> there[0, 3] = 4000
@@ -197,7 +197,7 @@ def unit_warnings(rig: Rig, scene: SceneSettings) -> list[str]:
     if unit == "auto" or rig.at_one_place:
         return []
     radius = rig.radius * unit / 1.1
-    if USUAL_RADII[0] <= radius <= USUAL_RADII[1]:
+    if radius <= USUAL_RADIUS:
         return []
     return [
         f"the cameras are up to {radius:.3g} m from their middle with scene.metres_per_unit {unit:g}: "

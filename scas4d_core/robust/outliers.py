@@ -247,13 +247,19 @@ def health(past: Past, off: float) -> float:
 
 
 def settle(
-    past: Past, psnr: Mapping[str, float], bright: Mapping[str, float], exposure: float, iterations: int = 0
+    past: Past,
+    psnr: Mapping[str, float],
+    bright: Mapping[str, float],
+    exposure: float,
+    iterations: int = 0,
+    moved: bool = True,
 ) -> Past:
     """The past after an update was committed.
 
     Args:
         psnr: dB by camera, of those learnt from when last rendered, of those left out as the update ended.
         bright: of every picture of the frame. exposure: of the frame. iterations: of the update, 0: as many as before.
+        moved: whether it gave another state. Of one that did not, no update's usual figures are known.
     """
     psnr = _capped(psnr)
     off = offsets(past, psnr)
@@ -289,7 +295,7 @@ def settle(
         brightness=brightness,
         out=outs,
         level=past.level + follows * (level - past.level) if known else level,
-        updates=past.updates + 1,
+        updates=past.updates + moved,
         held=0,
         behind=later,
         iterations=iterations or past.iterations,

@@ -296,7 +296,8 @@ class FrameSolver:
             off = outliers.misfits(given.past, psnr, outliers.LAST_DB)
             again = [view for view in result.views or given.views if view.name in off]
             psnr |= self._measured([*again, *given.suspects], result.gaussians)
-        past = outliers.settle(given.past, psnr, given.brightness, result.exposure, len(trace.losses))
+        moved = trace.kept is not Candidate.STILL
+        past = outliers.settle(given.past, psnr, given.brightness, result.exposure, len(trace.losses), moved)
         if trace.errors.get(Candidate.END):
             past = replace(past, error=usual_errors(given.past.error, trace.errors[trace.kept]))
         motion = result.motion if result.motion is not None and result.motion.finite else None

@@ -202,6 +202,15 @@ def test_what_is_usual_follows_slowly_and_not_what_was_left_out() -> None:
     assert PLACES["c0"] - 3 * outliers.PLACE_RATE - 0.2 < one.places["c0"] < PLACES["c0"]
 
 
+def test_an_update_that_changed_nothing_tells_nothing_of_updates() -> None:
+    """The frame after a first update that kept the state may still be met far less well than frame 0 was."""
+    new = replace(PAST, updates=0)
+    same, other = (outliers.settle(new, USUAL, BRIGHT, 1.0, moved=moved) for moved in (False, True))
+    worse = {name: value - (outliers.DROPS_DB[0] + outliers.DROPS_DB[1]) / 2 for name, value in USUAL.items()}
+    assert outliers.unmet(same, worse) is None
+    assert outliers.unmet(other, worse) is not None
+
+
 def test_a_camera_that_was_not_there_keeps_its_past_and_a_new_one_gets_its_own() -> None:
     seen = {name: value for name, value in USUAL.items() if name != "c1"} | {"new": LEVEL}
     bright = {name: value for name, value in BRIGHT.items() if name != "c1"} | {"new": 0.3}
