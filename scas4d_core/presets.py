@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from scas4d_core.effects.registry import Mode
 from scas4d_core.effects.switches import contradictions
@@ -151,8 +151,9 @@ def _setting_error(error: ValidationError) -> SettingError:
     """The first error of a validation, with the nearest known name as the remedy for an unknown one."""
     found = error.errors(include_url=False)
     first = found[0]
-    setting = ".".join(str(part) for part in first["loc"] if not _of_union(part))
-    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    setting = _place(first["loc"])
+    others = len({_place(one["loc"]) for one in found}) - 1  # members of a union each say why they do not match
+    more = f" (and {others} more)" if others else ""
     remedy = "docs/settings.md lists all settings"
     if first["type"] == "extra_forbidden":
         fault = "there is no setting of this name"
@@ -165,7 +166,33 @@ def _setting_error(error: ValidationError) -> SettingError:
         fault, remedy = (own.fault, own.remedy) if isinstance(own, InputError) and own.remedy else (str(own), remedy)
     else:
         fault = first["msg"]
+        if said := _description(first["loc"]):
+            remedy = f"{said} {remedy}"
     return SettingError(setting, first["input"], f"{fault}{more}", remedy, error)
+
+
+def _place(loc: Iterable[int | str]) -> str:
+    """The name of a setting, as ``scene.background.2``."""
+    return ".".join(str(part) for part in loc if not _of_union(part))
+
+
+def _description(loc: Iterable[int | str]) -> str:
+    """What the docs say of a setting; empty where they say nothing.
+
+    >>> _description(("scene", "image_scale", "float"))
+    'Pictures are resized by this before anything else.'
+    """
+    said = ""
+    model: type[BaseModel] = Settings
+    for part in loc:
+        if not isinstance(part, str) or part not in model.model_fields:
+            break
+        field = model.model_fields[part]
+        said = field.description or ""
+        if not (isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)):
+            break
+        model = field.annotation
+    return said
 
 
 def _of_union(part: int | str) -> bool:

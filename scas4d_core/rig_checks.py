@@ -37,6 +37,13 @@ LEAST_DEPTH = 0.05
 """Of the rig's extent: a common point that is nearer to a camera is where the cameras themselves are."""
 MOST_POINTS = 2000
 """Points of a cloud that are looked at, evenly out of all."""
+SEEN_TWICE = 0.1
+"""Share of a cloud that two cameras have to have in view each: two pictures are what a point is found in."""
+FAR = 100.0
+"""Radii of the rig from its middle to the points, in the median, from which their unit or world is questioned. Not of
+cameras that look all one way: nothing says how far."""
+ONE_WAY = 0.9
+"""Length of the mean of the viewing axes, from which the cameras look one way."""
 
 USUAL_RADIUS = 60.0
 """Metres: a larger rig was probably measured in another unit. Small ones stand before small things."""
@@ -174,12 +181,14 @@ def check_points(rig: Rig, positions: Float) -> None:
 
 
 def rig_warnings(rig: Rig, scene: SceneSettings, positions: Float | None = None) -> list[str]:
-    """Sentences on what may be wrong with a rig that can work: its unit, its poses (``pose_warnings``).
+    """Sentences on what may be wrong with a rig that can work: its unit, its poses, its cloud.
 
     Args:
         rig: in the user's world. scene: its unit. positions: [P, 3] of the cloud in the same world, or None.
     """
-    return [*unit_warnings(rig, scene), *pose_warnings(rig, positions)]
+    poses = pose_warnings(rig, positions)
+    cloud = [] if poses or positions is None else cloud_warnings(rig, positions)
+    return [*unit_warnings(rig, scene), *poses, *cloud]
 
 
 def unit_warnings(rig: Rig, scene: SceneSettings) -> list[str]:
@@ -188,8 +197,8 @@ def unit_warnings(rig: Rig, scene: SceneSettings) -> list[str]:
     >>> lens, there = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
     >>> there[0, 3] = 4000
     >>> rig = Rig((Camera("0", lens, np.eye(4), 64, 48), Camera("1", lens, there, 64, 48)))
-    >>> unit_warnings(rig, SceneSettings())[0][:81]
-    'the cameras are up to 2e+03 m from their middle with scene.metres_per_unit 1: for '
+    >>> unit_warnings(rig, SceneSettings())
+    ["the cameras are up to 2e+03 m from their middle with scene.metres_per_unit 1: for a calibration in milli..."]
     >>> unit_warnings(rig, SceneSettings(metres_per_unit=0.001))
     []
     """
@@ -203,6 +212,30 @@ def unit_warnings(rig: Rig, scene: SceneSettings) -> list[str]:
         f"the cameras are up to {radius:.3g} m from their middle with scene.metres_per_unit {unit:g}: "
         "for a calibration in millimetres give 0.001, in centimetres 0.01, or 'auto'; some limits are in metres"
     ]
+
+
+def cloud_warnings(rig: Rig, positions: Float) -> list[str]:
+    """A sentence on points [P, 3] that no two cameras have in view, or that lie far off; none where they fit.
+
+    >>> lens, beside = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
+    >>> beside[0, 3] = -0.2
+    >>> rig = Rig((Camera("0", lens, np.eye(4), 64, 48), Camera("1", lens, beside, 64, 48)))
+    >>> cloud_warnings(rig, np.array([[0.1, 0, 3]]))
+    []
+    >>> cloud_warnings(rig, np.array([[8, 0, 3]]))
+    ['two cameras have only 0% of the points in view: give them in the world and the unit of the calibration']
+    """
+    if len(rig) < 2 or rig.at_one_place or not len(positions):
+        return []
+    some = _some(positions)
+    world = "give them in the world and the unit of the calibration"
+    away = float(np.median(np.linalg.norm(some - rig.centre, axis=1))) / rig.radius
+    if away > FAR and np.linalg.norm(np.mean([camera.rotation[2] for camera in rig.cameras], axis=0)) < ONE_WAY:
+        return [f"the points are {away:.1g} radii of the rig away from it: {world}"]
+    twice = float(np.mean(sum(_sees(camera, some).astype(int) for camera in rig.cameras) >= 2))
+    if twice < SEEN_TWICE:
+        return [f"two cameras have only {twice:.0%} of the points in view: {world}"]
+    return []
 
 
 def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:

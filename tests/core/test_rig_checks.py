@@ -85,6 +85,18 @@ def test_an_unusual_unit_is_named(unit, warned):
     assert not warned or ("scene.metres_per_unit" in said[0] and "millimetres" in said[0])
 
 
+@pytest.mark.parametrize(
+    ("times", "shift", "warned"),
+    [(1, 0, ""), (1000, 0, "radii of the rig"), (1, 900, "radii of the rig"), (1, 5, "two cameras have only")],
+)
+def test_a_cloud_of_another_world_is_named(times, shift, warned):
+    """In millimetres before cameras in metres, beside them or far away."""
+    cloud = times * np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3)) + (0, 0, shift)
+    said = rig_warnings(rig_of(RIGS["inward"](np.zeros(3))), SceneSettings(), cloud)
+    assert len(said) == bool(warned)
+    assert not warned or warned in said[0]
+
+
 def test_points_speak_for_two_cameras_too():
     rig = inverted(rig_of(RIGS["inward"](np.zeros(3))[::3][:2]))
     assert pose_warnings(rig) == []
