@@ -20,11 +20,12 @@ from studies.quality.commands import (
 )
 from studies.rigs.commands import calibration, drift, rigs
 from studies.service.commands import crossing, faults, ingest, memory, views
+from studies.variants.commands import variants
 
 STUDIES = {
     "Quality": (quality, refit, effects, switches, targets, table, processors),
     "Rigs": (rigs, calibration, drift),
-    "Accuracy against time": (frontier, effort, paper),
+    "Accuracy against time": (frontier, effort, paper, variants),
     "Speed of the code": (kernels, device, moving),
     "Hard cases": (stability, timing),
     "The running service": (faults, ingest, views, memory, crossing),

@@ -1,0 +1,104 @@
+"""What contenders gain on variants, and what a choice made without a capture gains on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from client.cli.scores import Row
+
+BEHIND_DB = -0.05
+"""From which a difference counts as behind: less is in the spread of seeds."""
+
+Place = tuple[str, str]
+"""A capture and its variant."""
+Figures = dict[tuple[Place, str], list[Row]]
+"""Rows of all seeds by place and contender."""
+
+
+def page(rows: Sequence[Row], contenders: Sequence[str]) -> str:
+    """Tables in Markdown.
+
+    Args:
+        rows: with ``capture``, ``of``, ``contender``, ``seed``; failed ones have ``error``.
+        contenders: the first is what the others are compared with.
+    """
+    figures: Figures = {}
+    for row in rows:
+        if "error" not in row and row.get("updates"):
+            figures.setdefault(((row["capture"], row["of"]), row["contender"]), []).append(row)
+    first, others = contenders[0], contenders[1:]
+    places = [place for place in dict.fromkeys(place for place, _ in figures) if (place, first) in figures]
+    head = [f"{name}: dB more; time; tracks" for name in others]
+    lines = [
+        "| " + " | ".join(["capture", "variant", f"frame 0 dB, {first}", f"{first} dB", "tracks %", *head]) + " |",
+        "|" + "---|" * (5 + len(others)),
+    ]
+    for place in places:
+        base = figures[place, first]
+        told = [f"{mean(base, 'psnr_first'):.2f}", f"{mean(base, 'psnr'):.2f}{_spread(base)}", _tracks(base)]
+        told += [_against(figures.get((place, name), []), base) for name in others]
+        lines.append("| " + " | ".join([*place, *told]) + " |")
+    for name in others:
+        both = [place for place in places if (place, name) in figures]
+        if not both:
+            continue
+        gains = np.array([gain(figures, place, name, first) for place in both])
+        times = [ratio(figures[place, name], figures[place, first]) for place in both]
+        worst = int(gains.argmin())
+        lines += [
+            "",
+            f"**{name}**: {gains.mean():+.2f} dB at {np.exp(np.mean(np.log(times))):.2f} × the time; "
+            f"not behind on {np.mean(gains > BEHIND_DB):.0%} of {len(both)}; "
+            f"worst {gains[worst]:+.2f} dB ({', '.join(both[worst])}).",
+        ]
+    if len(others) > 1:
+        lines += ["", *left_out(figures, places, contenders)]
+    return "\n".join(lines)
+
+
+def left_out(figures: Figures, places: Sequence[Place], contenders: Sequence[str]) -> list[str]:
+    """For each capture, which contender wins on all others, and what it gains on this one."""
+    lines = ["| left out | chosen without it | gains on it dB |", "|---|---|---|"]
+    first = contenders[0]
+    for capture in dict.fromkeys(place[0] for place in places):
+        rest = [place for place in places if place[0] != capture]
+        own = [place for place in places if place[0] == capture]
+        whole = [name for name in contenders if all((place, name) in figures for place in (*rest, *own))]
+        if not rest or not whole:
+            continue
+        best = max(whole, key=lambda name: np.mean([gain(figures, place, name, first) for place in rest]))
+        gained = float(np.mean([gain(figures, place, best, first) for place in own]))
+        lines.append(f"| {capture} | {best} | {gained:+.2f} |")
+    return lines
+
+
+def gain(figures: Figures, place: Place, name: str, first: str) -> float:
+    """DB by which a contender is ahead of the first, in the mean over seeds and updates."""
+    return mean(figures[place, name], "psnr") - mean(figures[place, first], "psnr")
+
+
+def ratio(rows: Sequence[Row], base: Sequence[Row]) -> float:
+    """Seconds of an update over those of other rows."""
+    return mean(rows, "seconds_update") / mean(base, "seconds_update")
+
+
+def mean(rows: Sequence[Row], name: str) -> float:
+    """The mean of a value over rows."""
+    return float(np.mean([row[name] for row in rows]))
+
+
+def _spread(rows: Sequence[Row]) -> str:
+    return f" ± {np.std([row['psnr'] for row in rows], ddof=1):.2f}" if len(rows) > 1 else ""
+
+
+def _tracks(rows: Sequence[Row]) -> str:
+    return f"{mean(rows, 'track_3d_median'):.2f}" if all("track_3d_median" in row for row in rows) else "–"
+
+
+def _against(rows: Sequence[Row], base: Sequence[Row]) -> str:
+    if not rows:
+        return "–"
+    more = mean(rows, "psnr") - mean(base, "psnr")
+    return f"{more:+.2f}{_spread(rows)}; {ratio(rows, base):.2f}; {_tracks(rows)}"
