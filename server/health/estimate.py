@@ -20,8 +20,9 @@ SCALED_PIXEL = 112
 box around what moves, what stands alone; where there are no masks, targets and moments of two frames."""
 NOVEL_PIXEL = 38
 """Bytes for each pixel after scaling where Gaussians may be born: what each camera says is new there (a picture, an
-error, five masks: 21), and the distances to it in carving, or the parts of pictures that the born are fitted to (17).
-The voxels of a thing are few beside that."""
+error, five masks: 21), and the distances to it in carving, or the parts of pictures that the born are fitted to (17)."""
+VOXELS = 150e6
+"""Bytes of the voxels in which a new thing is carved, at their most: a million."""
 GAUSSIAN = 2200
 """Bytes for each Gaussian in the worker: state, layers, Adam, neighbours, and what a render needs."""
 READ_GAUSSIAN = 500
@@ -58,7 +59,7 @@ def estimate(rig: RigModel, settings: Settings, server: ServerSettings, scale: f
     gaussians = settings.static.max_gaussians or min(LARGEST_BUDGET, most)
     bears = any(settings.effects.get(name) != "off" for name in BEARING)
     pictures = pixels * PIXEL + scaled * (SCALED_PIXEL + NOVEL_PIXEL * bears)
-    worker = PROCESS + pictures + gaussians * GAUSSIAN
+    worker = PROCESS + pictures + gaussians * GAUSSIAN + VOXELS * bears
     readers = 2 * (PROCESS + gaussians * READ_GAUSSIAN)
     limit = machine_mb() if server.max_scene_memory_mb is None else server.max_scene_memory_mb
     in_mb = {

@@ -34,9 +34,11 @@ MOST_CELLS = 1 << 25
 """Of the grid in which things are told apart; what is strewn wider is no thing."""
 MOST_VOXELS = 1_000_000
 """A level that would hold more is not entered."""
+AT_ONCE = 1 << 16
+"""Voxels that are looked at together: each takes 200 bytes meanwhile."""
 SMALLEST = 27
 """Voxels of a thing, at least: three along each edge."""
-SIDES = np.stack(np.meshgrid(*[np.arange(2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+SIDES = np.stack(np.meshgrid(*[np.arange(2, dtype=np.int32)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +71,12 @@ def carve_new(seen: Sequence[Novelty]) -> Hull:
     pixel = float(np.median([_depth_of(one, middle) / one.camera.fx for one in seen]))
     voxel = 2 * reach / COARSE
     origin = middle - reach + voxel / 2
-    cells = np.stack(np.meshgrid(*[np.arange(COARSE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    cells = np.stack(np.meshgrid(*[np.arange(COARSE, dtype=np.int32)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     distances = [(_distance(one.new), _distance(one.new | one.covered)) for one in seen]
     while True:
         last = voxel <= VOXEL_PIXELS * pixel or 8 * len(cells) > MOST_VOXELS
-        cells = cells[_kept(seen, distances, origin + cells * voxel, voxel, last)]
+        parts = np.split(cells, range(AT_ONCE, len(cells), AT_ONCE))
+        cells = cells[np.concatenate([_kept(seen, distances, origin + part * voxel, voxel, last) for part in parts])]
         if last or len(cells) == 0:
             return _hull(cells, origin, voxel)
         cells = (2 * cells[:, None, :] + SIDES).reshape(-1, 3)
@@ -119,7 +122,7 @@ def _kept(
     return kept
 
 
-def _hull(cells: NDArray[np.int64], origin: Float, voxel: float) -> Hull:
+def _hull(cells: NDArray[np.int32], origin: Float, voxel: float) -> Hull:
     if len(cells) == 0:
         return Hull(np.zeros((0, 3)), np.zeros(0, np.bool_), np.zeros(0, np.int64), voxel)
     # Things far apart are moved together, with an empty layer between them: the grid is as large as they are.
@@ -140,7 +143,7 @@ def _hull(cells: NDArray[np.int64], origin: Float, voxel: float) -> Hull:
     return Hull((origin + cells * voxel)[kept], ~inner[at][kept], things[kept], voxel)
 
 
-def _without_gaps(places: NDArray[np.int64]) -> NDArray[np.int64]:
+def _without_gaps(places: NDArray[np.integer]) -> NDArray[np.int64]:
     """Places along an axis, from 1 on, with one empty place for each gap.
 
     >>> _without_gaps(np.array([7, -900, 8, 30]))

@@ -44,7 +44,7 @@ def test_an_estimate_creates_nothing(http):
     scaled = {"rig": rig(2000), "settings": {"scene": {"image_scale": 0.5}, "static": {"max_gaussians": 5000}}}
     found = http.post("/v1/estimate", json=scaled).json()
     assert (found["scaled_pixels"], found["gaussians"]) == (2 * 1000**2, 5000)
-    assert found["worker_mb"] == pytest.approx(280 + found["pictures_mb"] + found["gaussians_mb"], abs=0.1)
+    assert found["worker_mb"] == pytest.approx(280 + 150 + found["pictures_mb"] + found["gaussians_mb"], abs=0.1)
     problem(http.post("/v1/estimate", json={"rig": {}}), 422)
 
 
@@ -61,13 +61,13 @@ def test_what_the_cameras_say_of_what_is_new_is_counted_where_anything_may_be_bo
 
 
 def test_what_will_not_fit_is_refused_with_what_would(tmp_path):
-    running = Running(fake_settings(tmp_path, max_scene_memory_mb=1600))
+    running = Running(fake_settings(tmp_path, max_scene_memory_mb=1700))
     try:
         refused = httpx.post(f"{running.url}/v1/scenes", json={"rig": rig(2000)})
         document = problem(refused, 422)
         assert document["field"] == "rig.cameras"
         assert "image_scale to 0.5" in document["remedy"]
-        assert document["estimate"]["memory_mb"] > 1600
+        assert document["estimate"]["memory_mb"] > 1700
         body = {"rig": rig(2000), "settings": {"scene": {"image_scale": 0.5}}}
         assert httpx.post(f"{running.url}/v1/scenes", json=body, timeout=30).status_code == 201
     finally:
