@@ -20,7 +20,7 @@ SCALED_PIXEL = 112
 box around what moves, what stands alone; where there are no masks, targets and moments of two frames."""
 NOVEL_PIXEL = 38
 """Bytes for each pixel after scaling where Gaussians may be born: what each camera says is new there (a picture, an
-error, five masks: 21), and the distances to it in carving, or the parts of pictures that the born are fitted to (17)."""
+error, five masks: 21), the distances to it in carving, or the parts of pictures that the born are fitted to (17)."""
 VOXELS = 150e6
 """Bytes of the voxels in which a new thing is carved, at their most: a million."""
 GAUSSIAN = 2200
