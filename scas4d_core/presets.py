@@ -177,7 +177,7 @@ def _place(loc: Iterable[int | str]) -> str:
 
 
 def _description(loc: Iterable[int | str]) -> str:
-    """What the docs say of a setting; empty where they say nothing.
+    """The sentence of the docs on a setting; empty where they have none.
 
     >>> _description(("scene", "image_scale", "float"))
     'Pictures are resized by this before anything else.'

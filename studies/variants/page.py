@@ -1,4 +1,4 @@
-"""What contenders gain on variants, and what a choice made without a capture gains on it."""
+"""The page of the variants: gains of contenders, and what a choice made without a capture gains on it."""
 
 from __future__ import annotations
 
