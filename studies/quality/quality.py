@@ -16,7 +16,7 @@ from typing import Any
 
 from client.cli import evaluate
 from client.cli.evaluate import DEFAULT_OPTIONS, Job, Report, page
-from client.cli.scores import QUALITY, Row, Store
+from client.cli.scores import QUALITY, Row, Store, digest
 from client.importers.open_source import CaptureOptions
 from scas4d_core.warm_up import warm_up_elsewhere
 from studies.constants import all_varied
@@ -25,6 +25,8 @@ from studies.quality.settings import settings_of
 
 OBJECT_CAPTURES = ("robot", "wheel", "pendulums", "cloth", "spring")
 """The captures whose mean is reported beside them."""
+FIRST_FRAME = "scas4d_core.first_frame."
+"""What the names of constants begin with that frame 0 depends on: rows with others share no frame 0."""
 
 
 def run(
@@ -125,7 +127,9 @@ def measure(job: Job, folder: Path, report: Report = print) -> Row:
     from scas4d_core.kernels.jit import threads
     from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
 
-    first_file = folder / "first" / f"{first_frame_key(given, job.settings)}.npz"
+    own = [one for one in job.constants if one[0].startswith(FIRST_FRAME)]
+    of = f"-{digest(own)}" if own else ""
+    first_file = folder / "first" / f"{first_frame_key(given, job.settings)}{of}.npz"
     static = load_first_frame(first_file)
     if static is not None:
         report(f"    frame 0 from {first_file}")

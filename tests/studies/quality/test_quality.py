@@ -271,6 +271,18 @@ def test_the_study_measures_saves_and_goes_on_where_it_stopped(capture_folder, t
         quality.run([capture_folder], tmp_path, ["scas4d"], iterations=[7], masks=False, report=lines.append)
 
 
+def test_another_constant_of_frame_0_is_another_frame_0(capture_folder, tmp_path, stand_in):
+    stand_in(Perfect)
+    constants = ("scas4d_core.first_frame.static_scene.RATE_COLOUR", "scas4d_core.update.warm_start.WARM_START")
+    for place in (None, *constants):
+        given = ((place, 0.5),) if place else ()
+        job = quality.Job(capture_folder, "scas4d", settings_of("scas4d"), frames=2, constants=given)
+        Store(tmp_path)
+        quality.measure(job, tmp_path, lambda _: None)
+    names = sorted(file.stem.count("-") for file in (tmp_path / "first").iterdir())
+    assert names == [1, 2]  # that of the default and of an update's constant, and that of frame 0's own
+
+
 def test_frame_0_alone_without_help(capture_folder, tmp_path, stand_in):
     stand_in(Perfect)
     lines: list[str] = []
