@@ -34,7 +34,7 @@ from scas4d_core.robust.alarms import first_watched, sharpness
 from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness, fingerprints, goes_on, lit, noted
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import FrameSolver
-from scas4d_core.robust.update_input import UpdateInput
+from scas4d_core.robust.update_input import RESTING, UpdateInput
 from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.storage.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, cold_start, find_commit
 from scas4d_core.storage.history import History, HistoryError
@@ -255,12 +255,12 @@ class Reconstruction(CommittedScene):
             state=self.history.newest if carried.labels is None else labelled(self.history.newest, carried.labels),
             motion=carried.motion,
             seconds=frame.time - past.fitted if isfinite(past.fitted) else seconds,
-            step=seconds,
-            views=believed, suspects=[view for view in views if past.is_out(view.name)],
+            step=seconds, views=believed, suspects=[view for view in views if past.is_out(view.name)],
             brightness=bright, seed=frame.index, past=past, lengths=self._fixed.lengths, exposure=exposure,
-            light_moves=moves, left_out=left_out, unusable=unusable, carried=carried.effects,
+            end=self._budget.end(watch.began), each=self._budget.each, light_moves=moves, left_out=left_out,
             same=[name for name in shown if shown[name] == carried.shown.get(name)], sharp=sharpness(frame.images),
-            end=self._budget.end(watch.began), each=self._budget.each, rests=learns and carried.labels is None,
+            unusable=unusable, carried=carried.effects,
+            rests=learns and carried.labels is None and len(self.history.indices) <= RESTING,
         )  # fmt: skip
         solver = FrameSolver(updater, self._factory, self._picture, self._update)
         result, past = solver.run(given)

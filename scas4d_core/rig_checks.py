@@ -37,8 +37,8 @@ LEAST_DEPTH = 0.05
 """Of the rig's extent: a common point that is nearer to a camera is where the cameras themselves are."""
 MOST_POINTS = 2000
 """Points of a cloud that are looked at, evenly out of all."""
-SEEN_TWICE = 0.1
-"""Share of a cloud that two cameras have to have in view each: two pictures are what a point is found in."""
+SEEN_AT_ALL = 0.1
+"""Share of a cloud that the cameras together have to have in view."""
 FAR = 100.0
 """Radii of the rig from its middle to the points, in the median, from which their unit or world is questioned. Not of
 cameras that look all one way: nothing says how far."""
@@ -215,7 +215,7 @@ def unit_warnings(rig: Rig, scene: SceneSettings) -> list[str]:
 
 
 def cloud_warnings(rig: Rig, positions: Float) -> list[str]:
-    """A sentence on points [P, 3] that no two cameras have in view, or that lie far off; none where they fit.
+    """A sentence on points [P, 3] that no camera has in view, or that lie far off; none where they fit.
 
     >>> lens, beside = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
     >>> beside[0, 3] = -0.2
@@ -223,7 +223,7 @@ def cloud_warnings(rig: Rig, positions: Float) -> list[str]:
     >>> cloud_warnings(rig, np.array([[0.1, 0, 3]]))
     []
     >>> cloud_warnings(rig, np.array([[8, 0, 3]]))
-    ['two cameras have only 0% of the points in view: give them in the world and the unit of the calibration']
+    ['the cameras have only 0% of the points in view: give them in the world and the unit of the calibration']
     """
     if len(rig) < 2 or rig.at_one_place or not len(positions):
         return []
@@ -231,10 +231,10 @@ def cloud_warnings(rig: Rig, positions: Float) -> list[str]:
     world = "give them in the world and the unit of the calibration"
     away = float(np.median(np.linalg.norm(some - rig.centre, axis=1))) / rig.radius
     if away > FAR and np.linalg.norm(np.mean([camera.rotation[2] for camera in rig.cameras], axis=0)) < ONE_WAY:
-        return [f"the points are {away:.1g} radii of the rig away from it: {world}"]
-    twice = float(np.mean(sum(_sees(camera, some).astype(int) for camera in rig.cameras) >= 2))
-    if twice < SEEN_TWICE:
-        return [f"two cameras have only {twice:.0%} of the points in view: {world}"]
+        return [f"the points are {away:.0f} radii of the rig away from it: {world}"]
+    seen = float(np.mean(np.any([_sees(camera, some) for camera in rig.cameras], axis=0)))
+    if seen < SEEN_AT_ALL:
+        return [f"the cameras have only {seen:.0%} of the points in view: {world}"]
     return []
 
 

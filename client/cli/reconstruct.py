@@ -16,7 +16,7 @@ from client.cli.progress import Bars, console
 from scas4d_core.captures import Capture
 from scas4d_core.frame_outcome import AlarmKind
 from scas4d_core.presets import preset as named
-from scas4d_core.rig_checks import check_rig, unit_warnings
+from scas4d_core.rig_checks import check_rig, rig_warnings
 from scas4d_core.settings import Settings
 
 if TYPE_CHECKING:
@@ -104,8 +104,9 @@ def reconstruct(given: Capture, out: Path, *, frames: int | None, preset: str, c
     settings = named(preset, changes)
     positions = None if given.points is None else given.points.positions
     check_rig(given.full_rig, settings.scene, positions)
-    for sentence in unit_warnings(given.full_rig, settings.scene):
-        console.print(sentence)
+    for sentence in rig_warnings(given.full_rig, settings.scene, positions):
+        if sentence not in given.remarks:
+            console.print(sentence)
     capture = given.scaled(settings.scene.image_scale)
     count = min(frames or capture.frame_count, capture.frame_count)
     rig = capture.test_rig or capture.rig

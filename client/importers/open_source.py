@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -190,7 +191,8 @@ def uncalibrated(folder: Path, calibration: Calibration) -> list[str]:
     if not there and videos.is_dir():
         there = {path.stem for path in videos.iterdir() if path.suffix.lower() in ENDS}
     told = " ".join(calibration.remarks)
-    left = sorted(name for name in there.difference(calibration.names) if name not in told)
+    unknown = [name for name in there.difference(calibration.names) if not name.startswith(".")]
+    left = sorted(name for name in unknown if not re.search(rf"(?<!\w){re.escape(name)}(?!\w)", told))
     if not left or not there.intersection(calibration.names):  # else these are no folders of cameras
         return []
     return [f"left out, {calibration.source.name} has no such camera: {', '.join(left)}"]

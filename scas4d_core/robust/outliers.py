@@ -259,7 +259,7 @@ def settle(
     Args:
         psnr: dB by camera, of those learnt from when last rendered, of those left out as the update ended.
         bright: of every picture of the frame. exposure: of the frame. iterations: of the update, 0: as many as before.
-        moved: whether it gave another state. Of one that did not, no update's usual figures are known.
+        moved: whether it gave another state, or one before did: else no update's usual figures are known.
     """
     psnr = _capped(psnr)
     off = offsets(past, psnr)

@@ -25,6 +25,7 @@ from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.relocation import find_jump, shifted
 from scas4d_core.robust.update_input import UpdateInput
 from scas4d_core.settings import UpdateSettings
+from scas4d_core.update.best_state import by_size
 from scas4d_core.update.frame_update import Updater
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import AS_SET, AttemptOptions, UpdateResult, UpdateTrace
@@ -140,11 +141,14 @@ class FrameSolver:
         """Why nothing has to be updated, as the pictures alone say, or None."""
         if given.same and len(given.same) == len(given.brightness):
             return "the same pictures again"
-        if not given.rests:
+        if not given.rests or given.past.updates > 0:  # what was updated once is no frame 0 to rest at
             return None
         with self._timed():  # what most cameras do not agree on may still have moved
-            met_still = outliers.level_of(given.past, self._measured(given.views, given.state))
-        return "nothing is seen to move" if met_still > given.past.level - outliers.RESTS_DB else None
+            fits = self._measured(given.views, given.state)
+            level = outliers.level_of(given.past, fits)
+        if outliers.misfits(given.past, fits, outliers.LAST_DB):  # an update tells what is wrong with a camera
+            return None
+        return "nothing is seen to move" if level > given.past.level - outliers.RESTS_DB else None
 
     def _relit(self, given: UpdateInput) -> Solved | None:
         """A frame in a light that stays or moves: the colours take it on; None where the cameras tell of no other.
@@ -296,10 +300,11 @@ class FrameSolver:
             off = outliers.misfits(given.past, psnr, outliers.LAST_DB)
             again = [view for view in result.views or given.views if view.name in off]
             psnr |= self._measured([*again, *given.suspects], result.gaussians)
-        moved = trace.kept is not Candidate.STILL
+        moved = trace.kept is not Candidate.STILL or given.past.updates > 0
         past = outliers.settle(given.past, psnr, given.brightness, result.exposure, len(trace.losses), moved)
         if trace.errors.get(Candidate.END):
-            past = replace(past, error=usual_errors(given.past.error, trace.errors[trace.kept]))
+            found = by_size(trace.errors[trace.kept], trace.whole)
+            past = replace(past, error=usual_errors(given.past.error, found))
         motion = result.motion if result.motion is not None and result.motion.finite else None
         return replace(result, motion=motion, offsets=outliers.offsets(given.past, psnr)), past
 

@@ -14,6 +14,9 @@ from scas4d_core.robust.outliers import Past
 from scas4d_core.update.picture_loss import TrainingView
 from scas4d_core.update.warm_start import Motion
 
+RESTING = 10
+"""Frames at the beginning that may stand as nothing is seen to move: what enters is born only in frames that do not."""
+
 
 @dataclass(frozen=True, eq=False)
 class UpdateInput:

@@ -48,8 +48,8 @@ class CarryOver:
     Attributes:
         motion: the motion found, or None where the next update starts cold.
         labels: [N] the Gaussians that have been seen to move, in scenes without masks; None until some have.
-        seen: views of the last frame that was not held, in scenes without masks; the next are compared with them.
-            Until something is seen to move, of the first.
+        seen: views of the last frame that was not held, in scenes without masks; the next are compared with them. While
+            frames stand as nothing was seen to move, those of the first that was looked at.
         structure: digest of the clusters and neighbours that the motion belongs to.
         past: usual values of the scene and its cameras.
         shown: fingerprint of each picture of the last frame that was not held (``checks``).

@@ -45,7 +45,7 @@ INSIDE_CAMERAS = 3
 
 FIRST_LABELS = 32
 """Gaussians that must be found moving before the first labels are learnt: a mouse in a room is a few hundredths of a
-percent of it. Before, nothing moves."""
+percent of it. Before, frames stand that the state shows (``robust.solve_frame``); of others all may move."""
 NEW_LABELS = 0.01
 """Share of all Gaussians, and ..."""
 MORE_LABELS = 0.2

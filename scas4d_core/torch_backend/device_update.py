@@ -161,7 +161,7 @@ class DeviceUpdate:
         trace.losses, trace.psnr, trace.planned = found.losses, found.psnr, stopping.planned_so_far
         trace.cameras = {view.name: camera_fit(psnr) for view, psnr in zip(chain(*pictures), found.psnr, strict=False)}
         _take(deformation, Tables.of(hierarchy, found))
-        trace.errors = best.errors
+        trace.errors, trace.whole = best.errors, best.whole
         trace.kept = best.end(found.gaussians, trace.iterations, {})
         watch.lap("end")
         state = found.gaussians if trace.kept is Candidate.END else previous

@@ -50,12 +50,28 @@ def mean_error(errors: Mapping[str, float], names: Sequence[str]) -> float:
     return float(np.mean(values)) if values else nan
 
 
+WHOLE = " whole"
+"""Behind the names of views whose whole pictures were compared, where errors of several frames stand together."""
+
+
+def by_size(errors: Mapping[str, float], whole: bool) -> dict[str, float]:
+    """Errors under names that tell those of whole pictures, which are smaller, from those of small ones.
+
+    >>> by_size({"c0": 0.1}, whole=True)
+    {'c0 whole': 0.1}
+    """
+    return {name + WHOLE if whole else name: error for name, error in errors.items()}
+
+
 class ProbeViews:
     """Fixed training views for comparing states.
 
     Args:
         factory: of the rig. picture: renders. views: of the frame; ``spread`` of them are taken; of none
             nothing is compared.
+
+    Attributes:
+        whole: whether their whole pictures are compared, once a state was.
     """
 
     def __init__(self, factory: ViewFactory, picture: PictureLoss, views: Sequence[TrainingView]) -> None:
@@ -63,6 +79,7 @@ class ProbeViews:
         self._whole = [view for view in views if view.name in chosen]
         self._views = [factory.coarser(view, SCALE) for view in self._whole]
         self._picture, self._looked = picture, False
+        self.whole = False
 
     def errors(self, state: Gaussians, turns: Array | None = None) -> dict[str, float]:
         """The image loss (``losses.image_loss``) of a state in each view, by the camera's name.
@@ -74,7 +91,7 @@ class ProbeViews:
             self._looked = True
             small, whole = (self._error(views[0], state, turns) for views in (self._views, self._whole))
             if small > ALIASED * whole:
-                self._views = self._whole
+                self._views, self.whole = self._whole, True
         return {view.name: self._error(view, state, turns) for view in self._views}
 
     def _error(self, view: TrainingView, state: Gaussians, turns: Array | None) -> float:
@@ -108,6 +125,11 @@ class BestState:
         self.seconds = seconds
         self.errors: dict[Candidate, dict[str, float]] = {}
 
+    @property
+    def whole(self) -> bool:
+        """True where whole pictures were compared."""
+        return self._probes.whole
+
     def start(self, step: float | None = None) -> None:
         """Set the deformation to the motion before, or to none where that shows the frame better.
 
@@ -138,7 +160,7 @@ class BestState:
             self._set(motion)
 
     def stands(self, enough: Mapping[str, float] | None) -> bool:
-        """True where Θ_{t−1} shows this frame as well as ``enough``, errors by view; None: never."""
+        """True where Θ_{t−1} shows this frame as well as ``enough``, errors ``by_size``; None: never."""
         still = self.errors.get(Candidate.STILL)
         if (
             enough is None
@@ -146,6 +168,7 @@ class BestState:
             or self._mean(Candidate.STILL) > self._mean(Candidate.WARM, otherwise=np.inf)
         ):
             return False
+        still = by_size(still, self.whole)
         names = sorted(still.keys() & enough.keys())
         return bool(names) and mean_error(still, names) <= mean_error(enough, names)
 

@@ -158,7 +158,7 @@ class FrameUpdate:
                 stopping.saw(trace.iterations, best.error(work.look))
                 watch.lap("looks")
         deformation.forward()
-        trace.planned, trace.errors = stopping.planned_so_far, best.errors
+        trace.planned, trace.errors, trace.whole = stopping.planned_so_far, best.errors, best.whole
         trace.kept = work.kept = best.end(work.look, trace.iterations, trace.left_out)
         watch.lap("end")
         state = previous if work.kept is Candidate.STILL else self._commit(previous)

@@ -142,6 +142,7 @@ class UpdateTrace:
         planned: (iteration, iterations in all) whenever the stopping rule planned otherwise.
         errors: image loss by candidate, then by probe view; empty where nothing was compared. kept: the candidate that
             became Θ_t.
+        whole: whether these errors are of whole pictures.
         shown: by camera, the renderings of the last ``SHOWN`` iterations: evidence is taken from them without another
             rendering. Empty on other devices, and where an update ended sooner than planned.
         guards: those that acted, how often.
@@ -157,6 +158,7 @@ class UpdateTrace:
     planned: list[tuple[int, int]] = field(default_factory=list)
     errors: dict[Candidate, dict[str, float]] = field(default_factory=dict)
     kept: Candidate = Candidate.END
+    whole: bool = False
     shown: dict[str, Thinned] = field(default_factory=dict)
     guards: dict[str, int] = field(default_factory=dict)
 

@@ -22,7 +22,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 
-VERSION = 4
+VERSION = 5
 """Raise this when frame 0 comes out different from the same pictures and settings: what is kept is then fitted anew."""
 
 CLOUD_VERSION = 4

@@ -25,8 +25,8 @@ from studies.quality.settings import settings_of
 
 OBJECT_CAPTURES = ("robot", "wheel", "pendulums", "cloth", "spring")
 """The captures whose mean is reported beside them."""
-FIRST_FRAME = "scas4d_core.first_frame."
-"""What the names of constants begin with that frame 0 depends on: rows with others share no frame 0."""
+LATER = ("scas4d_core.update.", "scas4d_core.robust.", "scas4d_core.structure.")
+"""What the names of constants begin with that frame 0 does not depend on: rows with others share no frame 0."""
 
 
 def run(
@@ -127,7 +127,7 @@ def measure(job: Job, folder: Path, report: Report = print) -> Row:
     from scas4d_core.kernels.jit import threads
     from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
 
-    own = [one for one in job.constants if one[0].startswith(FIRST_FRAME)]
+    own = [one for one in job.constants if not one[0].startswith(LATER)]
     of = f"-{digest(own)}" if own else ""
     first_file = folder / "first" / f"{first_frame_key(given, job.settings)}{of}.npz"
     static = load_first_frame(first_file)

@@ -55,7 +55,7 @@ def variants(
         captures,
         contenders,
         out,
-        variants=variant or tuple(VARIANTS),
+        variants=variant or (),
         seeds=seed or (0,),
         frames=frames,
         quick=quick,

@@ -99,7 +99,7 @@ def run(
     contenders: Sequence[Contender],
     out: Path,
     *,
-    variants: Sequence[str] = tuple(VARIANTS),
+    variants: Sequence[str] = (),
     seeds: Sequence[int] = (0,),
     frames: int | None = None,
     quick: bool = False,
@@ -112,15 +112,16 @@ def run(
     Args:
         captures: folders. contenders: the first is what the others are compared with.
         out: rows and frames 0 go here; run again with the same folder to go on.
-        variants: names out of ``VARIANTS``. seeds: of the updates; frame 0 has the first in all.
+        variants: names out of ``VARIANTS``; none: all, or those of the screen.
+        seeds: of the updates; frame 0 has the first in all.
         frames: at most so many. quick: the screen, see ``QUICK``. again: measure rows anew that are on disk.
         options: how the captures are read. report: takes the lines that are printed.
 
     Raises:
         ValueError: an unknown preset or setting, or a value out of range.
     """
-    if quick:
-        variants, frames = QUICK, QUICK_FRAMES
+    variants = variants or (QUICK if quick else tuple(VARIANTS))
+    frames = frames or (QUICK_FRAMES if quick else None)
     jobs, places = list[VariantJob](), list[Row]()
     for capture in captures:
         for of in variants:

@@ -87,7 +87,7 @@ def test_an_unusual_unit_is_named(unit, warned):
 
 @pytest.mark.parametrize(
     ("times", "shift", "warned"),
-    [(1, 0, ""), (1000, 0, "radii of the rig"), (1, 900, "radii of the rig"), (1, 5, "two cameras have only")],
+    [(1, 0, ""), (1000, 0, "radii of the rig"), (1, 900, "radii of the rig"), (1, -8, "the cameras have only")],
 )
 def test_a_cloud_of_another_world_is_named(times, shift, warned):
     """In millimetres before cameras in metres, beside them or far away."""

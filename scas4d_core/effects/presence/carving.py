@@ -30,7 +30,7 @@ COARSE = 32
 """Voxels along an edge of the first grid."""
 VOXEL_PIXELS = 1.5
 """Edge of the smallest voxel, at most, in pixels at the middle of the stage."""
-MOST_CELLS = 1 << 25
+MOST_CELLS = 1 << 24
 """Of the grid in which things are told apart; what is strewn wider is no thing."""
 MOST_VOXELS = 1_000_000
 """A level that would hold more is not entered."""

@@ -9,6 +9,7 @@ import pytest
 from box_scene import MOVING, make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
+from scas4d_core.captures.frame import Frame
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.gaussians import Gaussians
@@ -54,12 +55,41 @@ def test_nothing_is_decided_while_nothing_moves() -> None:
     assert scene.history.gaussians(2).moving[MOVING:].mean() < 0.1
 
 
+def noisy(index: int, state: Gaussians = BOX, *, knocked: str = "") -> Frame:
+    """A frame with the noise of its sensor; the picture of one camera may be shifted by five pixels."""
+    frame, random = take_frame(index, float(index), state, RIG, False), np.random.default_rng(index)
+    images = {
+        name: np.clip(image + random.normal(0, 3, image.shape), 0, 255).astype(np.uint8)
+        for name, image in frame.images.items()
+    }
+    if knocked:
+        images[knocked] = np.roll(images[knocked], 5, axis=1)
+    return replace(frame, images=images)
+
+
 def test_until_something_is_seen_to_move_nothing_does() -> None:
     scene = start()
-    reports = [scene.step(take_frame(index, float(index), BOX, RIG, False)) for index in (1, 2)]
+    reports = [scene.step(noisy(index)) for index in (1, 2)]
     assert [report.outcome for report in reports] == 2 * [FrameOutcome.STOOD]
+    assert [report.attempts for report in reports] == 2 * [["nothing is seen to move"]]
     np.testing.assert_array_equal(scene.history.newest.means, BOX.means)
     assert len(scene._carried.seen) == len(RIG)
+
+
+def test_a_camera_that_is_off_ends_the_rest() -> None:
+    scene = start()
+    assert scene.step(noisy(1)).outcome is FrameOutcome.STOOD
+    report = scene.step(noisy(2, knocked="c2"))
+    assert report.outcome is not FrameOutcome.STOOD
+    assert "c2" in [alarm.camera for alarm in report.alarms]
+
+
+def test_a_rest_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What enters is born only where frames are updated, and no label tells of it."""
+    monkeypatch.setattr("scas4d_core.reconstruction.RESTING", 2)
+    scene = start()
+    found = [scene.step(noisy(index)).outcome for index in (1, 2, 3)]
+    assert found == [FrameOutcome.STOOD, FrameOutcome.STOOD, FrameOutcome.UPDATED]
 
 
 def test_what_is_too_slow_to_be_seen_from_frame_to_frame_adds_up() -> None:
