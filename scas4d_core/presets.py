@@ -17,7 +17,18 @@ TIES = ("rigidity", "isometry", "rotation")
 """Effects that tie neighbours together."""
 
 
-OURS = ("bending", "shadows", "camera_gain", "pose_drift", "light", "direction", "uncovered", "entering", "leaving")
+OURS = (
+    "bending",
+    "shading",
+    "shadows",
+    "camera_gain",
+    "pose_drift",
+    "light",
+    "direction",
+    "uncovered",
+    "entering",
+    "leaving",
+)
 """Effects that Dynamic3DGaussians does not have."""
 
 
@@ -33,7 +44,6 @@ PRESETS: dict[str, Settings] = {
     "adaptive": Settings(
         update=UpdateSettings(
             iterations=50,
-            cold_longer=3.0,
             still=0.02,
             layer_rates=(
                 LayerRates(rotation=0.044, translation=0.0088, scaling=0.002),
@@ -60,6 +70,7 @@ PRESETS: dict[str, Settings] = {
             beta2=0.999,
             rate_colour_standing=0.0025,
             momentum=1.0,
+            cold_longer=1.0,
             cold_start=1.0,
             judge=False,
             still=-1.0,

@@ -29,6 +29,7 @@ EFFECTS = {
     "moving_colour": "scas4d_core.effects.appearance.moving_colour",
     "standing_colour": "scas4d_core.effects.appearance.standing_colour",
     "direction": "scas4d_core.effects.appearance.direction",
+    "shading": "scas4d_core.effects.appearance.shading",
     "shadows": "scas4d_core.effects.appearance.shadows",
     "camera_gain": "scas4d_core.effects.appearance.camera_gain",
     "light": "scas4d_core.effects.appearance.light",

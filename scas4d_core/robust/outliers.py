@@ -23,8 +23,8 @@ LAST_DB = -5.0
 NEAR_DB = -4.0
 """The same, from which a camera is in doubt: its usual place does not follow, so that what lasts is seen to last; two
 frames in a row are an alarm. Clean: -3.7."""
-FITS_DB = -3.0
-"""From which a camera that was left out is believed again."""
+FITS_DB = -4.0
+"""From which a camera that was left out is believed again: colours that follow the others do not follow it."""
 NEW_DB = (-4.0, -2.0, -2.0)
 """More is allowed for in the first updates: a camera's place is known from frame 0 alone, or from one update."""
 DROP_DB = 6.0

@@ -131,9 +131,6 @@ class FrameSolver:
         elif outcome is FrameOutcome.UPDATED and (why := self._behind(given, result)) is not None:
             attempts[-1] += f": {why}"
             result = self._go_on(given, result, attempts)
-        elif outcome is FrameOutcome.UPDATED and self._far(given):
-            other = replace(given, seed=given.seed + 1)  # another order of the views
-            result = self._go_on(other, result, attempts, longer=1.0)
         result = replace(result, outcome=outcome, reason=reason, attempts=attempts, exposure=exposure)
         return self._committed(given, result)
 
@@ -257,19 +254,9 @@ class FrameSolver:
                 return retold(result if start is not ended else joined(result, tried), tried)
         return None
 
-    def _far(self, given: UpdateInput) -> bool:
-        """True for the first update of a scene, where it was no longer for that: there was far to go.
-
-        A budget in milliseconds is kept all the same.
-        """
-        settings, first = self._settings, given.past.updates == 0 and given.motion is None
-        return first and settings.judge and settings.cold_longer <= 1 and given.end is None
-
-    def _go_on(
-        self, given: UpdateInput, tried: UpdateResult, attempts: list[str], longer: float = SEARCH.longer
-    ) -> UpdateResult:
-        """On from where an update ended, for ``longer`` times the iterations; the better of both."""
-        options = self._options(given, replace(SEARCH, name="on from where the update ended", longer=longer))
+    def _go_on(self, given: UpdateInput, tried: UpdateResult, attempts: list[str]) -> UpdateResult:
+        """On from where an update ended, for longer; the better of both."""
+        options = self._options(given, replace(SEARCH, name="on from where the update ended"))
         result = self._run(given, tried.gaussians, None, options)
         result, fault = self._validated(given, given.state, result)
         after, before = (outliers.level_of(given.past, met(one)) for one in (result, tried))

@@ -121,8 +121,8 @@ def noted(
 ) -> Past:
     """The past with the looks at some cameras of a frame; the same where it says nothing.
 
-    That is a frame that was held, tried again, not moved, or lit otherwise, and any on a GPU, where no rendering is
-    kept. A camera that is left out says nothing either.
+    That is a frame that was held, tried again, not moved, or lit otherwise, the first that moved, which no motion led,
+    and any on a GPU, where no rendering is kept. A camera that is left out says nothing either.
 
     Args:
         past: after the frame. before: Θ_{t−1}. result: Θ_t, before anything is born. picture: renders.
@@ -130,7 +130,7 @@ def noted(
     """
     trace, after = result.trace, result.gaussians
     plain = result.outcome is FrameOutcome.UPDATED and len(result.attempts) == 1 and result.exposure == 1.0
-    if not plain or trace.kept is not Candidate.END or not trace.shown:
+    if not plain or past.updates < 2 or trace.kept is Candidate.STILL or not trace.shown:
         return past
     looks = {name: Looks(*row) for name, row in past.timing.items()}
     views = [one for one in result.views if one.name in trace.shown and one.name not in trace.left_out]
@@ -139,8 +139,10 @@ def noted(
     (ahead, back), most = moments(before, after), max(1, min(LOOKS, trace.iterations // ITERATIONS))
     for view in views[:most]:
         every, planes = trace.shown[view.name]
-        here, there = (_rendered(picture, state, view)[:, ::every, ::every].copy() for state in (ahead, back))
-        found = told(view.target[:3, ::every, ::every], *(_exposed(view, one) for one in (planes[:3], here, there)))
+        states = (ahead, back) if trace.kept is Candidate.END else (ahead, back, after)  # the end was shown
+        here, there, *now = (_rendered(picture, state, view)[:, ::every, ::every].copy() for state in states)
+        shown = now[0] if now else planes[:3]
+        found = told(view.target[:3, ::every, ::every], *(_exposed(view, one) for one in (shown, here, there)))
         known = replace(looks.get(view.name, Looks()), last=float(index))
         looks[view.name] = known if found is None else known.with_look(found, way, frame)
     return replace(past, timing={name: astuple(one) for name, one in looks.items()})

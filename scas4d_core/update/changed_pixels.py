@@ -20,16 +20,15 @@ from numpy.typing import NDArray
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import SMALLEST_SQUARE
 from scas4d_core.kernels import image_loss, tiles
-from scas4d_core.kernels.projection import TILE
+from scas4d_core.rasterize.blocks import pixels_of, tiles_of, widened
 from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Drawing, Gradients, Picture
 from scas4d_core.rasterize.limits import DEFAULT, Limits
 from scas4d_core.update.picture_loss import LABEL, PictureLoss, TrainingView, ViewFactory, means, no_lap
 
 Array = NDArray[np.float32]
+Flags = NDArray[np.uint8]
 State = tuple[Array, Array, Array, Array]
 
-BLOCK = 4
-"""Pixels of a block's side."""
 MARGIN = 2
 """Blocks by which what is drawn reaches further than what moves at the start: it will move on."""
 REACH = 2 * image_loss.REACH
@@ -136,9 +135,21 @@ class ChangedPixels(PictureLoss):
         region = self._drawn((means, factors, opacities, features), view)
         self._compare_box(region, view)
 
+    def residuals(
+        self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView, learnt: Flags
+    ) -> tuple[Array, Array]:
+        """See ``PictureLoss``; of what moves, from the pixels alone that it reaches."""
+        if not np.array_equal(learnt, self._moves):
+            return super().residuals(means, factors, opacities, features, view, learnt)
+        region = self._drawn((means, factors, opacities, features), view)
+        sums, weights = np.zeros((len(means), 3), np.float32), np.zeros(len(means), np.float32)
+        found = self._lacking(view)
+        sums[self._moving], weights[self._moving] = found[0][region.moving], found[1][region.moving]
+        return sums, weights
+
     def shown(self, view: TrainingView) -> Picture:
         """See ``PictureLoss``."""
-        drawn, shown = self.rasterizer.picture, _pixels(self.rasterizer.drawn, view.camera)
+        drawn, shown = self.rasterizer.picture, pixels_of(self.rasterizer.drawn, view.camera)
         whole = Picture(self._base(view).copy(), self._base_rests[_key(view)].copy())
         for plane, new in zip((*whole.features, whole.rest), (*drawn.features, drawn.rest), strict=True):
             np.copyto(plane, new, where=shown)
@@ -171,12 +182,12 @@ class ChangedPixels(PictureLoss):
     def _made(self, marks: NDArray[np.uint64], view: TrainingView) -> Region:
         """A region around marks, with those of the standing Gaussians that meet it."""
         assert self._stood is not None
-        blocks, camera = _widened(marks, view.camera), view.camera
+        blocks, camera = widened(marks, view.camera, MARGIN), view.camera
         splats, rects, _ = self.rasterizer.project(*self._stood, camera)
         meets = np.empty(len(self._standing), bool)
-        tiles.find_meeting(splats, rects, _tiles(camera)[0], blocks, meets)
+        tiles.find_meeting(splats, rects, tiles_of(camera)[0], blocks, meets)
         rows = np.sort(np.concatenate([self._moving, self._standing[meets]]))
-        learnt, shown = self._moves[rows].astype(np.uint8), _pixels(blocks, camera)
+        learnt, shown = self._moves[rows].astype(np.uint8), pixels_of(blocks, camera)
         box = _box(shown)
         region = Region(blocks, rows, learnt, np.flatnonzero(learnt), box, image_loss.near(shown[box]))
         self._follow(region, view)
@@ -210,7 +221,7 @@ class ChangedPixels(PictureLoss):
         base, (rows, columns) = self._base(view), region.box
         box = (rows.start, rows.stop, columns.start, columns.stop)
         part, g_part = self._part(len(base), box)
-        drawn, tiles_x = self.rasterizer.drawn, _tiles(view.camera)[0]
+        drawn, tiles_x = self.rasterizer.drawn, tiles_of(view.camera)[0]
         shifts = np.zeros(len(base))
         tiles.take_blocks(self.rasterizer.planes, base, drawn, tiles_x, box, part, shifts)
         sums = region.rest + self._losses(part, view, region.target, region.moments, region.near, g_part)
@@ -276,7 +287,7 @@ def reached(
 ) -> NDArray[np.uint64]:
     """[tiles] blocks of a picture that the supports of some Gaussians meet."""
     splats, rects, _ = rasterizer.project(*taken(state, rows), camera)
-    tiles_x, tiles_y = _tiles(camera)
+    tiles_x, tiles_y = tiles_of(camera)
     marks = np.zeros(tiles_x * tiles_y, np.uint64)
     tiles.mark_blocks(splats, rects, np.ones(len(rects), np.uint8), tiles_x, marks)
     return marks
@@ -285,48 +296,6 @@ def reached(
 def _key(view: TrainingView) -> tuple[str, int, int]:
     """The camera and the size of its pictures: probe views are of the same cameras, and smaller."""
     return view.name, view.camera.width, view.camera.height
-
-
-def _tiles(camera: CameraArrays) -> tuple[int, int]:
-    """Columns and rows of tiles."""
-    return -(-camera.width // TILE), -(-camera.height // TILE)
-
-
-def as_grid(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bool_]:
-    """[rows, columns] of blocks, from bits 8 x + y of each tile."""
-    tiles_x, tiles_y = _tiles(camera)
-    side = TILE // BLOCK
-    bits = np.unpackbits(blocks.astype("<u8").view(np.uint8).reshape(-1, 8), axis=1, bitorder="little")
-    grid = bits.reshape(tiles_y, tiles_x, side, side).transpose(0, 3, 1, 2)
-    return grid.reshape(tiles_y * side, tiles_x * side).astype(bool)
-
-
-def _pixels(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bool_]:
-    """[H, W] the pixels of blocks."""
-    grid = as_grid(blocks, camera)
-    return np.repeat(np.repeat(grid, BLOCK, 0), BLOCK, 1)[: camera.height, : camera.width]
-
-
-def as_blocks(grid: NDArray[np.bool_], camera: CameraArrays) -> NDArray[np.uint64]:
-    """[tiles] bits, from a grid of blocks."""
-    tiles_x, tiles_y = _tiles(camera)
-    side = TILE // BLOCK
-    bits = grid.reshape(tiles_y, side, tiles_x, side).transpose(0, 2, 3, 1).reshape(-1, side * side)
-    packed = np.packbits(bits, axis=1, bitorder="little")
-    return np.ascontiguousarray(packed).view("<u8").reshape(-1).astype(np.uint64)
-
-
-def _widened(marks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.uint64]:
-    """The marks and ``MARGIN`` blocks around them."""
-    grid = as_grid(marks, camera)
-    for _ in range(MARGIN):
-        wider = grid.copy()
-        wider[1:] |= grid[:-1]
-        wider[:-1] |= grid[1:]
-        grid = wider.copy()
-        grid[:, 1:] |= wider[:, :-1]
-        grid[:, :-1] |= wider[:, 1:]
-    return as_blocks(grid, camera)
 
 
 def _box(shown: NDArray[np.bool_]) -> tuple[slice, slice]:

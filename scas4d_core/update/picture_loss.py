@@ -316,10 +316,14 @@ class PictureLoss:
         Returns:
             [N, 3] RGB in pixels' worth, without the camera's exposure, and [N] pixels' worth.
         """
-        height, width = view.camera.height, view.camera.width
-        blocks = np.full(-(-width // TILE) * -(-height // TILE), 2**64 - 1, np.uint64)
-        drawing = Drawing(blocks, learnt)
+        tiles = -(-view.camera.width // TILE) * -(-view.camera.height // TILE)
+        drawing = Drawing(np.full(tiles, 2**64 - 1, np.uint64), learnt)
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background, drawing=drawing)
+        return self._lacking(view)
+
+    def _lacking(self, view: TrainingView) -> tuple[Array, Array]:
+        """The sums of ``residuals`` over what was drawn."""
+        height, width = view.camera.height, view.camera.width
         g_image, _ = self.rasterizer.gradient_buffers()
         gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
         here = (slice(None, 3), slice(height), slice(width))

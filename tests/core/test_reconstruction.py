@@ -70,7 +70,7 @@ def start(settings: Settings = SETTINGS, frame: Frame = FRAMES[0], world: WorldF
 def shortened(**changes: object) -> Settings:
     """Few iterations; changes of ``update``."""
     static = SETTINGS.static.model_copy(update={"iterations": 20})
-    update = SETTINGS.update.model_copy(update={"iterations": 3, **changes})
+    update = SETTINGS.update.model_copy(update={"iterations": 3, "cold_longer": 1.0, **changes})
     return SETTINGS.model_copy(update={"static": static, "update": update})
 
 
@@ -84,9 +84,9 @@ def test_frames_are_committed_and_reported(stepped: tuple[Reconstruction, list[F
     scene, reports = stepped
     assert scene.history.indices == [10, 12, 14]
     np.testing.assert_allclose(scene.history.times, [frame.time for frame in FRAMES])
-    for report, frame in zip(reports, FRAMES[1:], strict=True):
-        assert (report.index, report.time, report.iterations) == (frame.index, frame.time, 40)
-        assert len(report.loss) == 40
+    for report, frame, iterations in zip(reports, FRAMES[1:], (120, 40), strict=True):
+        assert (report.index, report.time, report.iterations) == (frame.index, frame.time, iterations)
+        assert len(report.loss) == iterations
         assert report.gaussians == len(scene.history.gaussians(10))
         assert report.moving == scene.history.gaussians(10).moving.sum()
         assert 20 < report.psnr < 60

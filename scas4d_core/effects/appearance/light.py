@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from scas4d_core.gaussians import Gaussians
     from scas4d_core.settings import Settings
 
-# Thresholds of the effect: 0.015 a frame at most on the five objects (robot, as it turns fastest), 0.009 on stage,
-# whose shadows wander, 0.027 to 0.065 while the lamp of lamps crosses the room.
+# Thresholds of the effect: 0.032 a frame at most on the five objects (robot, as it turns fastest: shading follows what
+# turns in a light that stays), 0.012 on stage, whose shadows wander, 0.023 to 0.061 while the lamp of lamps crosses.
 SAMPLE = 2000
 """Gaussians at most that the evidence is taken from: it has seven numbers to find."""
 OPAQUE = 0.3
@@ -99,6 +99,6 @@ EFFECT = Light(
     gauge="Colours are in the light of their frame; what differs from camera to camera is gain, and what flickers too.",
     cost="none that can be measured",
     auto=True,
-    on_above=0.02,
-    off_below=0.01,
+    on_above=0.035,
+    off_below=0.02,
 )

@@ -1,11 +1,7 @@
 """Shadows and light that wander over what stands: its colours follow the pictures once a frame, in closed form.
 
-At the end of an update each standing Gaussian's colour takes steps to the mean, over the pixels of some views, of what
-the pictures have more than the render, weighted by the Gaussian's share of each pixel: SIRT with ordered subsets
-(Gilbert 1972; Hudson and Larkin 1994), whose steps of 1 do not overshoot, because the shares of a pixel add up to at
-most 1. That is done in frames in which what stands looks other than in frame 0: elsewhere it would fit noise, and what
-cameras do not agree upon.
-The kernels are those of the rasterizer.
+At the end of an update the standing Gaussians' colours take the steps of ``closed_form``. That is done in frames in
+which what stands looks other than in frame 0: elsewhere it would fit noise, and what cameras do not agree upon.
 """
 
 from __future__ import annotations
@@ -16,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.effects.appearance.closed_form import follow_pictures
 from scas4d_core.effects.effect import Effect, Group, refused_at_zero, refused_on_gpu
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.effects.parts import Array, Arrays, Part, PartsBuilder, Work
@@ -28,10 +25,6 @@ if TYPE_CHECKING:
     from scas4d_core.update.picture_loss import PictureLoss, TrainingView
 
 NAME = "shadows"
-SUBSETS = 6
-"""Steps a frame, each from as many of the views as the others."""
-FEW = 1.0
-"""Pixels' worth of blending weight that is added to each Gaussian's: what is hardly seen stays as it is."""
 SIDE = 8
 """Pixels of the side of the squares whose mean colours are compared with frame 0's: their noise is small."""
 CHANGED = 0.02
@@ -56,8 +49,6 @@ class ShadowsPart(Part):
         """Steps them, where the end of the update is what is kept."""
         if work.kept is not Candidate.END or not self._stands.any() or work.rates.colour_standing == 0:
             return state
-        from scas4d_core.rasterize.shading import features_seen  # it loads the kernels
-
         before: Arrays = work.carried.get(NAME, {})
         known = [view for view in work.views if view.name in before]
         if len(known) < ENOUGH * len(before):
@@ -65,18 +56,7 @@ class ShadowsPart(Part):
         compared = [_compared(before[view.name], view, state, work.picture) for view in known]
         if sum((squares & stands).sum() for squares, stands in compared) <= HARDLY * sum(s.sum() for _, s in compared):
             return state
-        for first in range(min(SUBSETS, len(known))):
-            sums, weights = np.zeros((len(state), 3)), np.full(len(state), FEW)
-            for view in known[first::SUBSETS]:
-                features = features_seen(state, view.camera)
-                more, seen = work.picture.residuals(
-                    state.means, state.factors, state.opacities, features, view, self._stands
-                )
-                sums += more
-                weights += seen
-            step: Array = (sums / weights[:, None]).astype(np.float32)
-            state = state.replace(colours=state.colours + step)
-        return state
+        return follow_pictures(state, known, work.picture, self._stands)
 
 
 @dataclass(frozen=True)
@@ -146,7 +126,8 @@ def _compared(
 
 def _hidden(view: TrainingView, state: Gaussians, picture: PictureLoss) -> NDArray[np.bool_]:
     """[h, w] squares that what moves reaches."""
-    from scas4d_core.update.changed_pixels import BLOCK, as_grid, reached  # it loads the kernels
+    from scas4d_core.rasterize.blocks import BLOCK, as_grid  # these load the kernels
+    from scas4d_core.update.changed_pixels import reached
 
     given = (state.means, state.factors, state.opacities, np.zeros((len(state), 4), np.float32))
     blocks = reached(picture.rasterizer, given, np.flatnonzero(state.moving), view.camera)

@@ -16,7 +16,7 @@ from scas4d_core.robust.checks import evened, gain_of, relit
 from scas4d_core.robust.relocation import find_jump, shifted
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
-from scas4d_core.update.best_state import VIEWS, BestState, ProbeViews, mean_error, spread
+from scas4d_core.update.best_state import VIEWS, BestState, ProbeViews, by_size, mean_error, spread
 from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import AttemptOptions
@@ -102,7 +102,7 @@ def test_a_motion_that_ended_is_not_gone_on_with() -> None:
 def test_a_frame_that_stands_needs_no_iteration() -> None:
     update, frame = updater(), FOOTAGE.frame(0)
     settled = update.run(BEFORE, views(frame), None, 0.1, 0, compared(30))
-    enough = settled.trace.errors[settled.trace.kept]
+    enough = by_size(settled.trace.errors[settled.trace.kept], settled.trace.whole)
     stands = update.run(
         settled.gaussians,
         views(frame),

@@ -184,7 +184,7 @@ class Noted:
     def __init__(self, scene: Reconstruction, monkeypatch: pytest.MonkeyPatch) -> None:
         looked, found = timing.noted, list[tuple]()
         monkeypatch.setattr(timing, "noted", lambda *given: found.append(given) or looked(*given))
-        play(scene, range(1, 2), {})  # that one is tried twice: there is far to go
+        play(scene, range(1, 2), {})  # of that one nothing is told: no motion led it
         play(scene, range(2, 3), {})
         self.given, self.looked = found[-1], looked
 

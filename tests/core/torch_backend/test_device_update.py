@@ -222,8 +222,8 @@ def test_a_reconstruction_on_a_device_steps_there(monkeypatch: pytest.MonkeyPatc
         return DeviceUpdate(*args, device="cpu")  # type: ignore[arg-type]
 
     monkeypatch.setattr(update_device, "DeviceUpdate", made)
-    # without the judge, a first update does not go on from where it ended: the losses compared are of one start
-    settings = Settings(update=SETTINGS.model_copy(update={"iterations": 2, "judge": False}), device="cuda")
+    update = SETTINGS.model_copy(update={"iterations": 2, "cold_longer": 1.0, "judge": False})
+    settings = Settings(update=update, device="cuda", effects={"light": "off"})  # 2 iterations leave much to colours
     rig = to_user(RIG, RIG.world_frame(1.0))
     static = StaticResult(BEFORE, EXPOSURES, [])
     scene = Reconstruction.start(rig, take_frame(0, 0.0, BEFORE, RIG), settings, static=static)
@@ -344,4 +344,4 @@ def test_an_update_is_not_worse_than_going_on_as_before(motion: Motion) -> None:
     assert found.trace.kept == usual.trace.kept == "warm"
     np.testing.assert_allclose(found.gaussians.means, usual.gaussians.means, atol=1e-5)
     np.testing.assert_allclose(found.gaussians.rotations, usual.gaussians.rotations, atol=1e-5)
-    np.testing.assert_array_equal(found.gaussians.colours, BEFORE.colours)
+    np.testing.assert_allclose(found.gaussians.colours, usual.gaussians.colours, atol=1e-4)  # shaded where it moved to

@@ -12,12 +12,13 @@ from scipy.spatial.transform import Rotation
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import SMALLEST_CLUSTER
+from scas4d_core.rasterize.blocks import as_blocks, as_grid
 from scas4d_core.rasterize.cpu import CpuRasterizer
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.structure.neighbours import build_neighbours
 from scas4d_core.update import changed_pixels, frame_update
-from scas4d_core.update.changed_pixels import ChangedPixels, as_blocks, as_grid, reached
+from scas4d_core.update.changed_pixels import ChangedPixels, reached
 from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 from scas4d_core.update.result import AttemptOptions, UpdateResult

@@ -8,6 +8,7 @@ from box_scene import make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.update import best_state
 from scas4d_core.update.best_state import VIEWS, ProbeViews
 from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 
@@ -30,7 +31,10 @@ def probes(shown: Gaussians) -> tuple[ProbeViews, list[int]]:
 
 
 @pytest.mark.parametrize(("metres", "whole"), [(0.005, True), (0.5, False)])
-def test_a_state_that_is_nearly_right_is_compared_in_whole_pictures(metres: float, whole: bool) -> None:
+def test_a_state_that_is_nearly_right_is_compared_in_whole_pictures(
+    metres: float, whole: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(best_state, "FEWEST", 0)
     shown = moved(BOX, Rotation.identity(), np.array([metres, 0.0, 0.0]))
     views, widths = probes(shown)
     before = views.errors(BOX)
@@ -41,3 +45,10 @@ def test_a_state_that_is_nearly_right_is_compared_in_whole_pictures(metres: floa
     after = views.errors(shown)  # all candidates are compared in the same pictures
     assert set(widths) == {full if whole else full // 2}
     assert np.mean(list(after.values())) < np.mean(list(before.values()))
+
+
+def test_small_pictures_are_never_made_smaller() -> None:
+    views, widths = probes(moved(BOX, Rotation.identity(), np.array([0.5, 0.0, 0.0])))
+    views.errors(BOX)
+    assert views.whole
+    assert set(widths) == {RIG.cameras[0].width}

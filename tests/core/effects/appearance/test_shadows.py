@@ -69,7 +69,8 @@ def test_it_goes_off_where_nothing_changes_and_on_again() -> None:
 
 def test_what_moves_keeps_its_own_colours() -> None:
     truth = shaded(0.3)
-    on, off = followed("on", truth, moving_colour="off"), followed("off", truth, moving_colour="off")
+    held = {"moving_colour": "off", "shading": "off"}
+    on, off = followed("on", truth, **held), followed("off", truth, **held)
     for scene in (on, off):
         np.testing.assert_array_equal(scene.history.newest.colours[MOVES], STATE.colours[MOVES])
     assert (on.history.newest.colours[SHADED] != off.history.newest.colours[SHADED]).any()

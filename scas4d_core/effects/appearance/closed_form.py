@@ -1,0 +1,50 @@
+"""Colours in closed form, once a frame: what the pictures have more than the render, spread over what is seen.
+
+Each Gaussian's colour takes steps to the mean, over the pixels of some views, of what the pictures have more than the
+render, weighted by the Gaussian's share of each pixel: SIRT with ordered subsets (Gilbert 1972; Hudson and Larkin
+1994), whose steps of 1 do not overshoot, because the shares of a pixel add up to at most 1. The kernels are those of
+the rasterizer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from operator import attrgetter
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from scas4d_core.update.picture_loss import PictureLoss, TrainingView
+
+SUBSETS = 6
+"""Steps a frame, each from as many of the views as the others."""
+FEW = 1.0
+"""Pixels' worth of blending weight that is added to each Gaussian's: what is hardly seen stays as it is."""
+
+
+def follow_pictures(
+    state: Gaussians, views: Sequence[TrainingView], picture: PictureLoss, learnt: NDArray[np.uint8]
+) -> Gaussians:
+    """The state with the colours of some Gaussians stepped to what the pictures show.
+
+    Args:
+        state: as it is shown in the pictures. views: of the frame. picture: renders them.
+        learnt: [N] 1 for the Gaussians whose colours are stepped; the others keep theirs.
+    """
+    from scas4d_core.rasterize.shading import features_seen  # it loads the kernels
+
+    views = sorted(views, key=attrgetter("name"))  # the order of the rig's cameras changes no bit
+    for first in range(min(SUBSETS, len(views))):
+        sums, weights = np.zeros((len(state), 3)), np.full(len(state), FEW)
+        for view in views[first::SUBSETS]:
+            features = features_seen(state, view.camera)
+            more, seen = picture.residuals(state.means, state.factors, state.opacities, features, view, learnt)
+            sums += more
+            weights += seen
+        step = (sums / weights[:, None]).astype(np.float32)
+        state = state.replace(colours=state.colours + step)
+    return state

@@ -1,0 +1,57 @@
+"""Shading of what moves: as things turn in the light, their colours follow the pictures, once a frame in closed form.
+
+A hundred steps of Adam at a rate that leaves motion visible do not follow what turns: the error is carried into the
+next frame, and grows. At the end of an update the motion is found, and the rest is looks (``closed_form``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scas4d_core.effects.appearance.closed_form import follow_pictures
+from scas4d_core.effects.effect import Effect, Group, refused_at_zero
+from scas4d_core.effects.parts import Part, PartsBuilder, Work
+from scas4d_core.frame_outcome import Candidate
+from scas4d_core.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from scas4d_core.settings import Settings
+
+
+class ShadingPart(Part):
+    """Steps the colours of what moves at the end of an update."""
+
+    def __init__(self, builder: PartsBuilder) -> None:
+        self._moves = np.zeros(len(builder.first), np.uint8)
+        self._moves[builder.hierarchy.rows] = 1
+
+    def end(self, work: Work, state: Gaussians) -> Gaussians:
+        """Steps them, where a motion is what is kept and colours were not held."""
+        if work.kept is Candidate.STILL or work.rates.colour == 0 or not self._moves.any():
+            return state
+        return follow_pictures(state, work.views, work.picture, self._moves)
+
+
+@dataclass(frozen=True)
+class Shading(Effect):
+    """A closed-form step of the colours of what moves."""
+
+    def refused(self, settings: Settings) -> tuple[str, str] | None:
+        """Refused with a rate of 0."""
+        return refused_at_zero(settings, "rate_colour")
+
+    def join(self, builder: PartsBuilder) -> None:
+        """Adds the part."""
+        builder.parts.append(ShadingPart(builder))
+
+
+EFFECT = Shading(
+    name="shading",
+    group=Group.APPEARANCE,
+    says="Things turn in the light: the colours of what moves follow the pictures once a frame.",
+    gauge="It is of what moves, once the motion of the frame is found; gains of cameras are taken out before.",
+    cost="one render of each view and the weights in it, a frame",
+)

@@ -1,0 +1,54 @@
+"""Blocks of 4×4 pixels of a picture, as bits of its tiles and as a grid."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.kernels.projection import TILE
+from scas4d_core.rasterize.cpu import CameraArrays
+
+BLOCK = 4
+"""Pixels of a block's side."""
+
+
+def tiles_of(camera: CameraArrays) -> tuple[int, int]:
+    """Columns and rows of tiles."""
+    return -(-camera.width // TILE), -(-camera.height // TILE)
+
+
+def as_grid(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bool_]:
+    """[rows, columns] of blocks, from bits 8 x + y of each tile."""
+    tiles_x, tiles_y = tiles_of(camera)
+    side = TILE // BLOCK
+    bits = np.unpackbits(blocks.astype("<u8").view(np.uint8).reshape(-1, 8), axis=1, bitorder="little")
+    grid = bits.reshape(tiles_y, tiles_x, side, side).transpose(0, 3, 1, 2)
+    return grid.reshape(tiles_y * side, tiles_x * side).astype(bool)
+
+
+def pixels_of(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bool_]:
+    """[H, W] the pixels of blocks."""
+    grid = as_grid(blocks, camera)
+    return np.repeat(np.repeat(grid, BLOCK, 0), BLOCK, 1)[: camera.height, : camera.width]
+
+
+def as_blocks(grid: NDArray[np.bool_], camera: CameraArrays) -> NDArray[np.uint64]:
+    """[tiles] bits, from a grid of blocks."""
+    tiles_x, tiles_y = tiles_of(camera)
+    side = TILE // BLOCK
+    bits = grid.reshape(tiles_y, side, tiles_x, side).transpose(0, 2, 3, 1).reshape(-1, side * side)
+    packed = np.packbits(bits, axis=1, bitorder="little")
+    return np.ascontiguousarray(packed).view("<u8").reshape(-1).astype(np.uint64)
+
+
+def widened(marks: NDArray[np.uint64], camera: CameraArrays, by: int) -> NDArray[np.uint64]:
+    """The marks and so many blocks around them."""
+    grid = as_grid(marks, camera)
+    for _ in range(by):
+        wider = grid.copy()
+        wider[1:] |= grid[:-1]
+        wider[:-1] |= grid[1:]
+        grid = wider.copy()
+        grid[:, 1:] |= wider[:, :-1]
+        grid[:, :-1] |= wider[:, 1:]
+    return as_blocks(grid, camera)
