@@ -65,7 +65,7 @@ class Reconstruction(CommittedScene):
     >>> scene = Reconstruction.start(capture.rig, capture.frame(0), settings, points=capture.points)
     >>> report = scene.step(capture.frame(1))
     >>> report.index, report.iterations, report.outcome.held
-    (1, 100, False)
+    (1, 300, False)
     >>> scene.render(capture.rig.cameras[0]).colour.shape
     (256, 256, 3)
     """

@@ -286,11 +286,7 @@ class UpdateSettings(SettingsModel):
         description="Share of the iterations after which each Gaussian's own Δp, ΔR and Δs begin to learn; the layers "
         "of clusters begin one after the other before.",
     )
-    cold_longer: Positive = Field(
-        3.0,
-        description="Factor on the iterations where there is no motion to start from: what the first update misses is "
-        "missed by all that start from it.",
-    )
+    cold_longer: Positive = Field(3.0, description="Factor on the iterations where there is no motion to start from.")
     cold_start: float = Field(
         2.0, ge=1, description="Factor on the layers' rates where there is no motion to start from: further to go."
     )

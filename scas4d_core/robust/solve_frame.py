@@ -233,7 +233,7 @@ class FrameSolver:
         if self._spent(given, len(given.views)):
             attempts.append("not sought: the budget is spent")
             return None
-        ended = tried.gaussians
+        ended = _as_coloured(tried.gaussians, given.state)
         starts = [("sought from where the update ended", ended)]
         jump = find_jump(given.state, given.views, self._picture, self._rig)
         if jump is not None:
@@ -257,7 +257,7 @@ class FrameSolver:
     def _go_on(self, given: UpdateInput, tried: UpdateResult, attempts: list[str]) -> UpdateResult:
         """On from where an update ended, for longer; the better of both."""
         options = self._options(given, replace(SEARCH, name="on from where the update ended"))
-        result = self._run(given, tried.gaussians, None, options)
+        result = self._run(given, _as_coloured(tried.gaussians, given.state), None, options)
         result, fault = self._validated(given, given.state, result)
         after, before = (outliers.level_of(given.past, met(one)) for one in (result, tried))
         attempts.append(options.name if fault is None else f"{options.name}: {fault}")
@@ -303,6 +303,11 @@ class FrameSolver:
             self._picture.measure(state.means, state.factors, state.opacities, features, view)
             found[view.name] = self._picture.psnr
         return found
+
+
+def _as_coloured(state: Gaussians, before: Gaussians) -> Gaussians:
+    """A state in the colours of one before: those that followed a motion which was not met lead astray."""
+    return state.replace(colours=before.colours)
 
 
 def _standing(given: UpdateInput, trace: UpdateTrace, exposure: float, said: str) -> Solved:

@@ -96,8 +96,9 @@ def read_convergence(out: Path, capture: str) -> Row | None:
 
 
 def once(settings: Settings) -> Settings:
-    """The settings with one attempt a frame: a first update does not go on from where it ended."""
-    return settings.model_copy(update={"update": settings.update.model_copy(update={"judge": False})})
+    """The settings with one attempt of as many iterations a frame, the first too."""
+    update = settings.update.model_copy(update={"judge": False, "cold_longer": 1.0})
+    return settings.model_copy(update={"update": update})
 
 
 def _watched(capture: Capture, variant: Variant, out: Path, updates: int) -> list[dict[int, float]]:

@@ -155,7 +155,8 @@ def test_what_is_sought_from_where_an_update_ended_has_the_motion_of_both() -> N
     fake = Fake(met(LEVEL - 3))
     outcome, _ = solve(fake, given(replace(PAST, held=1)))
     assert names(fake) == ["as set", "on from where the update ended"]
-    assert fake.starts[1] is AFTER
+    np.testing.assert_array_equal(fake.starts[1].means, AFTER.means)
+    np.testing.assert_array_equal(fake.starts[1].colours, BEFORE.colours)  # not those that followed it astray
     assert outcome.motion is MOTION  # no better: the first is taken
     fake = Fake(met(LEVEL - 3), met(LEVEL - 1, gone(BEFORE, 0.06)))
     outcome, _ = solve(fake, given(replace(PAST, held=1)))
