@@ -26,7 +26,6 @@ from scas4d_core.rasterize.limits import DEFAULT, Limits
 from scas4d_core.update.picture_loss import LABEL, PictureLoss, TrainingView, ViewFactory, means, no_lap
 
 Array = NDArray[np.float32]
-Flags = NDArray[np.uint8]
 State = tuple[Array, Array, Array, Array]
 
 MARGIN = 2
@@ -136,14 +135,21 @@ class ChangedPixels(PictureLoss):
         self._compare_box(region, view)
 
     def residuals(
-        self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView, learnt: Flags
+        self,
+        means: Array,
+        factors: Array,
+        opacities: Array,
+        features: Array,
+        view: TrainingView,
+        learnt: NDArray[np.uint8],
+        most: float,
     ) -> tuple[Array, Array]:
         """See ``PictureLoss``; of what moves, from the pixels alone that it reaches."""
         if not np.array_equal(learnt, self._moves):
-            return super().residuals(means, factors, opacities, features, view, learnt)
+            return super().residuals(means, factors, opacities, features, view, learnt, most)
         region = self._drawn((means, factors, opacities, features), view)
         sums, weights = np.zeros((len(means), 3), np.float32), np.zeros(len(means), np.float32)
-        found = self._lacking(view)
+        found = self._lacking(view, most)
         sums[self._moving], weights[self._moving] = found[0][region.moving], found[1][region.moving]
         return sums, weights
 

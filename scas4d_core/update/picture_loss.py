@@ -307,27 +307,27 @@ class PictureLoss:
         features: Array,
         view: TrainingView,
         learnt: NDArray[np.uint8],
+        most: float,
     ) -> tuple[Array, Array]:
         """Sums over the pixels of what the view's picture has more than is rendered, and of 1, by blending weight.
 
         Args:
-            learnt: [N] 1 for the Gaussians that the sums are wanted of.
+            learnt: [N] 1 for the Gaussians that the sums are wanted of. most: RGB in 0…1 that a pixel counts as more.
 
-        Returns:
-            [N, 3] RGB in pixels' worth, without the camera's exposure, and [N] pixels' worth.
+        Returns: [N, 3] RGB in pixels' worth, without the camera's exposure, and [N] pixels' worth.
         """
         tiles = -(-view.camera.width // TILE) * -(-view.camera.height // TILE)
         drawing = Drawing(np.full(tiles, 2**64 - 1, np.uint64), learnt)
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background, drawing=drawing)
-        return self._lacking(view)
+        return self._lacking(view, most)
 
-    def _lacking(self, view: TrainingView) -> tuple[Array, Array]:
+    def _lacking(self, view: TrainingView, most: float) -> tuple[Array, Array]:
         """The sums of ``residuals`` over what was drawn."""
         height, width = view.camera.height, view.camera.width
         g_image, _ = self.rasterizer.gradient_buffers()
         gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
         here = (slice(None, 3), slice(height), slice(width))
-        g_image[here] = (view.target[:3] - offset) / gain - self.rasterizer.planes[here]
+        g_image[here] = np.clip((view.target[:3] - offset) / gain - self.rasterizer.planes[here], -most, most)
         g_image[LABEL, :height, :width] = 1
         found = self.rasterizer.feature_gradients(g_image)
         return found[:, :3].copy(), found[:, LABEL].copy()

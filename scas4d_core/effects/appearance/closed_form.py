@@ -3,7 +3,8 @@
 Each Gaussian's colour takes steps to the mean, over the pixels of some views, of what the pictures have more than the
 render, weighted by the Gaussian's share of each pixel: SIRT with ordered subsets (Gilbert 1972; Hudson and Larkin
 1994), whose steps of 1 do not overshoot, because the shares of a pixel add up to at most 1. The kernels are those of
-the rasterizer.
+the rasterizer. The last subset has the last word on what is seen otherwise from elsewhere, as something that has
+entered and is in no state yet; so each subset looks from all sides, and no pixel counts for much.
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
 
 SUBSETS = 6
 """Steps a frame, each from as many of the views as the others."""
+MOST = 0.2
+"""RGB in 0…1 that a pixel counts as more or less: what differs by more is not the light of a frame. With `visit`, which
+a ball enters, subsets from one side each and no such bound cost 10 dB: frames after it were not believed."""
 FEW = 1.0
 """Pixels' worth of blending weight that is added to each Gaussian's: what is hardly seen stays as it is."""
 
@@ -37,14 +41,28 @@ def follow_pictures(
     """
     from scas4d_core.rasterize.shading import features_seen  # it loads the kernels
 
-    views = sorted(views, key=attrgetter("name"))  # the order of the rig's cameras changes no bit
+    views = from_all_sides(views)
     for first in range(min(SUBSETS, len(views))):
         sums, weights = np.zeros((len(state), 3)), np.full(len(state), FEW)
         for view in views[first::SUBSETS]:
             features = features_seen(state, view.camera)
-            more, seen = picture.residuals(state.means, state.factors, state.opacities, features, view, learnt)
+            more, seen = picture.residuals(state.means, state.factors, state.opacities, features, view, learnt, MOST)
             sums += more
             weights += seen
         step = (sums / weights[:, None]).astype(np.float32)
         state = state.replace(colours=state.colours + step)
     return state
+
+
+def from_all_sides(views: Sequence[TrainingView]) -> list[TrainingView]:
+    """The views, each next one from as far as can be from those before; whatever the order of the rig's cameras is."""
+    left = sorted(views, key=attrgetter("name"))
+    centres = [-view.camera.pose[:, :3].T @ view.camera.pose[:, 3] for view in left]
+    nearest = np.full(len(left), np.inf)
+    found: list[TrainingView] = []
+    for _ in left:
+        at = int(np.argmax(nearest))
+        found.append(left[at])
+        nearest = np.minimum(nearest, [np.linalg.norm(centre - centres[at]) for centre in centres])
+        nearest[at] = -1
+    return found
