@@ -327,3 +327,18 @@ def rig_inside(frame: WorldFrame, cameras: Sequence[Camera]) -> Rig:
     array([ 0. ,  0. , -0.2])
     """
     return Rig(tuple(frame.camera_to_inside(camera) for camera in cameras))
+
+
+def farthest_first(centres: NDArray[np.floating], count: int) -> list[int]:
+    """So many of the points [N, 3], from the first on: each next one is the farthest from those taken.
+
+    >>> farthest_first(np.array([[0, 0, 0], [1, 0, 0], [5, 0, 0]]), 2)
+    [0, 2]
+    """
+    nearest = np.full(len(centres), np.inf)
+    taken: list[int] = []
+    while len(taken) < min(count, len(centres)):
+        taken.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, np.linalg.norm(centres - centres[taken[-1]], axis=-1))
+        nearest[taken[-1]] = -1
+    return taken

@@ -16,6 +16,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from client.cli.changes import changes_of
 from scas4d_core.presets import PRESETS
 from scas4d_core.settings import Settings
 from server.settings import PREFIX, ServerSettings
@@ -60,20 +61,12 @@ def method_rows(model: type[BaseModel], path: str = "") -> Iterator[str]:
             yield f"| `{path}{name}` | {default(field)} | {cell(field.description or '')} |"
 
 
-def changed(values: dict[str, Any], usual: dict[str, Any], path: str = "") -> Iterator[str]:
-    """Settings of a preset that are not the defaults, as they are written."""
-    for name, value in values.items():
-        if isinstance(value, dict) and isinstance(usual.get(name), dict) and path + name != "effects":
-            yield from changed(value, usual[name], f"{path}{name}.")
-        elif value != usual.get(name):
-            yield f"{path}{name}={json.dumps(value)}"
-
-
 def preset_rows() -> Iterator[str]:
     """Of the presets, what each changes."""
     usual = Settings().model_dump(mode="json")
     for name, settings in PRESETS.items():
-        found = ", ".join(f"`{one}`" for one in changed(settings.model_dump(mode="json"), usual))
+        changes = changes_of(settings.model_dump(mode="json"), usual)
+        found = ", ".join(f"`{one}={json.dumps(value)}`" for one, value in changes.items())
         yield f"| `{name}` | {cell(found or 'nothing: the default')} |"
 
 

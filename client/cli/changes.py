@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 
@@ -32,3 +32,22 @@ def parse_changes(changes: Sequence[str] | None) -> dict[str, Any]:
         except json.JSONDecodeError:
             inner[last] = text.strip()
     return result
+
+
+def changes_of(values: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:
+    """The nested settings that are not as usual, by dotted name; the inverse of ``parse_changes``.
+
+    >>> changes_of({"update": {"iterations": 200, "seed": 0}}, {"update": {"iterations": 100, "seed": 0}})
+    {'update.iterations': 200}
+    """
+    before = dict(_flat(usual))
+    return {name: value for name, value in _flat(values) if before.get(name) != value}
+
+
+def _flat(values: Mapping[str, Any], under: str = "") -> Iterator[tuple[str, Any]]:
+    """``{"update": {"iterations": 100}}`` as ``("update.iterations", 100)``."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{under}{name}.")
+        else:
+            yield f"{under}{name}", value

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from client.cli import pictures
+from client.cli.changes import changes_of
 from client.cli.progress import Bars
 from client.cli.reconstruct import compile_kernels, reconstruct_frames
 from client.cli.scores import Row, Store, digest, markdown, stage_table
@@ -92,13 +93,12 @@ class Job:
     @property
     def changes(self) -> str:
         """Differences from the preset beside iterations and seed, and what is withheld, in words for the table."""
-        usual, own = preset(self.preset).model_dump(mode="json"), self.record
+        usual = preset(self.preset).model_dump(mode="json")
         words = [
             f"{name}={json.dumps(value, separators=(',', ':'))}"
-            for name, value in _flat(own)
+            for name, value in changes_of(self.record, usual).items()
             if name not in ("update.iterations", "update.seed", "static.seed")
             and (name, value) != ("static.seconds", None)  # studies have no limit, and depend on no machine
-            and dict(_flat(usual)).get(name) != value
         ]
         words += ["no masks"] * (not self.masks) + ["no points"] * (not self.points)
         words += [f"held out {', '.join(self.options.test)}"] if self.options.test else []
@@ -325,12 +325,3 @@ def peak_megabytes() -> float | None:
     except ImportError:
         return None
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-
-
-def _flat(values: Mapping[str, Any], under: str = "") -> Iterator[tuple[str, Any]]:
-    """``{"update": {"iterations": 100}}`` as ``("update.iterations", 100)``."""
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{under}{name}.")
-        else:
-            yield f"{under}{name}", value

@@ -12,7 +12,7 @@ from math import nan
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.cameras import Rig
+from scas4d_core.cameras import Rig, farthest_first
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.rasterize.shading import features_seen, without_turn
@@ -36,15 +36,8 @@ smaller than their pixels, and no motion, and whole pictures are compared."""
 
 def spread(rig: Rig, names: Sequence[str], count: int = VIEWS) -> list[str]:
     """So many of the cameras, as far apart as can be: each next one is the farthest from those taken."""
-    if not names:
-        return []
     centres = np.array([rig[name].centre for name in names])
-    taken = [0]
-    while len(taken) < min(count, len(names)):
-        distances = np.linalg.norm(centres[:, None] - centres[None, taken], axis=-1).min(axis=1)
-        distances[taken] = -1
-        taken.append(int(distances.argmax()))
-    return [names[index] for index in taken]
+    return [names[index] for index in farthest_first(centres, count)]
 
 
 def mean_error(errors: Mapping[str, float], names: Sequence[str]) -> float:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import log10
+from math import log10, prod
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from scas4d_core.captures.images import area_average, resize_area
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import SMALLEST_SQUARE
 from scas4d_core.kernels import image_loss
-from scas4d_core.kernels.projection import TILE
+from scas4d_core.rasterize.blocks import tiles_of
 from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Drawing, Gradients, Picture
 from scas4d_core.rasterize.limits import DEFAULT, Limits
 
@@ -316,8 +316,7 @@ class PictureLoss:
 
         Returns: [N, 3] RGB in pixels' worth, without the camera's exposure, and [N] pixels' worth.
         """
-        tiles = -(-view.camera.width // TILE) * -(-view.camera.height // TILE)
-        drawing = Drawing(np.full(tiles, 2**64 - 1, np.uint64), learnt)
+        drawing = Drawing(np.full(prod(tiles_of(view.camera)), 2**64 - 1, np.uint64), learnt)
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background, drawing=drawing)
         return self._lacking(view, most)
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.cameras import farthest_first
 from scas4d_core.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -57,12 +58,5 @@ def follow_pictures(
 def from_all_sides(views: Sequence[TrainingView]) -> list[TrainingView]:
     """The views, each next one from as far as can be from those before; whatever the order of the rig's cameras is."""
     left = sorted(views, key=attrgetter("name"))
-    centres = [-view.camera.pose[:, :3].T @ view.camera.pose[:, 3] for view in left]
-    nearest = np.full(len(left), np.inf)
-    found: list[TrainingView] = []
-    for _ in left:
-        at = int(np.argmax(nearest))
-        found.append(left[at])
-        nearest = np.minimum(nearest, [np.linalg.norm(centre - centres[at]) for centre in centres])
-        nearest[at] = -1
-    return found
+    centres = np.array([-view.camera.pose[:, :3].T @ view.camera.pose[:, 3] for view in left])
+    return [left[index] for index in farthest_first(centres, len(left))]
