@@ -213,7 +213,7 @@ class UpdateSettings(SettingsModel):
 
     constants: ClassVar[Mapping[str, Constant]] = {
         "smallest_cluster": Constant(8, "scas4d_core.preparation.SMALLEST_CLUSTER"),
-        "layer_starts": Constant((0.0, 0.2, 0.4), "scas4d_core.update.schedule.LAYER_STARTS"),
+        "layer_starts": Constant((0.0, 0.2, 0.4), "scas4d_core.update.rates.LAYER_STARTS"),
         "coarse_until": Constant(0.0),
         "coarse_scale": Constant(0.5),
         "warm_start": Constant(1.0, "scas4d_core.update.warm_start.WARM_START"),
@@ -276,7 +276,7 @@ class UpdateSettings(SettingsModel):
         (
             LayerRates(rotation=0.04, translation=0.008, scaling=0.002),
             LayerRates(rotation=0.01, translation=0.002, scaling=0.002),
-            LayerRates(rotation=0.002, translation=0.0004, scaling=0.002),
+            LayerRates(rotation=0.006, translation=0.0012, scaling=0.002),
         ),
         min_length=1,
         description="One per layer, coarse to fine; with more layers the last is repeated.",
@@ -284,14 +284,14 @@ class UpdateSettings(SettingsModel):
     own_start: Share = Field(
         0.4,
         description="Share of the iterations after which each Gaussian's own Δp, ΔR and Δs begin to learn; the layers "
-        "of clusters begin one after the other before.",
+        "of clusters begin one after the other before, and rest one after the other.",
     )
     cold_longer: Positive = Field(3.0, description="Factor on the iterations where there is no motion to start from.")
     cold_start: float = Field(
         2.0, ge=1, description="Factor on the layers' rates where there is no motion to start from: further to go."
     )
-    rate_position: Positive = Field(1.6e-4, description="Δp, per metre of scene radius.")
-    rate_rotation: Positive = Field(0.002, description="ΔR, in units of tan(angle/2).")
+    rate_position: Positive = Field(3.2e-4, description="Δp, per metre of scene radius.")
+    rate_rotation: Positive = Field(0.004, description="ΔR, in units of tan(angle/2).")
     rate_scale: NotNegative = Field(0.001, description="Δs, log.")
     rate_colour: NotNegative = Field(0.0025, description="RGB of the Gaussians that move.")
     rate_colour_standing: NotNegative = Field(

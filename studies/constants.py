@@ -18,7 +18,7 @@ def varied(place: str, value: Any) -> Iterator[None]:
     A constant that a compiled kernel reads keeps the value that the kernel was compiled with.
 
     Args:
-        place: dotted name, as ``"scas4d_core.update.schedule.LAYER_STARTS"``. value: to be had within the block.
+        place: dotted name, as ``"scas4d_core.update.rates.LAYER_STARTS"``. value: to be had within the block.
 
     Raises:
         AttributeError: the module has no such constant.

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from scas4d_core.structure.hierarchy import Hierarchy
     from scas4d_core.update.deformation import CpuDeformation
     from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
-    from scas4d_core.update.schedule import Rates
+    from scas4d_core.update.rates import Rates
 
 Array = NDArray[np.float32]
 Arrays = dict[str, NDArray[Any]]

@@ -3,7 +3,7 @@
 Gaussians are taken in blocks of sixteen of one finest cluster, hence of one cluster in every layer; where the size of a
 cluster is no multiple of sixteen, its last block repeats its last Gaussian. Only points are kept between layers
 (pivots are their means): the backward carries factors and turns through the layers again, which costs less than
-reading them from memory.
+reading them from memory. Layers that rest are applied once (``settle``), and what follows begins behind them.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numba import prange
 from scas4d_core.kernels import lanes
 from scas4d_core.kernels.cascade import carry, carry_backward, cluster_gradient, cluster_table, moved
 from scas4d_core.kernels.deltas import apply_own, apply_own_backward
-from scas4d_core.kernels.jit import ONE, ZERO, kernel, parallel_kernel
+from scas4d_core.kernels.jit import kernel, parallel_kernel
 
 BLOCKS = 16
 """Blocks a task."""
@@ -30,16 +30,6 @@ def prefetch(block, rows, one, two):
     for lane in range(lanes.COUNT):
         lanes.fetch(one, rows[block, lane])
         lanes.fetch(two, rows[block, lane])
-
-
-@kernel
-def start_block(block, before, v):
-    """Fills v [13, 16] with the factors of frame t−1 and no turn."""
-    for k in range(9):
-        lanes.store(v, lanes.COUNT * k, lanes.load(before, (9 * block + k) * lanes.COUNT))
-    lanes.store(v, lanes.COUNT * 9, lanes.fill(ONE))
-    for k in range(10, 13):
-        lanes.store(v, lanes.COUNT * k, lanes.fill(ZERO))
 
 
 @kernel
@@ -72,29 +62,53 @@ def block_sums(points, present, sums):
 
 
 @parallel_kernel
+def settle(
+    layer, parameters, offsets, ranges, clusters, present, entering, about_origin, separate, points, sums, tables
+):  # fmt: skip
+    """Moves what enters a layer through it, for as long as it rests: ``entering`` then enters the layer below.
+
+    Args:
+        layer: not the last. entering: [B, 13 · 16] in place, see ``deform``, which tells of the others, too; of points
+            and sums those of the layer below are filled, of tables those of its clusters.
+    """
+    blocks = clusters.shape[0]
+    for j in prange(offsets[layer], offsets[layer + 1]):
+        cluster_table(parameters[j], sums[layer], ranges[j, 0], ranges[j, 1], ranges[j, 2], tables[j])
+    for task in prange((blocks + BLOCKS - 1) // BLOCKS):
+        for block in range(task * BLOCKS, min(blocks, (task + 1) * BLOCKS)):
+            table, place = tables[clusters[block, layer]], 3 * lanes.COUNT * block
+            here, below = place + layer * 3 * lanes.COUNT * blocks, place + (layer + 1) * 3 * lanes.COUNT * blocks
+            carry(table, about_origin, separate, points, here, entering[block], present, block * lanes.COUNT, None)
+            move_points(block, table, about_origin, points, layer, points, below)
+            sum_block(block, points, layer + 1, present, sums)
+
+
+@parallel_kernel
 def deform(
-    parameters, offsets, ranges, clusters, entries, rows, present, before, deltas, about_origin, separate,
+    first, parameters, offsets, ranges, clusters, entries, rows, present, entering, deltas, about_origin, separate,
     points, sums, tables, means, factors, state, acted,
 ):  # fmt: skip
     """Moves M of N Gaussians, in B blocks, through L layers of K clusters together.
 
     Args:
+        first: the first layer that does not rest; the points, sums and tables of those before are as they were left.
         parameters: [K, 10], layer after layer, coarse to fine. offsets: [L + 1] int64, the first cluster of each layer.
         ranges: [K, 3] int64, each cluster's first block, its last and one more, and its number of Gaussians.
         clusters: [B, L] int64, the clusters of each block.
         entries, rows: [B, 16] int64, each Gaussian's row among the M and among the N.
         present: [B, 16] float32, 0 where a Gaussian is repeated, else 1.
-        before: [B, 9, 16] factors of frame t−1. deltas: [M, 9] Δp, Δr, Δs.
+        entering: [B, 13 · 16] factors 0–8 and turns 9–12 as they enter layer ``first``; of frame t−1 those are its
+            factors and no turn. deltas: [M, 9] Δp, Δr, Δs.
         about_origin: 0 for the centred map, 1 for the published one. separate: None: J is applied to the factors; else
             nothing.
-        points: [max(L, 1), B, 3, 16] as they enter each layer; the first is given, the others are filled.
+        points: [max(L, 1), B, 3, 16] as they enter each layer; of ``first`` given, of those below filled.
         sums: [max(L, 1), B, 3] of them; likewise. tables: out [K, 26].
         means [N, 3], factors [N, 3, 3]: out at ``rows``. state: [M, 16], out its means and turns, see ``deltas``.
         acted: out [tasks of ``BLOCKS`` blocks, 3] int64, how often the guards in ``cascade.ACTED`` acted.
     """
     blocks, layers = clusters.shape
     tasks = (blocks + BLOCKS - 1) // BLOCKS
-    for layer in range(layers):
+    for layer in range(first, layers):
         for j in prange(offsets[layer], offsets[layer + 1]):
             cluster_table(parameters[j], sums[layer], ranges[j, 0], ranges[j, 1], ranges[j, 2], tables[j])
         if layer + 1 < layers:
@@ -109,8 +123,8 @@ def deform(
         moved_points = np.empty(3 * lanes.COUNT, np.float32)
         for block in range(task * BLOCKS, min(blocks, (task + 1) * BLOCKS)):
             prefetch(block + 1, rows, means, factors)
-            start_block(block, before, v)
-            for layer in range(layers):
+            v[:] = entering[block]
+            for layer in range(first, layers):
                 place = (layer * blocks + block) * 3 * lanes.COUNT
                 carry(
                     tables[clusters[block, layer]], about_origin, separate, points, place, v, present,
@@ -130,13 +144,13 @@ def deform(
 
 @parallel_kernel
 def deform_backward(
-    offsets, ranges, clusters, entries, rows, present, before, deltas, about_origin, separate, points, tables,
+    first, offsets, ranges, clusters, entries, rows, present, entering, deltas, about_origin, separate, points, tables,
     scale_weight, bounds, g_means, g_factors, g_tied, records, gradients, g_deltas, losses,
 ):  # fmt: skip
     """Backward of ``deform``, with the gradient of the scale loss added.
 
     Args:
-        offsets … tables: as ``deform`` left them.
+        first … tables: as ``deform`` left them; layers that rest get no gradient.
         scale_weight: weight of the scale loss over its mean's count 3M; 0 leaves it out.
         bounds: [M, 3] metres, the length each axis may have.
         g_means [N, 3], g_factors [N, 3, 3]: in. g_tied: [M, 8] in, of means and turns, see ``deltas``.
@@ -149,8 +163,8 @@ def deform_backward(
         g = np.empty(16 * lanes.COUNT, np.float32)
         for block in range(task * BLOCKS, min(blocks, (task + 1) * BLOCKS)):
             prefetch(block + 1, rows, g_means, g_factors)
-            start_block(block, before, v)
-            for layer in range(layers):
+            v[first * CARRIED : (first + 1) * CARRIED] = entering[block]
+            for layer in range(first, layers):
                 leaving = v[(layer + 1) * CARRIED : (layer + 2) * CARRIED]
                 leaving[:] = v[layer * CARRIED : (layer + 1) * CARRIED]
                 place = (layer * blocks + block) * 3 * lanes.COUNT
@@ -162,7 +176,7 @@ def deform_backward(
                 deltas, entries, rows, block * lanes.COUNT, present, v, layers * CARRIED, scale_weight, bounds,
                 g_means, g_factors, g_tied, g, g_deltas,
             )  # fmt: skip
-            for back in range(layers):
+            for back in range(layers - first):
                 layer = layers - 1 - back
                 place = (layer * blocks + block) * 3 * lanes.COUNT
                 record = (block * layers + layer) * records.shape[2]
@@ -170,6 +184,6 @@ def deform_backward(
                     tables[clusters[block, layer]], about_origin, separate, points, place, v, layer * CARRIED, g,
                     records, record,
                 )  # fmt: skip
-    for layer in range(layers):
+    for layer in range(first, layers):
         for j in prange(offsets[layer], offsets[layer + 1]):
             cluster_gradient(records, layer, ranges[j, 0], ranges[j, 1], tables[j], gradients[j])

@@ -31,7 +31,8 @@ from scas4d_core.torch_backend.deformation import (
     deform,
     material_rotations,
 )
-from scas4d_core.update.schedule import Rates, Stopping
+from scas4d_core.update.rates import Rates
+from scas4d_core.update.schedule import Stopping
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Render: TypeAlias = Callable[[Tensor, Tensor, Tensor, Tensor, CameraParams, Tensor, Limits], Rendered]
@@ -123,7 +124,7 @@ class TorchUpdate:
         optimizer = torch.optim.Adam(
             scene.parameter_groups(self.rates), betas=(self.rates.beta1, self.rates.beta2), eps=ADAM_EPSILON
         )
-        base = [(group["lr"], group["begins"]) for group in optimizer.param_groups]
+        base = [(group["lr"], group["learns"]) for group in optimizer.param_groups]
         history: list[tuple[Tensor, Tensor]] = []
         for iteration, view in enumerate(order):
             if self.on_cuda and stopping is not None and stopping.end is not None and iteration % TIMED_EVERY == 0:
@@ -131,14 +132,14 @@ class TorchUpdate:
             planned = len(order) if stopping is None else stopping.planned(iteration)
             if iteration >= planned:
                 break
-            for group, (rate, begins) in zip(optimizer.param_groups, base, strict=True):
-                group["lr"] = rate * self.rates.factor(iteration, planned, begins)
+            for group, (rate, learns) in zip(optimizer.param_groups, base, strict=True):
+                group["lr"] = rate * self.rates.factor(iteration, planned, *learns)
             sampled = None if rows is None else torch.as_tensor(rows[iteration], dtype=torch.int64, device=self.device)
             optimizer.zero_grad(set_to_none=True)
             loss = scene.loss(view, sampled)
             loss.backward()  # type: ignore[no-untyped-call]
             for group in optimizer.param_groups:
-                if group["lr"] == 0:  # not begun: its moments stay those of no step
+                if group["lr"] == 0:  # not begun: its moments stay those of no step; or it rests
                     for tensor in group["params"]:
                         tensor.grad = None
             optimizer.step()
@@ -244,28 +245,29 @@ class _Scene:
 
     def parameter_groups(self, rates: Rates) -> list[dict[str, Any]]:
         """Adam's groups of parameters; those of rate 0 are left out and need no gradient."""
-        groups: list[tuple[float, float, list[Tensor]]] = []
+        groups: list[tuple[float, tuple[float, float], list[Tensor]]] = []
         for k, ((_, params), (rotation, translation, scaling)) in enumerate(
             zip(self.layers, rates.layers, strict=True)
         ):
-            start = rates.start_of(k)
+            learns = rates.start_of(k), rates.rest_of(k)
             groups += [
-                (rotation, start, [params.r]),
-                (translation, start, [params.t]),
-                (scaling, start, [params.c, params.s]),
+                (rotation, learns, [params.r]),
+                (translation, learns, [params.t]),
+                (scaling, learns, [params.c, params.s]),
             ]
+        own, whole = (rates.start, 1.0), (0.0, 1.0)
         groups += [
-            (rates.position, rates.start, [self.deltas.dp]),
-            (rates.rotation, rates.start, [self.deltas.dr]),
-            (rates.scale, rates.start, [self.deltas.ds]),
-            (rates.colour, 0.0, [self.free_colours[0]]),
-            (rates.colour_standing, 0.0, [self.free_colours[1]]),
+            (rates.position, own, [self.deltas.dp]),
+            (rates.rotation, own, [self.deltas.dr]),
+            (rates.scale, own, [self.deltas.ds]),
+            (rates.colour, whole, [self.free_colours[0]]),
+            (rates.colour_standing, whole, [self.free_colours[1]]),
         ]
-        learnt = [(rate, start, tensors) for rate, start, tensors in groups if rate > 0]
+        learnt = [(rate, learns, tensors) for rate, learns, tensors in groups if rate > 0]
         for _, _, tensors in learnt:
             for tensor in tensors:
                 tensor.requires_grad_(True)
-        return [{"params": tensors, "lr": rate, "begins": start} for rate, start, tensors in learnt]
+        return [{"params": tensors, "lr": rate, "learns": learns} for rate, learns, tensors in learnt]
 
     def deformed(self) -> Deformed:
         """The moving Gaussians under the present parameters."""

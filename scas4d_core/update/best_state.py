@@ -204,6 +204,7 @@ class BestState:
         return best
 
     def _set(self, motion: Motion | None) -> None:
+        self._deformation.rest(0)
         warm_start(self._deformation, motion, self.seconds, self._momentum)
 
     def _note(self, candidate: Candidate, errors: dict[str, float]) -> None:

@@ -17,7 +17,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import GuardCounts
 from scas4d_core.kernels import neighbour_terms
 from scas4d_core.kernels.cascade import ACTED, PARAMETERS, RECORD, TABLE
-from scas4d_core.kernels.deform import BLOCKS, block_sums, deform, deform_backward
+from scas4d_core.kernels.deform import BLOCKS, CARRIED, block_sums, deform, deform_backward, settle
 from scas4d_core.kernels.deltas import PREVIOUS, STATE, TIED, TURN
 from scas4d_core.kernels.lanes import COUNT
 from scas4d_core.structure.hierarchy import Hierarchy
@@ -55,7 +55,7 @@ class CpuDeformation:
         turns: [M, 4], rotation since the frame before, filled by ``forward``.
         held_back: [held] int64, rows of Θ_{t−1} that are not finite, found by ``start``.
         guards: how often each guard acted since the last ``reset`` of the counts: those of ``cascade.ACTED`` each
-            ``forward``, the others each ``start``.
+            ``forward``, in layers that do not rest; the others each ``start``.
     """
 
     def __init__(
@@ -90,7 +90,9 @@ class CpuDeformation:
         held = len(blocks.entries)
         self._points = np.zeros((max(layers, 1), held, 3, COUNT), np.float32)
         self._sums = np.zeros((max(layers, 1), held, 3), np.float32)
-        self._before = np.zeros((held, 9, COUNT), np.float32)
+        self._before, self._entering = (np.zeros((held, CARRIED), np.float32) for _ in range(2))
+        self._before[:, 9 * COUNT : 10 * COUNT] = 1  # no turn
+        self._resting = 0
         self._records = np.zeros((held, layers, RECORD), np.float32)
         self._excess = np.zeros(held, np.float32)
         self._state = cache_lines(count)
@@ -120,8 +122,10 @@ class CpuDeformation:
         self._hold_back(sound)
         self._state[:, PREVIOUS : PREVIOUS + 3] = means[moving]
         self._points[0] = np.swapaxes(means[self._rows], 1, 2)
-        self._before[:] = np.swapaxes(factors[self._rows].reshape(*self._rows.shape, 9), 1, 2)
+        entering = self._before.reshape(-1, CARRIED // COUNT, COUNT)
+        entering[:, :9] = np.swapaxes(factors[self._rows].reshape(*self._rows.shape, 9), 1, 2)
         block_sums(self._points, self._present, self._sums)
+        self.rest(0)
         self.means = previous.means.copy()
         self.factors = previous.factors.copy()
 
@@ -142,12 +146,31 @@ class CpuDeformation:
         empty = int(np.count_nonzero(self._ranges[:, 2] == 0))
         self.guards.add(("held_back", "empty_cluster"), np.array([len(self.held_back), empty]))
 
+    def rest(self, layers: int) -> None:
+        """Let the first so many layers rest, as they are set now: they are applied once, and get no gradient.
+
+        What ``forward`` finds has the same bits. Whoever sets the parameters of one anew lets none rest before.
+
+        Raises:
+            ValueError: the last layer cannot.
+        """
+        if layers and layers >= len(self.clusters):
+            raise ValueError(f"{layers} of {len(self.clusters)} layers cannot rest: the last one goes on")
+        if layers < self._resting or layers == 0:
+            self._entering[:], self._resting = self._before, 0
+        for layer in range(self._resting, layers):
+            settle(
+                layer, self._parameters, self._offsets, self._ranges, self._clusters_of, self._present, self._entering,
+                self._about_origin, self._separate, self._points, self._sums, self._tables,
+            )  # fmt: skip
+        self._resting = layers
+
     def forward(self) -> None:
         """Equations (5) to (7): fill ``means``, ``factors`` and ``turns``."""
         deform(
-            self._parameters, self._offsets, self._ranges, self._clusters_of, self._entries, self._rows, self._present,
-            self._before, self.deltas, self._about_origin, self._separate, self._points, self._sums, self._tables,
-            self.means, self.factors, self._state, self._acted,
+            self._resting, self._parameters, self._offsets, self._ranges, self._clusters_of, self._entries, self._rows,
+            self._present, self._entering, self.deltas, self._about_origin, self._separate, self._points, self._sums,
+            self._tables, self.means, self.factors, self._state, self._acted,
         )  # fmt: skip
         self.means[self.held_back], self.factors[self.held_back] = self._held
         self.guards.add(ACTED, self._acted)
@@ -170,15 +193,17 @@ class CpuDeformation:
         return means
 
     def backward(self, g_means: Array, g_factors: Array, scale_weight: float) -> float:
-        """Fill ``cluster_gradients`` and ``delta_gradients``; returns the scale loss (metres, mean over axes).
+        """Fill ``cluster_gradients``, but of layers that rest, and ``delta_gradients``.
+
+        Returns the scale loss (metres, mean over axes).
 
         Args:
             g_means [N, 3], g_factors [N, 3, 3]: gradients of what ``forward`` filled.
         """
         axes = max(1, 3 * len(self.hierarchy.rows))
         deform_backward(
-            self._offsets, self._ranges, self._clusters_of, self._entries, self._rows, self._present, self._before,
-            self.deltas, self._about_origin, self._separate, self._points, self._tables,
+            self._resting, self._offsets, self._ranges, self._clusters_of, self._entries, self._rows, self._present,
+            self._entering, self.deltas, self._about_origin, self._separate, self._points, self._tables,
             np.float32(scale_weight / axes), self._bounds, g_means, g_factors, self._tied, self._records,
             self._gradients, self.delta_gradients, self._excess,
         )  # fmt: skip

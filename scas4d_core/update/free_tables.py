@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scas4d_core.effects.freedom import Freedom
 from scas4d_core.guards import GuardCounts
 from scas4d_core.update.deformation import CpuDeformation
-from scas4d_core.update.schedule import Adam, Rates
+from scas4d_core.update.rates import Adam, Rates
 
 Array = NDArray[np.float32]
 
@@ -41,21 +41,27 @@ class FreeTable:
 
     Args:
         table, gradients: [n, columns]; the table is stepped in place, and by nobody else. columns: rate of each column.
-        plan: of the rates. start: share of the iterations after which it begins.
+        plan: of the rates. start, rest: shares of the iterations after which it begins, and rests.
 
     Attributes:
         guards: of its steps.
     """
 
     def __init__(
-        self, table: Array, gradients: Array, columns: Sequence[float], plan: Rates, start: float = 0.0
+        self,
+        table: Array,
+        gradients: Array,
+        columns: Sequence[float],
+        plan: Rates,
+        start: float = 0.0,
+        rest: float = 1.0,
     ) -> None:
         self._table, self._gradients = table, gradients
         self._free = np.flatnonzero(columns)
         whole = len(self._free) == len(columns)
         # A copy in rows: the kernel is compiled for these.
         self._values = table if whole else np.take(table, self._free, axis=1)
-        self._adam = Adam(self._values, [rate for rate in columns if rate], plan, start)
+        self._adam = Adam(self._values, [rate for rate in columns if rate], plan, start, rest)
         self.guards: GuardCounts = self._adam.guards
 
     def step(self, iteration: int, planned: int) -> None:
@@ -71,8 +77,8 @@ def free_tables(deformation: CpuDeformation, rates: Rates) -> list[FreeTable]:
     """One per table that has a free column: each layer of clusters, the Gaussians' own deltas."""
     columns = [[r] * 3 + [t] * 3 + [scaling] * 4 for r, t, scaling in rates.layers]
     columns.append([rates.position] * 3 + [rates.rotation] * 3 + [rates.scale] * 3)
-    starts = [rates.start_of(layer) for layer in range(len(rates.layers))] + [rates.start]
+    times = [(rates.start_of(layer), rates.rest_of(layer)) for layer in range(len(rates.layers))] + [(rates.start, 1.0)]
     tables = [*deformation.clusters, deformation.deltas]
     gradients = [*deformation.cluster_gradients, deformation.delta_gradients]
-    given = zip(tables, gradients, columns, starts, strict=True)
-    return [FreeTable(table, g, rate, rates, start) for table, g, rate, start in given if any(rate)]
+    given = zip(tables, gradients, columns, times, strict=True)
+    return [FreeTable(table, g, rate, rates, *time) for table, g, rate, time in given if any(rate)]

@@ -11,7 +11,7 @@ from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 
 if TYPE_CHECKING:
-    from scas4d_core.update.schedule import Adam, Rates
+    from scas4d_core.update.rates import Adam, Rates
 
 
 FASTER = 2.0
@@ -48,7 +48,7 @@ class Colours(Part):
 
     def start(self, work: Work) -> None:
         """Moments start at zero."""
-        from scas4d_core.update import schedule  # it loads the kernels
+        from scas4d_core.update import rates, schedule  # they load the kernels
 
         self._soft = np.float32(schedule.SOFT_COLOUR_WEIGHT / max(work.colours.size, 1))
         moving, standing = self.freed(work.rates)
@@ -61,7 +61,7 @@ class Colours(Part):
             self._before = work.previous.colours[self._rows]
             self._table = work.colours[self._rows]
             by_row = np.full(len(self._rows), moving, np.float32)
-        self._optimizer = schedule.Adam(self._table, [1.0] * 3, work.rates, by_row=by_row)
+        self._optimizer = rates.Adam(self._table, [1.0] * 3, work.rates, by_row=by_row)
         self.guards = self._optimizer.guards
 
     def loss(self, work: Work) -> float:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Literal
+
 import numpy as np
 import pytest
 import torch
@@ -125,3 +128,44 @@ def assert_close(value: np.ndarray, expected: torch.Tensor | None) -> None:
     assert expected is not None
     truth = expected.numpy()
     np.testing.assert_allclose(value, truth, rtol=2e-4, atol=2e-5 * np.abs(truth).max())
+
+
+@pytest.mark.parametrize("kind", ["centred", "published"])
+def test_layers_that_rest_are_applied_once_and_all_else_keeps_its_bits(kind: Literal["centred", "published"]) -> None:
+    rng = np.random.default_rng(7)
+    labels = hierarchy(333, (3, 7, 20), rng)
+    layers = tuple(k.astype(np.int32) for k in labels), tuple(starts_of(k) for k in labels)
+    state = gaussians(*(rng.normal(size=(333, *shape)).astype(np.float32) for shape in ((3,), (3, 3))))
+    g_means, g_factors = (rng.normal(size=(333, *shape)).astype(np.float32) for shape in ((3,), (3, 3)))
+    bound = np.full((333, 3), 0.08, np.float32)
+    parameters = [(0.2 * rng.normal(size=(size, 10))).astype(np.float32) for size in (3, 7, 20)]
+    more = [(0.1 * rng.normal(size=(size, 10))).astype(np.float32) for size in (3, 7, 20)]
+
+    def found(rests: Sequence[int]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """After each change of what goes on, with so many layers at rest; the last layers' gradients with it."""
+        model = CpuDeformation(Hierarchy(np.arange(333), *layers), None, bound, kind)
+        model.start(state)
+        outputs, gradients = list[np.ndarray](), list[np.ndarray]()
+        for table, values in zip(model.clusters, parameters, strict=True):
+            table[:] = values
+        model.forward()
+        for going, resting in zip((0, 1, 2, 0), rests, strict=True):
+            model.rest(resting)
+            for table, values in zip(model.clusters[going:], more[going:], strict=True):
+                table += values
+            model.forward()
+            outputs += [model.means.copy(), model.factors.copy(), model.turns.copy()]
+            model.backward(g_means, g_factors, 0.1)
+            gradients += [model.delta_gradients.copy(), *(one.copy() for one in model.cluster_gradients[going:])]
+        return outputs, gradients
+
+    for resting, going in zip(found((0, 1, 2, 0)), found((0, 0, 0, 0)), strict=True):
+        for one, other in zip(resting, going, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_the_last_layer_does_not_rest() -> None:
+    labels = np.zeros(5, np.int32)
+    model = CpuDeformation(Hierarchy(np.arange(5), (labels,), (starts_of(labels),)), None, np.ones((5, 3)), "centred")
+    with pytest.raises(ValueError, match="1 of 1 layers cannot rest"):
+        model.rest(1)

@@ -25,7 +25,7 @@ from scas4d_core.torch_backend import deformation
 from scas4d_core.torch_backend import update as update_torch
 from scas4d_core.torch_backend.arrays import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchView
 from scas4d_core.torch_backend.update import TorchUpdate
-from scas4d_core.update.schedule import Rates
+from scas4d_core.update.rates import Rates
 
 MOVING, STANDING, NEAREST = 24, 6, 4
 CLOSE = 1e-9

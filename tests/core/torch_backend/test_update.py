@@ -14,7 +14,7 @@ from scas4d_core.torch_backend import losses
 from scas4d_core.torch_backend.arrays import Graph, TermWeights, TorchResult, TorchView
 from scas4d_core.torch_backend.deformation import quaternion_matrices, quaternion_product, rotation_quaternions
 from scas4d_core.torch_backend.update import TorchUpdate
-from scas4d_core.update.schedule import Rates
+from scas4d_core.update.rates import Rates
 
 MOVING, STANDING = 40, 8
 SHIFT = np.array([0.03, 0.02, -0.02])

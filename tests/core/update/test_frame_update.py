@@ -22,12 +22,13 @@ from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours
 from scas4d_core.torch_backend import arrays
 from scas4d_core.torch_backend import update as update_torch
-from scas4d_core.update import schedule
+from scas4d_core.update import rates, schedule
 from scas4d_core.update.deformation import MAX_SCALE, CpuDeformation
 from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory, view_order
+from scas4d_core.update.rates import Adam, Rates
 from scas4d_core.update.result import REPORT, AttemptOptions, Stopwatch, UpdateResult
-from scas4d_core.update.schedule import Adam, Rates, Stopping, ViewPlan, plan_samples
+from scas4d_core.update.schedule import Stopping, ViewPlan, plan_samples
 
 BEFORE = make_box()
 AFTER = moved(BEFORE)
@@ -277,6 +278,7 @@ def test_motion_is_found_with_a_separate_covariance() -> None:
 
 def agrees_with_the_twin(changes: dict[str, Any], masks: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(schedule, "NEIGHBOUR_SAMPLE", 150)
+    monkeypatch.setattr(rates, "LAYER_RESTS", (1.0,))  # the last iteration has gradients of all layers
     settings = SETTINGS.model_copy(update=changes)
     fused = Iteration(settings, monkeypatch, masks, count=6)
     _, gradients = twin_iteration(fused, settings, masks)
@@ -416,7 +418,7 @@ def test_deformation_starts_from_what_it_is_given() -> None:
 
 
 def test_a_layer_that_begins_late_stays_where_it_was_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(schedule, "LAYER_STARTS", (0.0, 0.5, 0.5))
+    monkeypatch.setattr(rates, "LAYER_STARTS", (0.0, 0.5, 0.5))
     settings = SETTINGS.model_copy(update={"own_start": 0.5, "iterations": 3})
     updater, views = prepare(settings)
     seen: list[list[np.ndarray]] = []

@@ -14,7 +14,7 @@ from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.update.schedule import Rates
+from scas4d_core.update.rates import Rates
 
 RIG = make_rig()
 BOX = make_box().replace(colours=np.random.default_rng(1).uniform(0.2, 0.6, (448, 3)).astype(np.float32))

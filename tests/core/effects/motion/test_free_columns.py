@@ -22,8 +22,8 @@ from scas4d_core.torch_backend.device_update import DeviceUpdate
 from scas4d_core.update import frame_update
 from scas4d_core.update.deformation import CpuDeformation
 from scas4d_core.update.frame_update import FrameUpdate
+from scas4d_core.update.rates import Adam, Rates
 from scas4d_core.update.result import AS_SET, AttemptOptions, UpdateResult
-from scas4d_core.update.schedule import Adam, Rates
 from scas4d_core.update.warm_start import Motion
 
 COLUMNS = {
@@ -75,8 +75,8 @@ def found_motion() -> Motion:
 class PlainTable:
     """A table as the loop stepped it before: Adam over all columns, those of rate 0 included."""
 
-    def __init__(self, table: np.ndarray, gradients: np.ndarray, columns: list[float], plan: Rates, start: float):
-        self._adam, self._gradients = Adam(table, columns, plan, start), gradients
+    def __init__(self, table: np.ndarray, gradients: np.ndarray, columns: list[float], plan: Rates, *times: float):
+        self._adam, self._gradients = Adam(table, columns, plan, *times), gradients
         self.guards = self._adam.guards
 
     def step(self, iteration: int, planned: int) -> None:
@@ -86,10 +86,10 @@ class PlainTable:
 def plain_tables(deformation: CpuDeformation, rates: Rates) -> list[PlainTable]:
     columns = [[r] * 3 + [t] * 3 + [scaling] * 4 for r, t, scaling in rates.layers]
     columns.append([rates.position] * 3 + [rates.rotation] * 3 + [rates.scale] * 3)
-    starts = [*(rates.start_of(layer) for layer in range(len(rates.layers))), rates.start]
+    layers = [(rates.start_of(layer), rates.rest_of(layer)) for layer in range(len(rates.layers))]
     tables, gradients = [*deformation.clusters, deformation.deltas], deformation.cluster_gradients
-    given = zip(tables, [*gradients, deformation.delta_gradients], columns, starts, strict=True)
-    return [PlainTable(table, g, column, rates, start) for table, g, column, start in given]
+    given = zip(tables, [*gradients, deformation.delta_gradients], columns, [*layers, (rates.start,)], strict=True)
+    return [PlainTable(table, g, column, rates, *times) for table, g, column, times in given]
 
 
 @pytest.mark.parametrize("off", [(), ("cluster_scaling", "own_rotation"), MOVES[3:], MOVES[:3]], ids=str)
@@ -142,7 +142,7 @@ def test_torch_obeys_the_same_freedoms() -> None:
     ties = ("rigidity", "isometry", "rotation")
     off = without("cluster_rotation", "own_position", *ties)
     on_cpu, on_device = run(updater(off, update)), run(updater(off, update, DeviceUpdate, device="cpu"))
-    np.testing.assert_allclose(on_device.trace.losses, on_cpu.trace.losses, rtol=1e-4)
+    np.testing.assert_allclose(on_device.trace.losses, on_cpu.trace.losses, rtol=2e-4)
     apart = np.linalg.norm(on_device.gaussians.means - on_cpu.gaussians.means, axis=1)[:MOVING]
     free = run(updater(without(*ties), update)).gaussians.means
     assert np.median(apart) < 0.05 * np.median(np.linalg.norm(free - on_cpu.gaussians.means, axis=1)[:MOVING])

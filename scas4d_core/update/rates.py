@@ -1,0 +1,181 @@
+"""Rates of an update, the same on every device: what each parameter learns by, and when; Adam's step.
+
+The coarse motion is found first. A layer of clusters begins once those above it have begun, and comes to rest before
+those below it do: what it still shakes by, from view to view, would be a motion of thousands of Gaussians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import cos, pi
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.guards import GuardCounts
+from scas4d_core.kernels.adam import ACTED, EVERY_ROW, adam
+
+if TYPE_CHECKING:
+    from scas4d_core.settings import UpdateSettings
+
+Array = NDArray[np.float32]
+
+STANDARD_RADIUS_M = 4.0
+"""The scene radius for which the translation rates of the layers are given."""
+
+
+LAYER_STARTS = (0.0, 0.2, 0.4)
+"""Share of the iterations after which a layer begins to learn, coarse to fine; with more layers the last is repeated.
+The coarse motion is found first: all at once, the finer layers take a part of it, each cluster another."""
+
+LAYER_RESTS = (0.5, 0.75, 1.0)
+"""Share of the iterations after which a layer rests, coarse to fine; of fewer layers the last ones, of more the first
+is repeated. All to the end cost 0.1 to 0.6 dB, while 0.4 to 0.6 and 0.7 to 0.8 came out alike (docs/method.md)."""
+
+
+def first_iteration(start: float, iterations: int) -> int:
+    """Number of the iteration, from 0, in which what begins after a share ``start`` of all takes its first step."""
+    return round(start * iterations)
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's rates per iteration; a rate of 0 leaves the parameter where it starts.
+
+    Attributes:
+        layers: (rotation r, translation t in metres, scaling c and s), one a layer, coarse to fine.
+        position, rotation, scale, colour: of Δp in metres, ΔR, Δs, RGB of moving. colour_standing: RGB of the rest.
+        end: rates fall to this fraction in the last iteration before what they are of rests, or the update ends, along
+            half a cosine; 1 keeps them.
+        beta1, beta2: Adam's decays.
+        starts: share of the iterations after which a layer begins, one a layer; what is missing begins at once.
+        rests: share of the iterations after which it rests; what is missing goes on to the end.
+        start: as ``starts``, of the Gaussians' own Δp, ΔR, Δs.
+    """
+
+    layers: tuple[tuple[float, float, float], ...]
+    position: float
+    rotation: float
+    scale: float
+    colour: float
+    colour_standing: float = 0.0
+    end: float = 1.0
+    beta1: float = 0.9
+    beta2: float = 0.999
+    starts: tuple[float, ...] = ()
+    rests: tuple[float, ...] = ()
+    start: float = 0.0
+
+    def factor(self, iteration: int, iterations: int, start: float = 0.0, rest: float = 1.0) -> float:
+        """Share of the rates in an iteration counted from 0, of what learns from one share of all to another; else 0.
+
+        It learns for one iteration at least.
+
+        >>> rates = Rates((), 0, 0, 0, 0, end=0.2)
+        >>> [round(rates.factor(i, 8, 0.25, 0.75), 2) for i in range(8)]
+        [0.0, 0.0, 1.0, 0.8, 0.4, 0.2, 0.0, 0.0]
+        """
+        first = first_iteration(start, iterations)
+        last = max(first, first_iteration(rest, iterations) - 1)
+        if not first <= iteration <= last:
+            return 0.0
+        done = (iteration - first) / max(1, last - first)
+        return self.end + (1 - self.end) * 0.5 * (1 + cos(pi * done))
+
+    def start_of(self, layer: int) -> float:
+        """Share of the iterations after which a layer begins."""
+        return self.starts[layer] if layer < len(self.starts) else 0.0
+
+    def rest_of(self, layer: int) -> float:
+        """Share of the iterations after which a layer rests; 1 where it goes on to the end."""
+        return self.rests[layer] if layer < len(self.rests) else 1.0
+
+    def resting(self, iteration: int, iterations: int) -> int:
+        """Number of layers, from the coarsest on, that do not learn any more in an iteration counted from 0."""
+        learns = (
+            iteration < max(first_iteration(start, iterations) + 1, first_iteration(rest, iterations))
+            for start, rest in ((self.start_of(k), self.rest_of(k)) for k in range(len(self.rests)))
+        )
+        return next((k for k, one in enumerate(learns) if one), len(self.rests))
+
+    def hurried(self, factor: float) -> Rates:
+        """Layers that turn and shift faster: where there is no motion to start from there is further to go."""
+        return replace(self, layers=tuple((factor * r, factor * t, scaling) for r, t, scaling in self.layers))
+
+    def tried(self, factor: float, rigid: bool, hold_colours: bool) -> Rates:
+        """All rates times a factor; ``rigid``: of clusters that turn and shift only; ``hold_colours``: colours stay."""
+        if (factor, rigid, hold_colours) == (1.0, False, False):
+            return self
+        own = 0.0 if rigid else factor
+        return replace(
+            self,
+            layers=tuple((factor * r, factor * t, own * scaling) for r, t, scaling in self.layers),
+            position=own * self.position,
+            rotation=own * self.rotation,
+            scale=own * self.scale,
+            colour=0.0 if hold_colours else factor * self.colour,
+            colour_standing=0.0 if hold_colours else factor * self.colour_standing,
+        )
+
+    @classmethod
+    def of(cls, settings: UpdateSettings, layers: int, radius: float) -> Rates:
+        """The rates of a scene whose cameras reach ``radius`` metres (``Rig.reach``), for so many layers."""
+        named = [settings.layer_rates[min(k, len(settings.layer_rates) - 1)] for k in range(layers)]
+        return cls(
+            layers=tuple((r.rotation, r.translation * radius / STANDARD_RADIUS_M, r.scaling) for r in named),
+            position=settings.rate_position * radius,
+            rotation=settings.rate_rotation,
+            scale=settings.rate_scale,
+            colour=settings.rate_colour,
+            colour_standing=settings.rate_colour_standing,
+            end=settings.rate_end,
+            beta1=settings.beta1,
+            beta2=settings.beta2,
+            starts=tuple(LAYER_STARTS[min(k, len(LAYER_STARTS) - 1)] for k in range(layers)),
+            rests=tuple(LAYER_RESTS[max(k - layers, -len(LAYER_RESTS))] for k in range(layers)),
+            start=settings.own_start,
+        )
+
+
+def all_begun(settings: UpdateSettings) -> float:
+    """Share of the iterations after which every layer and the Gaussians' own deltas learn."""
+    return max(settings.own_start, *LAYER_STARTS)
+
+
+class Adam:
+    """Adam over one table of parameters, with a rate per column, times one per row where given.
+
+    It steps from a share ``start`` of the iterations to a share ``rest`` and leaves the table alone before and after.
+    ``guards`` counts how often each guard of the step acted.
+    """
+
+    def __init__(
+        self,
+        parameters: Array,
+        columns: list[float],
+        rates: Rates,
+        start: float = 0.0,
+        rest: float = 1.0,
+        by_row: Array = EVERY_ROW,
+    ) -> None:
+        self._parameters = parameters
+        self._by_row = by_row
+        self._first, self._second = np.zeros_like(parameters), np.zeros_like(parameters)
+        self._plan, self._start, self._rest = rates, start, rest
+        self._rates = np.array(columns, np.float32)
+        self._beta1, self._beta2 = np.float32(rates.beta1), np.float32(rates.beta2)
+        self._steps = 0
+        self.guards = GuardCounts(*ACTED)
+
+    def step(self, gradients: Array, iteration: int, iterations: int) -> None:
+        """Take the step of an iteration, counted from 0."""
+        factor = self._plan.factor(iteration, iterations, self._start, self._rest)
+        if factor == 0:
+            return
+        self._steps += 1
+        acted = adam(
+            self._parameters, gradients, self._first, self._second, self._rates * np.float32(factor), self._by_row,
+            self._beta1, self._beta2, self._steps,
+        )  # fmt: skip
+        self.guards.add(ACTED, acted)
