@@ -106,7 +106,9 @@ def _reconstruct_a_ball() -> None:
     rig = _rig()
     points = _points()
     for masked, covariance in ((True, "entangled"), (False, "separate")):
-        update = settings.update.model_copy(update={"iterations": 4, "covariance": covariance})
+        # Several layers: those that rest have a kernel of their own.
+        changes = {"iterations": 4, "covariance": covariance, "clusters": (2, 8, 32)}
+        update = settings.update.model_copy(update=changes)
         settings = settings.model_copy(update={"update": update})
         reconstruction = Reconstruction.start(rig, _frame(rig, 0, masked), settings, points=points)
         for index in (1, 2):

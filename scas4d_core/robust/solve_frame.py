@@ -203,6 +203,7 @@ class FrameSolver:
             gate=(lambda first: outliers.misfits(past, first, outliers.FIRST_DB)) if settings.judge else None,
             compare=settings.judge or settings.stop_gain > 0,
             enough=enough if settings.still > -1 and template is AS_SET else None,
+            usual=past.error,
             step=given.step if given.step < given.seconds else None,
         )
 

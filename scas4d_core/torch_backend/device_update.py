@@ -129,8 +129,8 @@ class DeviceUpdate:
         probes = ProbeViews(self._factory, self._picture, views if options.compare else [])
         best = BestState(probes, deformation, previous, motion, seconds, settings.momentum)
         best.start(options.step)
-        rates = self._update.rates.tried(options.rates, options.rigid, options.hold_colours)
-        rates = rates.hurried(settings.cold_start) if motion is None else rates
+        hurry = settings.cold_start if motion is None else 1.0
+        rates = self._update.rates.of_attempt(options, hurry, best.unexplained(options.usual))
         work = Work(previous, deformation, rates, views, self._picture, dict(carried))
         for begin in self._hooks.start:
             begin(work)

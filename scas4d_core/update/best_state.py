@@ -169,6 +169,21 @@ class BestState:
         names = sorted(still.keys() & enough.keys())
         return bool(names) and mean_error(still, names) <= mean_error(enough, names)
 
+    def unexplained(self, usual: Mapping[str, float] | None) -> float:
+        """Share of what changed since Θ_{t−1} that the motion before leaves: about 0 to 1, and 1 where none is told.
+
+        What stands is met no better by any motion; ``usual``, errors ``by_size`` of updates at their end, takes it out.
+        """
+        still, warm = (self.errors.get(candidate) for candidate in (Candidate.STILL, Candidate.WARM))
+        if still is None or warm is None or not usual:
+            return 1.0
+        names = sorted(by_size(still, self.whole).keys() & usual.keys())
+        if not names:
+            return 1.0
+        unmoved, led = (mean_error(by_size(errors, self.whole), names) for errors in (still, warm))
+        met = mean_error(usual, names)
+        return (led - met) / (unmoved - met) if unmoved > met else 1.0
+
     def error(self, look: Gaussians) -> float:
         """Mean error on the probe views of the deformation as it is set, with its cascade brought up to date.
 

@@ -121,7 +121,8 @@ class FrameUpdate:
         probes = ProbeViews(self._factory, self._picture, views if options.compare else [])
         best = BestState(probes, deformation, previous, motion, seconds, settings.momentum)
         best.start(options.step)
-        rates = self._attempted(options, cold=motion is None)
+        hurry = settings.cold_start if motion is None else 1.0  # without a motion to start from there is further to go
+        rates = self._rates.of_attempt(options, hurry, best.unexplained(options.usual))
         work = Work(previous, deformation, rates, views, self._picture, dict(carried))
         work.tells = self.tells
         tables = free_tables(deformation, work.rates)
@@ -173,11 +174,6 @@ class FrameUpdate:
         watch.lap("commit")
         trace.seconds = watch.seconds
         return UpdateResult(state, found, trace, carried=work.carried, views=views)
-
-    def _attempted(self, options: AttemptOptions, cold: bool) -> Rates:
-        """The rates of an attempt; without a motion to start from there is further to go."""
-        rates = self._rates.tried(options.rates, options.rigid, options.hold_colours)
-        return rates.hurried(self.settings.cold_start if cold else 1.0)
 
     def _pictures(
         self, views: list[TrainingView], work: Work, trace: UpdateTrace, watch: Stopwatch, left: int

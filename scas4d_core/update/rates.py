@@ -1,7 +1,8 @@
 """Rates of an update, the same on every device: what each parameter learns by, and when; Adam's step.
 
-The coarse motion is found first. A layer of clusters begins once those above it have begun, and comes to rest before
-those below it do: what it still shakes by, from view to view, would be a motion of thousands of Gaussians.
+The coarse motion is found first. A layer of clusters begins once those above it have begun. Where the motion before
+leads near what a frame shows, it rests before those below it do: what it still shakes by, from view to view, would be a
+motion of thousands of Gaussians. Where there is further to go, all learn to the end.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from scas4d_core.kernels.adam import ACTED, EVERY_ROW, adam
 
 if TYPE_CHECKING:
     from scas4d_core.settings import UpdateSettings
+    from scas4d_core.update.result import AttemptOptions
 
 Array = NDArray[np.float32]
 
@@ -31,7 +33,10 @@ The coarse motion is found first: all at once, the finer layers take a part of i
 
 LAYER_RESTS = (0.5, 0.75, 1.0)
 """Share of the iterations after which a layer rests, coarse to fine; of fewer layers the last ones, of more the first
-is repeated. All to the end cost 0.1 to 0.6 dB, while 0.4 to 0.6 and 0.7 to 0.8 came out alike (docs/method.md)."""
+is repeated. 0.4 to 0.6 and 0.7 to 0.8 came out alike (docs/method.md)."""
+NEAR = 0.6
+"""Share of what changed that the motion before may leave unexplained, where layers rest. Where every second frame was
+left out it left 0.55 and more, and layers that rested cost 0.4 to 0.8 dB, up to 5 in a first update."""
 
 
 def first_iteration(start: float, iterations: int) -> int:
@@ -102,6 +107,15 @@ class Rates:
     def hurried(self, factor: float) -> Rates:
         """Layers that turn and shift faster: where there is no motion to start from there is further to go."""
         return replace(self, layers=tuple((factor * r, factor * t, scaling) for r, t, scaling in self.layers))
+
+    def of_attempt(self, options: AttemptOptions, hurry: float, unexplained: float) -> Rates:
+        """The rates of an attempt.
+
+        Args:
+            hurry: see ``hurried``. unexplained: share of what changed that the start leaves, see ``NEAR``.
+        """
+        rates = self.tried(options.rates, options.rigid, options.hold_colours).hurried(hurry)
+        return rates if unexplained <= NEAR else replace(rates, rests=())
 
     def tried(self, factor: float, rigid: bool, hold_colours: bool) -> Rates:
         """All rates times a factor; ``rigid``: of clusters that turn and shift only; ``hold_colours``: colours stay."""
