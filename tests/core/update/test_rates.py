@@ -1,0 +1,81 @@
+"""When layers begin and rest, and what decides whether they do."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from scas4d_core.frame_outcome import Candidate
+from scas4d_core.settings import UpdateSettings
+from scas4d_core.update.best_state import BestState
+from scas4d_core.update.rates import LAYER_RESTS, NEAR, Rates
+from scas4d_core.update.result import AttemptOptions
+
+
+def rates(layers: int = 3) -> Rates:
+    return Rates.of(UpdateSettings(), layers, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("layers", "rests"),
+    [(0, ()), (1, (1.0,)), (2, (0.75, 1.0)), (3, LAYER_RESTS), (5, (0.5, 0.5, 0.5, 0.75, 1.0))],
+)
+def test_the_finest_layer_learns_to_the_end_and_those_above_rest_before(layers: int, rests: tuple[float, ...]) -> None:
+    assert rates(layers).rests == rests
+
+
+def test_layers_rest_from_the_coarsest_on_and_the_last_one_never() -> None:
+    found = [rates().resting(iteration, 20) for iteration in range(20)]
+    assert found == [0] * 10 + [1] * 5 + [2] * 5
+    for iterations in (1, 2, 3, 7):
+        counts = [rates().resting(iteration, iterations) for iteration in range(iterations)]
+        assert counts == sorted(counts)
+        assert counts[0] == 0
+        assert counts[-1] < 3
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 3, 7, 20, 100])
+def test_a_layer_has_a_rate_until_it_rests_and_at_least_once(iterations: int) -> None:
+    for layer in range(3):
+        times = rates().start_of(layer), rates().rest_of(layer)
+        learns = [rates().factor(iteration, iterations, *times) > 0 for iteration in range(iterations)]
+        assert any(learns) or round(times[0] * iterations) >= iterations
+        for iteration, one in enumerate(learns):
+            assert not (one and rates().resting(iteration, iterations) > layer)
+
+
+def test_layers_rest_where_the_motion_before_leads_near_and_nowhere_else() -> None:
+    options = AttemptOptions(rates=0.5)
+    near, far = (rates().of_attempt(options, 2.0, unexplained) for unexplained in (NEAR, NEAR + 0.01))
+    assert near.rests == LAYER_RESTS
+    assert far.rests == ()
+    assert far.resting(99, 100) == 0
+    assert near.layers == far.layers
+    assert near.layers[0][0] == pytest.approx(rates().layers[0][0])  # half of it, twice
+
+
+@pytest.mark.parametrize(
+    ("still", "warm", "usual", "share"),
+    [
+        (0.5, 0.2, 0.1, 0.25),
+        (0.5, 0.6, 0.1, 1.25),
+        (0.5, 0.05, 0.1, -0.125),
+        (0.1, 0.1, 0.1, 1.0),  # nothing changed: nothing tells
+        (0.5, None, 0.1, 1.0),
+        (0.5, 0.2, None, 1.0),
+    ],
+)
+def test_what_the_motion_before_leaves_is_a_share_of_what_changed(
+    still: float, warm: float | None, usual: float | None, share: float
+) -> None:
+    probes: Any = SimpleNamespace(whole=False)
+    best = BestState(probes, *[None] * 3, 1.0, 0.0)  # type: ignore[arg-type]
+    best.errors = {Candidate.STILL: {"a": still, "b": still}}
+    if warm is not None:
+        best.errors[Candidate.WARM] = {"a": warm, "b": warm}
+    known = None if usual is None else {"a": usual, "b": usual, "c": 9.0}
+    assert best.unexplained(known) == pytest.approx(share)
+    assert best.unexplained({"c": 0.1}) == 1.0
+    assert best.unexplained({"a whole": 0.1}) == 1.0  # those of whole pictures are no measure of small ones
