@@ -130,7 +130,8 @@ class DeviceUpdate:
         best = BestState(probes, deformation, previous, motion, seconds, settings.momentum)
         best.start(options.step)
         hurry = settings.cold_start if motion is None else 1.0
-        rates = self._update.rates.of_attempt(options, hurry, best.unexplained(options.usual))
+        rates = self._update.rates.tried(options.rates, options.rigid, options.hold_colours).hurried(hurry)
+        rates = rates.led(best.unexplained(options.usual))
         work = Work(previous, deformation, rates, views, self._picture, dict(carried))
         for begin in self._hooks.start:
             begin(work)

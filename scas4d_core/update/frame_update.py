@@ -122,7 +122,8 @@ class FrameUpdate:
         best = BestState(probes, deformation, previous, motion, seconds, settings.momentum)
         best.start(options.step)
         hurry = settings.cold_start if motion is None else 1.0  # without a motion to start from there is further to go
-        rates = self._rates.of_attempt(options, hurry, best.unexplained(options.usual))
+        rates = self._rates.tried(options.rates, options.rigid, options.hold_colours).hurried(hurry)
+        rates = rates.led(best.unexplained(options.usual))
         work = Work(previous, deformation, rates, views, self._picture, dict(carried))
         work.tells = self.tells
         tables = free_tables(deformation, work.rates)

@@ -19,7 +19,6 @@ from scas4d_core.kernels.adam import ACTED, EVERY_ROW, adam
 
 if TYPE_CHECKING:
     from scas4d_core.settings import UpdateSettings
-    from scas4d_core.update.result import AttemptOptions
 
 Array = NDArray[np.float32]
 
@@ -108,14 +107,9 @@ class Rates:
         """Layers that turn and shift faster: where there is no motion to start from there is further to go."""
         return replace(self, layers=tuple((factor * r, factor * t, scaling) for r, t, scaling in self.layers))
 
-    def of_attempt(self, options: AttemptOptions, hurry: float, unexplained: float) -> Rates:
-        """The rates of an attempt.
-
-        Args:
-            hurry: see ``hurried``. unexplained: share of what changed that the start leaves, see ``NEAR``.
-        """
-        rates = self.tried(options.rates, options.rigid, options.hold_colours).hurried(hurry)
-        return rates if unexplained <= NEAR else replace(rates, rests=())
+    def led(self, unexplained: float) -> Rates:
+        """With no layer that rests, unless the start leaves little of what changed unexplained: at most ``NEAR``."""
+        return self if unexplained <= NEAR else replace(self, rests=())
 
     def tried(self, factor: float, rigid: bool, hold_colours: bool) -> Rates:
         """All rates times a factor; ``rigid``: of clusters that turn and shift only; ``hold_colours``: colours stay."""

@@ -11,7 +11,6 @@ from scas4d_core.frame_outcome import Candidate
 from scas4d_core.settings import UpdateSettings
 from scas4d_core.update.best_state import BestState
 from scas4d_core.update.rates import LAYER_RESTS, NEAR, Rates
-from scas4d_core.update.result import AttemptOptions
 
 
 def rates(layers: int = 3) -> Rates:
@@ -47,13 +46,11 @@ def test_a_layer_has_a_rate_until_it_rests_and_at_least_once(iterations: int) ->
 
 
 def test_layers_rest_where_the_motion_before_leads_near_and_nowhere_else() -> None:
-    options = AttemptOptions(rates=0.5)
-    near, far = (rates().of_attempt(options, 2.0, unexplained) for unexplained in (NEAR, NEAR + 0.01))
+    near, far = (rates().led(unexplained) for unexplained in (NEAR, NEAR + 0.01))
     assert near.rests == LAYER_RESTS
     assert far.rests == ()
     assert far.resting(99, 100) == 0
     assert near.layers == far.layers
-    assert near.layers[0][0] == pytest.approx(rates().layers[0][0])  # half of it, twice
 
 
 @pytest.mark.parametrize(
