@@ -60,7 +60,6 @@ PRESETS: dict[str, Settings] = {
         update=UpdateSettings(
             clusters=(),
             own_start=0.0,
-            rate_position=1.6e-4,
             rate_rotation=0.001,
             rate_scale=0.0,
             rate_end=1.0,

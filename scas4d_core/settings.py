@@ -284,14 +284,14 @@ class UpdateSettings(SettingsModel):
     own_start: Share = Field(
         0.4,
         description="Share of the iterations after which each Gaussian's own Δp, ΔR and Δs begin to learn; the layers "
-        "of clusters begin one after the other before, and rest one after the other.",
+        "of clusters begin one after the other before.",
     )
     cold_longer: Positive = Field(3.0, description="Factor on the iterations where there is no motion to start from.")
     cold_start: float = Field(
         2.0, ge=1, description="Factor on the layers' rates where there is no motion to start from: further to go."
     )
-    rate_position: Positive = Field(3.2e-4, description="Δp, per metre of scene radius.")
-    rate_rotation: Positive = Field(0.004, description="ΔR, in units of tan(angle/2).")
+    rate_position: Positive = Field(1.6e-4, description="Δp, per metre of scene radius.")
+    rate_rotation: Positive = Field(0.002, description="ΔR, in units of tan(angle/2).")
     rate_scale: NotNegative = Field(0.001, description="Δs, log.")
     rate_colour: NotNegative = Field(0.0025, description="RGB of the Gaussians that move.")
     rate_colour_standing: NotNegative = Field(
@@ -299,7 +299,10 @@ class UpdateSettings(SettingsModel):
         description="RGB of the Gaussians that stand, where standing_colour is on; with 0 they keep their colours.",
     )
     rate_end: float = Field(
-        0.05, gt=0, le=1, description="All rates decay to this fraction over the frame (cosine); 1: constant."
+        0.05,
+        gt=0,
+        le=1,
+        description="Rates decay to this fraction over the frame, or until a layer rests (cosine); 1: constant.",
     )
     beta1: float = Field(0.8, ge=0, lt=1, description="Adam's first decay.")
     beta2: Share = Field(0.95, description="Adam's second decay; 100 iterations are too few for the usual 0.999.")
