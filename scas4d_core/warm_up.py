@@ -14,7 +14,7 @@ import numpy as np
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import Frame, InitialPoints
-from scas4d_core.settings import Settings
+from scas4d_core.settings import Settings, UpdateSettings
 
 SIZE, BALL_M = 32, 0.4
 
@@ -106,17 +106,31 @@ def _reconstruct_a_ball() -> None:
     rig = _rig()
     points = _points()
     for masked, covariance in ((True, "entangled"), (False, "separate")):
-        # Several layers: those that rest have a kernel of their own.
-        changes = {"iterations": 4, "covariance": covariance, "clusters": (2, 8, 32)}
-        update = settings.update.model_copy(update=changes)
+        update = settings.update.model_copy(update={"iterations": 4, "covariance": covariance})
         settings = settings.model_copy(update={"update": update})
         reconstruction = Reconstruction.start(rig, _frame(rig, 0, masked), settings, points=points)
         for index in (1, 2):
             reconstruction.step(_frame(rig, index, masked))
+        _let_a_layer_rest(update)
         camera = rig.cameras[0]
         reconstruction.render(camera)
         reconstruction.tracks_of_pixels(camera, np.array([[SIZE / 2, SIZE / 2]]), 0, [0, 1])
         reconstruction.parts(2)
+
+
+def _let_a_layer_rest(settings: UpdateSettings) -> None:
+    """It has a kernel of its own, and none of the ball's layers need rest."""
+    from scas4d_core.gaussians import Gaussians
+    from scas4d_core.structure.hierarchy import build_hierarchy
+    from scas4d_core.update.deformation import CpuDeformation, length_bounds
+
+    points = _points()
+    ball = Gaussians.of_points(points.positions, radius=0.01, colours=points.colours)
+    hierarchy = build_hierarchy(ball.means, np.ones(len(ball), bool), (1, 2), 1)
+    bounds = length_bounds(hierarchy, ball)
+    deformation = CpuDeformation(hierarchy, None, bounds, settings.cluster_map, settings.covariance)
+    deformation.start(ball)
+    deformation.rest(1)
 
 
 def _rig() -> Rig:

@@ -131,7 +131,7 @@ class DeviceUpdate:
         best.start(options.step)
         hurry = settings.cold_start if motion is None else 1.0
         rates = self._update.rates.tried(options.rates, options.rigid, options.hold_colours).hurried(hurry)
-        rates = rates.led(best.unexplained(options.usual))
+        rates = rates.resting_if_near(best.unexplained(options.usual))
         work = Work(previous, deformation, rates, views, self._picture, dict(carried))
         for begin in self._hooks.start:
             begin(work)
@@ -163,6 +163,7 @@ class DeviceUpdate:
         trace.losses, trace.psnr, trace.planned = found.losses, found.psnr, stopping.planned_so_far
         trace.cameras = {view.name: camera_fit(psnr) for view, psnr in zip(chain(*pictures), found.psnr, strict=False)}
         _take(deformation, Tables.of(hierarchy, found))
+        deformation.forward()
         trace.errors, trace.whole = best.errors, best.whole
         trace.kept = best.end(found.gaussians, trace.iterations, {})
         watch.lap("end")

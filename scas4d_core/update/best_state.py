@@ -170,7 +170,9 @@ class BestState:
         return bool(names) and mean_error(still, names) <= mean_error(enough, names)
 
     def unexplained(self, usual: Mapping[str, float] | None) -> float:
-        """Share of what changed since Θ_{t−1} that the motion before leaves: about 0 to 1, and 1 where none is told.
+        """Share of what changed since Θ_{t−1} that the motion before leaves: about 0 to 1.
+
+        1 where nothing is compared, there was no motion before, or nothing changed.
 
         What stands is met no better by any motion; ``usual``, errors ``by_size`` of updates at their end, takes it out.
         """

@@ -125,7 +125,7 @@ class CpuDeformation:
         entering = self._before.reshape(-1, CARRIED // COUNT, COUNT)
         entering[:, :9] = np.swapaxes(factors[self._rows].reshape(*self._rows.shape, 9), 1, 2)
         block_sums(self._points, self._present, self._sums)
-        self.rest(0)
+        self._none_rests()
         self.means = previous.means.copy()
         self.factors = previous.factors.copy()
 
@@ -156,14 +156,17 @@ class CpuDeformation:
         """
         if layers and layers >= len(self.clusters):
             raise ValueError(f"{layers} of {len(self.clusters)} layers cannot rest: the last one goes on")
-        if layers < self._resting or layers == 0:
-            self._entering[:], self._resting = self._before, 0
+        if layers < self._resting:
+            self._none_rests()
         for layer in range(self._resting, layers):
             settle(
                 layer, self._parameters, self._offsets, self._ranges, self._clusters_of, self._present, self._entering,
                 self._about_origin, self._separate, self._points, self._sums, self._tables,
             )  # fmt: skip
         self._resting = layers
+
+    def _none_rests(self) -> None:
+        self._entering[:], self._resting = self._before, 0
 
     def forward(self) -> None:
         """Equations (5) to (7): fill ``means``, ``factors`` and ``turns``."""

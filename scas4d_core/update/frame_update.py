@@ -123,12 +123,12 @@ class FrameUpdate:
         best.start(options.step)
         hurry = settings.cold_start if motion is None else 1.0  # without a motion to start from there is further to go
         rates = self._rates.tried(options.rates, options.rigid, options.hold_colours).hurried(hurry)
-        rates = rates.led(best.unexplained(options.usual))
+        rates = rates.resting_if_near(best.unexplained(options.usual))
         work = Work(previous, deformation, rates, views, self._picture, dict(carried))
         work.tells = self.tells
-        tables = free_tables(deformation, work.rates)
         for start in self._hooks.start:
             start(work)
+        tables = free_tables(deformation, work.rates)  # a hook may have set where the layers start
         if not self._follows and best.stands(options.enough):
             stopping = Stopping(0)
         watch.lap("start")

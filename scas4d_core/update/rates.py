@@ -32,10 +32,12 @@ The coarse motion is found first: all at once, the finer layers take a part of i
 
 LAYER_RESTS = (0.5, 0.75, 1.0)
 """Share of the iterations after which a layer rests, coarse to fine; of fewer layers the last ones, of more the first
-is repeated. 0.4 to 0.6 and 0.7 to 0.8 came out alike (docs/method.md)."""
+is repeated. 0.5 to 0.6 and 0.7 to 0.8 came out alike (docs/method.md)."""
+LEAST_TIME = 0.3
+"""Share of the iterations that a layer has at least before it rests."""
 NEAR = 0.6
-"""Share of what changed that the motion before may leave unexplained, where layers rest. Where every second frame was
-left out it left 0.55 and more, and layers that rested cost 0.4 to 0.8 dB, up to 5 in a first update."""
+"""Share of what changed that the motion before may leave unexplained, where layers rest. With every second frame left
+out it left about 0.55 to 1.2, and layers that always rested cost 0.6 to 3.4 dB (docs/method.md)."""
 
 
 def first_iteration(start: float, iterations: int) -> int:
@@ -107,7 +109,7 @@ class Rates:
         """Layers that turn and shift faster: where there is no motion to start from there is further to go."""
         return replace(self, layers=tuple((factor * r, factor * t, scaling) for r, t, scaling in self.layers))
 
-    def led(self, unexplained: float) -> Rates:
+    def resting_if_near(self, unexplained: float) -> Rates:
         """With no layer that rests, unless the start leaves little of what changed unexplained: at most ``NEAR``."""
         return self if unexplained <= NEAR else replace(self, rests=())
 
@@ -129,6 +131,7 @@ class Rates:
     @classmethod
     def of(cls, settings: UpdateSettings, layers: int, radius: float) -> Rates:
         """The rates of a scene whose cameras reach ``radius`` metres (``Rig.reach``), for so many layers."""
+        starts = tuple(LAYER_STARTS[min(k, len(LAYER_STARTS) - 1)] for k in range(layers))
         named = [settings.layer_rates[min(k, len(settings.layer_rates) - 1)] for k in range(layers)]
         return cls(
             layers=tuple((r.rotation, r.translation * radius / STANDARD_RADIUS_M, r.scaling) for r in named),
@@ -140,8 +143,11 @@ class Rates:
             end=settings.rate_end,
             beta1=settings.beta1,
             beta2=settings.beta2,
-            starts=tuple(LAYER_STARTS[min(k, len(LAYER_STARTS) - 1)] for k in range(layers)),
-            rests=tuple(LAYER_RESTS[max(k - layers, -len(LAYER_RESTS))] for k in range(layers)),
+            starts=starts,
+            rests=tuple(
+                min(1.0, max(LAYER_RESTS[max(k - layers, -len(LAYER_RESTS))], start + LEAST_TIME))
+                for k, start in enumerate(starts)
+            ),
             start=settings.own_start,
         )
 

@@ -76,7 +76,8 @@ def mask_weight(settings: UpdateSettings, moving: int, count: int) -> float:
 
 
 COOLING = 0.15
-"""Share of the iterations that follows the decision to stop: the rates fall to their end first."""
+"""Share of the iterations that follows the decision to stop: the rates fall to their end first, but of a layer that
+would rest by then already."""
 
 LOOK_EVERY = 10
 """Iterations between two looks at the probe views, where an update ends once it gains nothing."""

@@ -136,3 +136,12 @@ def test_the_kernels_of_either_covariance_are_compiled(monkeypatch, tmp_path):
     assert {masked for masked, _ in asked} == {True, False}
     assert {covariance for _, covariance in asked} == {"entangled", "separate"}
     assert (tmp_path / "warm").exists()
+
+
+def test_a_layer_that_rests_is_among_the_kernels_of_either_covariance():
+    from scas4d_core.kernels.deform import settle
+    from scas4d_core.settings import UpdateSettings
+
+    for covariance in ("entangled", "separate"):
+        warm_up._let_a_layer_rest(UpdateSettings(covariance=covariance))
+    assert len(settle.signatures) == 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -97,6 +98,36 @@ def test_a_motion_that_ended_is_not_gone_on_with() -> None:
     still, warm = (mean_error(again.trace.errors[kind], list(again.trace.errors[kind])) for kind in list(Candidate)[1:])
     assert still < warm
     assert error(again.gaussians, FOOTAGE.frame(1)) <= still + 1e-6
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_coarse_layer_rests_where_the_motion_before_leads_near(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In an update whose plan grows past its rest and falls back: it learns again, and rests again."""
+    update, frame = updater(), FOOTAGE.frame(4)
+    if known:  # the frame is two on from where the motion led
+        monkeypatch.setattr("scas4d_core.update.rates.NEAR", 10.0)
+    moved = update.run(BEFORE, views(FOOTAGE.frame(1)), None, 0.1, 0, compared(60))
+    errors = moved.trace.errors[Candidate.END]
+    usual = by_size(errors, moved.trace.whole) if known else None
+    inside, coarse = update._deformation, list[np.ndarray]()
+    forward = inside.forward
+
+    def record() -> None:
+        coarse.append(inside.clusters[0].copy())
+        forward()
+
+    # Of two layers the first rests after three quarters.
+    plan = {**dict.fromkeys(range(10), 12), 10: 20, 11: 20, **dict.fromkeys(range(12, 20), 16)}
+    stopping = Stopping(20)
+    monkeypatch.setattr(stopping, "planned", plan.__getitem__)
+    monkeypatch.setattr(inside, "forward", record)
+    options = AttemptOptions(stopping=stopping, compare=True, usual=usual)
+    found = update.run(moved.gaussians, views(frame), moved.motion, 0.1, 0, options)
+    iterations = len(found.trace.losses)
+    assert (iterations, found.trace.kept) == (16, Candidate.END)
+    tables = coarse[-iterations - 1 :]
+    learnt = [bool((one != other).any()) for one, other in pairwise(tables)]
+    assert learnt == ([True] * 9 + [False] + [True] * 2 + [False] * 4 if known else [True] * 16)
 
 
 def test_a_frame_that_stands_needs_no_iteration() -> None:

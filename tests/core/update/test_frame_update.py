@@ -278,7 +278,6 @@ def test_motion_is_found_with_a_separate_covariance() -> None:
 
 def agrees_with_the_twin(changes: dict[str, Any], masks: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(schedule, "NEIGHBOUR_SAMPLE", 150)
-    monkeypatch.setattr(rates, "LAYER_RESTS", (1.0,))  # the last iteration has gradients of all layers
     settings = SETTINGS.model_copy(update=changes)
     fused = Iteration(settings, monkeypatch, masks, count=6)
     _, gradients = twin_iteration(fused, settings, masks)

@@ -19,7 +19,7 @@ def rates(layers: int = 3) -> Rates:
 
 @pytest.mark.parametrize(
     ("layers", "rests"),
-    [(0, ()), (1, (1.0,)), (2, (0.75, 1.0)), (3, LAYER_RESTS), (5, (0.5, 0.5, 0.5, 0.75, 1.0))],
+    [(0, ()), (1, (1.0,)), (2, (0.75, 1.0)), (3, LAYER_RESTS), (5, (0.5, 0.5, 0.7, 0.75, 1.0))],
 )
 def test_the_finest_layer_learns_to_the_end_and_those_above_rest_before(layers: int, rests: tuple[float, ...]) -> None:
     assert rates(layers).rests == rests
@@ -46,7 +46,7 @@ def test_a_layer_has_a_rate_until_it_rests_and_at_least_once(iterations: int) ->
 
 
 def test_layers_rest_where_the_motion_before_leads_near_and_nowhere_else() -> None:
-    near, far = (rates().led(unexplained) for unexplained in (NEAR, NEAR + 0.01))
+    near, far = (rates().resting_if_near(unexplained) for unexplained in (NEAR, NEAR + 0.01))
     assert near.rests == LAYER_RESTS
     assert far.rests == ()
     assert far.resting(99, 100) == 0
