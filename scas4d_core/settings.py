@@ -276,7 +276,7 @@ class UpdateSettings(SettingsModel):
         (
             LayerRates(rotation=0.04, translation=0.008, scaling=0.002),
             LayerRates(rotation=0.01, translation=0.002, scaling=0.002),
-            LayerRates(rotation=0.006, translation=0.0012, scaling=0.002),
+            LayerRates(rotation=0.002, translation=0.0004, scaling=0.002),
         ),
         min_length=1,
         description="One per layer, coarse to fine; with more layers the last is repeated.",
@@ -302,7 +302,7 @@ class UpdateSettings(SettingsModel):
         0.05,
         gt=0,
         le=1,
-        description="Rates decay to this fraction over the frame, or until a layer rests (cosine); 1: constant.",
+        description="Rates decay to this fraction over the frame or until a rest (cosine); 1: constant.",
     )
     beta1: float = Field(0.8, ge=0, lt=1, description="Adam's first decay.")
     beta2: Share = Field(0.95, description="Adam's second decay; 100 iterations are too few for the usual 0.999.")

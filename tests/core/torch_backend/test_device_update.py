@@ -326,8 +326,7 @@ def test_start_and_end_are_compared_and_a_frame_that_stands_needs_no_iteration()
         moves.trace.errors[Candidate.STILL], list(moves.trace.errors[Candidate.STILL])
     )
     views = ViewFactory(RIG).views(take_frame(1, 1.0, AFTER, RIG, True), {})
-    options = AttemptOptions(stopping=Stopping(8), compare=True)
-    usual = updater(FrameUpdate).run(BEFORE, views, None, 1.0, 1, options)
+    usual = updater(FrameUpdate).run(BEFORE, views, None, 1.0, 1, AttemptOptions(stopping=Stopping(8), compare=True))
     assert moves.trace.errors[Candidate.END] == pytest.approx(usual.trace.errors[Candidate.END], rel=0.05)
     enough = {  # small or whole pictures are compared, as each frame calls for
         name: error
