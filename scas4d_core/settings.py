@@ -299,10 +299,7 @@ class UpdateSettings(SettingsModel):
         description="RGB of the Gaussians that stand, where standing_colour is on; with 0 they keep their colours.",
     )
     rate_end: float = Field(
-        0.05,
-        gt=0,
-        le=1,
-        description="Rates decay to this fraction over the frame or until a rest (cosine); 1: constant.",
+        0.05, gt=0, le=1, description="Rates decay to this fraction by a layer's rest or the end (cosine); 1: constant."
     )
     beta1: float = Field(0.8, ge=0, lt=1, description="Adam's first decay.")
     beta2: Share = Field(0.95, description="Adam's second decay; 100 iterations are too few for the usual 0.999.")
