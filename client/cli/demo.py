@@ -78,7 +78,8 @@ def _ready(url: str, log: Path) -> bool:
     except ServiceUnreachable:
         return False
     except ServiceError as error:
-        if (error.problem.model_extra or {}).get("warming_up"):
+        said = error.problem.model_extra or {}
+        if said.get("warming_up") or said.get("recovering"):  # it will be, without anybody's doing
             return False
         raise RuntimeError(f"the service cannot become ready: {error}; its log is {log}") from None
     return True

@@ -13,8 +13,10 @@ import pytest
 from PIL import Image
 from running import HEIGHT, WIDTH
 
-from client.cli.demo import running_service
+from client.cli.demo import _ready, running_service
+from client.errors import ServiceError
 from client.sdk import Client
+from client.wire.service import ProblemDetails
 from scas4d_core.captures import open_capture
 from server.storage.disk import FolderLock
 
@@ -70,6 +72,19 @@ def test_its_scene_can_be_looked_at_later_and_its_parts_have_the_colours_of_the_
     with Image.open(io.BytesIO(file)) as found, Image.open(out / "parts.png") as left:
         assert np.array_equal(found.convert("RGB"), left.convert("RGB"))
         assert np.any(left)
+
+
+@pytest.mark.parametrize("said", [{"warming_up": True}, {"recovering": ["k3"]}, {}])
+def test_it_waits_for_what_will_be_ready_without_anybodys_doing(said, tmp_path, monkeypatch):
+    def not_ready(client):
+        raise ServiceError(ProblemDetails(title="not ready", status=503, detail="not yet", **said))
+
+    monkeypatch.setattr(Client, "ready", not_ready)
+    if said:
+        assert not _ready("http://127.0.0.1:1", tmp_path)
+    else:
+        with pytest.raises(RuntimeError, match="cannot become ready: 503: not yet"):
+            _ready("http://127.0.0.1:1", tmp_path)
 
 
 def test_another_demo_takes_the_place_of_the_one_before(capture_folder, tmp_path):
