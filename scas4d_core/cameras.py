@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -254,10 +255,11 @@ class Rig:
         """Camera names in the rig's order."""
         return tuple(camera.name for camera in self.cameras)
 
-    @property
+    @cached_property
     def centre(self) -> Float:
-        """[3] mean of the camera centres."""
+        """[3] mean of the camera centres; not to be written to."""
         centre: Float = np.mean([camera.centre for camera in self.cameras], axis=0)
+        centre.setflags(write=False)
         return centre
 
     @property
@@ -283,7 +285,7 @@ class Rig:
         """True where the cameras have no extent by which the scene could be measured."""
         return self._spread < ONE_PLACE
 
-    @property
+    @cached_property
     def _spread(self) -> float:
         return float(1.1 * max(np.linalg.norm(camera.centre - self.centre) for camera in self.cameras))
 

@@ -260,16 +260,19 @@ def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
     >>> pose_warnings(Rig(tuple(_inverted(camera) for camera in ring)))[0]
     'the poses seem to be the wrong way round, camera to world where world to camera is meant: the viewing axes ...'
     """
-    turned = [_inverted(camera) for camera in rig.cameras]
     if positions is not None and len(positions):
         some = _some(positions)
-        given, other = (float(np.mean([_sees(c, some) for c in cameras])) for cameras in (rig.cameras, turned))
+        given = float(np.mean([_sees(camera, some) for camera in rig.cameras]))
+        if given > FEW_SEE:  # no other way round can show so much more
+            return []
+        other = float(np.mean([_sees(_inverted(camera), some) for camera in rig.cameras]))
         if other < POINTS_SEEN or given > FEW_SEE * other:
             return []
         evidence = f"{given:.0%} of the points are in view of a camera on average, inverted {other:.0%}"
     else:
         if len(rig) < LEAST_CAMERAS:
             return []
+        turned = [_inverted(camera) for camera in rig.cameras]
         given, other = _come_together(rig.cameras, behind=True), _come_together(turned, behind=False)
         if given > FEW_SEE or other < MOST_SEE:
             return []

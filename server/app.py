@@ -36,6 +36,7 @@ from server.routes import (
     parts,
     points,
     reconstructions,
+    reference,
     render,
     scenes,
     stream,
@@ -78,6 +79,8 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         summary="Online 4D reconstruction of calibrated multi-camera rigs.",
         lifespan=lifespan,
         responses=problems.RESPONSES,
+        docs_url=None,  # `routes.reference` has both pages
+        redoc_url=None,
     )
     app.state.settings = settings
     app.state.guard = ConnectionGuard(ConnectionLimits.of(settings))
@@ -113,10 +116,12 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
             budget,
             tradeoff,
         ),
-        *(estimate, tickets, health, metrics, viewer),
+        *(estimate, tickets, health, metrics, viewer, reference),
     )
     for resource in resources:
-        app.include_router(resource.router, dependencies=[] if resource is viewer else [Depends(access.only_known)])
+        app.include_router(
+            resource.router, dependencies=[] if resource in (viewer, reference) else [Depends(access.only_known)]
+        )
         _answer_plain_requests(app, resource.router)
     _keep_document(app)
     return app

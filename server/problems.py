@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any
@@ -99,22 +100,34 @@ def plain_tuples(schema: Any) -> None:
             schema["items"] = schema.pop("prefixItems")[0]
 
 
+def first_sentence(text: str) -> str:
+    """The first sentence of a text, or what stands before its semicolon, without the stop at its end.
+
+    >>> first_sentence("Lists all scenes; wakes none. More.")
+    'Lists all scenes'
+    """
+    return re.split(r"[.;](?:\s|$)", " ".join(text.split()), maxsplit=1)[0]
+
+
 def document(app: FastAPI) -> dict[str, Any]:
-    """Returns the OpenAPI document, completed with the media type of errors and the token."""
+    """Returns the OpenAPI document, with summaries, the media type of errors, and the token if there is one."""
+    token = app.state.settings.token is not None
     if app.openapi_schema is None:
         written = FastAPI.openapi(app)
         for path, operations in written["paths"].items():
             for operation in operations.values():
+                operation["summary"] = first_sentence(operation.get("description", operation["summary"]))
                 for status in RESPONSES:
                     if str(status) in operation["responses"]:
                         operation["responses"][str(status)]["content"] = {MEDIA_TYPE: {"schema": PROBLEM}}
-                if path == "/health/live":
+                if token and path == "/health/live":
                     operation["security"] = []
         for schema in written.get("components", {}).get("schemas", {}).values():
             plain_tuples(schema)
-        schemes = written.setdefault("components", {}).setdefault("securitySchemes", {})
-        schemes["bearer"] = {"type": "http", "scheme": "bearer", "description": "Where the service has a token."}
-        written["security"] = [{"bearer": []}]
+        if token:
+            schemes = written.setdefault("components", {}).setdefault("securitySchemes", {})
+            schemes["bearer"] = {"type": "http", "scheme": "bearer", "description": "SCAS4D_TOKEN of the service."}
+            written["security"] = [{"bearer": []}]
     assert app.openapi_schema is not None  # FastAPI.openapi keeps what it returns
     return app.openapi_schema
 

@@ -18,8 +18,8 @@ from server.connections.config import guarded
 from server.connections.process import keep_freed_memory, room_for_connections
 from server.health import logs
 from server.processes.placement import STOP_SECONDS, Placement
-from server.scene.scenes import lock_data
 from server.settings import ServerSettings, unknown
+from server.storage.disk import lock_data
 
 log = logging.getLogger("scas4d.server")
 

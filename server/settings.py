@@ -47,8 +47,8 @@ FORMER = {
     "max_subscriptions": "server.stream.subscriber:MOST_SUBSCRIPTIONS",
     "max_stream_message_kb": "server.stream.subscriber:MESSAGE_KB",
     "stream_questions": "server.stream.shared_queries:QUERIES_AT_ONCE",
-    "waiting_questions": "server.processes.readers:MOST_WAITING",
-    "answer_seconds": "server.processes.readers:ANSWER_SECONDS",
+    "waiting_questions": "server.processes.query_queue:MOST_WAITING",
+    "answer_seconds": "server.processes.query_queue:ANSWER_SECONDS",
     "stop_seconds": "server.processes.placement:STOP_SECONDS",
 }
 """Settings of earlier versions, and the constants that they became, as module:name."""
@@ -159,7 +159,15 @@ class ServerSettings(BaseSettings):
     )
 
     max_scenes: int = Field(
-        default=8, ge=1, description="Scenes at a time; each holds two or three processes and some hundred megabytes."
+        default=8,
+        ge=1,
+        description="Scenes awake at a time, with up to three processes and some hundred megabytes each. Others sleep.",
+    )
+    sleep_seconds: float = Field(
+        default=600.0,
+        ge=0,
+        description="A scene that nobody sends to or looks at sleeps after so long: its processes end, and start again "
+        "when it is asked something. 0: never.",
     )
     max_scene_memory_mb: float | None = Field(
         default=None,

@@ -19,7 +19,7 @@ from studies.quality.commands import (
     targets,
 )
 from studies.rigs.commands import calibration, drift, rigs
-from studies.service.commands import crossing, faults, ingest, memory, views
+from studies.service.commands import crossing, faults, ingest, memory, sleeping, views
 from studies.variants.commands import variants
 
 STUDIES = {
@@ -28,7 +28,7 @@ STUDIES = {
     "Accuracy against time": (frontier, effort, paper, variants),
     "Speed of the code": (kernels, device, moving),
     "Hard cases": (stability, timing),
-    "The running service": (faults, ingest, views, memory, crossing),
+    "The running service": (faults, ingest, views, memory, sleeping, crossing),
 }
 """The commands by the heading under which `scripts/bench --help` lists them."""
 

@@ -1,4 +1,4 @@
-"""Calls on scenes: create, read, pause, resume, begin again, delete; the initial points of frame 0."""
+"""Calls on scenes: create, read, edit, pause, resume, put to sleep, begin again, delete; points of frame 0."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from client.wire import (
     IngestSettings,
     PointsReceipt,
     ReconstructionRequest,
+    Retention,
     RigModel,
     SceneCreate,
+    SceneEdit,
     SceneList,
     SceneStatus,
 )
@@ -115,6 +117,42 @@ def resume(id: str) -> Call[SceneStatus]:
     False
     """
     return Call("POST", path(id, "resume"), reads(SceneStatus))
+
+
+def edit_scene(
+    id: str,
+    *,
+    name: str | None = None,
+    archived: bool | None = None,
+    keep_frames: Retention | None = None,
+    keep_states: Retention | None = None,
+) -> Call[SceneStatus]:
+    """Renames a scene, archives it or takes that back, or changes what it keeps; what is None stays.
+
+    Args:
+        id: of the scene. name: for people.
+        archived: True: it takes no further frames, and sleeps unless it is looked at.
+        keep_frames, keep_states: rules for pictures and committed states, as in `IngestSettings`; they hold at once.
+
+    >>> from client.wire import Retention
+    >>> new = client.create_scene(rig)
+    >>> client.edit_scene(new.id, name="rehearsal", keep_frames=Retention(last=8)).name
+    'rehearsal'
+    >>> client.delete_scene(new.id)
+    """
+    edit = SceneEdit(name=name, archived=archived, keep_frames=keep_frames, keep_states=keep_states)
+    return Call("PATCH", path(id), reads(SceneStatus), arguments=body(edit))
+
+
+def put_to_sleep(id: str) -> Call[SceneStatus]:
+    """Ends the processes of an idle scene; it wakes by itself when it is asked or sent something.
+
+    >>> new = client.create_scene(rig)
+    >>> client.put_to_sleep(new.id).asleep
+    True
+    >>> client.delete_scene(new.id)
+    """
+    return Call("POST", path(id, "sleep"), reads(SceneStatus))
 
 
 def delete_scene(id: str) -> Call[None]:

@@ -11,6 +11,7 @@ import numpy as np
 import typer
 
 from client import rig
+from client.cli import scenes
 from client.cli.capture_options import opened, takes_capture
 from client.cli.changes import parse_changes
 from client.cli.progress import Bars, console
@@ -121,21 +122,6 @@ def push(
         raise SystemExit(f"scas4d: {status.error}")
 
 
-def scenes(url: Url = DEFAULT_URL, token: Token = None) -> None:
-    """Lists the scenes of a running service."""
-    rows: list[tuple[str, ...]] = [("scene", "name", "state", "cameras", "next frame", "queued", "committed", "error")]
-    with Client(url, token=token, outage=0) as client:
-        for status in client.scenes():
-            numbers = (len(status.cameras), status.next_frame, status.queued, status.committed)
-            rows.append((status.id, status.name, status.state, *map(str, numbers), status.error or ""))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:  # whole words, however narrow the terminal: they are read by programs too
-        line = "  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True))
-        console.print(line.rstrip(), highlight=False, markup=False, soft_wrap=True)
-    if len(rows) == 1:
-        console.print("no scene yet; make one with: scas4d push CAPTURE", highlight=False, soft_wrap=True)
-
-
 def watch(scene: Scene, url: Url = DEFAULT_URL, token: Token = None) -> None:
     """Prints each finished frame of a scene as it happens, until Ctrl-C or the scene is deleted."""
     from client.stream import Stream, finished_frames, scene_changes
@@ -218,7 +204,9 @@ def begin_again(
     ] = None,
     points: Annotated[
         Path | None,
-        typer.Option(help="npz with positions and colours (and foreground) to begin from; the scene's own without it."),
+        typer.Option(
+            help="npz with positions and colours (and foreground), or init_pt_cld.npz; without it the scene's own."
+        ),
     ] = None,
     no_points: Annotated[bool, typer.Option("--no-points", help="Begin from the pictures alone.")] = False,
     discard: Annotated[bool, typer.Option("--discard", help="Drop the frames that are committed.")] = False,
@@ -234,6 +222,10 @@ def begin_again(
         if points is not None:
             with np.load(points, allow_pickle=False) as file:
                 given = {name: file[name] for name in ("positions", "colours", "foreground") if name in file}
+                if not given and "data" in file and file["data"].shape[1:] in ((6,), (7,)):  # init_pt_cld.npz
+                    columns = np.split(file["data"], (3, 6), axis=1)
+                    given = {"positions": columns[0], "colours": columns[1].astype(np.float32)}
+                    given |= {"foreground": columns[2][:, 0].astype(np.float32)} if columns[2].size else {}
             if missing := {"positions", "colours"} - given.keys():
                 raise ValueError(
                     f"{points} has no {' and no '.join(sorted(missing))}; write numpy.savez(positions=…, colours=…)"
@@ -306,7 +298,7 @@ def register(app: typer.Typer) -> None:
     """Adds these commands."""
     app.command()(push)
     app.command(name="import")(import_)
-    app.command()(scenes)
+    app.add_typer(scenes.app, name="scenes")
     app.command()(watch)
     app.command()(budget)
     app.command()(begin_again)

@@ -75,6 +75,27 @@ class SceneCreate(Model):
     ingest: IngestSettings = IngestSettings()
 
 
+class SceneEdit(Model):
+    """Changes of a scene; what is left out or null stays as it is."""
+
+    name: str | None = Field(default=None, max_length=200, description="For people.")
+    archived: bool | None = Field(
+        default=None,
+        strict=True,
+        description="true: it takes no further frames, and sleeps unless it is looked at; not while frames wait.",
+    )
+    keep_frames: Retention | None = Field(default=None, description="As in `ingest`; holds at once.")
+    keep_states: Retention | None = Field(
+        default=None, description="As in `ingest`; holds at once: states beyond it are deleted for good."
+    )
+
+    @model_validator(mode="after")
+    def _changes_something(self) -> SceneEdit:
+        if all(value is None for _, value in self):
+            raise InputError("nothing is to be changed", "give name, archived, keep_frames or keep_states")
+        return self
+
+
 class ReconstructionRequest(Model):
     """Another beginning of a scene's reconstruction, from its first frame on, in place of the one before."""
 
@@ -167,6 +188,14 @@ class SceneStatus(Model):
     paused: bool = Field(
         default=False, description="It begins no further frame, whatever `state` says: one may still be at work."
     )
+    asleep: bool = Field(
+        default=False,
+        description="It was idle, has no processes and counts for nothing; it wakes by itself when it is asked or sent "
+        "something. What `state` says holds.",
+    )
+    archived: bool = Field(
+        default=False, description="It takes no frames until that is taken back; all it has can be looked at."
+    )
     degraded: bool = Field(
         default=False,
         description="Whatever `state` says: the last frame lost a camera, was held or met only by half, or was set "
@@ -179,7 +208,7 @@ class SceneStatus(Model):
     set_aside: int = Field(default=0, description="Frames that were taken and could not be reconstructed.")
     missing: int = Field(default=0, description="Frames that were declared missing.")
     skipped: int = Field(default=0, description="Frames that were skipped because the queue was full.")
-    worker_deaths: int = Field(default=0, description="Since the service started or the reconstruction began.")
+    worker_deaths: int = Field(default=0, description="Since the scene woke or its reconstruction began.")
     frames_held: int = Field(default=0, description="Frames whose pictures are in the frame log.")
     frame_bytes: int = Field(default=0, description="Of the frame log on disk.")
     states_deleted: int = Field(default=0, description="Committed states that retention has deleted.")

@@ -129,9 +129,8 @@ class DeviceUpdate:
         probes = ProbeViews(self._factory, self._picture, views if options.compare else [])
         best = BestState(probes, deformation, previous, motion, seconds, settings.momentum)
         best.start(options.step)
-        hurry = settings.cold_start if motion is None else 1.0
-        rates = self._update.rates.tried(options.rates, options.rigid, options.hold_colours).hurried(hurry)
-        rates = rates.resting_if_near(best.unexplained(options.usual))
+        rates = self._update.rates.tried(options.rates, options.rigid, options.hold_colours)
+        rates = rates.cold(settings.cold_start) if motion is None else rates.warm(best.unexplained(options.usual))
         work = Work(previous, deformation, rates, views, self._picture, dict(carried))
         for begin in self._hooks.start:
             begin(work)

@@ -121,9 +121,8 @@ class FrameUpdate:
         probes = ProbeViews(self._factory, self._picture, views if options.compare else [])
         best = BestState(probes, deformation, previous, motion, seconds, settings.momentum)
         best.start(options.step)
-        hurry = settings.cold_start if motion is None else 1.0  # without a motion to start from there is further to go
-        rates = self._rates.tried(options.rates, options.rigid, options.hold_colours).hurried(hurry)
-        rates = rates.resting_if_near(best.unexplained(options.usual))
+        rates = self._rates.tried(options.rates, options.rigid, options.hold_colours)
+        rates = rates.cold(settings.cold_start) if motion is None else rates.warm(best.unexplained(options.usual))
         work = Work(previous, deformation, rates, views, self._picture, dict(carried))
         work.tells = self.tells
         for start in self._hooks.start:

@@ -45,6 +45,16 @@ def first_iteration(start: float, iterations: int) -> int:
     return round(start * iterations)
 
 
+def learning(start: float, rest: float, iterations: int) -> range:
+    """The iterations, from 0, in which what learns from one share of all to another takes its steps: one at least.
+
+    >>> learning(0.25, 0.75, 8), learning(0.4, 0.5, 2)
+    (range(2, 6), range(1, 2))
+    """
+    first = first_iteration(start, iterations)
+    return range(first, max(first + 1, first_iteration(rest, iterations)))
+
+
 @dataclass(frozen=True)
 class Rates:
     """Adam's rates per iteration; a rate of 0 leaves the parameter where it starts.
@@ -82,11 +92,10 @@ class Rates:
         >>> [round(rates.factor(i, 8, 0.25, 0.75), 2) for i in range(8)]
         [0.0, 0.0, 1.0, 0.8, 0.4, 0.2, 0.0, 0.0]
         """
-        first = first_iteration(start, iterations)
-        last = max(first, first_iteration(rest, iterations) - 1)
-        if not first <= iteration <= last:
+        span = learning(start, rest, iterations)
+        if iteration not in span:
             return 0.0
-        done = (iteration - first) / max(1, last - first)
+        done = (iteration - span.start) / max(1, len(span) - 1)
         return self.end + (1 - self.end) * 0.5 * (1 + cos(pi * done))
 
     def start_of(self, layer: int) -> float:
@@ -99,18 +108,16 @@ class Rates:
 
     def resting(self, iteration: int, iterations: int) -> int:
         """Number of layers, from the coarsest on, that do not learn any more in an iteration counted from 0."""
-        learns = (
-            iteration < max(first_iteration(start, iterations) + 1, first_iteration(rest, iterations))
-            for start, rest in ((self.start_of(k), self.rest_of(k)) for k in range(len(self.rests)))
-        )
-        return next((k for k, one in enumerate(learns) if one), len(self.rests))
+        ends = (learning(self.start_of(k), self.rest_of(k), iterations).stop for k in range(len(self.rests)))
+        return next((k for k, end in enumerate(ends) if iteration < end), len(self.rests))
 
-    def hurried(self, factor: float) -> Rates:
-        """Layers that turn and shift faster: where there is no motion to start from there is further to go."""
-        return replace(self, layers=tuple((factor * r, factor * t, scaling) for r, t, scaling in self.layers))
+    def cold(self, factor: float) -> Rates:
+        """Without a motion to start from: layers turn and shift faster, as there is further to go, and none rests."""
+        layers = tuple((factor * r, factor * t, scaling) for r, t, scaling in self.layers)
+        return replace(self, layers=layers, rests=())
 
-    def resting_if_near(self, unexplained: float) -> Rates:
-        """With no layer that rests, unless the start leaves little of what changed unexplained: at most ``NEAR``."""
+    def warm(self, unexplained: float) -> Rates:
+        """From the motion before: no layer rests, unless that leaves little of what changed unexplained (``NEAR``)."""
         return self if unexplained <= NEAR else replace(self, rests=())
 
     def tried(self, factor: float, rigid: bool, hold_colours: bool) -> Rates:

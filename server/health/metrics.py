@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping
-from typing import Protocol
+from collections.abc import Iterator, Mapping, Sequence
 
 from prometheus_client import CollectorRegistry, Counter, Histogram
 from prometheus_client.core import GaugeMetricFamily, Metric
@@ -92,20 +91,13 @@ for how in ("held", "in_part"):
     DEGRADED.labels(how)
 
 
-class HasStatus(Protocol):
-    """A scene, as far as metrics read it."""
-
-    def status(self) -> SceneStatus:
-        """Returns the status as it is now."""
-
-
 class State:
     """Gauges of a service: scenes, queues, subscribers, disk."""
 
     def __init__(
         self,
         settings: ServerSettings,
-        scenes: Mapping[str, HasStatus],
+        scenes: Sequence[SceneStatus],
         hub: Hub,
         ready_after: float | None,
         connections: Mapping[str, int],
@@ -118,18 +110,21 @@ class State:
 
     def collect(self) -> Iterator[Metric]:
         """Yields the gauges as they are now."""
-        statuses = [scene.status() for scene in list(self.scenes.values())]
         by_state = GaugeMetricFamily("scas4d_scenes", "Scenes by state.", labels=["state"])
         for state in SceneState:
-            by_state.add_metric([state.value], sum(status.state == state for status in statuses))
+            by_state.add_metric([state.value], sum(status.state == state for status in self.scenes))
         yield by_state
+        awake = [status for status in self.scenes if not status.asleep]
+        yield GaugeMetricFamily(
+            "scas4d_scenes_asleep", "Scenes without processes, in any state.", value=len(self.scenes) - len(awake)
+        )
         for name, help, field in (
             ("scas4d_queue_frames", "Frames acknowledged and not finished.", "queued"),
             ("scas4d_committed_frames", "Frames that can be rendered and tracked.", "committed"),
             ("scas4d_gaussians", "Gaussians.", "gaussians"),
         ):
             gauge = GaugeMetricFamily(name, help, labels=["scene"])
-            for status in statuses:
+            for status in awake:
                 gauge.add_metric([status.id], getattr(status, field) or 0)
             yield gauge
         yield GaugeMetricFamily("scas4d_subscribers", "WebSockets that listen to scenes.", value=self.hub.count())

@@ -24,12 +24,10 @@ from server.http.tickets import SUBPROTOCOL, Tickets, accepting, take_offered
 from server.problems import Problem
 from server.settings import ServerSettings, is_loopback
 
-OPEN = frozenset(
-    {"/", "/viewer", "/favicon.ico", "/health/live", "/docs", "/docs/oauth2-redirect", "/redoc", "/openapi.json"}
-)
+OPEN = frozenset({"/", "/viewer", "/favicon.ico", "/health/live", "/docs", "/redoc", "/openapi.json"})
 """Paths that hold no data and need no token: the page that asks for one, and the description of the API."""
-OPEN_FOLDERS = ("/viewer/",)
-"""Files of the viewer's page."""
+OPEN_FOLDERS = ("/viewer/", "/docs/")
+"""Files of the viewer's page, and of the API's reference."""
 IN_URL = frozenset({"token", "access_token", "api_key", "ticket", "authorization"})
 
 HEADERS = {

@@ -212,10 +212,18 @@ class Ingest:
             raise self.full(index)
 
     def refuse_if_it_cannot_go_on(self) -> None:
-        """Refuses any frame of a scene that cannot begin, 422, or has failed, 409."""
+        """Refuses any frame of a scene that cannot begin, 422, or has failed or is archived, 409."""
         if self.ledger.next_frame == 0:
             self._can_begin()
         self.refuse_if_failed()
+        if self.ledger.edited.archived:
+            raise Problem(
+                409,
+                "the scene is archived",
+                field="id",
+                value=self.ledger.scene,
+                remedy='take that back: PATCH /v1/scenes/ID with {"archived": false}, or scas4d scenes restore ID',
+            )
 
     def refuse_if_failed(self) -> None:
         """Refuses, 409, what is asked of a scene that has failed."""

@@ -30,6 +30,13 @@ class SceneSpec:
 
 
 @dataclass(frozen=True)
+class KeepStates:
+    """Another rule for states from now on."""
+
+    rule: Retention
+
+
+@dataclass(frozen=True)
 class FrameReady:
     """The pictures of a frame lie in records of the frame log (`server.storage.frame_store`).
 
@@ -113,11 +120,15 @@ class Progressed:
 
 
 @dataclass(frozen=True)
-class FrameCommitted:
-    """The frame's state is on disk, with `report` (as `History.report` gives it back).
+class StatesRetained:
+    """A rule for states holds; it has deleted those of these frames."""
 
-    `deleted`: states that retention deleted after it.
-    """
+    deleted: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class FrameCommitted:
+    """The frame's state is on disk, with `report` (`History.report`); retention deleted `deleted` after it."""
 
     index: int
     report: dict[str, Any]

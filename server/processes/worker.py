@@ -9,7 +9,7 @@ import signal
 import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,12 +29,14 @@ from server.processes.messages import (
     FrameCommitted,
     FrameFailed,
     FrameReady,
+    KeepStates,
     Mend,
     Progressed,
     Ready,
     Remake,
     SceneSpec,
     Stalled,
+    StatesRetained,
     Stop,
 )
 from server.processes.placement import end_with_parent
@@ -71,6 +73,8 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
                 match message:
                     case FrameReady():
                         worker.take(message)
+                    case KeepStates():
+                        worker.keep(message)
                     case Mend():
                         worker.mend(message)
                     case Remake():
@@ -189,6 +193,11 @@ class Worker:
             # Without a first frame there is nothing to go on from.
             first = self.reconstruction is None
             return FrameFailed(message.index, f"{type(error).__name__}: {message_of(error)}", dropped, fatal=first)
+
+    def keep(self, message: KeepStates) -> None:
+        """Keeps states by another rule, and reports which that deletes."""
+        self.spec = replace(self.spec, keep_states=message.rule)
+        self.connection.send(StatesRetained(tuple(self.retain())))
 
     def mend(self, message: Mend) -> None:
         """Checks files that were found damaged, and reports the outcome of each."""

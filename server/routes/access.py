@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import difflib
+from collections.abc import AsyncIterator
 from typing import Annotated
 from urllib.parse import parse_qsl
 
@@ -15,7 +16,8 @@ from starlette.requests import HTTPConnection
 
 from server.problems import Problem
 from server.processes.messages import Answer, Query
-from server.scene.scenes import Scene, Scenes
+from server.scene.scene import Scene
+from server.scene.scenes import Scenes
 from server.settings import ServerSettings
 
 
@@ -29,13 +31,25 @@ def _settings(request: Request) -> ServerSettings:
     return settings
 
 
-def _scene(request: Request, id: Annotated[str, Path(max_length=64)]) -> Scene:
-    return _scenes(request)[id]
+SceneId = Annotated[str, Path(max_length=64)]
+
+
+async def _scene(request: Request, id: SceneId) -> AsyncIterator[Scene]:
+    async with _scenes(request).using(id) as scene:
+        yield scene
+
+
+async def _record(request: Request, id: SceneId) -> AsyncIterator[Scene]:
+    async with _scenes(request).using(id, place=False) as scene:
+        yield scene
 
 
 AllScenes = Annotated[Scenes, Depends(_scenes)]
 TheSettings = Annotated[ServerSettings, Depends(_settings)]
 TheScene = Annotated[Scene, Depends(_scene)]
+"""For what needs its processes: it is woken, and gets a place."""
+TheRecord = Annotated[Scene, Depends(_record)]
+"""For what is known without them: it is read back from its folder, whether there is a place or not."""
 FrameIndex = Annotated[int, Path(ge=0, le=1_000_000_000)]
 
 

@@ -20,7 +20,7 @@ from server.ingest.camera_files import receive_camera, receive_file, receive_for
 from server.ingest.receive import receive_frame
 from server.problems import Problem
 from server.processes.messages import PlyQuery
-from server.routes.access import FrameIndex, TheScene, ask
+from server.routes.access import FrameIndex, TheRecord, TheScene, ask
 
 router = APIRouter(prefix="/v1/scenes", tags=["frames"])
 
@@ -122,7 +122,7 @@ async def missing(scene: TheScene, n: FrameIndex, request: MissingRequest | None
 
 
 @router.get("/{id}/frames/{n}")
-async def report(scene: TheScene, n: FrameIndex) -> FrameReportModel:
+async def report(scene: TheRecord, n: FrameIndex) -> FrameReportModel:
     """Returns the state of a frame, and its numbers once it is committed."""
     found = await scene.report(n)
     if found is None:

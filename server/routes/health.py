@@ -15,12 +15,12 @@ router = APIRouter(prefix="/health", tags=["service"])
 @router.get("/live")
 async def live(scenes: AllScenes) -> Health:
     """Answers while the process runs. This is the only request of the API that never asks for a token."""
-    return Health(status="live", version=__version__, scenes=len(scenes.by_id))
+    return Health(status="live", version=__version__, scenes=len(scenes))
 
 
 @router.get("/ready")
 async def ready(request: Request, scenes: AllScenes) -> Health:
     """Answers 200 once scenes are recovered and kernels compiled, else 503. `ready_after`: seconds it took."""
-    scenes.check_recovered()
+    scenes.recovering.check()
     readiness: Readiness = request.app.state.readiness
-    return Health(status="ready", version=__version__, scenes=len(scenes.by_id), ready_after=readiness.check())
+    return Health(status="ready", version=__version__, scenes=len(scenes), ready_after=readiness.check())

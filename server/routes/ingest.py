@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from collections.abc import AsyncIterator
 
@@ -49,18 +50,19 @@ async def ingest(socket: WebSocket, id: str) -> None:
     """
     scenes: Scenes = socket.app.state.scenes
     server: ServerSettings = socket.app.state.settings
-    try:
-        scene = scenes[id]
-        scene.ingest.join()
-    except Problem as problem:  # the handshake is answered like any request
-        await socket.send_denial_response(problems.answer(problem.document, problem.headers))
-        return
-    limit_messages(socket.scope, min(int(server.max_body_mb * 1e6), largest_frame(scene.rig)))
-    try:
-        await socket.accept()
-        await _serve(socket, scenes, id)
-    finally:
-        scene.ingest.leave()
+    async with contextlib.AsyncExitStack() as held:
+        try:
+            scene = await held.enter_async_context(scenes.using(id))
+            scene.ingest.join()
+        except Problem as problem:  # the handshake is answered like any request
+            await socket.send_denial_response(problems.answer(problem.document, problem.headers))
+            return
+        limit_messages(socket.scope, min(int(server.max_body_mb * 1e6), largest_frame(scene.rig)))
+        try:
+            await socket.accept()
+            await _serve(socket, scenes, id)
+        finally:
+            scene.ingest.leave()
 
 
 async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:

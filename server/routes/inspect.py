@@ -8,7 +8,7 @@ from fastapi import APIRouter, Query
 
 from client.wire import RigModel
 from client.wire.listings import FrameList
-from server.routes.access import TheScene
+from server.routes.access import TheRecord, TheScene
 
 router = APIRouter(prefix="/v1/scenes")
 
@@ -17,7 +17,7 @@ MOST_FRAMES = 500
 
 
 @router.get("/{id}/rig", tags=["scenes"])
-async def rig(scene: TheScene) -> RigModel:
+async def rig(scene: TheRecord) -> RigModel:
     """Returns the cameras of the scene, as they were given."""
     return scene.request.rig
 

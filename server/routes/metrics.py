@@ -20,6 +20,6 @@ async def metrics(request: Request, scenes: AllScenes, settings: TheSettings) ->
     readiness: Readiness = request.app.state.readiness
     gauges = CollectorRegistry()
     state, guard = request.app.state, request.app.state.guard
-    gauges.register(counted.State(settings, scenes.by_id, state.hub, readiness.after, guard.counts()))
+    gauges.register(counted.State(settings, scenes.statuses(), state.hub, readiness.after, guard.counts()))
     text = generate_latest(counted.registry) + generate_latest(gauges)
     return Response(text, media_type=CONTENT_TYPE_PLAIN_0_0_4)

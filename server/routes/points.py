@@ -45,7 +45,8 @@ async def put(
     """Takes the cloud that frame 0 starts from; it has to come before frame 0.
 
     The body is an npz: `positions` [P, 3] in the rig's world and units, `colours` [P, 3] in 0…1, and optionally
-    `foreground` [P] in 0…1. The same body again gets the same answer. For a reconstruction that is to be begun anew
+    `foreground` [P] in 0…1; or `data` [P, 6 or 7] with these as columns, as Dynamic3DGaussians has it in
+    `init_pt_cld.npz`. The same body again gets the same answer. For a reconstruction that is to be begun anew
     it comes before `PUT …/reconstructions/{n}`, with `reconstruction=n`.
     """
     body = await request.body()
@@ -114,7 +115,7 @@ def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
                 remedy=f"give at most {limit} points",
             )
         with np.load(io.BytesIO(body), allow_pickle=False) as file:
-            arrays = {name: np.asarray(file[name]) for name in file.files if name in shapes}
+            arrays = {name: np.asarray(file[name]) for name in file.files if name in (*shapes, "data")}
     except (zipfile.BadZipFile, ValueError, OSError, EOFError, KeyError, RuntimeError, NotImplementedError) as error:
         raise Problem(
             422,
@@ -123,6 +124,8 @@ def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
             value=counted(len(body), "byte"),
             remedy="send numpy.savez(positions=…, colours=…, foreground=…) of plain numbers",
         ) from None
+    if (data := arrays.pop("data", None)) is not None and "positions" not in arrays:
+        arrays = columns_of(data)
     count = len(arrays["positions"]) if "positions" in arrays and arrays["positions"].ndim else 0
     for name, (kind, columns) in shapes.items():
         if name not in arrays and name == "foreground":
@@ -147,3 +150,21 @@ def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
             top = f"{arrays[name].min():g} … {arrays[name].max():g}"
             raise Problem(422, f"{name} has values {top}", field=name, value=top, remedy="give values in 0 … 1")
     return arrays
+
+
+def columns_of(data: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """Splits the array of an `init_pt_cld.npz` [P, 7]: x y z, r g b, foreground, the last of which may be missing.
+
+    Raises:
+        Problem: 422, it has another shape.
+    """
+    if data.ndim != 2 or data.shape[1] not in (6, 7):
+        raise Problem(
+            422,
+            f"data is {data.dtype} {data.shape}",
+            field="data",
+            value=f"{data.dtype} {data.shape}",
+            remedy="give numbers of shape [P, 7]: x y z, r g b, foreground; or positions and colours instead",
+        )
+    found = {"positions": data[:, :3], "colours": data[:, 3:6]}
+    return found | ({"foreground": data[:, 6]} if data.shape[1] == 7 else {})

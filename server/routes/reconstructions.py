@@ -31,4 +31,4 @@ async def put(
     with setting_problems():
         settings = changed(scene.spec.settings, asked.settings)
     await check_settings(scene.request, settings, server)
-    return (await scenes.begin_again(scene, Beginning(n, asked, settings, scene.rig))).status()
+    return await scenes.begin_again(scene, Beginning(n, asked, settings, scene.rig))

@@ -12,7 +12,7 @@ from client.wire import MAX_PIXELS_A_SIDE, RenderFormat, RenderKind, RenderReque
 from server.problems import Problem, counted
 from server.processes.messages import RenderQuery
 from server.routes.access import TheScene, ask
-from server.scene.scenes import Scene
+from server.scene.scene import Scene
 
 MOST_PIXELS = 8_000_000
 """Pixels of one view: 4K, some seconds on one core. A larger one would keep others waiting."""

@@ -1,4 +1,4 @@
-"""Routes of scenes: create, list, inspect, pause, resume, delete."""
+"""Routes of scenes: create, list, inspect, edit, pause, resume, put to sleep, delete."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 from fastapi import APIRouter, Response
 
-from client.wire import SceneCreate, SceneList, SceneStatus
+from client.wire import SceneCreate, SceneEdit, SceneList, SceneStatus
 from scas4d_core.cameras import CameraError
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.rig_checks import RigError, check_scene
@@ -15,7 +15,7 @@ from scas4d_core.settings import Settings
 from server.health import devices, estimate
 from server.http import validation
 from server.problems import Problem, of_rig
-from server.routes.access import AllScenes, TheScene, TheSettings
+from server.routes.access import AllScenes, SceneId, TheRecord, TheScene, TheSettings
 from server.settings import ServerSettings
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
@@ -83,19 +83,29 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
 
 @router.get("")
 async def listed(scenes: AllScenes) -> SceneList:
-    """Lists all scenes; answers 503 while those of an earlier run are being recovered."""
-    scenes.check_recovered()
-    return SceneList(scenes=[scene.status() for scene in scenes.by_id.values()])
+    """Lists all scenes, and wakes none; answers 503 while those of an earlier run are being recovered."""
+    scenes.recovering.check()
+    return SceneList(scenes=scenes.statuses())
 
 
 @router.get("/{id}")
-async def inspect(scene: TheScene) -> SceneStatus:
-    """Returns the scene's state, progress and queue."""
+async def inspect(id: SceneId, scenes: AllScenes) -> SceneStatus:
+    """Returns the scene's state, progress and queue, and does not wake it."""
+    return scenes.status(id)
+
+
+@router.patch("/{id}")
+async def edit(scene: TheRecord, request: SceneEdit) -> SceneStatus:
+    """Renames the scene, archives it or takes that back, or changes how many pictures and states it keeps.
+
+    It is on disk when this answers. States that a shorter `keep_states` deletes go within seconds, for good.
+    """
+    await scene.edit(request)
     return scene.status()
 
 
 @router.post("/{id}/pause")
-async def pause(scene: TheScene) -> SceneStatus:
+async def pause(scene: TheRecord) -> SceneStatus:
     """Pauses the scene after the frame at work: frames are accepted and not reconstructed, also after a restart."""
     await scene.pause(True)
     return scene.status()
@@ -108,7 +118,23 @@ async def resume(scene: TheScene) -> SceneStatus:
     return scene.status()
 
 
+@router.post("/{id}/sleep")
+async def put_to_sleep(id: SceneId, scenes: AllScenes) -> SceneStatus:
+    """Ends the processes of a scene that is idle: it wakes by itself when it is asked or sent something."""
+    if (scene := scenes.by_id.get(id)) is not None:
+        if not scene.idle:
+            raise Problem(
+                409,
+                "the scene is not idle: frames of it wait, or a request, a page or a sender is connected to it",
+                field="id",
+                value=id,
+                remedy="wait for its frames, and close pages and senders",
+            )
+        await scenes.put_to_sleep(scene)
+    return scenes.status(id)
+
+
 @router.delete("/{id}", status_code=204)
-async def delete(scene: TheScene, scenes: AllScenes) -> None:
+async def delete(id: SceneId, scenes: AllScenes) -> None:
     """Ends the scene and removes all it has on disk."""
-    await scenes.delete(scene.id)
+    await scenes.delete(id)

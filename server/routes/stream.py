@@ -27,20 +27,21 @@ async def stream(websocket: WebSocket, id: str) -> None:
     """Sends scene state, finished frames, live views, tracks and parts, as the client subscribes to them."""
     scenes: Scenes = websocket.app.state.scenes
     hub: Hub = websocket.app.state.hub
-    try:
-        scene = scenes[id]
-        _require_protocol(websocket)
-        subscriber = hub.join(id, scene.readers.ask, lambda channel: Subscriber(scene, channel))
-    except Problem as problem:  # the handshake is answered like any request: browsers see only that it failed
-        await websocket.send_denial_response(problems.answer(problem.document, problem.headers))
-        return
-    limit_messages(websocket.scope, 4 * subscriber.limits().message_bytes)  # `_read` says more
-    try:
-        await websocket.accept(subprotocol=STREAM_PROTOCOL)
-        await _serve(websocket, subscriber)
-    finally:
-        hub.leave(id, subscriber)
-        subscriber.close()
+    async with contextlib.AsyncExitStack() as held:
+        try:
+            scene = await held.enter_async_context(scenes.using(id))
+            _require_protocol(websocket)
+            subscriber = hub.join(id, scene.readers.ask, lambda channel: Subscriber(scene, channel))
+        except Problem as problem:  # the handshake is answered like any request: browsers see only that it failed
+            await websocket.send_denial_response(problems.answer(problem.document, problem.headers))
+            return
+        limit_messages(websocket.scope, 4 * subscriber.limits().message_bytes)  # `_read` says more
+        try:
+            await websocket.accept(subprotocol=STREAM_PROTOCOL)
+            await _serve(websocket, subscriber)
+        finally:
+            hub.leave(id, subscriber)
+            subscriber.close()
 
 
 def _require_protocol(websocket: WebSocket) -> None:

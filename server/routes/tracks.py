@@ -17,7 +17,7 @@ from server.processes import track_answers
 from server.processes.messages import TracksQuery
 from server.routes import render
 from server.routes.access import TheScene, ask
-from server.scene.scenes import Scene
+from server.scene.scene import Scene
 
 router = APIRouter(prefix="/v1/scenes", tags=["tracks"])
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 from fastapi import APIRouter
 
 from client.wire import ReplayRequest, TradeoffModel
-from server.routes.access import TheScene
+from server.routes.access import TheRecord, TheScene
 from server.scene import tradeoff
-from server.scene.scenes import Scene
+from server.scene.scene import Scene
 
 router = APIRouter(prefix="/v1/scenes", tags=["budget"])
 
 
 @router.get("/{id}/tradeoff")
-async def get(scene: TheScene) -> TradeoffModel:
+async def get(scene: TheRecord) -> TradeoffModel:
     """Returns points of accuracy and time: measured in the newest 64 frames, replayed, and extrapolated in time."""
     return await answer(scene)
 

@@ -1,7 +1,9 @@
-"""Checks a request to begin a scene's reconstruction anew, and makes the event of it; it changes nothing."""
+"""A scene's reconstruction begun anew: checks the request, makes the event of it, journals it."""
 
 from __future__ import annotations
 
+import asyncio
+import logging
 from dataclasses import dataclass
 
 from client.wire import FrameState, ReconstructionRequest
@@ -9,10 +11,16 @@ from scas4d_core.cameras import Rig
 from scas4d_core.rig_checks import RigError, check_start
 from scas4d_core.settings import Settings
 from server.problems import Problem, counted, of_rig
+from server.storage.definition import read_definition
+from server.storage.disk import full_disk, no_room
 from server.storage.events import ReconstructionBegun
 from server.storage.frame_table import FrameEntry
+from server.storage.journal import Journal
 from server.storage.layout import SceneFolder
 from server.storage.ledger import Ledger
+from server.storage.recovery import recover
+
+log = logging.getLogger("scas4d.server")
 
 
 def how_to_begin_again(ledger: Ledger) -> str:
@@ -22,6 +30,12 @@ def how_to_begin_again(ledger: Ledger) -> str:
         f"begin its reconstruction anew: PUT /v1/scenes/{ledger.scene}/reconstructions/{number}, "
         f"or scas4d begin-again {ledger.scene}"
     )
+
+
+def begins_anew(id: str) -> Problem:
+    """Makes the answer, 503, for a scene whose reconstruction is being begun anew."""
+    fault = "the reconstruction of this scene is being begun anew"
+    return Problem(503, fault, field="id", value=id, remedy="ask again", headers={"Retry-After": "1"})
 
 
 @dataclass(frozen=True)
@@ -117,6 +131,32 @@ class Beginning:
             remedy=f"{remedy}; ingest.keep_frames of a scene says how many are kept",
             expected=ledger.next_frame if held is None else held,
         )
+
+
+async def journal_beginning(folder: SceneFolder, beginning: Beginning) -> list[str]:
+    """Journals the beginning of a scene that is stopped, if it still may: a frame may have been committed since.
+
+    Returns:
+        Sentences about damage that was found.
+
+    Raises:
+        Problem: see `Beginning.event`; 507, the disk is full.
+    """
+    definition, _ = await asyncio.to_thread(read_definition, folder)
+    found = await asyncio.to_thread(recover, folder, definition.id, definition.as_json())
+    event = beginning.event(found.ledger, found.folder)
+    assert event is not None
+    journal = Journal(folder.journal, found.good)
+    try:
+        await journal.append(*found.events, event)
+    except OSError as error:
+        if no_room(error):
+            raise full_disk(error) from None
+        raise
+    finally:
+        await journal.close()
+    log.warning("scene %s begins reconstruction %d with frame %d", folder.name, event.number, event.index)
+    return found.damage
 
 
 def _is_sent(entry: FrameEntry) -> bool:

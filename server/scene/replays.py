@@ -59,6 +59,11 @@ class Replays:
         self.status = ReplayStatus()
         self.points: dict[int, TradeoffPoint] = {}
 
+    @property
+    def busy(self) -> bool:
+        """True while a replay runs."""
+        return self._process is not None
+
     def start(self, request: ReplayRequest) -> None:
         """Starts a replay in a process of its own.
 

@@ -4,39 +4,35 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import chain
-from typing import Any
 
-from client.wire import Budget, FrameReportModel, FrameState, SceneBudget, SceneState, SceneStatus
+from client.wire import Budget, FrameReportModel, FrameState, SceneBudget, SceneEdit, SceneState, SceneStatus
 from scas4d_core.cameras import Camera
 from scas4d_core.errors import message_of
 from scas4d_core.first_frame.calibration.record import in_use
-from scas4d_core.frame_outcome import first_warnings, timing_warnings
-from scas4d_core.rig_checks import RigError, check_start, rig_warnings
+from scas4d_core.rig_checks import RigError, check_start
 from server.ingest.acknowledge import Ingest, IngestRules, uncancelled
 from server.ingest.open_frames import OpenFrames
-from server.problems import Problem, of_rig
+from server.problems import Problem, counted, of_rig
 from server.processes.messages import SceneSpec
 from server.processes.placement import STOP_SECONDS, Placement
 from server.processes.readers import Readers
 from server.repair.mending import DamageKind, DamageLog
 from server.repair.scrub import Scrub
-from server.scene.beginning import how_to_begin_again
+from server.scene.found import FoundScene
 from server.scene.replays import Replays
-from server.scene.status import FrameReports, camera_of, effective_budget, effects_of, state_of
+from server.scene.status import FrameReports, SceneFacts, camera_of, effective_budget
 from server.scene.supervision import Background
 from server.scene.updates import Updates
 from server.settings import ServerSettings
-from server.storage.definition import Definition
-from server.storage.events import BudgetChanged, JournalEvent, PauseChanged, SceneCreated
+from server.storage.events import BudgetChanged, JournalEvent, PauseChanged, SceneCreated, SceneEdited
 from server.storage.frame_store import FrameLogIndex
 from server.storage.frame_table import FrameTable
 from server.storage.journal import Journal
-from server.storage.layout import SceneFolder
 from server.storage.ledger import SceneLog
-from server.storage.recovery import Recovered
 from server.storage.snapshot import events_of
 from server.stream.hub import FrameFinished, Hub, SceneChanged
 
@@ -50,10 +46,12 @@ class Scene:
     aside, missing or skipped. The ledger has all that is known of them; acknowledged changes are journalled first.
 
     Args:
-        definition, folder: of the scene. found: the content of its folder, of a new scene too.
+        found: the content of its folder, of a new scene too.
         server: settings of the service. placement: starts its processes. hub: publishes its events.
 
     Attributes:
+        has_place: it has a place among the scenes that may have processes; else it is asleep. users: requests that are
+            being answered, and connections. used: when the last of them ended, `time.monotonic`.
         log: journal, ledger and frame log. ingest: accepts whole frames. open_frames: accepts them camera by camera.
         updates: gives frames to the worker. readers: answer queries. replays: of its last frames.
         points_sha256: of the initial cloud. warnings: what looks wrong with the rig, a sentence each.
@@ -61,13 +59,13 @@ class Scene:
 
     def __init__(
         self,
-        definition: Definition,
-        folder: SceneFolder,
-        found: Recovered,
+        found: FoundScene,
         server: ServerSettings,
         placement: Placement,
         hub: Hub,
     ) -> None:
+        definition, content, folder = found.definition, found.content, found.content.folder
+        self.has_place, self.users, self.used = False, 0, time.monotonic()
         self.id, self.request, self.created = definition.id, definition.request, definition.created
         self.rig = rig = definition.request.rig.rig()
         asked = definition.request.ingest
@@ -80,18 +78,19 @@ class Scene:
             minimum_cameras=-(-len(rig) // 2) if least is None else min(least, len(rig)),
             part_seconds=asked.part_seconds,
         )
-        self.spec = SceneSpec(folder, rig, definition.settings, self.rules.minimum_cameras, asked.keep_states)
-        self.points_sha256: str | None = None
-        self.warnings = rig_warnings(rig, definition.settings.scene)
+        kept = content.ledger.edited.rules(asked)
+        self.spec = SceneSpec(folder, rig, definition.settings, self.rules.minimum_cameras, kept.keep_states)
+        self.points_sha256 = found.points_sha256
+        self.warnings = found.warnings
         self._definition = definition
         self._hub = hub
         self._background = Background(self._failed)
-        self._damage = DamageLog(found.damage)
-        self.ledger = found.ledger
+        self._damage = DamageLog(content.damage)
+        self.ledger = content.ledger
         self.log = SceneLog(
-            found.ledger,
-            Journal(folder.journal, found.good, self._all_events, self._journal_renewed),
-            FrameLogIndex(folder.frames, found.sizes),
+            content.ledger,
+            Journal(folder.journal, content.good, self._all_events, self._journal_renewed),
+            FrameLogIndex(folder.frames, content.sizes),
             self._waits,
         )
         self.readers = Readers(self.spec, placement, lambda files: self.updates.mending.noticed(files))
@@ -104,10 +103,11 @@ class Scene:
             self._reports,
             self._background,
             placement,
-            keep_frames=asked.keep_frames,
+            keep_frames=kept.keep_frames,
             publish=partial(hub.publish, self.id),
             close_due=lambda: self.open_frames.close_due(),
-            remake=found.remake,
+            remake=content.remake,
+            first=found.first,
         )
         self.ingest = Ingest(
             self.log,
@@ -119,8 +119,8 @@ class Scene:
         )
         self.open_frames = OpenFrames(self.ingest, self._background.run)
         self.replays = Replays(self.spec, self.ledger, placement, self.updates.mending.noticed, self._background)
-        if found.events:
-            self._background.run(self.log.write(*found.events))
+        if content.events:
+            self._background.run(self.log.write(*content.events))
         scrub = Scrub(
             definition,
             folder,
@@ -131,7 +131,7 @@ class Scene:
             mb_per_second=server.scrub_mb_per_second,
             pause_seconds=server.scrub_pause_seconds,
         )
-        self._background.run(scrub.run())
+        self._background.run(scrub.run(), endless=True)
 
     def _check_start(self) -> None:
         """Refuses to begin where nothing tells how far away things are: 422."""
@@ -158,63 +158,44 @@ class Scene:
         return self.ledger.next_frame
 
     @property
+    def _facts(self) -> SceneFacts:
+        updates = self.updates
+        return SceneFacts(
+            definition=self._definition,
+            ledger=self.ledger,
+            pictures=self.log.pictures,
+            has_points=self.points_sha256 is not None,
+            queue_limit=self.rules.queue_frames,
+            first=updates.first,
+            damage=self._damage.sentences,
+            warnings=self.warnings,
+            trouble=updates.trouble or updates.mending.trouble,
+            at_work=updates.at_work,
+            progress=updates.progress,
+            worker_deaths=updates.worker.deaths.count,
+            asleep=not self.has_place,
+        )
+
+    @property
     def error(self) -> str | None:
         """Sentence that says why the scene is failed or degraded, or None."""
-        if self.ledger.fatal is not None:
-            return f"{self.ledger.fatal}; {how_to_begin_again(self.ledger)}"
-        return self.updates.trouble or self.updates.mending.trouble
+        return self._facts.error
 
     @property
     def state(self) -> SceneState:
         """State of the scene; see `SceneStatus`."""
-        return state_of(self.ledger, at_work=self.updates.at_work, degraded=self.error is not None)
+        return self._facts.state
 
     def status(self) -> SceneStatus:
         """Describes the scene as it is now."""
-        ledger, updates = self.ledger, self.updates
-        newest = self._newest_record or {}
-        return SceneStatus(
-            id=self.id,
-            name=self.request.name,
-            state=self.state,
-            error=self.error,
-            progress=updates.progress,
-            cameras=list(self.rig.names),
-            has_points=self.points_sha256 is not None,
-            next_frame=ledger.next_frame,
-            queued=ledger.unfinished,
-            queue_limit=self.rules.queue_frames,
-            committed=len(ledger.committed),
-            first_committed=ledger.committed[0] if ledger.committed else None,
-            last_committed=ledger.committed[-1] if ledger.committed else None,
-            gaussians=updates.gaussians,
-            reconstruction=ledger.reconstruction,
-            first_frame=ledger.frames.first,
-            paused=ledger.paused,
-            degraded=self.error is not None and ledger.fatal is None,
-            open_frames=sorted(ledger.open),
-            set_aside=ledger.counts[FrameState.SET_ASIDE],
-            missing=ledger.counts[FrameState.MISSING],
-            skipped=ledger.counts[FrameState.SKIPPED],
-            worker_deaths=updates.deaths.count,
-            frames_held=len(self.log.pictures),
-            frame_bytes=self.log.pictures.bytes,
-            states_deleted=ledger.states_deleted,
-            effects=effects_of(self.spec.settings, self._newest_record),
-            damage=self._damage.sentences,
-            warnings=[*self.warnings, *first_warnings(updates.first), *timing_warnings(newest.get("timing"))],
-            created=self.created.isoformat(),
-            ingest=self.request.ingest,
-            settings=self.spec.settings.model_dump(mode="json"),
-            budget=ledger.budgets[-1][1],
-        )
+        return self._facts.status()
 
     @property
-    def _newest_record(self) -> Mapping[str, Any] | None:
-        """The record of the newest commit, where there is one in memory."""
-        frames = self.ledger.frames
-        entry = frames.get(frames.committed[-1]) if frames.committed else None
-        return None if entry is None else entry.record
+    def idle(self) -> bool:
+        """True where nothing is under way that would be lost or delayed if its processes ended."""
+        closing = bool(self.ledger.open) and self.rules.part_seconds is not None
+        busy = self.updates.has_work or self.readers.busy or self.replays.busy or self._background.busy
+        return not (self.users or closing or busy or self.log.lock.locked() or self._hub.count(self.id))
 
     def camera(self, name: str) -> Camera:
         """Returns a camera of the rig, as frame 0 refined it where that was asked for; see `camera_of`."""
@@ -303,12 +284,47 @@ class Scene:
         await uncancelled(change())
         self.updates.begin()
 
+    async def edit(self, edit: SceneEdit) -> None:
+        """Changes name, archive or retention; they hold over a restart.
+
+        Raises:
+            Problem: 409, the scene is to be archived and frames of it wait; 507, the disk is full.
+        """
+
+        async def change() -> None:
+            async with self.log.lock:
+                if edit.archived:
+                    self._refuse_unfinished()
+                event = SceneEdited(**dict(edit))
+                if event.after(self.ledger.edited) != self.ledger.edited:
+                    await self.log.append(event)
+
+        await uncancelled(change())
+        kept = self.ledger.edited.rules(self.request.ingest)
+        await self.updates.keep(kept.keep_frames, kept.keep_states)
+
+    def _refuse_unfinished(self) -> None:
+        waiting = self.ledger.unfinished + len(self.ledger.open)
+        if waiting and self.ledger.fatal is None:
+            raise Problem(
+                409,
+                f"{counted(waiting, 'frame')} of the scene not finished",
+                field="archived",
+                value=True,
+                remedy="wait until `queued` and `open_frames` of its status are empty (POST …/resume if it is paused)",
+            )
+
+    def start(self) -> None:
+        """Starts the processes before there is anything to do: a new scene is quick with its first frame and view."""
+        self.updates.worker.start()
+        self.readers.start()
+
     async def stop(self, seconds: float = STOP_SECONDS) -> None:
         """Ends the processes of the scene; its folder stays. They have `seconds` to end by themselves."""
         self.open_frames.stop()
         self.updates.stop()
         self._background.cancel()
-        await asyncio.gather(self.updates.stop_worker(seconds), self.readers.stop(seconds), self.replays.stop())
+        await asyncio.gather(self.updates.worker.stop(seconds), self.readers.stop(seconds), self.replays.stop())
         self._background.cancel()  # what the last messages of the processes began
         await self.log.journal.close()
 

@@ -1,4 +1,4 @@
-"""Supervises a scene's worker: counts its deaths, times its frames; and keeps the scene's background tasks.
+"""Supervises a scene's worker: starts it, counts its deaths, times its frames; keeps the scene's background tasks.
 
 A death is the worker's own doing or not; that decides when it is started again and when a frame is given up.
 """
@@ -14,6 +14,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from server.processes import worker
+from server.processes.messages import SceneSpec
+from server.processes.placement import Ended, Placement, Process
 from server.storage.events import FrameSetAside, WorkerDied
 from server.storage.frame_table import FrameEntry
 
@@ -91,6 +94,81 @@ def given_up(entry: FrameEntry, death: WorkerDied) -> FrameSetAside | None:
     else:
         return None
     return FrameSetAside(index=death.index, reason=reason)
+
+
+class WorkerProcess:
+    """At most one process at a time. On the event loop.
+
+    Args:
+        spec: of the scene; another one holds from the next start on.
+        received: called with every message of the process.
+        ended: called when the process ended without being asked to; `start_in` starts the next.
+
+    Attributes:
+        ready: the process has said that it has taken the scene up; to be set by who receives that message.
+        deaths: how often a process died, and whether by its own doing.
+    """
+
+    def __init__(
+        self,
+        spec: SceneSpec,
+        placement: Placement,
+        received: Callable[[Any], None],
+        ended: Callable[[Ended], None],
+    ) -> None:
+        self.spec = spec
+        self.ready = False
+        self.deaths = WorkerDeaths()
+        self._placement = placement
+        self._received = received
+        self._ended = ended
+        self._process: Process | None = None
+        self._next: asyncio.TimerHandle | None = None
+        self._closed = False
+
+    @property
+    def starts_again(self) -> bool:
+        """True between a death and the next start."""
+        return self._next is not None
+
+    def start(self) -> None:
+        """Starts the process, unless it runs, is about to, or the scene ends."""
+        if self._process is None and self._next is None and not self._closed:
+            self.deaths.started()
+            self._process = self._placement.start(worker.main, self.spec, self._received, self._gone)
+
+    def start_in(self, seconds: float) -> None:
+        """Starts the next process after so long."""
+        if not self._closed:
+            self._next = asyncio.get_running_loop().call_later(seconds, self._again)
+
+    def send(self, message: Any) -> bool:
+        """Posts a message to a process that is ready; starts one and returns False where there is none."""
+        if self.ready and self._process is not None:
+            self._process.send(message)
+            return True
+        self.start()
+        return False
+
+    def close(self) -> None:
+        """Starts no process any more."""
+        self._closed = True
+        if self._next is not None:
+            self._next.cancel()
+
+    async def stop(self, seconds: float) -> None:
+        """Ends the process, which has `seconds` to do so itself; an unfinished frame is updated again by the next."""
+        if self._process is not None:
+            await self._process.stop(seconds)
+
+    def _again(self) -> None:
+        self._next = None
+        self.start()
+
+    def _gone(self, reason: Ended) -> None:
+        self.ready, self._process = False, None
+        if not self._closed:
+            self._ended(reason)
 
 
 class WorkClock:
@@ -177,11 +255,19 @@ class Background:
     def __init__(self, failed: Callable[[BaseException], None]) -> None:
         self._failed = failed
         self._tasks: set[asyncio.Task[None]] = set()
+        self._endless: set[asyncio.Task[None]] = set()
 
-    def run(self, coroutine: Coroutine[Any, Any, None]) -> None:
+    @property
+    def busy(self) -> bool:
+        """True while a task is not done that ends by itself."""
+        return bool(self._tasks - self._endless)
+
+    def run(self, coroutine: Coroutine[Any, Any, None], *, endless: bool = False) -> None:
         """Begins a task; tasks run in the order of the calls where they do not wait."""
         task = asyncio.get_running_loop().create_task(coroutine)
         self._tasks.add(task)
+        if endless:
+            self._endless.add(task)
         task.add_done_callback(self._done)
 
     def _done(self, task: asyncio.Task[None]) -> None:

@@ -2,31 +2,32 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
-from client.wire import FrameReportModel, FrameState, ProgressModel, Retention
+from client.wire import FrameState, ProgressModel, Retention
 from server.health import metrics
-from server.processes import worker
 from server.processes.messages import (
     Broken,
     FrameCommitted,
     FrameFailed,
     FrameReady,
+    KeepStates,
     Mended,
     Progressed,
     Ready,
     SceneSpec,
     Stalled,
+    StatesRetained,
 )
-from server.processes.placement import Ended, Placement, Process
+from server.processes.placement import Ended, Placement
 from server.processes.readers import Readers
 from server.repair.mending import DamageKind, DamageLog, Mending
-from server.scene.status import FrameReports
-from server.scene.supervision import Background, WorkClock, WorkerDeaths, given_up
+from server.scene.status import FrameReports, last_trouble, of_first_report, trouble_of
+from server.scene.supervision import Background, WorkClock, WorkerProcess, given_up
 from server.storage.events import FrameSetAside, PicturesDeleted, StatesDeleted, WorkerDied
 from server.storage.ledger import SceneLog
 from server.stream.hub import Event, FrameFinished, SceneChanged
@@ -43,10 +44,11 @@ class Updates:
         tell: publishes an event to the scene's subscribers.
         close_due: closes open frames for which there may be room now.
         remake: frames whose states were found damaged at the start, with the reason.
+        first: see below.
 
     Attributes:
         trouble: why the scene is degraded: a sentence about the last frame, the worker or the disk, or None.
-        progress: of frame 0, while it is at work. gaussians: in the newest state, where it is known.
+        progress: of frame 0, while it is at work. worker: its process.
         first: what of the first frame's report matters later: its cloud and its calibration.
     """
 
@@ -64,6 +66,7 @@ class Updates:
         publish: Callable[[Event], None],
         close_due: Callable[[], Awaitable[None]],
         remake: Mapping[int, str],
+        first: Mapping[str, Any],
     ) -> None:
         self._log = scene_log
         self._ledger = scene_log.ledger
@@ -77,26 +80,23 @@ class Updates:
         self._publish = publish
         self._close_due = close_due
         self.clock = WorkClock()
-        self.deaths = WorkerDeaths()
-        self.trouble = self._last_trouble()
+        self.worker = WorkerProcess(spec, placement, self._from_worker, self._worker_ended)
+        self.trouble = last_trouble(self._ledger)
         self.progress: ProgressModel | None = None
-        self.gaussians: int | None = None
-        self.first: Mapping[str, Any] = {}
+        self.first = first
         self._index: int | None = None
-        self._ready = False
         self._holding = 0
-        self._stopping = False
-        self._restart: asyncio.TimerHandle | None = None
+        self._rule: Retention | None = None
+        """For states, that the worker has not said it keeps."""
+        self._told = False
         self.mending = Mending(
             self._ledger,
             damage,
-            to_worker=self._to_worker,
+            to_worker=self.worker.send,
             changed=self._states_changed,
             journal=lambda event: background.run(scene_log.write(event)),
             remake=remake,
         )
-        self._worker: Process
-        self._start_worker()
 
     def tell(self, event: Event) -> None:
         """Counts and publishes an event; to be called at every change of the scene's status or of a frame."""
@@ -116,16 +116,32 @@ class Updates:
     @property
     def at_work(self) -> bool:
         """True while the worker has a frame."""
-        return self._index is not None and self._ready
+        return self._index is not None and self.worker.ready
+
+    @property
+    def has_work(self) -> bool:
+        """True while a frame is at work or waits, or something is mended or will be."""
+        mending = self.mending.at_work is not None or self.mending.trouble is not None
+        waits = bool(self._holding or self._waiting()) or self._rule is not None or self.worker.starts_again
+        return self._index is not None or waits or mending
+
+    def _waiting(self) -> list[int]:
+        ledger = self._ledger
+        return [] if ledger.paused or ledger.fatal is not None else ledger.waiting()
 
     def begin(self) -> None:
         """Gives the worker its next frame, if it is idle and one waits; to be called whenever that may have changed."""
         self.tell(SceneChanged())
         ledger = self._ledger
-        busy = self._index is not None or self._holding or self.mending.at_work is not None
-        if not self._ready or self._stopping or busy:
+        if self._index is not None or self._holding or self.mending.at_work is not None:
             return
-        waiting = [] if ledger.paused or ledger.fatal is not None else ledger.waiting()
+        waiting = self._waiting()
+        if not self.worker.ready:
+            if waiting or self.mending.trouble is not None or self._rule is not None:
+                self.worker.start()
+            return
+        if self._rule is not None and not self._told:
+            self._told = self.worker.send(KeepStates(self._rule))
         if not waiting:
             if self.mending.waiting:
                 self.mending.begin()
@@ -137,7 +153,7 @@ class Updates:
         ledger.move(index, FrameState.UPDATING)
         self._index = index
         self.clock.begin(first=not ledger.committed)
-        self._worker.send(FrameReady(index, receipt.time, entry.files, receipt.identity, ledger.budget_of(index)))
+        self.worker.send(FrameReady(index, receipt.time, entry.files, receipt.identity, ledger.budget_of(index)))
         self.tell(SceneChanged())
 
     @contextmanager
@@ -164,6 +180,9 @@ class Updates:
                 self.tell(SceneChanged())
             case FrameCommitted():
                 self._background.run(self._commit(message))
+            case StatesRetained():
+                self._rule = None
+                self._background.run(self._states_deleted(message.deleted))
             case FrameFailed():
                 event = FrameSetAside(
                     index=message.index, reason=message.reason, dropped=message.dropped, fatal=message.fatal
@@ -172,7 +191,7 @@ class Updates:
             case Mended():
                 self.mending.mended(message)
                 if not self.first:  # it could not be read before
-                    self._background.run(self.recall())
+                    self._background.run(self._recall())
             case Stalled():
                 self.trouble = f"frame {message.index} waits for room on the disk: {message.reason}"
                 self.clock.stall(message.seconds)
@@ -198,31 +217,35 @@ class Updates:
             self._readers.refresh()
             if ready.indices[-1] > newest:  # committed by a worker that died before it could say so
                 self.tell(FrameFinished(ledger.frames[ready.indices[-1]].report))
-        self.trouble = self._last_trouble()
-        self._ready = True
+        self.trouble = last_trouble(self._ledger)
+        self.worker.ready = True
         self.mending.taken_up(ready.damaged)
         self.begin()
 
     async def _commit(self, message: FrameCommitted) -> None:
-        self.deaths.committed()
+        self.worker.deaths.committed()
         self.clock.end(committed=True)
         self._index, self.progress = None, None
         self._ledger.move(message.index, FrameState.COMMITTED)
         self._record(message.index, message.report)
         report = self._ledger.frames[message.index].report
         self.trouble = trouble_of(report)
-        self._readers.refresh((message.index, *message.deleted))
+        self._readers.refresh((message.index,))
         self.tell(FrameFinished(report))
         self.begin()
-        if message.deleted:
-            self.mending.retired(message.deleted)
-            deleted = StatesDeleted(frames=message.deleted)
-            self._ledger.apply(deleted)
-            self.tell(SceneChanged())
-            await self._log.write(deleted)
+        await self._states_deleted(message.deleted)
         await self.retain()
         if self._ledger.open:
             await self._close_due()
+
+    async def _states_deleted(self, frames: tuple[int, ...]) -> None:
+        if frames:
+            self.mending.retired(frames)
+            self._readers.refresh(frames)
+            deleted = StatesDeleted(frames=frames)
+            self._ledger.apply(deleted)
+            self.tell(SceneChanged())
+            await self._log.write(deleted)
 
     async def _set_aside(self, event: FrameSetAside) -> None:
         await self._log.write(event)
@@ -250,23 +273,12 @@ class Updates:
 
     def _record(self, index: int, record: Mapping[str, Any]) -> None:
         self._ledger.frames.set_record(index, record)
-        self.gaussians = record.get("gaussians")
-        self._recall(record)
+        self.first = of_first_report(record) or self.first
 
-    def _recall(self, record: Mapping[str, Any]) -> None:
-        """Keeps what the report of the first frame alone has."""
-        if record.get("cloud") or record.get("calibration"):
-            self.first = {name: record.get(name) for name in ("cloud", "calibration", "shortened", "grey")}
-
-    async def recall(self) -> None:
-        """Reads the first report of a scene that is found again; to be called before anybody asks for it."""
+    async def _recall(self) -> None:
+        """Reads the report of the first frame, which could not be read before."""
         if self._ledger.committed:
-            self._recall(await self._reports.record(self._ledger.committed[0]))
-
-    def _last_trouble(self) -> str | None:
-        """Returns what went wrong with the newest frame that was tried, or None."""
-        last = self._ledger.last_tried()
-        return None if last is None else trouble_of(self._ledger.frames[last].report)
+            self.first = of_first_report(await self._reports.record(self._ledger.committed[0])) or self.first
 
     async def retain(self) -> None:
         """Deletes pictures from the frame log by the scene's rule, except those needed to make states again."""
@@ -280,13 +292,16 @@ class Updates:
         await self._log.delete_pictures(names)
         await self._log.write(event)
 
-    # Mending.
+    async def keep(self, frames: Retention, states: Retention) -> None:
+        """Keeps so much from now on, and deletes what is beyond it."""
+        if states != self.worker.spec.keep_states:
+            self.worker.spec = replace(self.worker.spec, keep_states=states)
+            self._rule, self._told = states, False
+            self.begin()
+        self._keep_frames = frames
+        await self.retain()
 
-    def _to_worker(self, message: Any) -> bool:
-        """Posts a message; returns False where no worker can receive one."""
-        if self._ready:
-            self._worker.send(message)
-        return self._ready
+    # Mending.
 
     def _states_changed(self, frames: tuple[int, ...]) -> None:
         if frames:
@@ -295,17 +310,13 @@ class Updates:
 
     # The worker's life.
 
-    def _start_worker(self) -> None:
-        self.deaths.started()
-        self._worker = self._placement.start(worker.main, self._spec, self._from_worker, self._worker_ended)
-
     def _worker_ended(self, reason: Ended) -> None:
-        self._ready, self.progress = False, None
+        self.progress, self._told = None, False
         self.clock.end(committed=False)
-        if self._stopping or self._ledger.fatal is not None:
+        if self._ledger.fatal is not None:
             return
         metrics.RESTARTS.labels("worker").inc()
-        own, delay = self.deaths.died(reason.exit_code)
+        own, delay = self.worker.deaths.died(reason.exit_code)
         self.trouble = f"the worker is gone: {reason}; it is started again in {delay:g} s"
         log.error("scene %s: %s", self._ledger.scene, self.trouble)
         self._background.run(self._after_death(str(reason), own, delay))
@@ -322,29 +333,9 @@ class Updates:
             if event is not None and not await self._reports.is_committed(index):
                 await self._set_aside(event)
         self.tell(SceneChanged())
-        if not self._stopping:
-            self._restart = asyncio.get_running_loop().call_later(delay, self._start_worker)
+        self.worker.start_in(delay)
 
     def stop(self) -> None:
         """Starts no worker again, and tries no mending again."""
-        self._stopping = True
-        if self._restart is not None:
-            self._restart.cancel()
+        self.worker.close()
         self.mending.stop()
-
-    async def stop_worker(self, seconds: float) -> None:
-        """Ends the worker, which has `seconds` to do so itself; an unfinished frame is updated again after the next."""
-        await self._worker.stop(seconds)
-
-
-def trouble_of(report: FrameReportModel) -> str | None:
-    """Says why a scene is degraded whose newest finished frame has this report; None: it is not."""
-    if report.state == FrameState.SET_ASIDE:
-        return f"frame {report.index} was set aside: {report.error}"
-    if report.outcome is not None and report.outcome.degraded:
-        verb = "" if report.outcome.held else "committed in part: "
-        return f"frame {report.index} was {verb}{report.degraded}"
-    if report.dropped_cameras:
-        left_out = "; ".join(f"{name}: {reason}" for name, reason in report.dropped_cameras.items())
-        return f"frame {report.index} was committed without camera {left_out}"
-    return None

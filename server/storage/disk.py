@@ -9,6 +9,7 @@ from pathlib import Path
 
 from scas4d_core.errors import message_of
 from server.problems import Problem
+from server.storage.layout import DataFolder
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """Errors of a full disk: they go away once there is room."""
@@ -57,3 +58,18 @@ class FolderLock:
     def release(self) -> None:
         """Releases the lock."""
         os.close(self._file)
+
+
+def lock_data(data: Path) -> FolderLock:
+    """Locks the data folder for this service; the folder is made when missing.
+
+    Raises:
+        RuntimeError: another service is at work in it.
+    """
+    data.mkdir(parents=True, exist_ok=True)
+    try:
+        return FolderLock(DataFolder(data).lock, wait=False)
+    except BlockingIOError:
+        raise RuntimeError(
+            f"another service is at work in {data}; stop it, or give this one another folder: --data FOLDER"
+        ) from None

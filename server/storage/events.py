@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from client.wire import Budget, FileKind, ReconstructionRequest
+from client.wire import Budget, FileKind, IngestSettings, ReconstructionRequest, Retention
 
 Hashes = dict[str, dict[FileKind, str]]
 """BLAKE3 of each file, by camera and kind."""
@@ -115,6 +115,26 @@ class PauseChanged(_Event):
     paused: bool
 
 
+class SceneEdited(_Event):
+    """Name, archive or retention of the scene was changed: all that is not None. Several are as one (`after`)."""
+
+    fact: Literal["edited"] = "edited"
+    name: str | None = None
+    archived: bool | None = None
+    keep_frames: Retention | None = None
+    keep_states: Retention | None = None
+
+    def after(self, before: SceneEdited) -> SceneEdited:
+        """Both changes in one, this one later."""
+        given = {name: getattr(self, name) for name in self.__class__.model_fields if getattr(self, name) is not None}
+        return before.model_copy(update=given)
+
+    def rules(self, ingest: IngestSettings) -> IngestSettings:
+        """The rules of a scene with those of retention that were changed."""
+        changed = {"keep_frames": self.keep_frames, "keep_states": self.keep_states}
+        return ingest.model_copy(update={name: rule for name, rule in changed.items() if rule is not None})
+
+
 class BudgetChanged(_Event):
     """Another budget holds from frame `index` on; a frame that is updated again gets the budget that held for it."""
 
@@ -186,6 +206,7 @@ JournalEvent = Annotated[
     | StatesDeleted
     | StateFound
     | PauseChanged
+    | SceneEdited
     | BudgetChanged
     | ReconstructionBegun,
     Field(discriminator="fact"),

@@ -5,9 +5,13 @@ The committed states inside `states/` are laid out by `scas4d_core.storage.frame
 
 from __future__ import annotations
 
+import contextlib
+import secrets
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from scas4d_core.storage.npz import sync_folder
 from server.storage.events import ReconstructionBegun
 
 
@@ -35,6 +39,23 @@ class DataFolder:
     def scene(self, id: str) -> SceneFolder:
         """Folder of a scene."""
         return SceneFolder(self.scenes / id)
+
+    def bury(self, path: Path, name: str) -> Path:
+        """Moves a file or a folder to the deleted ones; returns its new path. Blocking."""
+        grave = self.deleted / f"{name}-{secrets.token_hex(4)}"
+        path.rename(grave)
+        sync_folder(self.deleted)
+        sync_folder(path.parent)
+        return grave
+
+    def sweep(self) -> None:
+        """Removes what was moved to the deleted ones. Blocking."""
+        for path in self.deleted.iterdir():
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                with contextlib.suppress(OSError):
+                    path.unlink()
 
 
 @dataclass(frozen=True)
@@ -108,6 +129,11 @@ class SceneFolder:
 
     def _of(self, name: str) -> Path:
         return self.path / f"{name}{_suffix(self.reconstruction)}"
+
+    @property
+    def card(self) -> Path:
+        """Status of a scene that is asleep (`server.scene.card`); nothing is lost with it."""
+        return self.path / "asleep.json"
 
     @property
     def worker_lock(self) -> Path:

@@ -30,6 +30,7 @@ from server.storage.events import (
     PauseChanged,
     PicturesDeleted,
     ReconstructionBegun,
+    SceneEdited,
     StateFound,
     StatesDeleted,
     WorkerDied,
@@ -57,6 +58,7 @@ class Ledger:
     Attributes:
         frames: every index below `next_frame`. open: frames that cameras send one by one. fatal: reason why the scene
             cannot go on, or None. budgets: the first frame that each holds for, rising.
+        edited: the changes of its name, archive and retention since it was created.
         begun: the event that the present reconstruction was begun by; None: it came with the scene.
     """
 
@@ -68,6 +70,7 @@ class Ledger:
         self.fatal: str | None = None
         self.states_deleted = 0
         self.budgets: list[tuple[int, Budget]] = [(0, Budget())]
+        self.edited = SceneEdited()
         self.begun: ReconstructionBegun | None = None
 
     @property
@@ -138,6 +141,8 @@ class Ledger:
                 self.frames.found(event.index, event.time)
             case PauseChanged():
                 self.paused = event.paused
+            case SceneEdited():
+                self.edited = event.after(self.edited)
             case ReconstructionBegun() if event.number > self.reconstruction:
                 self.begun, self.fatal, self.states_deleted = event, None, 0
                 self.frames.begin_again(event.index)
@@ -209,7 +214,7 @@ class Ledger:
         new = Ledger(self.scene)
         new.frames, new.open = self.frames.copy(), copy.deepcopy(self.open)
         new.paused, new.fatal, new.states_deleted = self.paused, self.fatal, self.states_deleted
-        new.budgets, new.begun = list(self.budgets), self.begun
+        new.budgets, new.begun, new.edited = list(self.budgets), self.begun, self.edited
         return new
 
     def waiting(self) -> list[int]:

@@ -116,7 +116,7 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
     elif debris:
         remove(frames, debris)
     sizes = {name: size for name, size in sizes.items() if name not in debris}
-    remake = _remade(ledger, states, broken, _deletes_states(definition or {}))
+    remake = _remade(ledger, states, broken, _deletes_states(definition or {}, ledger))
     damage.extend(f"frame {index}: {reason}" for index, reason in remake.items() if index not in states.damaged)
     events += ledger.reconcile(states.indices, states.damaged, remake)
     if states.newest:
@@ -155,8 +155,10 @@ def _unnamed(ledger: Ledger, sizes: dict[str, int]) -> set[str]:
     return set(sizes) - named
 
 
-def _deletes_states(definition: Mapping[str, Any]) -> bool:
+def _deletes_states(definition: Mapping[str, Any], ledger: Ledger) -> bool:
     """True for a scene with a rule that deletes old states."""
+    if ledger.edited.keep_states is not None:
+        return any(value is not None for _, value in ledger.edited.keep_states)
     rule = definition.get("request", {}).get("ingest", {}).get("keep_states") or {}
     return any(value is not None for value in rule.values())
 

@@ -16,6 +16,7 @@ from server.storage.events import (
     PartAccepted,
     PauseChanged,
     PicturesDeleted,
+    SceneEdited,
     StateFound,
     StatesDeleted,
     WorkerDied,
@@ -62,6 +63,8 @@ def events_of(ledger: Ledger) -> Iterator[JournalEvent]:
             yield BudgetChanged(index=first, budget=budget)
     if ledger.paused:
         yield PauseChanged(paused=True)
+    if ledger.edited != SceneEdited():
+        yield ledger.edited
 
 
 def _of_frame(entry: FrameEntry, fatal: str | None) -> Iterator[JournalEvent]:

@@ -19,7 +19,7 @@ from client.wire.stream import BulkHead, PartsSubscription, StreamProblem, pack
 from server.problems import SERVICE_FAULT, Problem
 from server.processes.messages import PartsQuery, Query, RenderQuery, TracksQuery
 from server.routes import render, tracks
-from server.scene.scenes import Scene
+from server.scene.scene import Scene
 from server.stream.outbox import Outbox
 from server.stream.shared_queries import SharedQueries, fingerprint
 

@@ -31,7 +31,7 @@ from client.wire.stream import (
 from server.http import validation
 from server.problems import Problem, counted
 from server.routes import render, tracks
-from server.scene.scenes import Scene
+from server.scene.scene import Scene
 from server.stream.hub import Channel, Event, FrameFinished
 from server.stream.live_queries import LiveParts, LiveQuery, LiveRender, LiveTracks
 from server.stream.outbox import Outbox

@@ -165,3 +165,19 @@ def memory(
 
     need_server()
     typer.echo(json.dumps(measure(cameras, size, gaussians, scale, masks)))
+
+
+def sleeping(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a scene, DATA/scenes/ID.")],
+    count: Annotated[int, typer.Option(min=1, help="Scenes that sleep.")] = 500,
+    views: Annotated[int, typer.Option(min=1, help="Scenes that are woken by a view.")] = 5,
+    work: Annotated[Path, typer.Option(help="Data folder of the copies; what is there goes.")] = Path("out/sleeping"),
+) -> None:
+    """Measures memory, listing and first views of scenes that sleep: copies of one; prints JSON."""
+    import json
+
+    from client.cli.extras import need_server
+    from studies.service import memory as of
+
+    need_server()
+    typer.echo(json.dumps(of.sleeping(scene, count, min(views, count), work.resolve())))

@@ -1,8 +1,9 @@
 """Files of the three packages that one frame crosses between PUT and commit, and one render between request and answer.
 
 Both bound how much a reader has to open to follow a frame. A file counts when a function of it runs, in whatever
-process; `__init__` files, the kernels and the groups of effects (those that a scene has: a few of many) are left aside.
-The service runs as usual, with a profiler in each process.
+process. Left aside are `__init__` files, the kernels, the groups of effects (those that a scene has: a few of many) and
+`server/repair` (which looks at the disk every few seconds, whatever comes). The service runs as usual, with a profiler
+in each process.
 """
 
 from __future__ import annotations
@@ -78,6 +79,7 @@ def crossed(folder: Path, capture: Capture) -> dict[str, list[str]]:
         "PYTHONPATH": path,
         "CROSSING_FOLDER": str(folder),
         "SCAS4D_SCRUB_MB_PER_SECOND": "0",
+        "SCAS4D_SLEEP_SECONDS": "0",
         "SCAS4D_LOG_LEVEL": "info",
     }
     assert capture.test_rig is not None
@@ -137,6 +139,7 @@ def _files(folder: Path, phase: str, root: Path) -> Iterator[str]:
                 inside = path.relative_to(root)
                 aside = path.name == "__init__.py" or "kernels" in inside.parts
                 aside = aside or ("effects" in inside.parts and inside.parts[-2] != "effects")
+                aside = aside or inside.parts[:2] == ("server", "repair")
                 if inside.parts[0] in PACKAGES and not aside:
                     yield inside.as_posix()
 

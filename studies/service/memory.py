@@ -1,9 +1,17 @@
 """Measures the peak memory of a reconstruction against the estimate of the service (server/health/estimate.py).
 
 Frame 0 and two updates of a ball in the middle of a ring of cameras, in few iterations: memory does not depend on them.
+And memory of a service whose scenes all sleep, with the time of their listing and of a first view.
 """
 
 from __future__ import annotations
+
+import os
+import re
+import shutil
+import time
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -14,7 +22,10 @@ from scas4d_core.captures import Frame, InitialPoints
 from scas4d_core.presets import preset
 from server.health.estimate import estimate
 from server.settings import ServerSettings
+from server.storage.definition import read_definition, write_definition
+from server.storage.layout import DataFolder, SceneFolder
 from studies.constants import varied
+from studies.service.process import Service
 
 
 def ring(count: int, size: int) -> Rig:
@@ -62,3 +73,62 @@ def measure(cameras: int, size: int, gaussians: int, scale: float, masks: bool) 
     expected = estimate(RigModel.of(rig), settings, ServerSettings()).worker_mb
     kept = len(reconstruction.history.gaussians(0))
     return {"peak_mb": round(peak), "estimate_mb": round(expected), "ratio": peak / expected, "kept": kept}
+
+
+def sleeping(scene: Path, count: int, views: int, work: Path) -> dict[str, float]:
+    """Copies a scene's folder, starts a service over the copies, which sleep, and asks for views of some.
+
+    Args:
+        scene: folder of a scene with committed frames, in the data folder of a service that has ended.
+        count: copies. views: scenes that are woken, one after the other. work: data folder; what is there goes.
+
+    Returns:
+        MB a scene; seconds from the start to the list, where the folders are new to the service and later; median and
+        longest seconds to the first view of a scene.
+    """
+    shutil.rmtree(work, ignore_errors=True)
+    empty, full = work / "empty", DataFolder(work / "full")
+    full.scenes.mkdir(parents=True)
+    definition, _ = read_definition(SceneFolder(scene))
+    names = [f"{number:012x}" for number in range(count)]
+    for name in names:
+        folder = full.scene(name)
+        shutil.copytree(scene, folder.path)
+        write_definition(folder, replace(definition, id=name))
+        os.utime(folder.journal, (0, 0))  # used long ago
+    found = {}
+    for name, data in (("empty", empty), ("new", full.path), ("again", full.path)):
+        data.mkdir(exist_ok=True)
+        service = Service(data)
+        try:
+            began = time.perf_counter()
+            service.start()
+            listed = service.http.get("/v1/scenes").json()["scenes"]
+            found[name] = time.perf_counter() - began, _resident_mb(service.pid), len(listed)
+            waited = [_first_view(service, one) for one in names[:views]] if name == "again" else []
+        finally:
+            service.stop()
+    (_, alone, _), (new, together, counted), (seconds, _, again) = found["empty"], found["new"], found["again"]
+    assert (counted, again) == (count, count), f"{counted} and {again} of {count} scenes are listed"
+    return {
+        "mb_a_scene": (together - alone) / count,
+        "new_list_s": new,
+        "list_s": seconds,
+        "view_s": float(np.median(waited)),
+        "longest_view_s": max(waited),
+    }
+
+
+def _first_view(service: Service, name: str) -> float:
+    camera = service.http.get(f"/v1/scenes/{name}").json()["cameras"][0]
+    began = time.perf_counter()
+    service.http.post(f"/v1/scenes/{name}/render", json={"camera": camera}).raise_for_status()
+    waited = time.perf_counter() - began
+    service.http.post(f"/v1/scenes/{name}/sleep").raise_for_status()
+    return waited
+
+
+def _resident_mb(pid: int) -> float:
+    match = re.search(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
+    assert match is not None
+    return int(match[1]) / 1000

@@ -26,6 +26,8 @@ CALLS = [
     calls.pause("s"),
     calls.resume("s"),
     calls.begin_again("s", 3),
+    calls.edit_scene("s", name="x"),
+    calls.put_to_sleep("s"),
     calls.delete_scene("s"),
     calls.put_points("s", POINTS),
     calls.put_frame("s", 7, {"c0": b"x"}),

@@ -43,7 +43,7 @@ class Running:
     def recovered(self, asked):
         try:
             if asked:
-                self.app.state.scenes.check_recovered()
+                self.app.state.scenes.recovering.check()
         except Problem:
             return False
         return True

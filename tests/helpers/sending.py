@@ -90,3 +90,32 @@ def animated():
     file = io.BytesIO()
     first.save(file, "PNG", save_all=True, append_images=[second])
     return file.getvalue()
+
+
+@contextlib.contextmanager
+def serving_with(folder, **changes):
+    running = Running(fake_settings(folder, **changes))
+    try:
+        with httpx.Client(base_url=running.url, timeout=30) as http, Client(running.url, patience=20) as sdk:
+            yield running, http, sdk
+    finally:
+        running.stop()
+
+
+def filled(http, count=2, red=0):
+    id = create(http)
+    for index in range(count):
+        put_form(http, id, index, pictures(red))
+        finished(http, id, index)
+    settled(http, id)
+    return id
+
+
+def put_to_sleep(http, id):
+    wait_for(lambda: http.post(f"/v1/scenes/{id}/sleep").status_code == 200)
+    assert status(http, id)["asleep"] is True
+
+
+def view(http, id, frame=None):
+    query = {"camera": "c0"} | ({} if frame is None else {"frame": frame})
+    return http.post(f"/v1/scenes/{id}/render", json=query)

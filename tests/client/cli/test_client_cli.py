@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 from running import HEIGHT, WIDTH, make_rig, pictures
+from typer.testing import CliRunner
 
 from client.cli.changes import parse_changes
 from client.cli.commands import frame_line, out_of_step
+from client.cli.main import app
 from client.cli.pictures import coloured, comparison, psnr
 from client.rig import push
 from client.sdk import Client
@@ -83,6 +85,38 @@ def test_watch_prints_frames_until_the_scene_is_gone(service, capture_folder):
     missing = scas4d("watch", "nowhere", "--url", service.url)
     assert missing.returncode == 1
     assert "Traceback" not in missing.stderr
+
+
+def test_scenes_are_managed(service):
+    with Client(service.url) as client:
+        id = client.create_scene(make_rig(), name="first take").id
+        other = client.create_scene(make_rig()).id
+
+        def scenes(*given, input=None):
+            return CliRunner().invoke(app, ["scenes", *given, "--url", service.url], input=input)
+
+        assert "second take" in scenes("rename", id, "second take").stdout
+        assert client.scene(id).name == "second take"
+        scenes("pause", id, other)
+        assert (client.scene(id).paused, client.scene(other).paused) == (True, True)
+        scenes("resume", id, other)
+        assert (client.scene(id).paused, client.scene(other).paused) == (False, False)
+        scenes("keep", id, "--frames", "5", "--states", "all")
+        kept = client.scene(id).ingest
+        assert (kept.keep_frames.last, kept.keep_states.last) == (5, None)
+        assert "neither a number of frames nor all" in scas4d("scenes", "keep", id, "--frames", "few").stderr
+        assert "asleep" in scenes("sleep", id).stdout
+        assert "archived" in scenes("archive", id).stdout
+        assert id not in scenes().stdout
+        assert "1 archived; scas4d scenes --all" in scenes().stdout
+        assert id in scenes("--all").stdout
+        scenes("restore", id)
+        assert id in scenes().stdout
+        refused = scenes("delete", id, input="n\n")
+        assert "delete scene" in refused.stdout
+        assert client.scene(id)
+        assert scenes("delete", id, other, "--yes").exit_code == 0
+        assert not {id, other} & {status.id for status in client.scenes()}
 
 
 def test_import_makes_a_capture_that_can_be_pushed(service, tmp_path):

@@ -75,6 +75,9 @@ def test_the_digest_is_of_names_and_contents(tmp_path):
     second = cache.digest(tmp_path)
     (tmp_path / "a.py").rename(tmp_path / "b.py")
     assert len({first, second, cache.digest(tmp_path)}) == 3
+    (tmp_path / "below").mkdir()
+    (tmp_path / "b.py").rename(tmp_path / "below" / "b.py")
+    assert len({first, second, cache.digest(tmp_path)}) == 3
 
 
 def test_versions_used_last_are_kept(tmp_path):

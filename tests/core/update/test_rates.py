@@ -46,11 +46,17 @@ def test_a_layer_has_a_rate_until_it_rests_and_at_least_once(iterations: int) ->
 
 
 def test_layers_rest_where_the_motion_before_leads_near_and_nowhere_else() -> None:
-    near, far = (rates().resting_if_near(unexplained) for unexplained in (NEAR, NEAR + 0.01))
+    near, far = (rates().warm(unexplained) for unexplained in (NEAR, NEAR + 0.01))
     assert near.rests == LAYER_RESTS
     assert far.rests == ()
     assert far.resting(99, 100) == 0
     assert near.layers == far.layers
+
+
+def test_without_a_motion_before_layers_are_faster_and_none_rests() -> None:
+    cold = rates().cold(2.0)
+    assert cold.rests == ()
+    assert [turn for turn, _, _ in cold.layers] == [2 * turn for turn, _, _ in rates().layers]
 
 
 @pytest.mark.parametrize(

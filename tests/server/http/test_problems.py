@@ -16,9 +16,9 @@ def test_an_unknown_address(http):
 
 
 def test_a_method_that_is_not_there_names_those_that_are(http, quiet_scene):
-    answer = http.patch(f"/v1/scenes/{quiet_scene}")
-    assert problem(answer, 405)["value"] == "PATCH"
-    assert answer.headers["allow"] == "DELETE, GET"
+    answer = http.put(f"/v1/scenes/{quiet_scene}")
+    assert problem(answer, 405)["value"] == "PUT"
+    assert answer.headers["allow"] == "DELETE, GET, PATCH"
     assert "GET" in answer.json()["remedy"]
 
 

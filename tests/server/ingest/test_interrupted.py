@@ -35,7 +35,7 @@ def test_a_refused_sender_that_goes_in_the_middle_leaves_the_frame_free(http, ma
 
 
 def on_the_loop(scene, coroutine):
-    return asyncio.run_coroutine_threadsafe(coroutine, scene.updates._worker._loop)
+    return asyncio.run_coroutine_threadsafe(coroutine, scene.updates.worker._process._loop)
 
 
 @pytest.mark.parametrize("part", [False, True])

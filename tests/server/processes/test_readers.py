@@ -18,8 +18,7 @@ from running import HEIGHT, WIDTH, Running, fake_settings, make_rig, pictures, p
 
 from client.sdk import Client
 from client.wire import CameraModel, part_colour
-from server.processes import readers as readers_module
-from server.processes import renderer
+from server.processes import query_queue, renderer
 
 PATIENCE_S = 30
 
@@ -27,7 +26,7 @@ PATIENCE_S = 30
 @pytest.fixture(scope="module")
 def impatient(tmp_path_factory):
     """A service that soon gives up waiting for an answer; long enough for a process to start on a busy machine."""
-    with mock.patch.object(readers_module, "ANSWER_SECONDS", 15.0):
+    with mock.patch.object(query_queue, "ANSWER_SECONDS", 15.0):
         running = Running(fake_settings(tmp_path_factory.mktemp("data")))
         yield running
         running.stop()
@@ -142,7 +141,7 @@ def test_the_process_for_bulk_starts_with_the_first_question_and_yields_to_the_o
 
 def test_too_many_questions_are_refused(scene, monkeypatch):
     id, readers, http = scene
-    monkeypatch.setattr(readers_module, "MOST_WAITING", 1)
+    monkeypatch.setattr(query_queue, "MOST_WAITING", 1)
     hanging = in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}"))
     until(lambda: readers.bulk._at_work is not None)
     in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids=0"))

@@ -11,6 +11,7 @@ from client.calls import put_frame
 from client.sdk import ServiceError
 from client.wire import RigModel
 from scas4d_core.captures import InitialPoints
+from scas4d_core.storage.npz import read_npz
 from server.processes import track_answers
 from server.routes import points
 
@@ -40,7 +41,7 @@ def test_a_scene_is_created_listed_and_deleted(http, service):
     url = created.headers["Location"]
     assert status["id"] in [scene["id"] for scene in http.get("/v1/scenes").json()["scenes"]]
     scene = service.app.state.scenes[status["id"]]
-    processes = [scene.updates._worker._process, scene.readers.views.process._process]
+    processes = [scene.updates.worker._process._process, scene.readers.views.process._process]
     assert http.delete(url).status_code == 204
     problem(http.get(url), 404)
     assert not scene.spec.folder.path.exists()
@@ -216,6 +217,27 @@ def test_a_left_handed_rig_is_told_the_way_out(http):
 def beside_one_another(count):
     """A rig whose cameras look along the world's z axis."""
     return RigModel.of(make_rig(count)).model_dump(mode="json")
+
+
+@pytest.mark.parametrize("columns", [6, 7])
+def test_a_cloud_of_dynamic3dgs_is_taken_as_it_is(http, sdk, scene, service, columns):
+    data = np.array([[0, 0, 1, 0.1, 0.2, 0.3, 1], [0, 0, 2, 0.4, 0.5, 0.6, 0], [0, 0, 3, 0, 0, 1, 0.5]])[:, :columns]
+    file = io.BytesIO()
+    np.savez(file, data=data)
+    answer = http.put(f"/v1/scenes/{scene}/points", content=file.getvalue())
+    assert (answer.status_code, answer.json()["points"]) == (200, 3)
+    stored = read_npz(service.app.state.scenes[scene].spec.folder.points)
+    np.testing.assert_array_equal(stored["positions"], data[:, :3])
+    np.testing.assert_array_equal(stored["colours"], data[:, 3:6].astype(np.float32))
+    assert ("foreground" in stored) == (columns == 7)
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (3,), (0, 7)])
+def test_a_cloud_of_another_shape_is_refused(http, quiet_scene, shape):
+    file = io.BytesIO()
+    np.savez(file, data=np.zeros(shape))
+    refused = problem(http.put(f"/v1/scenes/{quiet_scene}/points", content=file.getvalue()), 422)
+    assert refused["field"] in ("data", "positions")
 
 
 @pytest.mark.parametrize("parts", [False, True])

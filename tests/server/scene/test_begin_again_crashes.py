@@ -13,7 +13,7 @@ from sending import create, put_form, serving, settled, status, wait_for
 
 from client.wire import ReconstructionRequest
 from scas4d_core.storage.history import History
-from server.scene import scenes
+from server.scene import beginning, found
 from server.storage.events import FrameAccepted, FrameSetAside, PicturesDeleted, ReconstructionBegun, StatesDeleted
 from server.storage.journal import Journal, bytes_of, read_journal
 from server.storage.layout import DataFolder
@@ -66,7 +66,7 @@ def crashes(monkeypatch):
                 step("event", self.path.parent.name, self.path.parent)
             await super().append(*events)
 
-    write, bury = scenes.write_definition, scenes.Scenes._bury
+    write, bury = found.write_definition, DataFolder.bury
 
     def definition(folder, given):
         step("definition", folder.name, folder.path)
@@ -77,9 +77,9 @@ def crashes(monkeypatch):
             step(f"move {path.name}", path.parent.name, path.parent)
         return bury(self, path, name)
 
-    monkeypatch.setattr(scenes, "Journal", Watched)
-    monkeypatch.setattr(scenes, "write_definition", definition)
-    monkeypatch.setattr(scenes.Scenes, "_bury", moved)
+    monkeypatch.setattr(beginning, "Journal", Watched)
+    monkeypatch.setattr(found, "write_definition", definition)
+    monkeypatch.setattr(DataFolder, "bury", moved)
     return at, reached
 
 
@@ -195,7 +195,7 @@ def test_a_full_disk_refuses_and_leaves_the_scene_as_it_was(tmp_path, monkeypatc
         id = filled(http, sdk)
         before = committed(tmp_path, id)
         with monkeypatch.context() as patched:
-            patched.setattr(scenes, "Journal", Full)
+            patched.setattr(beginning, "Journal", Full)
             problem(begin(http, id), 507)
         assert committed(tmp_path, id) == before
         assert settled(http, id)["reconstruction"] == 0

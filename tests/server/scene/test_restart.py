@@ -206,7 +206,7 @@ def test_it_answers_while_scenes_are_recovered(tmp_path, monkeypatch):
         assert go_on.acquire(timeout=60)
         return recovery.recover(*given)
 
-    monkeypatch.setattr("server.scene.scenes.recover", recover)
+    monkeypatch.setattr("server.scene.found.recover", recover)
     running = Running(fake_settings(tmp_path), ready=False)
     try:
         with httpx.Client(base_url=running.url, timeout=30) as http:
@@ -241,7 +241,7 @@ def test_a_service_that_ends_while_scenes_are_recovered_leaves_them_as_they_are(
         id = create(http)
     go_on = threading.Semaphore(0)
     monkeypatch.setattr(
-        "server.scene.scenes.recover", lambda *given: go_on.acquire(timeout=60) and recovery.recover(*given)
+        "server.scene.found.recover", lambda *given: go_on.acquire(timeout=60) and recovery.recover(*given)
     )
     running = Running(fake_settings(tmp_path), ready=False)
     threading.Timer(0.5, go_on.release).start()

@@ -1,0 +1,159 @@
+"""The commands `scas4d scenes …`: lists, renames, pauses, archives, puts to sleep and deletes scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from client.cli.progress import console
+from client.sdk import DEFAULT_URL, Client
+from client.wire import Retention, SceneStatus
+
+Url = Annotated[str, typer.Option(envvar="SCAS4D_URL", help="Address of the service.")]
+Token = Annotated[
+    str | None, typer.Option(envvar="SCAS4D_TOKEN", help="Token of the service; better given in SCAS4D_TOKEN.")
+]
+Scenes = Annotated[list[str], typer.Argument(metavar="SCENE...", help="Ids of scenes.")]
+
+app = typer.Typer(help="Lists the scenes of the service, and manages them.", invoke_without_command=True)
+
+
+HEAD = ("scene", "name", "state", "cameras", "next frame", "queued", "committed", "awake", "error")
+
+
+def table(statuses: Sequence[SceneStatus]) -> list[str]:
+    """Scenes as lines of a table with a head; whole words, however narrow the terminal: programs read them too."""
+    rows: list[tuple[str, ...]] = [HEAD]
+    for status in statuses:
+        awake = "archived" if status.archived else "asleep" if status.asleep else "yes"
+        numbers = (len(status.cameras), status.next_frame, status.queued, status.committed)
+        rows.append((status.id, status.name, status.state, *map(str, numbers), awake, status.error or ""))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+@app.callback()
+def listed(
+    context: typer.Context,
+    url: Url = DEFAULT_URL,
+    token: Token = None,
+    all: Annotated[bool, typer.Option("--all", help="Archived ones, too.")] = False,
+) -> None:
+    """Lists the scenes of the service, oldest first; SCENE in other commands is the id."""
+    if context.invoked_subcommand is not None:
+        return
+    with Client(url, token=token, outage=0) as client:
+        found = client.scenes()
+    shown = [status for status in found if all or not status.archived]
+    _say(*table(shown))
+    if hidden := len(found) - len(shown):
+        _say(f"{hidden} archived; scas4d scenes --all lists them, too")
+    if not found:
+        _say("no scene yet; make one with: scas4d push CAPTURE")
+
+
+@app.command()
+def rename(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="For people; the id stays.")],
+    url: Url = DEFAULT_URL,
+    token: Token = None,
+) -> None:
+    """Gives a scene another name."""
+    with Client(url, token=token) as client:
+        _told(client.edit_scene(scene, name=name))
+
+
+@app.command()
+def pause(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
+    """Pauses scenes after the frame at work: they take frames, and reconstruct none."""
+    with Client(url, token=token) as client:
+        for scene in scenes:
+            _told(client.pause(scene))
+
+
+@app.command()
+def resume(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
+    """Goes on with paused scenes."""
+    with Client(url, token=token) as client:
+        for scene in scenes:
+            _told(client.resume(scene))
+
+
+@app.command()
+def archive(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
+    """Archives scenes: they take no further frames, sleep unless they are looked at, and are listed with --all."""
+    with Client(url, token=token) as client:
+        for scene in scenes:
+            _told(client.edit_scene(scene, archived=True))
+
+
+@app.command()
+def restore(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
+    """Takes scenes out of the archive."""
+    with Client(url, token=token) as client:
+        for scene in scenes:
+            _told(client.edit_scene(scene, archived=False))
+
+
+@app.command()
+def keep(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene.")],
+    frames: Annotated[
+        str | None,
+        typer.Option(metavar="COUNT|all", help="Keep the pictures of so many frames, the last, or of all."),
+    ] = None,
+    states: Annotated[
+        str | None,
+        typer.Option(metavar="COUNT|all", help="Keep so many committed states, the last; others are deleted for good."),
+    ] = None,
+    url: Url = DEFAULT_URL,
+    token: Token = None,
+) -> None:
+    """Changes how many pictures and committed states a scene keeps; it holds at once."""
+    with Client(url, token=token) as client:
+        _told(client.edit_scene(scene, keep_frames=_rule("--frames", frames), keep_states=_rule("--states", states)))
+
+
+@app.command()
+def sleep(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
+    """Ends the processes of idle scenes now; a scene wakes by itself when it is asked or sent something."""
+    with Client(url, token=token) as client:
+        for scene in scenes:
+            _told(client.put_to_sleep(scene))
+
+
+@app.command()
+def delete(
+    scenes: Scenes,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    url: Url = DEFAULT_URL,
+    token: Token = None,
+) -> None:
+    """Deletes scenes and all they have on disk, for good."""
+    with Client(url, token=token) as client:
+        for status in [client.scene(scene) for scene in scenes]:
+            named = f"scene {status.id}" + (f" ({status.name})" if status.name else "")
+            if not yes:
+                typer.confirm(f"delete {named} with {status.committed} committed frames?", abort=True)
+            client.delete_scene(status.id)
+            _say(f"{named} is deleted")
+
+
+def _rule(option: str, given: str | None) -> Retention | None:
+    if given is None or given == "all":
+        return None if given is None else Retention()
+    if not given.isdecimal():
+        raise ValueError(f"{option} {given} is neither a number of frames nor all; give as {option} 100")
+    return Retention(last=int(given))
+
+
+def _told(status: SceneStatus) -> None:
+    _say(*table([status]))
+
+
+def _say(*lines: str) -> None:
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)

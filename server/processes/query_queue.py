@@ -1,0 +1,198 @@
+"""A reader process and the queue of queries before it.
+
+A process that ends by itself is started again, each time after a longer pause.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+from server.health import metrics
+from server.problems import Problem, counted
+from server.processes.messages import Answer, AskedQuery, Damaged, Query, Refused, SceneSpec
+from server.processes.placement import Entry, Placement, Process
+
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
+"""Pause before a process that ended by itself is started again; it doubles with each end without an answer."""
+MOST_WAITING = 64
+"""Queries before a process; more get 503. Beyond a second or two of views, waiting only makes it worse."""
+ANSWER_SECONDS = 120.0
+"""A query that takes longer gets 503: the longest that is let in takes about half of it."""
+
+Noticed = Callable[[Mapping[str, str]], None]
+"""Called with files of the states' folder that cannot be read, by name with the reason."""
+
+log = logging.getLogger("scas4d.server")
+
+
+@dataclass(eq=False)
+class _WaitingQuery:
+    """A query and the future of its answer."""
+
+    number: int
+    query: Query
+    answer: asyncio.Future[Answer | Refused]
+
+    def end(self, answer: Answer | Refused) -> None:
+        if not self.answer.done():
+            self.answer.set_result(answer)
+
+
+class QueryQueue:
+    """A reader process and the queue before it. The process has one query at a time; cancelled ones are never started.
+
+    Args:
+        entry: what runs in the process.
+        grace: seconds, see above. damaged: called with the files that the process found damaged.
+
+    Attributes:
+        process: or None, before the first query and while it rests.
+        stale: frames that were committed, deleted or taken back since the last query; None: any may have been.
+    """
+
+    def __init__(
+        self,
+        entry: Entry,
+        spec: SceneSpec,
+        placement: Placement,
+        *,
+        grace: float,
+        damaged: Noticed,
+    ) -> None:
+        self._entry = entry
+        self._spec = spec
+        self._placement = placement
+        self._grace = grace
+        self._damaged = damaged
+        self._waiting: deque[_WaitingQuery] = deque()
+        self._at_work: _WaitingQuery | None = None
+        self.process: Process | None = None
+        self._life: object = None
+        self._ending: set[asyncio.Task[None]] = set()
+        self._failures = 0
+        self._pause: asyncio.TimerHandle | None = None
+        self._asked = 0
+        self.stale: set[int] | None = set()
+        self._closed = False
+
+    @property
+    def busy(self) -> bool:
+        """True while a query waits or is being answered, or a process that was given up ends."""
+        return bool(self._waiting or self._at_work or self._ending)
+
+    def start(self) -> None:
+        """Starts the process now, not with the first query."""
+        if self.process is None and self._pause is None and not self._closed:
+            self._start()
+
+    async def ask(self, query: Query) -> Answer | Refused:
+        """Queues a query and returns its answer.
+
+        Raises:
+            Problem: 503, too many wait, or no answer within the time that the service allows.
+        """
+        if len(self._waiting) >= MOST_WAITING:
+            raise Problem(
+                503,
+                f"{counted(len(self._waiting), 'question')} of this scene waiting for an answer already",
+                field="id",
+                value=self._spec.folder.name,
+                remedy="ask less often, or subscribe (WS …/stream): it sends the newest only",
+                headers={"Retry-After": "1"},
+            )
+        if self._closed:
+            return Refused(0, "the scene has ended", status=503)
+        self._asked += 1
+        turn = _WaitingQuery(self._asked, query, asyncio.get_running_loop().create_future())
+        self._waiting.append(turn)
+        self._next()
+        try:
+            return await asyncio.wait_for(turn.answer, ANSWER_SECONDS)
+        except TimeoutError:
+            raise Problem(
+                503,
+                f"no answer within {ANSWER_SECONDS:g} s",
+                field="id",
+                value=self._spec.folder.name,
+                remedy="ask for less at once, or again later",
+                headers={"Retry-After": "5"},
+            ) from None
+        finally:
+            if turn in self._waiting:
+                self._waiting.remove(turn)
+            if turn is self._at_work:  # the asker has gone
+                asyncio.get_running_loop().call_later(self._grace, self._give_up, turn)
+
+    async def stop(self, seconds: float) -> None:
+        """Ends the process within `seconds`, at once if it is busy; queries that wait, and later ones, are refused."""
+        self._closed = True
+        if self._pause is not None:
+            self._pause.cancel()
+        turns = [*self._waiting, *([self._at_work] if self._at_work else [])]
+        process, busy = self.process, self._at_work is not None
+        self.process = self._at_work = None
+        if process is not None:
+            await process.stop(0 if busy else seconds)
+        await asyncio.gather(*self._ending)
+        for turn in turns:
+            turn.end(Refused(turn.number, "the scene has ended", status=503))
+
+    def _start(self) -> None:
+        self._life = life = object()
+        ended = partial(self._process_ended, life)
+        self.process = self._placement.start(self._entry, self._spec, self._answered, ended)
+
+    def _next(self) -> None:
+        """Gives the process the next query, if it is free."""
+        if self._at_work is not None or self._pause is not None or self._closed or not self._waiting:
+            return
+        if self.process is None:
+            self._start()
+        assert self.process is not None
+        self._at_work = self._waiting.popleft()
+        stale, self.stale = None if self.stale is None else frozenset(self.stale), set()
+        self.process.send(AskedQuery(self._at_work.number, self._at_work.query, stale))
+
+    def _answered(self, message: Answer | Refused | Damaged) -> None:
+        if isinstance(message, Damaged):
+            self._damaged(message.files)
+            return
+        turn = self._at_work
+        if turn is None or turn.number != message.number:  # of a process that was given up
+            return
+        self._failures = 0
+        self._at_work = None
+        turn.end(message)
+        self._next()
+
+    def _give_up(self, turn: _WaitingQuery) -> None:
+        """Ends the process if it is still busy with a cancelled query."""
+        if self._at_work is not turn or self.process is None:
+            return
+        log.warning("scene %s: a %s query was cancelled; its reader restarts", self._spec.folder.name, turn.query.kind)
+        task = asyncio.ensure_future(self.process.stop(0))
+        self._ending.add(task)
+        task.add_done_callback(self._ending.discard)
+        self.process = self._at_work = self._life = None
+        self._next()
+
+    def _process_ended(self, life: object, reason: str) -> None:
+        if life is not self._life or self._closed:
+            return
+        metrics.RESTARTS.labels("reader").inc()
+        turn, self.process, self._at_work = self._at_work, None, None
+        pause = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2**self._failures)
+        self._failures += 1
+        log.error("scene %s: a reader is gone (%s); the next in %g s", self._spec.folder.name, reason, pause)
+        if turn is not None:
+            turn.end(Refused(turn.number, f"the reader ended while it was busy with this: {reason}", status=500))
+        self._pause = asyncio.get_running_loop().call_later(pause, self._go_on)
+
+    def _go_on(self) -> None:
+        self._pause = None
+        self._next()

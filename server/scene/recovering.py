@@ -1,0 +1,75 @@
+"""Finds the scenes of the data folder when the service starts, and reads them back in the background."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from collections.abc import Awaitable, Callable
+
+from scas4d_core.storage.npz import sync_folder
+from server.problems import Problem, counted
+from server.storage.definition import never_acknowledged
+from server.storage.layout import DataFolder, SceneFolder
+
+
+class Recovering:
+    """The scenes that were found at the start, until they are recovered.
+
+    Args:
+        data: folder of the service. read: reads a scene back, and raises nothing.
+    """
+
+    def __init__(self, data: DataFolder, read: Callable[[SceneFolder], Awaitable[object]]) -> None:
+        self._data = data
+        self._read = read
+        self._count = 0
+        self._left: list[str] = []
+        self._task: asyncio.Task[None] | None = None
+
+    async def begin(self) -> None:
+        """Lists the scenes; a journal may be that of a day, so they are read in the background."""
+        self._left = await asyncio.to_thread(self._folders)
+        self._count = len(self._left)
+        self._task = asyncio.create_task(self._run())
+
+    async def stop(self) -> None:
+        """Ends it."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.wait([self._task])
+
+    def check(self, id: str | None = None) -> None:
+        """Checks that all scenes, or one of them, are recovered.
+
+        Raises:
+            Problem: 503, with the number of those that are.
+        """
+        if id not in self._left and (id is not None or not self._left):
+            return
+        raise Problem(
+            503,
+            f"recovering {self._count - len(self._left)} of {counted(self._count, 'scene')}",
+            field="id" if id is not None else None,
+            value=id,
+            remedy="ask again: all acknowledged frames are on disk, and are being read",
+            headers={"Retry-After": "1"},
+            recovering=list(self._left),
+        )
+
+    async def _run(self) -> None:
+        while self._left:
+            await self._read(self._data.scene(self._left[0]))
+            del self._left[0]
+        await asyncio.to_thread(self._data.sweep)
+
+    def _folders(self) -> list[str]:
+        """Lists the folders of scenes, newest journal first; moves those never acknowledged to the deleted ones."""
+        found = []
+        for path in sorted(path for path in self._data.scenes.iterdir() if path.is_dir()):
+            folder = SceneFolder(path)
+            if never_acknowledged(folder):
+                path.rename(self._data.deleted / f"{path.name}-{secrets.token_hex(4)}")
+            else:
+                found.append((folder.journal.stat().st_mtime if folder.journal.exists() else 0.0, path.name))
+        sync_folder(self._data.scenes)
+        return [name for _, name in sorted(found, reverse=True)]
