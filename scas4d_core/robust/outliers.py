@@ -45,6 +45,8 @@ MOST_OUT = 0.5
 CLEAN_DB = 40.0
 """All that is met better counts as this: beyond, 5 dB are a thousandth of the range, and no sign of a fault."""
 
+ERROR_RISE = 1.02
+"""Times that the usual error of a probe view rises at most in an update."""
 OTHER_EFFORT = 1.5
 """Times more or fewer iterations than the update before, from which the usual level begins anew."""
 
@@ -300,6 +302,14 @@ def settle(
         behind=later,
         iterations=iterations or past.iterations,
     )
+
+
+def usual_errors(before: Mapping[str, float], now: Mapping[str, float]) -> dict[str, float]:
+    """The errors by view that are usual: they fall at once and rise slowly.
+
+    A noisy frame's error would else be enough for the next good one, which moved.
+    """
+    return {name: min(value, ERROR_RISE * before.get(name, value)) for name, value in now.items()}
 
 
 def _capped(psnr: Mapping[str, float]) -> dict[str, float]:

@@ -19,7 +19,6 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.rasterize.shading import features_seen
 from scas4d_core.robust import outliers, timing
 from scas4d_core.robust.alarms import alarms_of, colours_by_camera
-from scas4d_core.robust.attempt_results import joined, met, retold, usual_errors
 from scas4d_core.robust.checks import EXPOSURE, evened, gain_of, relit, validated
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.relocation import find_jump, shifted
@@ -216,12 +215,12 @@ class FrameSolver:
         if not self._settings.judge:
             return None
         with self._timed():
-            return outliers.unmet(given.past, met(result), len(result.trace.losses))
+            return outliers.unmet(given.past, result.trace.met, len(result.trace.losses))
 
     def _behind(self, given: UpdateInput, result: UpdateResult) -> str | None:
         if not self._settings.judge or self._spent(given):
             return None
-        return outliers.behind(given.past, met(result), len(result.trace.losses))
+        return outliers.behind(given.past, result.trace.met, len(result.trace.losses))
 
     def _spent(self, given: UpdateInput, more: int = 0) -> bool:
         """True where the budget has no time left for another attempt, with ``more`` iterations before it."""
@@ -250,10 +249,10 @@ class FrameSolver:
             result, fault = self._validated(given, start, result)
             # A few iterations more are no excuse for meeting it less well.
             both = len(tried.trace.losses) + len(result.trace.losses)
-            why = fault or outliers.unmet(given.past, met(result), both)
+            why = fault or outliers.unmet(given.past, result.trace.met, both)
             attempts.append(name if why is None else f"{name}: {why}")
             if why is None:
-                return retold(result if start is not ended else joined(result, tried), tried)
+                return (result if start is not ended else result.joined(tried)).retold(tried)
         return None
 
     def _go_on(self, given: UpdateInput, tried: UpdateResult, attempts: list[str]) -> UpdateResult:
@@ -261,9 +260,9 @@ class FrameSolver:
         options = self._options(given, replace(SEARCH, name="on from where the update ended"))
         result = self._run(given, _as_coloured(tried.gaussians, given.state), None, options)
         result, fault = self._validated(given, given.state, result)
-        after, before = (outliers.level_of(given.past, met(one)) for one in (result, tried))
+        after, before = (outliers.level_of(given.past, one.trace.met) for one in (result, tried))
         attempts.append(options.name if fault is None else f"{options.name}: {fault}")
-        return retold(joined(result, tried), tried) if fault is None and after > before else tried
+        return result.joined(tried).retold(tried) if fault is None and after > before else tried
 
     def _held(
         self,
@@ -293,7 +292,7 @@ class FrameSolver:
         past = outliers.settle(given.past, psnr, given.brightness, result.exposure, len(trace.losses), moved)
         if trace.errors.get(Candidate.END):
             found = by_size(trace.errors[trace.kept], trace.whole)
-            past = replace(past, error=usual_errors(given.past.error, found))
+            past = replace(past, error=outliers.usual_errors(given.past.error, found))
         motion = result.motion if result.motion is not None and result.motion.finite else None
         return replace(result, motion=motion, offsets=outliers.offsets(given.past, psnr)), past
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import NamedTuple, TypedDict
 
@@ -174,6 +174,11 @@ class UpdateTrace:
         """DB by camera, when last rendered."""
         return {name: fit["psnr"] for name, fit in self.cameras.items()}
 
+    @property
+    def met(self) -> dict[str, float]:
+        """DB of the cameras that were learnt from to the end."""
+        return {name: psnr for name, psnr in self.fits.items() if name not in self.left_out}
+
     def see(self, view: TrainingView, picture: PictureLoss, left: int) -> None:
         """Note a view that was rendered and compared; its colour shift is evidence for gains of cameras, too.
 
@@ -226,3 +231,18 @@ class UpdateResult:
     carried: Mapping[str, Arrays] = field(default_factory=dict)
     views: Sequence[TrainingView] = ()
     joins: NDArray[np.int64] | None = None
+
+    def joined(self, first: UpdateResult) -> UpdateResult:
+        """An update that went on from where another ended: its motion is that of both."""
+        if self.motion is None or first.motion is None:
+            return self
+        return replace(self, motion=self.motion.after(first.motion))
+
+    def retold(self, first: UpdateResult) -> UpdateResult:
+        """A later attempt with the errors of the frame before and of the warm start as the first one found them."""
+        errors: dict[Candidate, dict[str, float]] = {**first.trace.errors}
+        errors.pop(Candidate.END, None)
+        if self.trace.errors:
+            errors[Candidate.END] = self.trace.errors[self.trace.kept]
+        shown = self.trace.shown if self.trace.kept is Candidate.END else {}
+        return replace(self, trace=replace(self.trace, errors=errors, kept=Candidate.END, shown=shown))

@@ -15,10 +15,9 @@ from scas4d_core.effects.parts import NOTHING, Arrays
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust import outliers as judge
-from scas4d_core.robust.attempt_results import ERROR_RISE
 from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness
 from scas4d_core.robust.checks import lit as with_light
-from scas4d_core.robust.outliers import Past
+from scas4d_core.robust.outliers import ERROR_RISE, Past
 from scas4d_core.robust.solve_frame import FrameSolver
 from scas4d_core.robust.update_input import UpdateInput
 from scas4d_core.settings import UpdateSettings
