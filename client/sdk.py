@@ -151,6 +151,7 @@ class Client(_ClientBase):
 
     live = _sends(calls.live)
     ready = _sends(calls.ready)
+    ingest_ready = _sends(calls.ingest_ready)
     metrics = _sends(calls.metrics)
     ticket = _sends(calls.ticket)
     create_scene = _sends(calls.create_scene)
@@ -172,6 +173,7 @@ class Client(_ClientBase):
     frame = _sends(calls.frame)
     frames = _sends(calls.frames)
     ply = _sends(calls.ply)
+    picture = _sends(calls.picture)
     render = _sends(calls.render)
     render_file = _sends(calls.render_file)
     render_arrays = _sends(calls.render_arrays)
@@ -269,6 +271,7 @@ class AsyncClient(_ClientBase):
 
     live = _sends_async(calls.live)
     ready = _sends_async(calls.ready)
+    ingest_ready = _sends_async(calls.ingest_ready)
     metrics = _sends_async(calls.metrics)
     ticket = _sends_async(calls.ticket)
     create_scene = _sends_async(calls.create_scene)
@@ -290,6 +293,7 @@ class AsyncClient(_ClientBase):
     frame = _sends_async(calls.frame)
     frames = _sends_async(calls.frames)
     ply = _sends_async(calls.ply)
+    picture = _sends_async(calls.picture)
     render = _sends_async(calls.render)
     render_file = _sends_async(calls.render_file)
     render_arrays = _sends_async(calls.render_arrays)

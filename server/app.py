@@ -19,6 +19,7 @@ from server.connections.guard import ConnectionGuard, ConnectionLimits
 from server.connections.proxies import ClientLimit
 from server.health.readiness import Readiness
 from server.http import handlers
+from server.http.encoding import HeadAsGet, compressed
 from server.http.middleware import AccessLog, AuthMiddleware, BodyLimit
 from server.http.tickets import Tickets
 from server.problems import Problem
@@ -88,6 +89,8 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     handlers.install(app)
     # The last one added is the first that a request meets.
     app.add_middleware(BodyLimit, limit=int(settings.max_body_mb * 1e6))
+    app.add_middleware(compressed)
+    app.add_middleware(HeadAsGet)
     if settings.allowed_origins:
         app.add_middleware(
             CORSMiddleware,

@@ -120,7 +120,7 @@ def document(app: FastAPI) -> dict[str, Any]:
                 for status in RESPONSES:
                     if str(status) in operation["responses"]:
                         operation["responses"][str(status)]["content"] = {MEDIA_TYPE: {"schema": PROBLEM}}
-                if token and path == "/health/live":
+                if token and path.startswith("/health/"):
                     operation["security"] = []
         for schema in written.get("components", {}).get("schemas", {}).values():
             plain_tuples(schema)

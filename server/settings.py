@@ -75,7 +75,7 @@ class ServerSettings(BaseSettings):
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen at; 0 takes a free one.")
     token: SecretStr | None = Field(
         default=None,
-        description="Every request but /health/live, the viewer's page and the API's description has to bear it "
+        description="Every request but those of /health, the viewer's page and the API's description has to bear it "
         "(Authorization: Bearer). None: every user of this machine may do everything.",
     )
     token_file: Path | None = Field(

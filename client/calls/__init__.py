@@ -7,7 +7,7 @@ is numpy.
 
 from client.calls.budgets import budget, end_replay, replay, set_budget, tradeoff
 from client.calls.call import Call
-from client.calls.frames import close_frame, declare_missing, frame, frames, ply, put_camera, put_frame
+from client.calls.frames import close_frame, declare_missing, frame, frames, picture, ply, put_camera, put_frame
 from client.calls.gaussians import gaussians
 from client.calls.parts import parts
 from client.calls.scenes import (
@@ -24,7 +24,7 @@ from client.calls.scenes import (
     scene,
     scenes,
 )
-from client.calls.service import live, metrics, ready, ticket
+from client.calls.service import ingest_ready, live, metrics, ready, ticket
 from client.calls.tracks import tracks, tracks_arrays
 from client.calls.views import render, render_arrays, render_file
 
@@ -42,10 +42,12 @@ __all__ = [
     "frame",
     "frames",
     "gaussians",
+    "ingest_ready",
     "live",
     "metrics",
     "parts",
     "pause",
+    "picture",
     "ply",
     "put_camera",
     "put_frame",

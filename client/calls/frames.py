@@ -6,7 +6,15 @@ from collections.abc import Mapping
 from typing import Any
 
 from client.calls.call import Call, body, path, reads
-from client.wire import FRAME_MEDIA_TYPE, FrameReceipt, FrameReportModel, MissingRequest, PartReceipt, frame_chunks
+from client.wire import (
+    FRAME_MEDIA_TYPE,
+    FileKind,
+    FrameReceipt,
+    FrameReportModel,
+    MissingRequest,
+    PartReceipt,
+    frame_chunks,
+)
 from client.wire.listings import FrameList
 
 
@@ -126,3 +134,15 @@ def ply(id: str, index: int) -> Call[bytes]:
     b'ply'
     """
     return Call("GET", path(id, "frames", index, "splat.ply"), lambda response: response.content)
+
+
+def picture(id: str, index: int, camera: str, kind: FileKind = FileKind.IMAGE) -> Call[bytes]:
+    """Reads one camera's picture of a frame, or its mask, byte for byte as it was sent.
+
+    >>> client.picture(scene, 1, "c0")[:3]
+    b'\xff\xd8\xff'
+    """
+    arguments = {"params": {"kind": kind.value}}
+    return Call(
+        "GET", path(id, "frames", index, "cameras", camera), lambda response: response.content, arguments=arguments
+    )

@@ -24,6 +24,15 @@ def ready() -> Call[Health]:
     return Call("GET", "/health/ready", reads(Health))
 
 
+def ingest_ready() -> Call[Health]:
+    """Reads whether frames can be taken; an error while scenes are recovered or the disk has no room.
+
+    >>> client.ingest_ready().ingest_ready
+    True
+    """
+    return Call("GET", "/health/ingest", reads(Health))
+
+
 def metrics() -> Call[str]:
     """Reads counters and gauges in the text format of Prometheus.
 

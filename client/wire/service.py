@@ -18,6 +18,9 @@ class Health(Model):
     ready_after: float | None = Field(
         default=None, description="Seconds from the start of the service until its kernels were warmed up."
     )
+    ingest_ready: bool | None = Field(
+        default=None, description="The disk has room for frames; null where that was not looked at."
+    )
 
 
 class Ticket(Model):

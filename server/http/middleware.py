@@ -24,8 +24,10 @@ from server.http.tickets import SUBPROTOCOL, Tickets, accepting, take_offered
 from server.problems import Problem
 from server.settings import ServerSettings, is_loopback
 
-OPEN = frozenset({"/", "/viewer", "/favicon.ico", "/health/live", "/docs", "/redoc", "/openapi.json"})
-"""Paths that hold no data and need no token: the page that asks for one, and the description of the API."""
+PROBES = frozenset({"/health/live", "/health/ready", "/health/ingest"})
+"""What an orchestrator asks: it has no token, and learns how many scenes there are."""
+OPEN = PROBES | {"/", "/viewer", "/favicon.ico", "/docs", "/redoc", "/openapi.json"}
+"""Paths that hold no data and need no token: probes, the page that asks for one, and the description of the API."""
 OPEN_FOLDERS = ("/viewer/", "/docs/")
 """Files of the viewer's page, and of the API's reference."""
 IN_URL = frozenset({"token", "access_token", "api_key", "ticket", "authorization"})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from typing import Annotated, Any
 
@@ -16,11 +17,14 @@ from client.wire import (
     MissingRequest,
     PartReceipt,
 )
+from server.http.unchanging import unchanging
 from server.ingest.camera_files import receive_camera, receive_file, receive_form
 from server.ingest.receive import receive_frame
 from server.problems import Problem
 from server.processes.messages import PlyQuery
 from server.routes.access import FrameIndex, TheRecord, TheScene, ask
+from server.scene.scene import Scene
+from server.storage.frame_store import FrameDamage, read_pictures
 
 router = APIRouter(prefix="/v1/scenes", tags=["frames"])
 
@@ -51,6 +55,11 @@ PICTURE: dict[str, Any] = {
             FRAME_MEDIA_TYPE: {"schema": {**BINARY, "description": "Picture and mask of the camera at once."}},
         },
     }
+}
+SENT_AS = {b"\xff\xd8": ("image/jpeg", ".jpg"), b"\x89P": ("image/png", ".png"), b"RI": ("image/webp", ".webp")}
+"""Media type and ending of a picture's file by its first bytes."""
+FILE: dict[int | str, dict[str, Any]] = {
+    200: {"content": {kind: {"schema": BINARY} for kind, _ in SENT_AS.values()}, "description": "As it was sent."}
 }
 CameraPath = Annotated[str, Path(max_length=64, description="Of the rig.")]
 Seconds = Annotated[
@@ -106,6 +115,25 @@ async def put_camera(
         raise Problem(400, "the sender closed the connection", field="body", remedy="send the picture again") from None
 
 
+@router.get("/{id}/frames/{n}/cameras/{c}", response_class=Response, responses=FILE)
+async def picture(
+    scene: TheRecord,
+    n: FrameIndex,
+    c: CameraPath,
+    request: Request,
+    kind: Annotated[FileKind, Query(description="The picture, or its mask.")] = FileKind.IMAGE,
+) -> Response:
+    """Returns one camera's picture of frame n, byte for byte as it was sent.
+
+    Pictures are kept as `ingest.keep_frames` of the scene says; 404 names what is not there: the camera, the frame, its
+    pictures, or this one of them.
+    """
+    data = await _stored(scene, n, c, kind)
+    media_type, ending = SENT_AS[bytes(data[:2])]
+    name = f"{scene.id[:8]}-{n:06d}-{c}{'' if kind == FileKind.IMAGE else '-mask'}{ending}"
+    return unchanging(request, data, media_type=media_type, name=name, inline=True)
+
+
 @router.post("/{id}/frames/{n}/close", status_code=202)
 async def close(scene: TheScene, n: FrameIndex) -> FrameReceipt:
     """Closes a frame that cameras send one by one, with those that are in; what comes later is refused."""
@@ -144,7 +172,33 @@ async def report(scene: TheRecord, n: FrameIndex) -> FrameReportModel:
 async def ply(scene: TheScene, n: FrameIndex, request: Request) -> Response:
     """Exports a committed frame in the file format of 3D Gaussian Splatting."""
     answer = await ask(request, scene, PlyQuery(scene.committed_frame(n, "n")))
-    return Response(answer.body, media_type=answer.media_type)
+    return unchanging(request, answer.body, media_type=answer.media_type, name=f"{scene.id[:8]}-{n:06d}.ply")
+
+
+async def _stored(scene: Scene, n: int, c: str, kind: FileKind) -> memoryview:
+    """Reads a picture or mask from the frame log.
+
+    Raises:
+        Problem: 404, there is none; 500, it is damaged.
+    """
+    if c not in scene.rig.names:
+        raise Problem(404, f"the rig has no camera {c!r}", field="c", value=c, remedy=f"one of {scene.rig.names}")
+    entry = scene.ledger.frames.get(n)
+    if entry is None:
+        remedy = f"wait for it: the next is {scene.next_frame}"
+        raise Problem(404, f"frame {n} has not come", field="n", value=n, remedy=remedy)
+    field, fault = "n", f"the pictures of frame {n} are not kept any more"
+    for name in entry.files:
+        try:
+            stored = await asyncio.to_thread(read_pictures, scene.spec.folder.frames, name)
+        except FrameDamage as error:
+            fault = f"the pictures of frame {n} cannot be read: {error}"
+            continue
+        if (found := (stored.images if kind == FileKind.IMAGE else stored.masks).get(c)) is not None:
+            return found
+        field, fault = "c", f"no {kind.value} of camera {c} was sent with frame {n}"
+    remedy = "ask for a newer frame; PATCH of the scene's `keep_frames` keeps more of them"
+    raise Problem(404, fault, field=field, value=n if field == "n" else c, remedy=remedy)
 
 
 def _media_type(request: Request) -> str:

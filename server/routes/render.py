@@ -9,6 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 
 from client import __version__
 from client.wire import MAX_PIXELS_A_SIDE, RenderFormat, RenderKind, RenderRequest
+from server.http.unchanging import disposition, is_known
 from server.problems import Problem, counted
 from server.processes.messages import RenderQuery
 from server.routes.access import TheScene, ask
@@ -27,6 +28,8 @@ PICTURES: dict[int | str, dict[str, Any]] = {
     }
 }
 SEVERAL = (RenderFormat.NPZ, RenderFormat.FLOAT32)
+ENDINGS = {one: f".{'jpg' if one == RenderFormat.JPEG else one.value}" for one in RenderFormat}
+"""Of files, by format."""
 LOSSY = (RenderFormat.JPEG, RenderFormat.WEBP)
 
 
@@ -75,9 +78,12 @@ async def _answer(scene: Scene, request: Request, view: RenderRequest) -> Respon
             "Cache-Control": "private, no-cache",
             "ETag": f'W/"{__version__}-{scene.ledger.reconstruction}-{view.frame}"',
         }
-        if request.method == "GET" and request.headers.get("if-none-match") == keep["ETag"]:
+        if is_known(request, keep["ETag"]):
             return Response(status_code=304, headers=keep)
     found = await ask(request, scene, query)
+    seen_by = view.camera if isinstance(view.camera, str) else "view"
+    name = f"{scene.id[:8]}-{query.frame:06d}-{seen_by}-{query.kinds[0]}{ENDINGS[view.format]}"
+    keep["Content-Disposition"] = disposition(name, inline=True)
     return Response(found.body, media_type=found.media_type, headers={**found.headers, **keep})
 
 

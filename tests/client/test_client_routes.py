@@ -16,6 +16,7 @@ POINTS = InitialPoints(np.zeros((1, 3)), np.zeros((1, 3), np.float32))
 CALLS = [
     calls.live(),
     calls.ready(),
+    calls.ingest_ready(),
     calls.metrics(),
     calls.ticket(),
     calls.create_scene(make_rig()),
@@ -37,6 +38,7 @@ CALLS = [
     calls.frame("s", 7),
     calls.frames("s"),
     calls.ply("s", 7),
+    calls.picture("s", 7, "c0"),
     calls.render("s", "c0"),
     calls.render_file("s", "c0"),
     calls.render_arrays("s", "c0"),

@@ -187,11 +187,14 @@ def test_a_wrong_token_is_refused(guarded, given):
 
 
 def test_everything_but_what_bears_no_data_is_behind_the_token(guarded):
-    assert get(guarded, "/health/live").status_code == 200
-    for path in get(guarded, "/openapi.json").json()["paths"]:
-        if path != "/health/live":
-            problem(get(guarded, re.sub(r"{\w+}", "0", path)), 401)
-    for path in ("/metrics", "/health/ready", "/v1", "/nowhere", "/viewerx", "//v1/scenes"):
+    probes = {"/health/live", "/health/ready", "/health/ingest"}
+    paths = set(get(guarded, "/openapi.json").json()["paths"])
+    assert probes <= paths
+    for path in probes:
+        assert get(guarded, path).status_code == 200
+    for path in paths - probes:
+        problem(get(guarded, re.sub(r"{\w+}", "0", path)), 401)
+    for path in ("/metrics", "/health/other", "/v1", "/nowhere", "/viewerx", "//v1/scenes"):
         problem(get(guarded, path), 401)
         assert get(guarded, path, **BEARER).status_code in (200, 404)
     problem(httpx.get(f"{guarded.url}/v1/scenes", headers=[("Authorization", BEARER["Authorization"])] * 2), 401)
