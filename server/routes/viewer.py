@@ -13,7 +13,7 @@ router = APIRouter(include_in_schema=False)
 
 FOLDER = Path(__file__).parents[1] / "viewer"
 MEDIA_TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
-FILES = {file.name: file for file in FOLDER.iterdir() if file.suffix in MEDIA_TYPES}
+FILES = {str(file.relative_to(FOLDER)): file for file in FOLDER.rglob("*") if file.suffix in MEDIA_TYPES}
 """The files that are served: these names and no others."""
 
 HEADERS = {
@@ -39,7 +39,7 @@ async def elsewhere() -> Response:
     return RedirectResponse("/viewer/")
 
 
-@router.get("/viewer/{name}")
+@router.get("/viewer/{name:path}")
 async def file(name: str) -> Response:
     """Returns a file of the page."""
     return _answer(name)

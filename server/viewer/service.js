@@ -5,12 +5,12 @@ const KEY = "scas4d.token";
 export class ServiceError extends Error {
   constructor(problem) {
     const end = problem.detail.endsWith(".") ? "" : ".";
-    super(sentence(problem.detail + end + (problem.remedy ? ` To mend it: ${problem.remedy}.` : "")));
+    super(capital(problem.detail + end + (problem.remedy ? ` To mend it: ${problem.remedy}.` : "")));
     this.status = problem.status;
   }
 }
 
-const sentence = (text) => text.charAt(0).toUpperCase() + text.slice(1);
+const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 
 export const token = {
   get: () => sessionStorage.getItem(KEY),
@@ -18,20 +18,28 @@ export const token = {
   forget: () => sessionStorage.removeItem(KEY),
 };
 
-export async function call(method, path, body) {
+/** Sends a request; returns the answer, whatever media type it has. */
+export async function fetched(method, path, body, signal) {
   const headers = {};
   if (token.get()) headers.Authorization = `Bearer ${token.get()}`;
   if (body !== undefined) headers["Content-Type"] = "application/json";
   let response;
   try {
-    response = await fetch(path, { method, headers, body: body === undefined ? undefined : JSON.stringify(body) });
-  } catch {
+    response = await fetch(path, { method, headers, signal, body: body === undefined ? undefined : JSON.stringify(body) });
+  } catch (error) {
+    if (error.name === "AbortError") throw error;
     throw new ServiceError({ status: 0, detail: "the service does not answer" });
   }
-  if (response.ok) return response.status === 204 ? null : response.json();
+  if (response.ok) return response;
   const problem = await response.json().catch(() => null);
   throw new ServiceError(problem?.detail ? problem
     : { status: response.status, detail: `the service answered ${response.status} ${response.statusText}` });
+}
+
+/** Sends a request; returns the JSON of the answer, null where it has none. */
+export async function call(method, path, body) {
+  const response = await fetched(method, path, body);
+  return response.status === 204 ? null : response.json();
 }
 
 export const scenePath = (id) => `/v1/scenes/${encodeURIComponent(id)}`;

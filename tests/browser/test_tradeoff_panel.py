@@ -10,7 +10,7 @@ from client.sdk import Client
 from client.wire import Budget
 
 GROUPED = """async () => {
-  const { Tradeoff } = await import("/viewer/tradeoff.js");
+  const { Tradeoff } = await import("/viewer/panels/tradeoff.js");
   const panel = new Tradeoff((id) => document.getElementById(id));
   const point = { kind: "measured", error: 0.02, psnr: 30, threads: 1 };
   const points = [[90, 1000, 3], [110, 1010, 4], [200, 2000, 2]].map(([iterations, milliseconds, frames]) =>

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import posixpath
 import re
 
 import pytest
@@ -29,9 +30,13 @@ def test_people_find_it(http):
 
 
 def test_every_file_that_the_page_names_is_served(http):
-    sources = {"index.html": HTML} | {name: path.read_text() for name, path in FILES.items() if path.suffix == ".js"}
-    named = {name for text in sources.values() for name in re.findall(r"(?:/viewer/|from \"\./)([\w.-]+)", text)}
-    assert {"main.js", "viewer.css", "icon.svg", "stream.js"} <= named
+    named = set(re.findall(r"/viewer/([\w./-]+)", HTML))
+    for name, path in FILES.items():
+        if path.suffix == ".js":
+            imported = re.findall(r"from \"(\.[\w./-]+)\"", path.read_text())
+            named |= {posixpath.normpath(posixpath.join(posixpath.dirname(name), other)) for other in imported}
+    assert {"main.js", "viewer.css", "icon.svg", "stream.js", "view/live.js"} <= named
+    assert named | {"index.html"} == set(FILES)  # no file is left over
     kinds = {"js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
     for name in named:
         assert http.get(f"/viewer/{name}").headers["content-type"].startswith(kinds[name.rpartition(".")[2]])

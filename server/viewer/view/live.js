@@ -3,12 +3,15 @@
 import { Orbit, project, readCamera } from "./geometry.js";
 import { paintDepth } from "./colours.js";
 import { drawFrusta, drawTracks } from "./overlay.js";
+import { fetched, scenePath } from "../service.js";
 
 const SETTLE_MS = 220;
 const SLOW_MS = 1000;
 const TARGET_MS = 90;
 const CLICK_PX = 4;
 const EMPTY = [16, 19, 24];
+const FIT_PX = 200;
+const COVERED = 40; // of 255, from which a pixel shows something
 const MODES = {
   colour: { kinds: ["colour"], format: "jpeg" },
   depth: { kinds: ["depth"], format: "float32" },
@@ -17,7 +20,7 @@ const MODES = {
 };
 
 export class LiveView {
-  /** @param on { pick(u, v, camera, frame), shown(info), turned(), slow(mode) } */
+  /** @param on { pick(u, v, camera, frame), shown(info), turned(), slow(mode), stale(whether) } */
   constructor(canvas, overlay, on) {
     this.canvas = canvas;
     this.overlay = overlay;
@@ -25,6 +28,7 @@ export class LiveView {
     this.mode = "colour";
     this.parts = null;
     this.frame = null;
+    this.background = null; // the scene's
     this.showFrusta = false;
     this.tracks = [];
     this.largest = 8e6;
@@ -35,6 +39,7 @@ export class LiveView {
   /** Begins with a scene: its rig, its stream. */
   open(stream, rig) {
     this.stream = stream;
+    this.scene = stream.scene;
     this.rig = rig.cameras.map(readCamera);
     this.orbit = new Orbit(this.rig);
     this.tag = 0;
@@ -59,8 +64,16 @@ export class LiveView {
     for (const canvas of [this.canvas, this.overlay]) canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height);
   }
 
+  /** Another kind of picture; the one that is shown is not taken for it meanwhile. */
   setMode(mode) {
     this.mode = mode;
+    if (this.shown) this.on.stale(this.shown.mode !== mode);
+    this.moved(true);
+  }
+
+  /** @param background [red, green, blue] in 0…1, null for the scene's */
+  setBackground(background) {
+    this.background = background;
     this.moved(true);
   }
 
@@ -103,7 +116,8 @@ export class LiveView {
   request(verb, share = 1) {
     const [width, height] = this.size(share);
     const camera = this.orbit.camera(width, height);
-    const request = { camera, frame: this.frame, parts: this.mode === "parts" ? this.parts : null, ...MODES[this.mode] };
+    const request = { camera, frame: this.frame, parts: this.mode === "parts" ? this.parts : null,
+      background: this.background, ...MODES[this.mode] };
     this.asked.set(++this.tag, { camera, mode: this.mode, at: performance.now(), share });
     clearTimeout(this.slow);
     this.slow = setTimeout(() => this.stream && this.on.slow(this.mode), SLOW_MS);
@@ -116,13 +130,13 @@ export class LiveView {
 
   async receive(head, bytes) {
     const asked = this.asked.get(head.tag);
-    if (!asked) return;
+    if (!asked || asked.mode !== this.mode) return;
     const first = !asked.answered;
     asked.answered = true;
     const number = this.latest = (this.latest || 0) + 1;
     const painted = await this.decode(asked, head, bytes);
     // Decoding takes turns: a newer picture may have been painted meanwhile.
-    if (number < (this.painted || 0) || !this.stream) return;
+    if (number < (this.painted || 0) || !this.stream || asked.mode !== this.mode) return;
     this.painted = number;
     const { width, height } = asked.camera;
     this.canvas.width = width;
@@ -134,6 +148,7 @@ export class LiveView {
     if (first && head.missed === 0) this.adapt(milliseconds, asked.share);
     if (head.tag === this.tag) clearTimeout(this.slow);
     this.shown = { camera: asked.camera, frame: head.frame, mode: asked.mode, tag: head.tag };
+    this.on.stale(false);
     this.draw();
     this.on.shown({ ...this.shown, milliseconds, width, height, near: painted.near, far: painted.far });
   }
@@ -207,7 +222,6 @@ export class LiveView {
       this.orbit.zoom(Math.exp(Math.max(-0.5, Math.min(0.5, event.deltaY / (event.deltaMode ? 10 : 500)))));
       this.moved();
     }, { passive: false });
-    canvas.addEventListener("keydown", (event) => this.key(event));
   }
 
   pinch(fingers, event) {
@@ -221,20 +235,53 @@ export class LiveView {
     this.moved();
   }
 
+  /** Moves the camera by a key; answers whether it is one of those that do. */
   key(event) {
     const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
-    if (!this.stream || event.ctrlKey || event.altKey || event.metaKey) return;
+    if (!this.stream) return false;
     if (arrows[event.key]) {
       const [x, y] = arrows[event.key];
       if (event.shiftKey) this.orbit.pan(0.05 * x, 0.05 * y);
       else this.orbit.turn(0.08 * x, -0.08 * y);
     } else if (event.key === "+" || event.key === "=") this.orbit.zoom(0.9);
     else if (event.key === "-") this.orbit.zoom(1 / 0.9);
-    else if (event.key.toLowerCase() === "t") this.pickMiddle();
     else if (event.key === "Home" || event.key === "0") this.orbit.from(this.rig[0]);
-    else return;
-    event.preventDefault();
+    else if (event.key.toLowerCase() === "t") {
+      this.pickMiddle();
+      return true;
+    } else return false;
     this.moved();
+    return true;
+  }
+
+  /** Moves nearer or farther until what is in the scene fills the view, and into its middle. */
+  async fit() {
+    if (!this.shown) return;
+    const box = this.canvas.parentElement.getBoundingClientRect();
+    const small = FIT_PX / Math.max(box.width, box.height);
+    const camera = this.orbit.camera(Math.round(box.width * small), Math.round(box.height * small));
+    const bitmap = await createImageBitmap(await this.rendered({ camera, kinds: ["alpha"], format: "png" }));
+    const canvas = new OffscreenCanvas(bitmap.width, bitmap.height);
+    canvas.getContext("2d").drawImage(bitmap, 0, 0);
+    const { data, width, height } = canvas.getContext("2d").getImageData(0, 0, bitmap.width, bitmap.height);
+    const seen = { left: width, top: height, right: -1, bottom: -1 };
+    for (let y = 0; y < height; y++) for (let x = 0; x < width; x++) {
+      if (data[4 * (y * width + x)] < COVERED) continue;
+      Object.assign(seen, { left: Math.min(seen.left, x), right: Math.max(seen.right, x), top: Math.min(seen.top, y), bottom: y });
+    }
+    if (seen.right < 0 || !this.stream) this.orbit?.from(this.rig[0]);
+    else this.orbit.fit(seen, camera);
+    this.moved();
+  }
+
+  /** A picture of the view as it is, sharp, as a file. */
+  snapshot() {
+    const { camera, mode } = this.shown;
+    return this.rendered({ camera, kinds: MODES[mode].kinds, format: "png", background: this.background, parts: mode === "parts" ? this.parts : null });
+  }
+
+  async rendered(request) {
+    return (await fetched("POST", `${scenePath(this.scene)}/render`, { frame: this.shown.frame, ...request })).blob();
   }
 
   pickMiddle() {

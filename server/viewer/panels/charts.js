@@ -87,9 +87,9 @@ export class Chart {
     if (this.kind === "bars") {
       low = 0;
       // One frame that had to wait for a compiler would make all others invisible: it leaves the chart at the top.
-      const middle = [...values].sort((a, b) => a - b)[values.length >> 1];
-      const usual = Math.max(...values.filter((value) => value <= 5 * middle));
-      clipped = (value) => value > 5 * middle;
+      const median = [...values].sort((a, b) => a - b)[values.length >> 1];
+      const usual = Math.max(...values.filter((value) => value <= 5 * median));
+      clipped = (value) => value > 5 * median;
       high = usual;
     }
     const pad = this.kind === "bars" ? 0 : Math.max(0.12 * (high - low), 0.5);

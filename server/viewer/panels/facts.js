@@ -1,37 +1,8 @@
-// The panels beside the view: the scene's state, the queue, the cameras' health.
+// The panels beside the view: facts, warnings, effects, the queue, the cameras' health.
 
-export const STATES = {
-  awaiting_first_frame: "Waiting for its first frame",
-  initialising: "Reconstructing the first frame",
-  ready: "Ready",
-  updating: "Updating",
-  paused: "Paused",
-  degraded: "Degraded",
-  failed: "Failed",
-};
-
-/** The state of the scene in words, with what else holds. */
-export function stateWords(status) {
-  const words = [STATES[status.state] ?? status.state];
-  if (status.paused && status.state !== "paused" && status.state !== "failed") words.push("pausing");
-  if (status.degraded && status.state !== "degraded") words.push("degraded");
-  return words.join(" · ");
-}
-
-/** The same with a capital letter and a full stop. */
-export const sentence = (text) => text && text[0].toUpperCase() + text.slice(1) + (/[.?!]$/.test(text) ? "" : ".");
+import { node, sentence } from "../page.js";
 
 const number = new Intl.NumberFormat("en");
-
-export function node(name, attributes = {}, ...children) {
-  const made = document.createElement(name);
-  for (const [key, value] of Object.entries(attributes)) {
-    if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
-    else if (value !== null && value !== false) made.setAttribute(key, value === true ? "" : value);
-  }
-  made.append(...children);
-  return made;
-}
 
 /** The reason why a committed frame does not show its pictures, or only in part; empty if it does. */
 export function reasonOf(report) {

@@ -1,7 +1,7 @@
 // The trade-off panel: error over milliseconds a frame, and the budget.
 
 import { element, step } from "./charts.js";
-import { call, scenePath } from "./service.js";
+import { call, scenePath } from "../service.js";
 
 // Points with a time but no error have a strip of their own below the plot, so that the two are not confused.
 const [LEFT, RIGHT, TOP, STRIP, BOTTOM] = [48, 20, 36, 34, 18];
@@ -21,7 +21,7 @@ const HOW = { measured: "measured on frames of the scene", replayed: "replayed",
 /** Writes milliseconds in the usual unit. */
 const spoken = (time) => (time < 1000 ? `${short(time)} ms` : `${short(time / 1000)} s`);
 
-const middle = (values) => [...values].sort((a, b) => a - b)[values.length >> 1];
+const median = (values) => [...values].sort((a, b) => a - b)[values.length >> 1];
 
 /** Rounds to three significant digits: enough to choose by. */
 const short = (value) => Number(value.toPrecision(value < 100 ? 2 : 3));
@@ -202,8 +202,8 @@ export class Tradeoff {
 
   brought(updates) {
     const psnr = updates.map((one) => one.psnr).filter((value) => value !== null && value !== undefined);
-    const time = spoken(1000 * middle(updates.map((one) => one.seconds.total)));
-    return psnr.length ? `${time}, ${middle(psnr).toFixed(1)} dB a frame` : `${time} a frame`;
+    const time = spoken(1000 * median(updates.map((one) => one.seconds.total)));
+    return psnr.length ? `${time}, ${median(psnr).toFixed(1)} dB a frame` : `${time} a frame`;
   }
 
   /** Sets the control back to the budget that holds. */
@@ -287,7 +287,7 @@ export class Tradeoff {
     element("text", { x: 2, y: 11, class: "label start" }, svg).textContent =
       by === "error" ? "error of training views, lower is better" : "PSNR of training views, dB, higher is better";
     const unmeasured = points.some((point) => point[by] === null);
-    if (unmeasured) element("text", { x: LEFT - 5, y: base - 7, class: "label end" }, svg).textContent = "no error";
+    if (unmeasured) element("text", { x: LEFT - 5, y: base - 7, class: "label end" }, svg).textContent = "unknown";
     element("rect", { x: LEFT, y: TOP + height + 8, width, height: STRIP - 8, class: "strip" }, svg);
     element("line", { x1: LEFT, x2: clientWidth - RIGHT, y1: base, y2: base, class: "axis" }, svg);
     for (let power = 10 ** Math.floor(Math.log10(first)); power < last; power *= 10) {

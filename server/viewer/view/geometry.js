@@ -70,6 +70,9 @@ export function fitRig(cameras) {
 }
 
 const POLE = 88 * Math.PI / 180;
+// Distances of the orbit in radii of the rig: nearer is inside what is seen, farther it is a dot.
+const [NEAREST, FARTHEST] = [0.05, 5];
+const FILLED = 0.85;
 
 /** A camera that turns about a target with "up" fixed. */
 export class Orbit {
@@ -134,6 +137,16 @@ export class Orbit {
   }
 
   zoom(factor) {
-    this.distance = Math.max(0.02 * this.rig.radius, Math.min(20 * this.rig.radius, this.distance * factor));
+    this.distance = Math.max(NEAREST * this.rig.radius, Math.min(FARTHEST * this.rig.radius, this.distance * factor));
+  }
+
+  /** Brings a box of pixels of a picture, { left, top, right, bottom }, into the middle, and lets it fill most of the view. */
+  fit(box, picture) {
+    const camera = readCamera(picture);
+    const unit = this.distance / camera.fx; // of the world a pixel, at the target
+    const right = (box.left + box.right + 1 - camera.width) / 2 * unit;
+    const down = (box.top + box.bottom + 1 - camera.height) / 2 * unit;
+    this.target = add(this.target, add(scale(camera.rows[0], right), scale(camera.rows[1], down)));
+    this.zoom(Math.max((box.right + 1 - box.left) / camera.width, (box.bottom + 1 - box.top) / camera.height) / FILLED);
   }
 }

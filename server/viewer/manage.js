@@ -1,0 +1,107 @@
+// The dialog in which a scene is managed: its name, what it keeps, pausing, archiving, sleep, beginning again, deletion.
+
+import { call, scenePath } from "./service.js";
+import { $, page, sentence } from "./page.js";
+
+export class Manage {
+  /** @param changed called with the status that a change led to */
+  constructor(changed) {
+    this.dialog = $("manage");
+    this.changed = changed;
+    $("manage-open").addEventListener("click", () => this.open());
+    $("manage-close").addEventListener("click", () => this.dialog.close());
+    $("manage-save").addEventListener("click", () => this.save());
+    $("manage-pause").addEventListener("click", () => this.post(page.status.paused ? "resume" : "pause"));
+    $("manage-archive").addEventListener("click", () => this.edit({ archived: !page.status.archived }, page.status.archived ? "restored" : "archived"));
+    $("manage-sleep").addEventListener("click", () => this.post("sleep"));
+    $("manage-again").addEventListener("click", () => this.sure($("manage-again"), "Discard all frames and begin again", () => this.again()));
+    $("manage-delete").addEventListener("click", () => this.sure($("manage-delete"), "Delete for good", () => this.remove()));
+    this.dialog.addEventListener("close", () => this.unsure());
+  }
+
+  open() {
+    if (!page.status) return;
+    $("manage-words").textContent = "";
+    $("manage-name").value = page.status.name;
+    const kept = (rule) => rule?.last ?? "";
+    $("manage-frames").value = kept(page.status.ingest.keep_frames);
+    $("manage-states").value = kept(page.status.ingest.keep_states);
+    this.show();
+    this.dialog.showModal();
+  }
+
+  /** Shows what can be done now; the status comes with every change. */
+  show() {
+    const status = page.status;
+    if (!status) return this.dialog.open && this.dialog.close();
+    $("manage-title").textContent = status.name || status.id;
+    $("manage-id").textContent = status.id;
+    $("manage-pause").textContent = status.paused ? "Resume" : "Pause";
+    $("manage-pause").disabled = status.state === "failed";
+    $("manage-archive").textContent = status.archived ? "Restore" : "Archive";
+    $("manage-sleep").disabled = status.asleep;
+    $("manage-again").disabled = status.archived || status.next_frame === 0;
+  }
+
+  async save() {
+    const edit = {};
+    const name = $("manage-name").value.trim();
+    if (name !== page.status.name) edit.name = name;
+    for (const [id, field] of [["manage-frames", "keep_frames"], ["manage-states", "keep_states"]]) {
+      const given = $(id).value === "" ? null : Number($(id).value);
+      if (given !== (page.status.ingest[field]?.last ?? null)) edit[field] = given === null ? {} : { last: given };
+    }
+    if (Object.keys(edit).length) await this.edit(edit, "saved");
+    else this.say("nothing was changed");
+  }
+
+  edit(edit, done) {
+    return this.run(() => call("PATCH", scenePath(page.scene), edit), done);
+  }
+
+  post(verb) {
+    const done = { pause: "paused", resume: "resumed", sleep: "asleep; it wakes when it is asked or sent something" }[verb];
+    return this.run(() => call("POST", `${scenePath(page.scene)}/${verb}`), done);
+  }
+
+  again() {
+    const body = { discard: true };
+    return this.run(() => call("PUT", `${scenePath(page.scene)}/reconstructions/${page.status.reconstruction + 1}`, body), "begun again");
+  }
+
+  async remove() {
+    await this.run(() => call("DELETE", scenePath(page.scene)), "deleted");
+    this.dialog.close();
+  }
+
+  async run(act, done) {
+    this.unsure();
+    try {
+      const status = await act();
+      if (status?.id === page.scene) this.changed(status);
+      this.say(done);
+    } catch (error) {
+      this.say(error.message);
+    }
+    this.show();
+  }
+
+  say(words) {
+    $("manage-words").textContent = sentence(words);
+  }
+
+  /** The first press asks, the second one does it. */
+  sure(button, words, act) {
+    if (button.dataset.sure) return act();
+    this.unsure();
+    button.dataset.sure = button.textContent;
+    button.textContent = words;
+  }
+
+  unsure() {
+    for (const button of this.dialog.querySelectorAll("[data-sure]")) {
+      button.textContent = button.dataset.sure;
+      delete button.dataset.sure;
+    }
+  }
+}

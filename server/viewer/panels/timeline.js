@@ -1,0 +1,107 @@
+// Time: which frame is shown, the slider with its marks, and playing at the recorded rate.
+
+import { isHeld } from "./facts.js";
+import { $, node, page, readable } from "../page.js";
+
+const SHORTEST_MS = 20; // no screen shows more pictures
+const END_MS = 400; // the last frame stays before it begins again
+
+export class Timeline {
+  /** @param shown called when another frame is chosen */
+  constructor(shown) {
+    this.shown = shown;
+    this.playing = null;
+    $("time").addEventListener("input", (event) => {
+      this.stop();
+      this.choose(readable()[Number(event.target.value)]?.index ?? null);
+    });
+    $("play").addEventListener("click", () => this.play());
+    $("back").addEventListener("click", () => this.step(-1));
+    $("forth").addEventListener("click", () => this.step(1));
+    $("live").addEventListener("click", () => this.live());
+  }
+
+  /** Chooses the frame nearest to an index; null follows the newest. */
+  choose(index) {
+    const frames = readable().map((report) => report.index);
+    if (!frames.length) return;
+    page.frame = index === null ? null : frames.reduce((best, one) => (Math.abs(one - index) < Math.abs(best - index) ? one : best));
+    this.shown();
+  }
+
+  step(count) {
+    this.stop();
+    const frames = readable().map((report) => report.index);
+    if (!frames.length) return;
+    const at = page.frame === null ? frames.length - 1 : frames.indexOf(page.frame);
+    this.choose(frames[Math.max(0, Math.min(frames.length - 1, at + count))]);
+  }
+
+  live() {
+    this.stop();
+    if (page.frame !== null) this.choose(null);
+  }
+
+  /** Plays from the frame shown on, by the times of the frames: where pictures take longer, frames are left out. */
+  play() {
+    if (this.playing) return this.stop();
+    const frames = readable();
+    if (frames.length < 2) return;
+    const at = frames.findIndex((report) => report.index === page.frame);
+    this.from(frames[at < 0 || at === frames.length - 1 ? 0 : at]);
+    $("play").textContent = "❚❚";
+    $("play").setAttribute("aria-label", "Pause");
+  }
+
+  from(report) {
+    const [began, time] = [performance.now(), report.time];
+    const turn = () => {
+      const frames = readable();
+      const now = time + (performance.now() - began) / 1000;
+      const at = Math.max(0, frames.findLastIndex((one) => one.time <= now));
+      if (frames[at].index !== page.frame) this.choose(frames[at].index);
+      const next = frames[at + 1];
+      this.playing = next ? setTimeout(turn, Math.max(SHORTEST_MS, 1000 * (next.time - now)))
+        : setTimeout(() => this.from(readable()[0]), END_MS);
+    };
+    turn();
+  }
+
+  stop() {
+    clearTimeout(this.playing);
+    this.playing = null;
+    $("play").textContent = "▶";
+    $("play").setAttribute("aria-label", "Play");
+  }
+
+  /** Draws the slider, its marks, and the words beside it; returns the report of the frame that is shown. */
+  draw() {
+    const reports = readable();
+    const slider = $("time");
+    slider.disabled = reports.length < 2;
+    slider.max = Math.max(reports.length - 1, 0);
+    const at = page.frame === null ? reports.length - 1 : reports.findIndex((report) => report.index === page.frame);
+    slider.value = Math.max(at, 0);
+    const report = reports[at];
+    slider.setAttribute("aria-valuetext", report ? `frame ${report.index}` : "no frame");
+    const how = isHeld(report) ? " · held" : report?.degraded ? " · in part" : "";
+    $("moment").textContent = report ? `frame ${report.index} · ${report.time.toFixed(2)} s${how}` : "no frame";
+    $("reason").hidden = !report?.degraded;
+    $("reason").textContent = report?.degraded ? `Frame ${report.index}: ${report.degraded}.` : "";
+    $("live").setAttribute("aria-pressed", String(page.frame === null));
+    for (const id of ["play", "back", "forth", "live"]) $(id).disabled = reports.length < 2;
+    this.mark(reports);
+    return report;
+  }
+
+  /** Marks frames on the slider whose state is not what their pictures show. */
+  mark(reports) {
+    const last = Math.max(reports.length - 1, 1);
+    $("marks").replaceChildren(...reports.flatMap((report, at) => {
+      if (!report.degraded) return [];
+      const mark = node("span", { title: `frame ${report.index}: ${report.degraded}`, onclick: () => this.choose(report.index) });
+      mark.style.left = `${100 * at / last}%`;
+      return [mark];
+    }));
+  }
+}

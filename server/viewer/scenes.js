@@ -1,0 +1,102 @@
+// The list of scenes, the address of the page, and the token.
+
+import { call, token } from "./service.js";
+import { NO_SCENE, noService } from "./states.js";
+import { $, curtain, node, page } from "./page.js";
+
+const LIST_EVERY_MS = 4000;
+
+/** What the address of the page names: scene, frame. */
+export const wanted = () => Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
+
+export function remember() {
+  const words = new URLSearchParams({ scene: page.scene });
+  if (page.frame !== null) words.set("frame", page.frame);
+  history.replaceState(null, "", `#${words}`);
+}
+
+const called = (scene) => (scene.name ? `${scene.name} (${scene.id.slice(0, 6)})` : scene.id);
+const beside = (scene) => (scene.state === "failed" ? " · failed" : scene.archived ? " · archived" : scene.asleep ? " · asleep" : "");
+
+export class SceneList {
+  /** @param open opens a scene by its status in the list */
+  constructor(open) {
+    this.open = open;
+    this.gone = false; // the scene that was open is not there any more: what was said of it stays
+    $("scenes").addEventListener("change", (event) => this.choose(event.target.value));
+    setInterval(() => this.look(), LIST_EVERY_MS);
+    document.addEventListener("visibilitychange", () => document.hidden || this.look());
+  }
+
+  /** Lists the scenes again, and opens the one that is wanted. */
+  async look() {
+    let scenes;
+    try {
+      scenes = (await call("GET", "/v1/scenes")).scenes;
+    } catch (error) {
+      if (error.status === 401 || error.status === 403) return this.askForToken(error.status === 401 && token.get());
+      if (!page.stream) curtain(noService(error));
+      return;
+    }
+    this.scenes = scenes;
+    const chosen = page.scene ?? wanted().scene;
+    this.draw(scenes);
+    const there = scenes.find((scene) => scene.id === chosen) ?? (this.gone || chosen ? null : scenes.at(-1));
+    if (!there && !this.gone && !page.stream && chosen) this.missing(chosen);
+    if (!there && scenes.length) $("scenes").prepend(node("option", { value: "", disabled: true, selected: true }, "choose a scene"));
+    if (there) $("scenes").value = there.id;
+    if (!scenes.length && !page.stream && !this.gone && !chosen) curtain(NO_SCENE);
+    if (there && there.id !== page.scene) this.choose(there.id);
+  }
+
+  draw(scenes) {
+    const select = $("scenes");
+    const words = scenes.map((scene) => called(scene) + beside(scene));
+    select.disabled = scenes.length === 0;
+    if (document.activeElement === select && select.options.length === scenes.length) { // it may be open
+      words.forEach((text, i) => (select.options[i].textContent = text));
+      return;
+    }
+    select.replaceChildren(...scenes.map((scene, i) => node("option", { value: scene.id }, words[i])));
+  }
+
+  choose(id) {
+    this.gone = false;
+    this.open(this.scenes.find((scene) => scene.id === id) ?? { id });
+  }
+
+  /** Buttons for all scenes but one. */
+  others(id) {
+    return (this.scenes ?? []).filter((scene) => scene.id !== id).map((scene) => [scene.name || scene.id, () => this.choose(scene.id)]);
+  }
+
+  /** The address names a scene that is not here. No other scene is opened in its place: it would be taken for it. */
+  missing(id) {
+    const actions = this.others(id);
+    curtain({ title: "There is no such scene", words: `The service has no scene ${id}. ${actions.length ? "Choose one:" : "It has no others either."}`, actions });
+  }
+
+  /** The scene that was open is gone, or may not be looked at any more. */
+  async ended(id, reason, status) {
+    this.gone = true;
+    history.replaceState(null, "", location.pathname);
+    if (status === 401 || status === 403) this.askForToken(true);
+    await this.look();
+    const actions = this.others(id);
+    curtain({ title: status === 404 ? "The scene is gone" : "Not allowed", words: `${reason} ${actions.length ? "Choose another one:" : ""}`, actions });
+  }
+
+  askForToken(again) {
+    const door = $("door");
+    if (door.open) return;
+    if (again) $("door-words").textContent = "The token is wrong. Enter the token that the service was started with (SCAS4D_TOKEN).";
+    token.forget();
+    door.showModal();
+    door.addEventListener("close", () => {
+      token.set($("token").value.trim());
+      $("token").value = "";
+      this.gone = false;
+      this.look();
+    }, { once: true });
+  }
+}
