@@ -313,6 +313,10 @@ $("to-check").addEventListener("click", () => {
   $("warnings").scrollIntoView({ block: "nearest" });
   $("warnings-title").focus({ preventScroll: true });
 });
+const narrow = window.matchMedia("(max-width: 900px)");
+const unfold = () => ($("more").open = !narrow.matches);
+narrow.addEventListener("change", unfold);
+unfold();
 listenToKeys(view, {
   mode: setMode,
   step: (count) => timeline.step(count),

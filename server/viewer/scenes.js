@@ -61,6 +61,7 @@ export class SceneList {
   }
 
   choose(id) {
+    if (id === page.scene) return;
     this.gone = false;
     this.open(this.scenes.find((scene) => scene.id === id) ?? { id });
   }

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import base64
+import io
+
 import browser_engine
 import numpy as np
 import pytest
 from browser_page import FRAMES, canvas, opened, push, shown, start_scene, until
+from PIL import Image
 from running import Running, fake_settings
 
 from client.sdk import Client
@@ -311,3 +315,119 @@ def test_a_scene_that_begins_again_is_shown_anew(page, service):
         shown(page, frame="4")
         assert page.locator("#facts").inner_text().count("2 committed") == 1
         sdk.delete_scene(id)
+
+
+def test_the_page_as_a_tool(page, service, finished):
+    """Fit, background, snapshot, and one camera's picture beside the view."""
+    opened(page, service, finished)
+    first = rests(page)
+    page.keyboard.press("f")
+    fitted = rests(page)
+    rows, columns = np.nonzero(fitted[..., :3].sum(-1) > 60)
+    height, width = fitted.shape[:2]
+    filled = max((rows.max() - rows.min()) / height, (columns.max() - columns.min()) / width)
+    assert 0.7 < filled < 1
+    assert abs((rows.max() + rows.min()) / 2 - height / 2) < 0.1 * height
+    page.select_option("#background", "[1,1,1]")
+    white = rests(page)
+    assert white[2, 2, :3].tolist() == [255, 255, 255]
+    with page.expect_download() as download:
+        page.keyboard.press("s")
+    assert download.value.suggested_filename == f"ring-frame-{FRAMES - 1}-colour.png"
+    saved = np.array(Image.open(download.value.path()).convert("RGB")).astype(int)
+    assert np.abs(saved - white[..., :3]).mean() < 3  # a JPEG is on the page, a PNG was saved
+    page.select_option("#background", "")
+    page.keyboard.press("Home")
+    assert not differs(first, rests(page))
+    for _ in range(20):
+        page.keyboard.press("-")
+    far = rests(page)
+    assert (far[..., :3].sum(-1) > 60).sum() > 10  # it does not vanish
+    assert page.faults == []
+
+
+def test_a_camera_s_picture_beside_the_view(page, service, finished):
+    opened(page, service, finished)
+    rests(page)
+    page.select_option("#beside-what", "picture")
+    page.select_option("#beside-camera", "2")
+    box = "document.getElementById('beside').dataset"
+    until(page, f"{box}.camera === 'c2' && {box}.what === 'picture' && {box}.frame === '{FRAMES - 1}'")
+    sent = page.evaluate("document.querySelector('#beside canvas').toDataURL('image/png').split(',')[1]")
+    sent = np.array(Image.open(io.BytesIO(base64.b64decode(sent))).convert("RGB"))
+    assert sent.shape == (24, 32, 3)
+    assert sent[0, 0].tolist() == [0, 10, 20]  # as `push` sends it
+    for what in ("render", "difference", "heat"):
+        page.select_option("#beside-what", what)
+        until(page, f"{box}.what === '{what}'")
+    page.locator("#time").fill("0")
+    until(page, f"{box}.frame === '0'")
+    page.select_option("#beside-what", "")
+    assert page.locator("#beside").is_hidden()
+    assert page.faults == []
+
+
+def test_keys_work_whatever_was_used_last(page, service, finished):
+    opened(page, service, finished)
+    rests(page)
+    uses = (
+        lambda: page.locator("#time").fill("2"),
+        lambda: page.select_option("#from", "1"),
+        lambda: page.check("#frusta"),
+        lambda: page.click("#back"),
+        lambda: page.select_option("#scenes", finished),
+        lambda: page.click("#psnr"),
+    )
+    for use in uses:
+        use()
+        page.keyboard.press("4")
+        shown(page, mode="alpha")
+        page.keyboard.press("1")
+        shown(page, mode="colour")
+        page.keyboard.press(",")
+    page.click("#play")
+    assert page.locator("#play").get_attribute("aria-label") == "Pause"
+    page.keyboard.press(" ")  # not the button again
+    assert page.locator("#play").get_attribute("aria-label") == "Play"
+    page.locator("#from").focus()
+    page.keyboard.press("2")
+    shown(page, mode="depth")
+    assert page.locator("#from").input_value() == "1"
+    assert page.faults == []
+
+
+def test_another_kind_of_picture_is_not_taken_for_what_was_chosen(page, service, finished):
+    opened(page, service, finished)
+    rests(page)
+    page.click("#modes [data-mode=depth]")
+    rests(page, mode="depth")
+    page.evaluate("document.getElementById('overlay')")
+    stale = page.evaluate(
+        """() => {
+        document.querySelector('#modes [data-mode=parts]').click();
+        return [document.getElementById('view').classList.contains('stale'), document.getElementById('legend').hidden];
+        }"""
+    )
+    assert stale == [True, True]
+    shown(page, mode="parts")
+    assert not page.evaluate("document.getElementById('view').classList.contains('stale')")
+    assert page.faults == []
+
+
+def test_it_plays_at_the_recorded_rate(page, service, finished):
+    opened(page, service, finished, frame=0)
+    rests(page, frame="0")
+    took = page.evaluate(
+        """() => new Promise((done) => {
+        const began = performance.now();
+        const look = setInterval(() => {
+            if (!document.getElementById('moment').innerText.startsWith('frame 6')) return;
+            clearInterval(look);
+            done(performance.now() - began);
+        }, 5);
+        document.getElementById('play').click();
+        })"""
+    )
+    assert took > 550  # six frames of a tenth of a second: never faster than they were taken
+    page.click("#play")
+    assert page.faults == []
