@@ -109,7 +109,7 @@ def head_length(prefix: bytes | bytearray | memoryview) -> int:
     magic, length = PREFIX.unpack_from(prefix)
     if magic != MAGIC:
         raise FramingError(
-            f"begins with {bytes(magic).hex(' ')}, not with S4DF", "send a frame as client.wire.framing does"
+            f"begins with {bytes(magic).hex(' ')}, not with S4DF", "send a frame as docs/api.md has it, byte by byte"
         )
     if length > MAX_HEAD:
         raise FramingError(f"declares a head of {length} bytes", f"a head has at most {MAX_HEAD}")

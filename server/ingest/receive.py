@@ -245,7 +245,8 @@ async def receive_frame(
         if keep:
             ingest.coming(head.index)
             begun.append(head.index)
-        return receiving_of(ingest, head, ingest.time_of(head.index, head.time), keep=keep)
+        whole = head.model_copy(update={"part": False})  # the address says so, whatever the head does
+        return receiving_of(ingest, whole, ingest.time_of(head.index, head.time), keep=keep)
 
     try:
         head, receiving = await read_framed(body, begin, length)

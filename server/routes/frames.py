@@ -33,7 +33,7 @@ BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
         "content": {
-            FRAME_MEDIA_TYPE: {"schema": {**BINARY, "description": "S4DF, as client/wire/framing.py writes it."}},
+            FRAME_MEDIA_TYPE: {"schema": {**BINARY, "description": "S4DF; docs/api.md has it byte by byte."}},
             "multipart/form-data": {
                 "schema": {
                     "type": "object",

@@ -126,6 +126,16 @@ def test_a_lost_definition_does_not_cost_the_frames(tmp_path):
         problem(http.get(f"/v1/scenes/{empty}"), 404)  # a scene that was never acknowledged looks the same
 
 
+def test_a_whole_frame_whose_head_says_part_is_found_whole_without_a_journal(tmp_path):
+    with serving(tmp_path) as (http, _):
+        id = create(http)
+        http.post(f"/v1/scenes/{id}/pause")
+        assert put(http, id, 0, part=True).status_code == 202
+    folder = SceneFolder(tmp_path / "scenes" / id)
+    folder.journal.unlink()
+    assert recover(folder, id).ledger.waiting() == [0]
+
+
 def test_a_journal_that_cannot_be_written_costs_its_scene_only(tmp_path, monkeypatch):
     with serving(tmp_path) as (http, _):
         bad, good = create(http), create(http)

@@ -1,0 +1,146 @@
+"""The sender in C++ beside docs/api.md: it compiles without a warning, and what it sends arrives."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import fakes
+import pytest
+from running import Running, fake_settings, make_rig, picture, pictures
+
+from client.sdk import Client
+from server.storage.frame_store import read_pictures
+
+ROOT = Path(__file__).parents[2]
+SOURCE = ROOT / "docs" / "examples" / "send_frame.cpp"
+TOKEN = "a-token-of-thirty-two-characters"
+COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+
+
+@pytest.fixture(scope="module")
+def sender(tmp_path_factory):
+    """The compiled program."""
+    if COMPILER is None:
+        pytest.skip("there is no C++ compiler here (c++, g++ or clang++)")
+    program = tmp_path_factory.mktemp("sender") / "send_frame"
+    strict = ["-std=c++17", "-Wall", "-Wextra", "-Werror", "-O1"]
+    done = subprocess.run([COMPILER, *strict, SOURCE, "-o", program], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return program
+
+
+@pytest.fixture(scope="module")
+def guarded_service(tmp_path_factory):
+    """A service that asks for a token."""
+    running = Running(fake_settings(tmp_path_factory.mktemp("data"), token=TOKEN))
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def sdk(guarded_service):
+    with Client(guarded_service.url, token=TOKEN, patience=20) as client:
+        yield client
+
+
+@pytest.fixture
+def scene(sdk):
+    id = sdk.create_scene(make_rig(), frames_per_second=10).id
+    yield id
+    sdk.delete_scene(id)
+
+
+@pytest.fixture
+def begin(sender, tmp_path):
+    """Starts the program with files of a frame; the caller waits for its end."""
+
+    def started(url, scene, index, images, masks=None, *more, token=TOKEN):
+        arguments = []
+        for field, data in {**images, **{f"mask.{name}": mask for name, mask in (masks or {}).items()}}.items():
+            file = tmp_path / f"{index}-{field}.png"
+            file.write_bytes(data)
+            arguments.append(f"{field}={file}")
+        environment = {**os.environ, "SCAS4D_TOKEN": token}
+        command = [sender, url, scene, str(index), *arguments, *more]
+        return subprocess.Popen(
+            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, encoding="utf-8"
+        )
+
+    return started
+
+
+def ended(process):
+    """Its exit status, and what it wrote to stdout and stderr."""
+    out, err = process.communicate(timeout=60)
+    return process.returncode, out, err
+
+
+def stored(service, scene):
+    """The frames of a scene in the service's data folder, by index."""
+    files = sorted((service.app.state.settings.data / "scenes" / scene).rglob("*.frame"))
+    return {found.index: found for found in (read_pictures(file.parent, file.name) for file in files)}
+
+
+def test_it_is_short_enough_to_read():
+    lines = SOURCE.read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 150
+    assert max(map(len, lines)) <= 120
+
+
+def test_pictures_arrive_byte_for_byte(guarded_service, sdk, scene, begin):
+    images = {"c0": picture(3, format="JPEG"), "c1": picture(4)}
+    masks = {name: picture(255, mode="L") for name in images}
+    status, out, err = ended(begin(guarded_service.url, scene, 0, images, masks, "time=0.125"))
+    assert (status, err) == (0, "")
+    assert out.startswith("202 {")
+    assert '"time":0.125' in out
+    found = stored(guarded_service, scene)[0]
+    assert {name: bytes(data) for name, data in found.images.items()} == images
+    assert {name: bytes(data) for name, data in found.masks.items()} == masks
+    assert ended(begin(guarded_service.url, scene, 0, images, masks, "time=0.125")) == (status, out, err)
+    assert sdk.wait(scene, 0).state == "committed"
+
+
+def test_a_wrong_token_and_a_gap_are_told(guarded_service, scene, begin):
+    status, out, err = ended(begin(guarded_service.url, scene, 0, pictures(), token="another-token-of-that-length"))
+    assert (status, out) == (1, "")
+    assert err.startswith("401 ")
+    assert "the token is wrong" in err
+    status, out, err = ended(begin(guarded_service.url, scene, 5, pictures()))
+    assert (status, out) == (1, "")
+    assert err.startswith("409 ")
+    assert '"expected": 0' in err
+
+
+def test_a_full_queue_is_waited_out(guarded_service, sdk, scene, begin):
+    sdk.put_frame(scene, 0, pictures())
+    sdk.wait(scene, 0)
+    sdk.put_frame(scene, 1, pictures(fakes.SLOW))
+    sdk.put_frame(scene, 2, pictures())
+    status, out, err = ended(begin(guarded_service.url, scene, 3, pictures(7)))
+    assert status == 0, err
+    assert err.startswith("429 ")
+    assert "sending frame 3 again in" in err
+    assert out.startswith("202 ")
+    assert bytes(stored(guarded_service, scene)[3].images["c0"]) == pictures(7)["c0"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected", "message"),
+    [
+        ([], 2, "usage: send_frame"),
+        (["https://127.0.0.1:8000", "scene", "0", "c0=a.png"], 2, "usage: send_frame"),
+        (["http://127.0.0.1:8000", "scene", "x", "c0=a.png"], 2, "usage: send_frame"),
+        (["http://127.0.0.1:8000", "scene", "0", "c0=nowhere.png"], 1, "nowhere.png cannot be read"),
+        (["http://127.0.0.1:8000", "scene", "0", "c0"], 1, "'c0' is not CAMERA=PICTURE"),
+        (["http://127.0.0.1:8000", "scene", "0", f'c"0={SOURCE}'], 1, "cannot be the name of a camera"),
+        (["http://127.0.0.1:1", "scene", "0", f"c0={SOURCE}"], 1, "127.0.0.1:1 cannot be reached"),
+    ],
+)
+def test_wrong_arguments_are_told(sender, arguments, expected, message):
+    done = subprocess.run([sender, *arguments], capture_output=True, text=True, timeout=60)
+    assert done.returncode == expected
+    assert message in done.stderr
