@@ -4,7 +4,7 @@ import { element, step } from "./charts.js";
 import { call, scenePath } from "../service.js";
 
 // Points with a time but no error have a strip of their own below the plot, so that the two are not confused.
-const [LEFT, RIGHT, TOP, STRIP, BOTTOM] = [48, 20, 36, 34, 18];
+const [LEFT, RIGHT, TOP, STRIP, BOTTOM] = [56, 20, 36, 34, 18];
 const EFFECT_FRAMES = 16;
 // Under a budget in time every frame has iterations of its own: measured points of about the same time and not too
 // different iterations are one.

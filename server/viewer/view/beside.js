@@ -14,15 +14,12 @@ const WORDS = {
 };
 
 export class Beside {
-  /**
-   * @param box has a canvas and a caption
-   * @param failed says why there is nothing to show
-   */
-  constructor(box, failed) {
+  /** @param box has a canvas and a caption */
+  constructor(box) {
     this.box = box;
     this.canvas = box.querySelector("canvas");
+    this.context = this.canvas.getContext("2d", { willReadFrequently: true });
     this.caption = box.querySelector("figcaption");
-    this.failed = failed;
     this.what = "";
     this.camera = 0;
     this.wanted = this.shown = "";
@@ -45,7 +42,7 @@ export class Beside {
     this.abort?.abort();
     this.frame = undefined;
     this.wanted = this.shown = "";
-    this.canvas.getContext("2d").clearRect(0, 0, this.canvas.width, this.canvas.height);
+    this.context.clearRect(0, 0, this.canvas.width, this.canvas.height);
     this.caption.textContent = "";
   }
 
@@ -75,7 +72,7 @@ export class Beside {
     if (wish !== this.wanted) return;
     const { width, height } = made ?? own;
     Object.assign(this.canvas, { width, height });
-    const context = this.canvas.getContext("2d", { willReadFrequently: true });
+    const { context } = this;
     if (!own || !made) context.drawImage(own ?? made, 0, 0, width, height);
     else {
       const pixels = (bitmap) => {
@@ -90,7 +87,7 @@ export class Beside {
   }
 
   say([, , , name, frame], words) {
-    this.canvas.getContext("2d").clearRect(0, 0, this.canvas.width, this.canvas.height);
+    this.context.clearRect(0, 0, this.canvas.width, this.canvas.height);
     this.caption.textContent = `Camera ${name}, frame ${frame}: ${words}`;
     delete this.box.dataset.frame;
   }

@@ -261,9 +261,9 @@ export class LiveView {
     const small = FIT_PX / Math.max(box.width, box.height);
     const camera = this.orbit.camera(Math.round(box.width * small), Math.round(box.height * small));
     const bitmap = await createImageBitmap(await this.rendered({ camera, kinds: ["alpha"], format: "png" }));
-    const canvas = new OffscreenCanvas(bitmap.width, bitmap.height);
-    canvas.getContext("2d").drawImage(bitmap, 0, 0);
-    const { data, width, height } = canvas.getContext("2d").getImageData(0, 0, bitmap.width, bitmap.height);
+    const context = new OffscreenCanvas(bitmap.width, bitmap.height).getContext("2d", { willReadFrequently: true });
+    context.drawImage(bitmap, 0, 0);
+    const { data, width, height } = context.getImageData(0, 0, bitmap.width, bitmap.height);
     const seen = { left: width, top: height, right: -1, bottom: -1 };
     for (let y = 0; y < height; y++) for (let x = 0; x < width; x++) {
       if (data[4 * (y * width + x)] < COVERED) continue;
