@@ -19,8 +19,9 @@ from server.connections.guard import ConnectionGuard, ConnectionLimits
 from server.connections.proxies import ClientLimit
 from server.health.readiness import Readiness
 from server.http import handlers
+from server.http.authentication import AuthMiddleware
 from server.http.encoding import HeadAsGet, compressed
-from server.http.middleware import AccessLog, AuthMiddleware, BodyLimit
+from server.http.middleware import AccessLog, BodyLimit
 from server.http.tickets import Tickets
 from server.problems import Problem
 from server.processes.placement import Placement
@@ -40,6 +41,7 @@ from server.routes import (
     reference,
     render,
     scenes,
+    shares,
     stream,
     tickets,
     tracks,
@@ -119,7 +121,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
             budget,
             tradeoff,
         ),
-        *(estimate, tickets, health, metrics, viewer, reference),
+        *(estimate, tickets, shares, health, metrics, viewer, reference),
     )
     for resource in resources:
         app.include_router(

@@ -24,7 +24,7 @@ from client.calls.scenes import (
     scene,
     scenes,
 )
-from client.calls.service import ingest_ready, live, metrics, ready, ticket
+from client.calls.service import ingest_ready, live, metrics, ready, share, ticket
 from client.calls.tracks import tracks, tracks_arrays
 from client.calls.views import render, render_arrays, render_file
 
@@ -63,6 +63,7 @@ __all__ = [
     "scene",
     "scenes",
     "set_budget",
+    "share",
     "ticket",
     "tracks",
     "tracks_arrays",

@@ -139,8 +139,8 @@ def ply(id: str, index: int) -> Call[bytes]:
 def picture(id: str, index: int, camera: str, kind: FileKind = FileKind.IMAGE) -> Call[bytes]:
     """Reads one camera's picture of a frame, or its mask, byte for byte as it was sent.
 
-    >>> client.picture(scene, 1, "c0")[:3]
-    b'\xff\xd8\xff'
+    >>> client.picture(scene, 1, "c0")[1:4]
+    b'PNG'
     """
     arguments = {"params": {"kind": kind.value}}
     return Call(

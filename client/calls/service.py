@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from client.calls.call import Call, reads
-from client.wire import Health, Ticket
+from client.calls.call import Call, body, reads
+from client.wire import Health, Share, ShareRequest, Ticket
 
 
 def live() -> Call[Health]:
@@ -49,3 +49,16 @@ def ticket() -> Call[Ticket]:
     True
     """
     return Call("POST", "/v1/tickets", reads(Ticket))
+
+
+def share(scene: str | None = None, seconds: int = 7 * 86_400) -> Call[Share]:
+    """Makes a token that may only read one scene, or all, and the page's address that has it.
+
+    The service has to have a token itself, else everybody may do everything.
+
+    >>> client.share(scene)
+    Traceback (most recent call last):
+    client.errors.Conflict: 409: the service has no token: whoever reaches it may do everything (...)
+    """
+    request = ShareRequest(scene=scene, seconds=seconds)
+    return Call("POST", "/v1/shares", reads(Share), repeatable=False, arguments=body(request))

@@ -1,4 +1,4 @@
-"""The commands `scas4d scenes …`: lists, renames, pauses, archives, puts to sleep and deletes scenes."""
+"""The commands `scas4d scenes …`: lists, renames, pauses, archives, puts to sleep, shares and deletes scenes."""
 
 from __future__ import annotations
 
@@ -123,6 +123,19 @@ def sleep(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
     with Client(url, token=token) as client:
         for scene in scenes:
             _told(client.put_to_sleep(scene))
+
+
+@app.command()
+def share(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene, or all.")],
+    hours: Annotated[float, typer.Option(min=0.01, max=87_840, help="So long the link holds.")] = 168,
+    url: Url = DEFAULT_URL,
+    token: Token = None,
+) -> None:
+    """Prints a link at which others may look at a scene, and change nothing; it cannot be taken back."""
+    with Client(url, token=token) as client:
+        made = client.share(None if scene == "all" else scene, round(3600 * hours))
+    _say(url.rstrip("/") + made.address, f"holds until {made.ends}; the token alone: {made.token}")
 
 
 @app.command()

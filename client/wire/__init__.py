@@ -46,7 +46,7 @@ from client.wire.scenes import (
     SceneState,
     SceneStatus,
 )
-from client.wire.service import Health, ProblemDetails, Ticket
+from client.wire.service import Health, ProblemDetails, Share, ShareRequest, Ticket
 from client.wire.tracks import GaussianModel, GaussiansModel, TracksModel, TracksRequest, tracks_model
 from client.wire.tradeoff import (
     CurveMean,
@@ -118,6 +118,8 @@ __all__ = [
     "SceneList",
     "SceneState",
     "SceneStatus",
+    "Share",
+    "ShareRequest",
     "Ticket",
     "TimeModel",
     "TracksModel",

@@ -43,3 +43,19 @@ class ProblemDetails(BaseModel):
     field: str | None = None
     value: str | None = None
     remedy: str | None = None
+
+
+class ShareRequest(Model):
+    """A token that may only read."""
+
+    scene: str | None = Field(default=None, max_length=64, description="The only one that it shows; all where null.")
+    seconds: int = Field(default=7 * 86_400, ge=1, le=316_224_000, description="So long it holds; a week.")
+
+
+class Share(Model):
+    """A token that may only read, and the page's address that has it."""
+
+    token: str = Field(description="For `Authorization: Bearer`.")
+    scene: str | None
+    ends: str = Field(description="UTC, ISO 8601.")
+    address: str = Field(description="Behind the address of the service. What follows # is sent to no server.")

@@ -17,7 +17,7 @@ from server.connections import guard as guard_module
 from server.connections.guard import ConnectionGuard
 from server.connections.record import PROGRESS_BYTES, Phase
 from server.connections.refusals import Refusal, problem, response
-from server.http.middleware import HEADERS
+from server.http.authentication import HEADERS
 
 END_OF_HEAD = b"\r\n\r\n"
 CHUNKED_BYTES = 64 << 10

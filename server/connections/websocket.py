@@ -13,7 +13,7 @@ from websockets.http11 import Request
 from server.connections.guard import LINGER_LONGEST_S, ConnectionGuard
 from server.connections.record import Phase
 from server.connections.refusals import Refusal, problem, response
-from server.http.middleware import HEADERS
+from server.http.authentication import HEADERS
 
 EARLY_BYTES = 1 << 16
 """Largest message of a WebSocket before its handshake is answered: no client has to send one then."""

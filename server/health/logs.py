@@ -12,7 +12,7 @@ import sys
 from datetime import UTC, datetime
 from typing import Any, Literal
 
-SECRETS = re.compile(r"(?i)(bearer\s+|scas4d\.ticket\.|(?:token|ticket)=)[^\s\"',;&]+")
+SECRETS = re.compile(r"(?i)(bearer\s+|scas4d\.(?:ticket|read)\.|(?:token|ticket)=)[^\s\"',;&]+")
 """A secret follows these: it is hidden wherever it appears, because clients send it and any message may quote it."""
 
 _PLAIN = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName"}

@@ -13,6 +13,7 @@ from collections.abc import Callable
 
 from starlette.types import Message, Scope, Send
 
+from server.http.permissions import ALL, Permission
 from server.problems import Problem, counted
 
 SUBPROTOCOL = "scas4d.ticket."
@@ -32,33 +33,33 @@ class Tickets:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._until: dict[bytes, float] = {}
+        self._waiting: dict[bytes, tuple[float, Permission]] = {}
 
-    def issue(self) -> str:
-        """Issues a new ticket.
+    def issue(self, permission: Permission = ALL) -> str:
+        """Issues a new ticket; its bearer may do what the bearer of the token may that asked for it.
 
         Raises:
             Problem: 429, as many wait as may.
         """
         now = self._clock()
-        self._until = {digest: until for digest, until in self._until.items() if until > now}
-        if len(self._until) >= MOST_TICKETS:
+        self._waiting = {digest: ticket for digest, ticket in self._waiting.items() if ticket[0] > now}
+        if len(self._waiting) >= MOST_TICKETS:
             raise Problem(
                 429,
-                f"{counted(len(self._until), 'ticket')} of at most {MOST_TICKETS} wait to be used",
+                f"{counted(len(self._waiting), 'ticket')} of at most {MOST_TICKETS} wait to be used",
                 field="tickets",
                 value=MOST_TICKETS,
                 remedy=f"use them, or wait {TICKET_SECONDS:g} s",
                 headers={"Retry-After": str(max(1, round(TICKET_SECONDS)))},
             )
         ticket = secrets.token_urlsafe(24)
-        self._until[_digest(ticket)] = now + TICKET_SECONDS
+        self._waiting[_digest(ticket)] = (now + TICKET_SECONDS, permission)
         return ticket
 
-    def redeem(self, ticket: str) -> bool:
-        """Uses a ticket; returns True if it was issued, is still alive and was not used before."""
-        until = self._until.pop(_digest(ticket), None)
-        return until is not None and until > self._clock()
+    def redeem(self, ticket: str) -> Permission | None:
+        """Uses a ticket; returns what its bearer may do, None if it was not issued, is too old or was used before."""
+        until, permission = self._waiting.pop(_digest(ticket), (0.0, None))
+        return permission if until > self._clock() else None
 
 
 def _digest(ticket: str) -> bytes:

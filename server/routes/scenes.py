@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Request, Response
 
 from client.wire import SceneCreate, SceneEdit, SceneList, SceneStatus
 from scas4d_core.cameras import CameraError
@@ -14,6 +14,7 @@ from scas4d_core.rig_checks import RigError, check_scene
 from scas4d_core.settings import Settings
 from server.health import devices, estimate
 from server.http import validation
+from server.http.permissions import ALL, PERMISSION
 from server.problems import Problem, of_rig
 from server.routes.access import AllScenes, SceneId, TheRecord, TheScene, TheSettings
 from server.settings import ServerSettings
@@ -82,10 +83,11 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
 
 
 @router.get("")
-async def listed(scenes: AllScenes) -> SceneList:
-    """Lists all scenes, and wakes none; answers 503 while those of an earlier run are being recovered."""
+async def listed(scenes: AllScenes, request: Request) -> SceneList:
+    """Lists all scenes, and wakes none; a link has its own alone. 503 while those of an earlier run are recovered."""
     scenes.recovering.check()
-    return SceneList(scenes=scenes.statuses())
+    only = request.scope.get(PERMISSION, ALL).scene
+    return SceneList(scenes=[status for status in scenes.statuses() if only in (None, status.id)])
 
 
 @router.get("/{id}")

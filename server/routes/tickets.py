@@ -5,6 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter, Request
 
 from client.wire import Ticket
+from server.http.permissions import ALL, PERMISSION
 from server.http.tickets import SUBPROTOCOL, TICKET_SECONDS, Tickets
 
 router = APIRouter(prefix="/v1/tickets", tags=["service"])
@@ -14,5 +15,5 @@ router = APIRouter(prefix="/v1/tickets", tags=["service"])
 async def issue(request: Request) -> Ticket:
     """Issues a ticket that opens one WebSocket within seconds; the request bears the token."""
     tickets: Tickets = request.app.state.tickets
-    ticket = tickets.issue()
+    ticket = tickets.issue(request.scope.get(PERMISSION, ALL))
     return Ticket(ticket=ticket, subprotocol=SUBPROTOCOL + ticket, seconds=TICKET_SECONDS)

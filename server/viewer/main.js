@@ -9,7 +9,7 @@ import { Timeline } from "./panels/timeline.js";
 import { Tracks } from "./panels/tracks.js";
 import { Tradeoff } from "./panels/tradeoff.js";
 import { SceneList, remember, wanted } from "./scenes.js";
-import { call, scenePath } from "./service.js";
+import { call, scenePath, token } from "./service.js";
 import { beforeFirstFrame, OPENING, stateKey, stateWords, WAKING } from "./states.js";
 import { Stream } from "./stream.js";
 import { Beside } from "./view/beside.js";
@@ -135,7 +135,9 @@ function showStatus(status) {
   if (page.status && status.reconstruction !== page.status.reconstruction) return openScene(status); // begun anew
   page.status = status;
   const chip = $("state");
-  chip.hidden = $("manage-open").hidden = false;
+  chip.hidden = false;
+  $("manage-open").hidden = token.reads();
+  $("measure").hidden = $("budget-box").hidden = token.reads();
   chip.textContent = stateWords(status);
   chip.dataset.state = stateKey(status);
   $("trouble").hidden = !status.error;

@@ -15,6 +15,15 @@ export function remember() {
   history.replaceState(null, "", `#${words}`);
 }
 
+/** Takes the token of a link out of the address, where others would see it. */
+function takeToken() {
+  const words = new URLSearchParams(location.hash.slice(1));
+  if (!words.has("token")) return;
+  token.set(words.get("token"));
+  words.delete("token");
+  history.replaceState(null, "", `${location.pathname}${words.size ? `#${words}` : ""}`);
+}
+
 const called = (scene) => (scene.name ? `${scene.name} (${scene.id.slice(0, 6)})` : scene.id);
 const beside = (scene) => (scene.state === "failed" ? " · failed" : scene.archived ? " · archived" : scene.asleep ? " · asleep" : "");
 
@@ -22,6 +31,7 @@ export class SceneList {
   /** @param open opens a scene by its status in the list */
   constructor(open) {
     this.open = open;
+    takeToken();
     this.gone = false; // the scene that was open is not there any more: what was said of it stays
     $("scenes").addEventListener("change", (event) => this.choose(event.target.value));
     setInterval(() => this.look(), LIST_EVERY_MS);
@@ -90,7 +100,7 @@ export class SceneList {
   askForToken(again) {
     const door = $("door");
     if (door.open) return;
-    if (again) $("door-words").textContent = "The token is wrong. Enter the token that the service was started with (SCAS4D_TOKEN).";
+    if (again) $("door-words").textContent = `The ${token.reads() ? "link has ended" : "token is wrong"}. Enter the token that the service was started with (SCAS4D_TOKEN).`;
     token.forget();
     door.showModal();
     door.addEventListener("close", () => {

@@ -16,6 +16,8 @@ export const token = {
   get: () => sessionStorage.getItem(KEY),
   set: (value) => sessionStorage.setItem(KEY, value),
   forget: () => sessionStorage.removeItem(KEY),
+  /** Whether the bearer may look and not change anything. */
+  reads: () => sessionStorage.getItem(KEY)?.startsWith("scas4d.read.") ?? false,
 };
 
 /** Sends a request; returns the answer, whatever media type it has. */

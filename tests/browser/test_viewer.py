@@ -431,3 +431,30 @@ def test_it_plays_at_the_recorded_rate(page, service, finished):
     assert took > 550  # six frames of a tenth of a second: never faster than they were taken
     page.click("#play")
     assert page.faults == []
+
+
+def test_a_link_shows_one_scene_and_changes_nothing(page, tmp_path):
+    token = "a-token-that-is-long-enough"
+    service = Running(fake_settings(tmp_path, token=token), core=browser_engine.install)
+    try:
+        with Client(service.url, token=token, patience=30) as sdk:
+            id, other = start_scene(sdk, "shown"), start_scene(sdk, "hidden")
+            push(sdk, id, 0)
+            sdk.wait(id, 0)
+            link = sdk.share(id)
+        page.goto(service.url + link.address)
+        shown(page, frame="0")
+        assert "token" not in page.url
+        assert page.locator("#scenes option").count() == 1
+        assert page.locator("#manage-open").is_hidden()
+        assert page.locator("#budget-box").is_hidden()
+        page.select_option("#beside-what", "picture")
+        until(page, "document.getElementById('beside').dataset.frame === '0'")
+        page.reload()
+        shown(page, frame="0")
+        assert page.faults == []
+        page.goto(f"{service.url}/#scene={other}")
+        page.reload()
+        until(page, "document.querySelector('#curtain h2').innerText === 'There is no such scene'")
+    finally:
+        service.stop()

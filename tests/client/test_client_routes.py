@@ -19,6 +19,7 @@ CALLS = [
     calls.ingest_ready(),
     calls.metrics(),
     calls.ticket(),
+    calls.share(),
     calls.create_scene(make_rig()),
     calls.estimate(make_rig()),
     calls.scenes(),

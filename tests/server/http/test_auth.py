@@ -15,7 +15,8 @@ from running import Running, fake_settings, make_rig, problem
 from client.wire import RigModel
 from client.wire.stream import STREAM_PROTOCOL
 from server.http import tickets as tickets_module
-from server.http.middleware import AuthMiddleware, check_origin
+from server.http.authentication import AuthMiddleware
+from server.http.origin import check_origin
 from server.http.tickets import SUBPROTOCOL, Tickets
 from server.settings import ServerSettings, SettingsError
 
@@ -326,7 +327,7 @@ def test_tickets_expire_are_bounded_and_kept_hashed(monkeypatch):
     now = [0.0]
     tickets = Tickets(clock=lambda: now[0])
     first, second = tickets.issue(), tickets.issue()
-    assert not any(first.encode() in digest for digest in tickets._until)
+    assert not any(first.encode() in digest for digest in tickets._waiting)
     with pytest.raises(Exception, match="2 tickets of at most 2 wait"):
         tickets.issue()
     assert tickets.redeem(first)
@@ -334,7 +335,7 @@ def test_tickets_expire_are_bounded_and_kept_hashed(monkeypatch):
     now[0] = 31.0
     assert not tickets.redeem(second)
     assert tickets.issue()
-    assert len(tickets._until) == 1
+    assert len(tickets._waiting) == 1
 
 
 def test_it_listens_beyond_the_loopback_only_with_a_token(tmp_path):

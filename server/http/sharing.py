@@ -1,0 +1,60 @@
+"""Tokens that may only read, for a time: of one scene, as links to share have them, or of all.
+
+Such a token is `scas4d.read.<scene or *>.<end>.<signature>`: the end in seconds since the epoch, the signature an
+HMAC-SHA256 of what stands before it. Nothing is kept: another token of the service ends them all.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import hmac
+import time
+
+from server.http.permissions import Permission
+from server.problems import Problem
+
+PREFIX = "scas4d.read."
+ALL_SCENES = "*"
+LONGEST_SECONDS = 10 * 366 * 86_400
+"""Ten years: a monitor's token."""
+
+
+class Sharing:
+    """Makes and reads tokens that may only read.
+
+    Args:
+        secret: the token of the service.
+    """
+
+    def __init__(self, secret: str) -> None:
+        # A key of its own: what is signed here is no proof of the token for anything else.
+        self._key = hmac.digest(secret.encode(), b"scas4d tokens that may only read", hashlib.sha256)
+
+    def issue(self, scene: str | None, end: int) -> str:
+        """Makes a token for a scene, or for all, that ends then; `end` in seconds since the epoch."""
+        text = f"{PREFIX}{ALL_SCENES if scene is None else scene}.{end}"
+        return f"{text}.{self._signature(text)}"
+
+    def read(self, token: str) -> Permission | None:
+        """Returns what the bearer of a token may do; None where it was not made here.
+
+        Raises:
+            Problem: 401, it has ended.
+        """
+        text, _, signature = token.rpartition(".")
+        if not hmac.compare_digest(signature.encode(), self._signature(text).encode()):
+            return None
+        scene, _, end = text.removeprefix(PREFIX).rpartition(".")
+        if int(end) <= time.time():
+            raise Problem(
+                401,
+                "the link, or the token for reading, has ended",
+                field="Authorization",
+                remedy="ask whoever gave it to you for another: POST /v1/shares, or scas4d scenes share",
+                headers={"WWW-Authenticate": 'Bearer realm="scas4d", error="invalid_token"'},
+            )
+        return Permission(scene=None if scene == ALL_SCENES else scene)
+
+    def _signature(self, text: str) -> str:
+        return base64.urlsafe_b64encode(hmac.digest(self._key, text.encode(), hashlib.sha256)).decode().rstrip("=")

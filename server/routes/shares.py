@@ -1,0 +1,42 @@
+"""Route of tokens that may only read, and of links to share."""
+
+from __future__ import annotations
+
+import time
+from datetime import UTC, datetime
+
+from fastapi import APIRouter
+
+from client.wire import Share, ShareRequest
+from server.http.sharing import Sharing
+from server.problems import Problem
+from server.routes.access import AllScenes, TheSettings
+
+router = APIRouter(prefix="/v1/shares", tags=["service"])
+
+
+@router.post("", status_code=201)
+async def share(request: ShareRequest, scenes: AllScenes, settings: TheSettings) -> Share:
+    """Makes a token that may only read, of one scene or of all, and the address at which the page shows it.
+
+    It cannot be taken back: it ends by itself, or with the token of the service.
+    """
+    secret = settings.secret
+    if secret is None:
+        raise Problem(
+            409,
+            "the service has no token: whoever reaches it may do everything",
+            field="SCAS4D_TOKEN",
+            remedy="start it with SCAS4D_TOKEN; then others need a token, or a link",
+        )
+    if request.scene is not None:
+        scenes.status(request.scene)  # 404 where there is none
+    end = int(time.time() + request.seconds)
+    token = Sharing(secret).issue(request.scene, end)
+    shown = f"scene={request.scene}&" if request.scene is not None else ""
+    return Share(
+        token=token,
+        scene=request.scene,
+        ends=datetime.fromtimestamp(end, UTC).isoformat(),
+        address=f"/#{shown}token={token}",
+    )
