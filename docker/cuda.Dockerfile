@@ -3,7 +3,8 @@
 # needs is locked with hashes; torch and gsplat are pinned by version alone, because torch for CUDA 12.8 comes from an
 # index of its own (torch from PyPI is built for CUDA 13). The digest is as in cpu.Dockerfile.
 # The base contains nvcc, with which gsplat compiles its kernels at first use, into /cache; so it cannot be a small one.
-# TORCH_CUDA_ARCH_LIST is the architecture of the GPU (9.0: H100, 8.9: L4).
+# TORCH_CUDA_ARCH_LIST is the architecture of the GPU (9.0: H100, 8.9: L4); MAX_JOBS limits the compilers, of which each
+# takes some GB of the container's memory.
 ARG BASE=nvidia/cuda:12.8.1-devel-ubuntu24.04@sha256:520292dbb4f755fd360766059e62956e9379485d9e073bbd2f6e3c20c270ed66
 
 FROM ${BASE} AS base
@@ -32,7 +33,7 @@ COPY --from=build /opt/scas4d /opt/scas4d
 RUN install -d -o 10001 -g 10001 -m 700 /data /cache
 ENV PATH=/opt/scas4d/bin:${PATH} HOME=/tmp PYTHONDONTWRITEBYTECODE=1 \
     SCAS4D_DATA=/data NUMBA_CACHE_DIR=/cache/numba SCAS4D_HOST=0.0.0.0 SCAS4D_PORT=8000 \
-    TORCH_EXTENSIONS_DIR=/cache/torch TORCH_CUDA_ARCH_LIST=9.0
+    TORCH_EXTENSIONS_DIR=/cache/torch TORCH_CUDA_ARCH_LIST=9.0 MAX_JOBS=2
 USER 10001:10001
 WORKDIR /tmp
 VOLUME ["/data", "/cache"]
