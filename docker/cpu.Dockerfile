@@ -1,12 +1,38 @@
-# docker build -f docker/cpu.Dockerfile -t scas4d .
-FROM python:3.12-slim
-WORKDIR /scas4d
-COPY . .
-RUN scripts/setup server
-ENV SCAS4D_DATA=/data NUMBA_CACHE_DIR=/cache/numba SCAS4D_HOST=0.0.0.0
+# The service on a CPU. From the root of the repository: docker build -f docker/cpu.Dockerfile -t scas4d .
+# docker/try-image builds it without a Docker engine and runs it as docker/compose.yaml does.
+# The digest is the one under which public repositories pin this tag; it was not resolved at the registry itself.
+# docker/pin-images does that, and renews it.
+ARG BASE=python:3.11-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b
+
+FROM ${BASE} AS build
+WORKDIR /build
+COPY docker/requirements.lock docker/build.lock ./
+RUN python3 -m venv /opt/scas4d \
+    && /opt/scas4d/bin/python -m pip install --no-cache-dir --require-hashes --only-binary :all: -r requirements.lock \
+    && find /opt/scas4d -type d -name tests -prune -exec rm -r {} + \
+    && python3 -m venv tools \
+    && tools/bin/python -m pip install --no-cache-dir --require-hashes --only-binary :all: -r build.lock
+COPY pyproject.toml README.md LICENSE ./
+COPY scas4d_core scas4d_core
+COPY server server
+COPY client client
+RUN tools/bin/python -m pip wheel --no-cache-dir --no-deps --no-build-isolation --wheel-dir wheel . \
+    && /opt/scas4d/bin/python -m pip install --no-cache-dir --no-deps --no-index wheel/*.whl \
+    && /opt/scas4d/bin/python -m pip uninstall --yes pip setuptools
+
+FROM ${BASE}
+COPY --from=build /opt/scas4d /opt/scas4d
+# A volume takes its owner from these folders when it is made. The service writes there and in /tmp, nowhere else.
+RUN install -d -o 10001 -g 10001 -m 700 /data /cache
+ENV PATH=/opt/scas4d/bin:/usr/local/bin:/usr/bin:/bin HOME=/tmp PYTHONDONTWRITEBYTECODE=1 \
+    SCAS4D_DATA=/data NUMBA_CACHE_DIR=/cache/numba SCAS4D_HOST=0.0.0.0 SCAS4D_PORT=8000
+USER 10001:10001
+WORKDIR /tmp
 VOLUME ["/data", "/cache"]
 EXPOSE 8000
-# The service does not start without SCAS4D_TOKEN or SCAS4D_TOKEN_FILE, because it listens at all addresses here.
-HEALTHCHECK --start-period=120s CMD .venv/bin/python -c "import urllib.request as u; u.urlopen('http://127.0.0.1:8000/health/live', timeout=5)"
-STOPSIGNAL SIGTERM
-CMD [".venv/bin/scas4d", "serve"]
+HEALTHCHECK --start-period=60s --interval=30s --timeout=10s \
+    CMD ["python", "-c", "import os, urllib.request as u; \
+        u.urlopen('http://127.0.0.1:%(SCAS4D_PORT)s/health/live' % os.environ, timeout=5)"]
+# The service listens at all addresses of the container, and so does not start without a token:
+# SCAS4D_TOKEN_FILE names a mounted file, SCAS4D_TOKEN is the token itself.
+CMD ["scas4d", "serve"]

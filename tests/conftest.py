@@ -8,7 +8,7 @@ import pytest
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 WITHOUT_KERNELS = (
-    "tests/core/captures", "tests/client/importers", "tests/core/metrics", "tests/server/connections",
+    "tests/core/captures", "tests/client/importers", "tests/core/metrics", "tests/docker", "tests/server/connections",
     "tests/test_docs.py", "tests/test_house.py", "tests/test_imports.py", "tests/test_wheel.py",
 )  # fmt: skip
 """Tests that run no kernel, in no process: they go on while another process compiles."""

@@ -89,6 +89,8 @@ for state in ("acknowledged", "committed", "set_aside", "skipped", "missing"):
     FRAMES.labels(state)
 for how in ("held", "in_part"):
     DEGRADED.labels(how)
+for process in ("worker", "reader"):
+    RESTARTS.labels(process)
 
 
 class State:
