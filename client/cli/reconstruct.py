@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -86,7 +87,15 @@ def reconstruct_frames(
         yield reconstruction, done
 
 
-def reconstruct(given: Capture, out: Path, *, frames: int | None, preset: str, changes: Mapping[str, Any]) -> None:
+def reconstruct(
+    given: Capture,
+    out: Path,
+    *,
+    frames: int | None,
+    preset: str,
+    changes: Mapping[str, Any],
+    videos: bool = False,
+) -> None:
     """Reconstructs every frame; `out` gets pictures beside the truth, `states/` and `last.ply`.
 
     The truth is that of the test cameras or, where there are none, of one training camera, and the last line says so.
@@ -97,6 +106,7 @@ def reconstruct(given: Capture, out: Path, *, frames: int | None, preset: str, c
         frames: how many; all where None.
         preset: named settings.
         changes: what differs from the preset, nested.
+        videos: the pictures of each camera are left as a video, too, at the capture's rate.
     """
     from scas4d_core.query.ply import write_ply
     from scas4d_core.storage.history import History
@@ -115,7 +125,8 @@ def reconstruct(given: Capture, out: Path, *, frames: int | None, preset: str, c
         shutil.rmtree(out / "states")
     history = History(out / "states")
     compile_kernels(settings)
-    with Bars() as bars:
+    with Bars() as bars, ExitStack() as open_videos:
+        add: dict[str, Callable[[pictures.Picture], None]] = {}
         for reconstruction, done in reconstruct_frames(given, settings, count, history=history, progress=bars):
             index = done.index
             truth = capture.test_frame(index) if capture.test_rig is not None else capture.frame(index)
@@ -132,7 +143,13 @@ def reconstruct(given: Capture, out: Path, *, frames: int | None, preset: str, c
                     truth.images[camera.name],
                 )
                 scores.append(pictures.psnr(true, render))
-                pictures.save(out / f"camera_{camera.name}" / f"{index:06d}.png", pictures.comparison(true, render))
+                compared = pictures.comparison(true, render)
+                pictures.save(out / f"camera_{camera.name}" / f"{index:06d}.png", compared)
+                if videos and camera.name not in add:
+                    file = out / f"camera_{camera.name}.mp4"
+                    add[camera.name] = open_videos.enter_context(pictures.video(file, given.fps))
+                if videos:
+                    add[camera.name](compared)
             console.print(f"frame {index}: {np.mean(scores):.2f} dB{told(done.report)}")
     write_ply(out / "last.ply", history.gaussians(history.indices[-1]), reconstruction.world)
     seen = (

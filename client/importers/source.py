@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -10,9 +9,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Literal, Protocol
 
+import imageio.v3 as imageio
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from client.importers.calibration import Calibration
 from client.importers.undistort import Undistorter
@@ -167,10 +166,6 @@ def check_times(name: str, times: Sequence[float]) -> None:
 
 def encode(picture: Picture, encoding: Encoding) -> bytes:
     """Encodes a picture or mask as the bytes of a file."""
-    file = io.BytesIO()
-    image = Image.fromarray(picture)
     if encoding == "png":
-        image.save(file, "PNG", compress_level=1)
-    else:
-        image.save(file, "JPEG", quality=JPEG_QUALITY, subsampling=0)
-    return file.getvalue()
+        return imageio.imwrite("<bytes>", picture, extension=".png", compress_level=1)
+    return imageio.imwrite("<bytes>", picture, extension=".jpg", quality=JPEG_QUALITY, subsampling=0)

@@ -6,6 +6,7 @@ import json
 import re
 from pathlib import Path
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 from PIL import Image
@@ -137,3 +138,17 @@ def test_unlike_cameras_are_reconstructed_straight_from_their_folder(tmp_path):
     )
     assert row["measured_on"] == "test cameras"
     assert row["psnr_first"] > 18
+
+
+def test_videos_show_what_the_pictures_show(capture_folder, tmp_path):
+    given = open_source(capture_folder)
+    reconstruct(given, tmp_path, frames=3, preset="scas4d", changes=CHANGES, videos=True)
+    for folder in sorted(tmp_path.glob("camera_*/")):
+        shown = imageio.imread(folder.with_suffix(".mp4"), plugin="pyav")
+        assert len(shown) == 3
+        assert imageio.immeta(folder.with_suffix(".mp4"), plugin="pyav")["fps"] == pytest.approx(given.fps, rel=0.01)
+        for index, frame in enumerate(shown):
+            picture = np.asarray(Image.open(folder / f"{index:06d}.png"))
+            height, width = frame.shape[:2]
+            assert picture.shape[0] - height in (0, 1)
+            assert psnr(picture[:height, :width], frame) > 25
