@@ -232,7 +232,7 @@ def cloud_warnings(rig: Rig, positions: Float) -> list[str]:
     away = float(np.median(np.linalg.norm(some - rig.centre, axis=1))) / rig.radius
     if away > FAR and np.linalg.norm(np.mean([camera.rotation[2] for camera in rig.cameras], axis=0)) < ONE_WAY:
         return [f"the points are {away:.0f} radii of the rig away from it: {world}"]
-    seen = float(np.mean(np.any([_sees(camera, some) for camera in rig.cameras], axis=0)))
+    seen = float(np.mean(np.any(_seen(rig.cameras, some), axis=0)))
     if seen < SEEN_AT_ALL:
         return [f"the cameras have only {seen:.0%} of the points in view: {world}"]
     return []
@@ -262,10 +262,10 @@ def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
     """
     if positions is not None and len(positions):
         some = _some(positions)
-        given = float(np.mean([_sees(camera, some) for camera in rig.cameras]))
+        given = float(np.mean(_seen(rig.cameras, some)))
         if given > FEW_SEE:  # no other way round can show so much more
             return []
-        other = float(np.mean([_sees(_inverted(camera), some) for camera in rig.cameras]))
+        other = float(np.mean(_seen([_inverted(camera) for camera in rig.cameras], some)))
         if other < POINTS_SEEN or given > FEW_SEE * other:
             return []
         evidence = f"{given:.0%} of the points are in view of a camera on average, inverted {other:.0%}"
@@ -287,6 +287,17 @@ def _inverted(camera: Camera) -> Camera:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = camera.rotation.T, camera.centre
     return Camera(camera.name, camera.intrinsics, pose, camera.width, camera.height)
+
+
+def _seen(cameras: Sequence[Camera], points: Float) -> NDArray[np.bool_]:
+    """[C, P] as `_sees`, of all cameras at once: a service may start over hundreds of rigs."""
+    poses, lenses = np.stack([one.world_to_camera for one in cameras]), np.stack([one.intrinsics for one in cameras])
+    sizes = np.array([(one.width, one.height) for one in cameras])[:, None]
+    there = points @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
+    depth = there[..., 2:]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        uv = there[..., :2] / depth * lenses[:, None, [0, 1], [0, 1]] + lenses[:, None, :2, 2]
+    return np.asarray(((depth > 0) & (uv >= 0) & (uv <= sizes)).all(axis=-1))
 
 
 def _sees(camera: Camera, points: Float) -> NDArray[np.bool_]:

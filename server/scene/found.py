@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from scas4d_core.rig_checks import rig_warnings
-from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.storage.npz import sync_folder
 from server.scene.status import SceneFacts, last_trouble, of_first_report
 from server.storage.definition import Definition, DefinitionError, read_definition, write_definition
@@ -116,16 +115,6 @@ def find(folder: SceneFolder, bury: Callable[[Path, str], object], said: Sequenc
         content,
         points_sha256(folder.points),
         rig_warnings(rig, settings.scene) if positions is None else rig_warnings(rig, settings.scene, positions),
-        _first_report(folder, content),
+        of_first_report(content.first_report) if content.ledger.committed else {},
         used,
     )
-
-
-def _first_report(folder: SceneFolder, content: Recovered) -> Mapping[str, Any]:
-    committed = content.ledger.committed
-    if not committed:
-        return {}
-    try:
-        return of_first_report(History.load(folder.states, only=(committed[0],)).report(committed[0]))
-    except HistoryError:  # it is mended later, and read then
-        return {}

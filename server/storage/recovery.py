@@ -45,6 +45,7 @@ class Recovered:
         good: bytes of the journal that are whole. events: those that the journal lacks, applied already.
         sizes: bytes of each record of the frame log. damage: a sentence for each thing that was dropped.
         remake: frames whose states are damaged or gone, with the reason, and whose pictures are held.
+        first_report: of the first committed frame that can be read; empty where there is none.
     """
 
     folder: SceneFolder
@@ -54,15 +55,17 @@ class Recovered:
     sizes: dict[str, int]
     damage: list[str]
     remake: dict[int, str] = field(default_factory=dict)
+    first_report: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class _States:
-    """Committed states: times of those that can be read, faults of the others, and the newest one's report."""
+    """Committed states: times of those that can be read, faults of the others, reports of the newest and the first."""
 
     times: dict[int, float] = field(default_factory=dict)
     damaged: dict[int, str] = field(default_factory=dict)
     newest: dict[str, Any] = field(default_factory=dict)
+    first: dict[str, Any] = field(default_factory=dict)
 
     @property
     def indices(self) -> list[int]:
@@ -145,7 +148,7 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
         except OSError as error:
             if not no_room(error):
                 raise
-    return Recovered(folder, ledger, good, events, sizes, damage, remake)
+    return Recovered(folder, ledger, good, events, sizes, damage, remake, states.first)
 
 
 def _unnamed(ledger: Ledger, sizes: dict[str, int]) -> set[str]:
@@ -285,9 +288,9 @@ def _states(folder: Path, damage: list[str]) -> _States:
             damage.append(f"the committed states cannot be read: {error}")
         return _States()
     damage.extend(f"frame {index}: its state is damaged: {reason}" for index, reason in history.damaged.items())
-    report: dict[str, Any] = {}
+    newest: dict[str, Any] = {}
     if history.indices:
         with contextlib.suppress(HistoryError):  # the worker loads the state, or says why it cannot
-            report = history.report(history.indices[-1])
+            newest = history.report(history.indices[-1])
     times = dict(zip(history.indices, history.times.tolist(), strict=True))
-    return _States(times, dict(history.damaged), report)
+    return _States(times, dict(history.damaged), newest, history.first_report)
