@@ -50,7 +50,7 @@ UPDATE_SECONDS = Histogram(
 )
 ANSWER_SECONDS = Histogram(
     "scas4d_answer_seconds",
-    "From the question to the answer of a scene's reader, by kind (render, tracks, parts, ply) and outcome.",
+    "From the question to the answer of a scene's reader, by kind (render, tracks, parts, gaussians, ply) and outcome.",
     ["kind", "outcome"],
     buckets=SECONDS,
     registry=registry,
@@ -116,6 +116,11 @@ class State:
         for state in SceneState:
             by_state.add_metric([state.value], sum(status.state == state for status in self.scenes))
         yield by_state
+        yield GaugeMetricFamily(
+            "scas4d_scenes_degraded",
+            "Scenes that are degraded, whatever their state.",
+            value=sum(status.degraded for status in self.scenes),
+        )
         awake = [status for status in self.scenes if not status.asleep]
         yield GaugeMetricFamily(
             "scas4d_scenes_asleep", "Scenes without processes, in any state.", value=len(self.scenes) - len(awake)

@@ -93,6 +93,9 @@ class Readers:
         try:
             answer, outcome = await self._answer(query), "answered"
             return answer
+        except asyncio.CancelledError:
+            outcome = "cancelled"  # by who asked: no fault
+            raise
         finally:
             metrics.ANSWER_SECONDS.labels(query.kind, outcome).observe(time.perf_counter() - began)
 

