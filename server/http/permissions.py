@@ -11,15 +11,16 @@ from server.problems import Problem
 
 READS = re.compile(r"/v1/(tickets|estimate|scenes/[^/]+/(render|tracks/query))")
 """Addresses whose POST changes nothing: the question is in the body."""
-WRITES = re.compile(r"/v1/scenes/[^/]+/ingest")
-"""WebSockets that take something."""
+READ_SOCKETS = re.compile(r"/v1/scenes/[^/]+/stream")
+"""WebSockets that only send."""
 
 
 class Permission(NamedTuple):
-    """A bearer may change things, or only read; all scenes, or one."""
+    """A bearer may change things, or only read; all scenes, or one; until `end`, seconds since the epoch, or always."""
 
     write: bool = False
     scene: str | None = None
+    end: int | None = None
 
 
 ALL = Permission(write=True)
@@ -55,7 +56,7 @@ def check(permission: Permission, scope: Scope) -> None:
 
 def _reads(scope: Scope) -> bool:
     if scope["type"] == "websocket":
-        return WRITES.fullmatch(scope["path"]) is None
+        return READ_SOCKETS.fullmatch(scope["path"]) is not None
     return scope["method"] in ("GET", "HEAD", "OPTIONS") or (
         scope["method"] == "POST" and READS.fullmatch(scope["path"]) is not None
     )

@@ -54,7 +54,7 @@ class Sharing:
                 remedy="ask whoever gave it to you for another: POST /v1/shares, or scas4d scenes share",
                 headers={"WWW-Authenticate": 'Bearer realm="scas4d", error="invalid_token"'},
             )
-        return Permission(scene=None if scene == ALL_SCENES else scene)
+        return Permission(scene=None if scene == ALL_SCENES else scene, end=int(end))
 
     def _signature(self, text: str) -> str:
         return base64.urlsafe_b64encode(hmac.digest(self._key, text.encode(), hashlib.sha256)).decode().rstrip("=")

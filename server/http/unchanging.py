@@ -12,7 +12,7 @@ from starlette.responses import Response
 
 from server.problems import Problem
 
-RANGE = re.compile(r"bytes=(\d*)-(\d*)")
+RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 TAG_BYTES = 16
 KEEP = "private, no-cache"
 """Caches keep an answer, and ask before each use whether it still holds: a damaged state may be made again."""

@@ -5,24 +5,17 @@ from __future__ import annotations
 from importlib.util import find_spec
 from pathlib import Path
 
-from fastapi import APIRouter
-from starlette.responses import FileResponse, RedirectResponse, Response
+from fastapi import APIRouter, Request
+from starlette.responses import RedirectResponse, Response
 
-from server.problems import Problem
+from server.http.files import MEDIA_TYPES, policy, served
 
 router = APIRouter(include_in_schema=False)
 
 FOLDER = Path(__file__).parents[1] / "reference"
-MEDIA_TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 VENDORED = ("swagger-ui-bundle.js", "swagger-ui.css")
-HEADERS = {
-    # As the viewer's, but Swagger UI sets styles and shows small pictures that its own code has.
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
-    "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-cache",
-}
+HEADERS = policy(style_src="'self' 'unsafe-inline'", img_src="'self' data:")
+"""As the viewer's, but Swagger UI sets styles and shows small pictures that its own code has."""
 
 
 def _files() -> dict[str, Path]:
@@ -39,9 +32,9 @@ FILES = _files()
 
 
 @router.get("/docs")
-async def page() -> Response:
+async def page(request: Request) -> Response:
     """Returns the page."""
-    return _answer("index.html")
+    return served(request, FILES, "index.html", HEADERS, "/docs")
 
 
 @router.get("/redoc")
@@ -51,13 +44,6 @@ async def elsewhere() -> Response:
 
 
 @router.get("/docs/{name}")
-async def file(name: str) -> Response:
+async def file(request: Request, name: str) -> Response:
     """Returns a file of the page."""
-    return _answer(name)
-
-
-def _answer(name: str) -> Response:
-    found = FILES.get(name)
-    if found is None:
-        raise Problem(404, f"the reference has no file {name!r}", field="name", value=name, remedy="open /docs")
-    return FileResponse(found, media_type=MEDIA_TYPES[found.suffix], headers=HEADERS)
+    return served(request, FILES, name, HEADERS, "/docs")

@@ -70,8 +70,8 @@ async def _answer(scene: Scene, request: Request, view: RenderRequest) -> Respon
     """Checks the request and asks the reader."""
     query = query_of(scene, view)
     # The last frame is another one in a moment, and parts are found anew. A frame that was named stays what it is until
-    # the reconstruction is begun anew, but for a damaged state that is made again, nearly the same: it may be kept, but
-    # not shown before it was asked whether it still is.
+    # the reconstruction is begun anew, but for a damaged state that is made again, as good as before: the tag is a weak
+    # one, and a view is not shown before it was asked whether it still is.
     keep = {"Cache-Control": "no-store"}
     if view.frame is not None and RenderKind.PARTS not in view.kinds:
         keep = {

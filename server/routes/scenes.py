@@ -97,13 +97,15 @@ async def inspect(id: SceneId, scenes: AllScenes) -> SceneStatus:
 
 
 @router.patch("/{id}")
-async def edit(scene: TheRecord, request: SceneEdit) -> SceneStatus:
+async def edit(id: SceneId, scenes: AllScenes, request: SceneEdit) -> SceneStatus:
     """Renames the scene, archives it or takes that back, or changes how many pictures and states it keeps.
 
-    It is on disk when this answers. States that a shorter `keep_states` deletes go within seconds, for good.
+    It is on disk when this answers. States that a shorter `keep_states` deletes go within seconds, for good; the scene
+    wakes for that.
     """
-    await scene.edit(request)
-    return scene.status()
+    async with scenes.using(id, place=request.keep_states is not None) as scene:
+        await scene.edit(request)
+        return scene.status()
 
 
 @router.post("/{id}/pause")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import time
 
 from fastapi import APIRouter, WebSocket
 from starlette.websockets import WebSocketDisconnect, WebSocketState
@@ -12,6 +13,7 @@ from starlette.websockets import WebSocketDisconnect, WebSocketState
 from client.wire.stream import STREAM_PROTOCOL, TOO_BIG
 from server import problems
 from server.connections.websocket import limit_messages
+from server.http.permissions import ALL, PERMISSION
 from server.problems import Problem
 from server.scene.scenes import Scenes
 from server.stream.hub import Hub
@@ -38,7 +40,7 @@ async def stream(websocket: WebSocket, id: str) -> None:
         limit_messages(websocket.scope, 4 * subscriber.limits().message_bytes)  # `_read` says more
         try:
             await websocket.accept(subprotocol=STREAM_PROTOCOL)
-            await _serve(websocket, subscriber)
+            await _serve(websocket, subscriber, websocket.scope.get(PERMISSION, ALL).end)
         finally:
             hub.leave(id, subscriber)
             subscriber.close()
@@ -56,13 +58,16 @@ def _require_protocol(websocket: WebSocket) -> None:
         )
 
 
-async def _serve(websocket: WebSocket, subscriber: Subscriber) -> None:
-    """Serves until the client or the service closes."""
+async def _serve(websocket: WebSocket, subscriber: Subscriber, end: float | None) -> None:
+    """Serves until the client or the service closes, or until the end of what the client may do."""
     await subscriber.greet()
     reading = asyncio.create_task(_read(websocket, subscriber))
     writing = asyncio.create_task(_write(websocket, subscriber))
     try:
-        await asyncio.wait((reading, writing), return_when=asyncio.FIRST_COMPLETED)
+        seconds = None if end is None else max(0.0, end - time.time())
+        done, _ = await asyncio.wait((reading, writing), timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+        if not done:
+            await websocket.close(1008, "the link has ended")
     finally:
         for task in (reading, writing):
             task.cancel()

@@ -63,6 +63,14 @@ class Beginning:
         """
         if self._known(ledger):
             return None
+        if ledger.edited.archived:
+            raise Problem(
+                409,
+                "the scene is archived: all it has stays as it is",
+                field="archived",
+                value=True,
+                remedy='take that back first: PATCH …/scenes/{id} with {"archived": false}, scas4d scenes restore',
+            )
         index = self._first(ledger)
         count = len(ledger.committed)
         if count > 1 and not self.asked.discard:

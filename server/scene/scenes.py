@@ -8,7 +8,7 @@ import secrets
 import shutil
 import time
 from collections.abc import AsyncIterator, Coroutine, Sequence
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from datetime import UTC, datetime
 from typing import Any, NoReturn
 
@@ -163,14 +163,7 @@ class Scenes:
 
     async def _wake(self, id: str) -> None:
         if not await self._restore(self._data.scene(id), self.asleep[id].status.damage, wake=True):
-            reason = self.unreadable.pop(id)  # it may be the disk, and pass: the scene sleeps on
-            raise Problem(
-                503,
-                f"the scene cannot be read: {reason}",
-                field="id",
-                value=id,
-                remedy="look after its folder, then ask again",
-            )
+            raise sleep.cannot_wake(id, self.unreadable.pop(id))
         del self.asleep[id]
 
     async def _look(self) -> None:
@@ -178,7 +171,10 @@ class Scenes:
         while (seconds := sleep.look_seconds(self.server)) is not None:
             await asyncio.sleep(seconds)
             for scene in sleep.tired(tuple(self.by_id.values()), self.server):
-                await self.put_to_sleep(scene)
+                try:
+                    await self.put_to_sleep(scene)
+                except Exception:  # one that cannot fall asleep keeps no other awake
+                    log.exception("scene %s did not fall asleep", scene.id)
 
     async def _restore(self, folder: SceneFolder, said: Sequence[str] = (), *, wake: bool = False) -> bool:
         """Reads a scene back from its folder; returns False, and notes why, where that cannot be done.
@@ -317,7 +313,9 @@ class Scenes:
         Raises:
             Problem: see `refuse`.
         """
-        await self._turns.end(id)
+        while id in self._turns:  # whoever waits for the same turn may begin another
+            with suppress(Problem):  # it cannot wake: no reason to keep it
+                await self._turns.end(id)
         folder = self._data.scene(id).path
         if id in self.asleep and id not in self._beginning:
             del self.asleep[id]

@@ -3,8 +3,8 @@
 import { Manage } from "./manage.js";
 import { listenToKeys } from "./keys.js";
 import { $, curtain, inOrder, node, note, page, sentence } from "./page.js";
-import { Chart } from "./panels/charts.js";
-import { reasonOf, showCameras, showEffects, showFacts, showQueue, showWarnings } from "./panels/facts.js";
+import { Figures } from "./panels/figures.js";
+import { showCameras, showEffects, showFacts, showQueue, showWarnings } from "./panels/facts.js";
 import { Timeline } from "./panels/timeline.js";
 import { Tracks } from "./panels/tracks.js";
 import { Tradeoff } from "./panels/tradeoff.js";
@@ -15,6 +15,7 @@ import { Stream } from "./stream.js";
 import { Beside } from "./view/beside.js";
 import { LiveView } from "./view/live.js";
 
+const SLEEP_TRIES = 10;
 const FINISHED = ["committed", "set_aside", "missing", "skipped"];
 
 const view = new LiveView($("picture"), $("overlay"), {
@@ -33,15 +34,14 @@ const view = new LiveView($("picture"), $("overlay"), {
 });
 const beside = new Beside($("beside"));
 const timeline = new Timeline(() => {
-  remember();
+  if (!timeline.playing) remember(); // browsers bound how often an address may change
   view.setFrame(page.frame);
   showMoment();
-});
+}, () => page.scene && remember());
 const tracks = new Tracks(view);
-const psnr = new Chart($("psnr"), "line", "dB", (index) => timeline.choose(index));
-const seconds = new Chart($("seconds"), "bars", "s", (index) => timeline.choose(index));
+const figures = new Figures((index) => timeline.choose(index));
 const tradeoff = new Tradeoff($);
-const manage = new Manage(showStatus);
+const manage = new Manage(showStatus, letGo);
 const list = new SceneList(openScene);
 
 // A scene.
@@ -105,6 +105,29 @@ function closeScene() {
   $("queue-words").textContent = $("note").textContent = "";
   $("cameras").replaceChildren();
   delete $("view").dataset.tag;
+}
+
+/** Puts the scene to sleep that the page has kept awake. */
+async function letGo() {
+  const { scene: id } = page;
+  const name = page.status.name || id;
+  closeScene();
+  list.leave();
+  $("connection").textContent = "Not connected";
+  $("connection").classList.remove("good");
+  curtain({ title: `${name} falls asleep`, share: null });
+  for (let tries = 0; ; tries++) {
+    try {
+      await call("POST", `${scenePath(id)}/sleep`);
+      break;
+    } catch (error) { // the service may not know yet that this page has gone
+      if (tries === SLEEP_TRIES) return curtain({ title: `${name} stays awake`, words: error.message, actions: [["Open it", () => list.choose(id)]] });
+      await new Promise((done) => setTimeout(done, 300));
+    }
+  }
+  await list.look();
+  curtain({ title: `${name} is asleep`, words: "It has no processes, and wakes when it is asked or sent something.",
+    actions: [["Wake it", () => list.choose(id)], ...list.others(id)] });
 }
 
 function gone(reason, status) {
@@ -184,35 +207,14 @@ function finished(report, missed) {
 }
 
 function redraw() {
-  const reports = inOrder();
-  const fault = (one) => (one.state === "committed" ? "" : one.error ?? one.state);
-  psnr.set(reports.map((one) => ({ index: one.index, value: one.psnr ?? null, fault: fault(one), held: reasonOf(one) })));
-  // The first frame takes minutes and would flatten all others; it is written below the chart.
-  const first = reports.find((one) => one.state === "committed");
-  const updates = reports.filter((one) => one !== first);
-  const budgets = updates.filter((one) => one.budget);
-  const changes = new Map(budgets.slice(1).map((one, i) => [one.index, change(budgets[i].budget, one.budget)]));
-  tradeoff.follow(updates);
-  seconds.set(reports.map((one) => ({ index: one.index, fault: fault(one), held: reasonOf(one), change: changes.get(one.index),
-    value: one === first ? null : one.seconds?.total ?? null })));
-  const times = updates.map((one) => one.seconds?.total).filter((value) => value !== undefined).sort((a, b) => a - b);
-  $("figures").textContent = first
-    ? `First frame ${(first.seconds?.total ?? 0).toFixed(1)} s` + (times.length ? `; updates: median ${times[times.length >> 1].toFixed(2)} s, at most ${times.at(-1).toFixed(2)} s` : "")
-    : "";
+  figures.draw();
+  tradeoff.follow(figures.updates);
   showMoment();
-}
-
-/** A change of budget since the frame before, in words. */
-function change(before, now) {
-  if (JSON.stringify(before) === JSON.stringify(now)) return "";
-  if (now.budget_ms !== null) return `from here on ${now.budget_ms} ms`;
-  return now.iterations !== null ? `from here on ${now.iterations} iterations` : "from here on another budget";
 }
 
 function showMoment() {
   const report = timeline.draw();
-  psnr.choose(report?.index ?? null);
-  seconds.choose(report?.index ?? null);
+  figures.choose(report?.index ?? null);
   if (!page.rig) return;
   const reports = inOrder().filter((one) => one.state === "committed");
   const index = page.frame ?? reports.at(-1)?.index;

@@ -1,19 +1,22 @@
 // The dialog in which a scene is managed: its name, what it keeps, pausing, archiving, sleep, beginning again, deletion.
 
 import { call, scenePath } from "./service.js";
-import { $, page, sentence } from "./page.js";
+import { $, note, page, sentence } from "./page.js";
 
 export class Manage {
-  /** @param changed called with the status that a change led to */
-  constructor(changed) {
+  /**
+   * @param changed called with the status that a change led to
+   * @param letGo puts the scene to sleep, and shows it no more
+   */
+  constructor(changed, letGo) {
     this.dialog = $("manage");
-    this.changed = changed;
+    Object.assign(this, { changed, letGo });
     $("manage-open").addEventListener("click", () => this.open());
     $("manage-close").addEventListener("click", () => this.dialog.close());
     $("manage-save").addEventListener("click", () => this.save());
     $("manage-pause").addEventListener("click", () => this.post(page.status.paused ? "resume" : "pause"));
     $("manage-archive").addEventListener("click", () => this.edit({ archived: !page.status.archived }, page.status.archived ? "restored" : "archived"));
-    $("manage-sleep").addEventListener("click", () => this.post("sleep"));
+    $("manage-sleep").addEventListener("click", () => this.sleep());
     $("manage-again").addEventListener("click", () => this.sure($("manage-again"), "Discard all frames and begin again", () => this.again()));
     $("manage-delete").addEventListener("click", () => this.sure($("manage-delete"), "Delete for good", () => this.remove()));
     this.dialog.addEventListener("close", () => this.unsure());
@@ -60,8 +63,7 @@ export class Manage {
   }
 
   post(verb) {
-    const done = { pause: "paused", resume: "resumed", sleep: "asleep; it wakes when it is asked or sent something" }[verb];
-    return this.run(() => call("POST", `${scenePath(page.scene)}/${verb}`), done);
+    return this.run(() => call("POST", `${scenePath(page.scene)}/${verb}`), { pause: "paused", resume: "resumed" }[verb]);
   }
 
   again() {
@@ -70,8 +72,13 @@ export class Manage {
   }
 
   async remove() {
-    await this.run(() => call("DELETE", scenePath(page.scene)), "deleted");
+    if (await this.run(() => call("DELETE", scenePath(page.scene)), "deleted")) this.dialog.close();
+  }
+
+  /** The page itself keeps the scene awake: it lets go of it first. */
+  sleep() {
     this.dialog.close();
+    this.letGo();
   }
 
   async run(act, done) {
@@ -80,14 +87,18 @@ export class Manage {
       const status = await act();
       if (status?.id === page.scene) this.changed(status);
       this.say(done);
+      return true;
     } catch (error) {
       this.say(error.message);
+      return false;
+    } finally {
+      this.show();
     }
-    this.show();
   }
 
   say(words) {
-    $("manage-words").textContent = sentence(words);
+    if (this.dialog.open) $("manage-words").textContent = sentence(words);
+    else if (words) note(words);
   }
 
   /** The first press asks, the second one does it. */

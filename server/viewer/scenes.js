@@ -53,7 +53,10 @@ export class SceneList {
     this.draw(scenes);
     const there = scenes.find((scene) => scene.id === chosen) ?? (this.gone || chosen ? null : scenes.at(-1));
     if (!there && !this.gone && !page.stream && chosen) this.missing(chosen);
-    if (!there && scenes.length) $("scenes").prepend(node("option", { value: "", disabled: true, selected: true }, "choose a scene"));
+    if (!there && scenes.length && $("scenes").options[0].value) {
+      $("scenes").prepend(node("option", { value: "", disabled: true, selected: true }, "choose a scene"));
+    }
+    if (!there && scenes.length) $("scenes").value = "";
     if (there) $("scenes").value = there.id;
     if (!scenes.length && !page.stream && !this.gone && !chosen) curtain(NO_SCENE);
     if (there && there.id !== page.scene) this.choose(there.id);
@@ -63,8 +66,9 @@ export class SceneList {
     const select = $("scenes");
     const words = scenes.map((scene) => called(scene) + beside(scene));
     select.disabled = scenes.length === 0;
-    if (document.activeElement === select && select.options.length === scenes.length) { // it may be open
-      words.forEach((text, i) => (select.options[i].textContent = text));
+    const there = [...select.options].filter((option) => option.value);
+    if (there.map((option) => option.value).join() === scenes.map((scene) => scene.id).join()) { // it may be open
+      words.forEach((text, i) => (there[i].textContent = text));
       return;
     }
     select.replaceChildren(...scenes.map((scene, i) => node("option", { value: scene.id }, words[i])));
@@ -87,10 +91,15 @@ export class SceneList {
     curtain({ title: "There is no such scene", words: `The service has no scene ${id}. ${actions.length ? "Choose one:" : "It has no others either."}`, actions });
   }
 
-  /** The scene that was open is gone, or may not be looked at any more. */
-  async ended(id, reason, status) {
+  /** No scene is shown until one is chosen. */
+  leave() {
     this.gone = true;
     history.replaceState(null, "", location.pathname);
+  }
+
+  /** The scene that was open is gone, or may not be looked at any more. */
+  async ended(id, reason, status) {
+    this.leave();
     if (status === 401 || status === 403) this.askForToken(true);
     await this.look();
     const actions = this.others(id);

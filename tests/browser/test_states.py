@@ -206,6 +206,41 @@ def test_the_dialog_of_a_scene(sized, service):
         assert sized.locator("#manage-delete").inner_text() == "Delete"
 
 
+def test_a_scene_is_put_to_sleep_by_the_page_that_shows_it(sized, service):
+    with scene_of(service, name="tired") as (sdk, id):
+        push(sdk, id, 0)
+        sdk.wait(id, 0)
+        opened(sized, service, id)
+        shown(sized, frame="0")
+        sized.click("#manage-open")
+        sized.click("#manage-sleep")
+        title(sized, "tired is asleep")
+        assert sdk.scene(id).asleep
+        looked_at(sized, "put-to-sleep", faults=("409",))
+        sized.locator("#curtain .choice").first.click()
+        shown(sized, frame="0")
+
+
+def test_a_deletion_that_fails_is_told(sized, service):
+    def answer(route):
+        if route.request.method == "DELETE":
+            route.fulfill(status=503, json={"detail": "the disk does not do", "status": 503})
+        else:
+            route.continue_()
+
+    with scene_of(service) as (sdk, id):
+        push(sdk, id, 0)
+        sdk.wait(id, 0)
+        opened(sized, service, id)
+        shown(sized, frame="0")
+        sized.route(f"**/v1/scenes/{id}", answer)
+        sized.click("#manage-open")
+        for _ in range(2):
+            sized.click("#manage-delete")
+        until(sized, "document.getElementById('manage-words').innerText.includes('disk does not do')")
+        assert sized.locator("#manage[open]").count() == 1
+
+
 def test_a_scene_is_begun_again_and_deleted_by_hand(sized, service):
     with Client(service.url, patience=30) as sdk:
         id = start_scene(sdk, "by hand")

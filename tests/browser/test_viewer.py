@@ -17,13 +17,13 @@ from client.wire import part_colour
 
 
 def rests(page, **wanted):
-    """The same, when a picture of full size is shown and nothing more comes."""
+    """The same, when the picture that was asked for last is shown and nothing more is asked for."""
     shown(page, **wanted)
     before = None
-    for _ in range(50):
+    for _ in range(100):
         page.wait_for_timeout(300)
-        tag = page.evaluate("document.getElementById('view').dataset.tag")
-        if tag == before:
+        tag, asked = page.evaluate("(({ tag, asked }) => [tag, asked])(document.getElementById('view').dataset)")
+        if tag == asked == before:
             return canvas(page)
         before = tag
     raise AssertionError("pictures go on coming")

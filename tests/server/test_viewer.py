@@ -43,9 +43,16 @@ def test_every_file_that_the_page_names_is_served(http):
     assert not re.search(r"<script(?! type=\"module\" src=)|<style| on\w+=|style=", HTML)  # the policy would stop them
 
 
-@pytest.mark.parametrize("name", ["nothing.js", "..%2Fsettings.py", "%2e%2e/viewer.py", "index.html%00"])
+@pytest.mark.parametrize(
+    "name", ["nothing.js", "..%2Fsettings.py", "%2e%2e/viewer.py", "view", "view/", "./main.js%20"]
+)
 def test_nothing_else_is_served(http, name):
     problem(http.get(f"/viewer/{name}"), 404)
+
+
+def test_a_control_character_is_refused(http):
+    for name in ("index.html%00", "main.js%0A"):
+        assert problem(http.get(f"/viewer/{name}"), 400)["field"] == "path"
 
 
 def test_the_rig_comes_back_as_it_was_given(http, scene):

@@ -99,6 +99,9 @@ function sentences(report) {
 
 /** Fills a row for each camera: PSNR of its picture, shift of its colours, and faults. */
 export function showCameras(body, summary, names, report, lookFrom) {
+  const said = JSON.stringify([names, report?.index, report?.cameras, report?.alarms]);
+  if (body.dataset.said === said) return; // a row that has the focus keeps it
+  body.dataset.said = said;
   const fits = report?.cameras ?? {};
   const known = Object.values(fits).map((fit) => fit.psnr).filter((value) => value !== null);
   const [low, high] = [Math.min(...known, 20), Math.max(...known, 40)];

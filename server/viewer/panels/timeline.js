@@ -7,10 +7,12 @@ const SHORTEST_MS = 20; // no screen shows more pictures
 const END_MS = 400; // the last frame stays before it begins again
 
 export class Timeline {
-  /** @param shown called when another frame is chosen */
-  constructor(shown) {
-    this.shown = shown;
-    this.playing = null;
+  /**
+   * @param shown called when another frame is chosen
+   * @param stopped called when playing ends
+   */
+  constructor(shown, stopped) {
+    Object.assign(this, { shown, stopped, playing: null });
     $("time").addEventListener("input", (event) => {
       this.stop();
       this.choose(readable()[Number(event.target.value)]?.index ?? null);
@@ -69,7 +71,9 @@ export class Timeline {
 
   stop() {
     clearTimeout(this.playing);
+    const played = this.playing !== null;
     this.playing = null;
+    if (played) this.stopped();
     $("play").textContent = "▶";
     $("play").setAttribute("aria-label", "Play");
   }
@@ -96,6 +100,9 @@ export class Timeline {
 
   /** Marks frames on the slider whose state is not what their pictures show. */
   mark(reports) {
+    const said = JSON.stringify([reports.length, reports.filter((report) => report.degraded).map((report) => [report.index, report.degraded])]);
+    if ($("marks").dataset.said === said) return; // a mark that is being pressed stays
+    $("marks").dataset.said = said;
     const last = Math.max(reports.length - 1, 1);
     $("marks").replaceChildren(...reports.flatMap((report, at) => {
       if (!report.degraded) return [];

@@ -119,6 +119,7 @@ export class LiveView {
     const request = { camera, frame: this.frame, parts: this.mode === "parts" ? this.parts : null,
       background: this.background, ...MODES[this.mode] };
     this.asked.set(++this.tag, { camera, mode: this.mode, at: performance.now(), share });
+    this.canvas.parentElement.dataset.asked = this.tag;
     clearTimeout(this.slow);
     this.slow = setTimeout(() => this.stream && this.on.slow(this.mode), SLOW_MS);
     if (this.asked.size > 64) this.asked.delete(this.asked.keys().next().value);
@@ -134,9 +135,10 @@ export class LiveView {
     const first = !asked.answered;
     asked.answered = true;
     const number = this.latest = (this.latest || 0) + 1;
+    const { stream } = this;
     const painted = await this.decode(asked, head, bytes);
-    // Decoding takes turns: a newer picture may have been painted meanwhile.
-    if (number < (this.painted || 0) || !this.stream || asked.mode !== this.mode) return;
+    // Decoding takes turns: a newer picture may have been painted meanwhile, or another scene opened.
+    if (number < (this.painted || 0) || this.stream !== stream || asked.mode !== this.mode) return;
     this.painted = number;
     const { width, height } = asked.camera;
     this.canvas.width = width;
@@ -257,10 +259,12 @@ export class LiveView {
   /** Moves nearer or farther until what is in the scene fills the view, and into its middle. */
   async fit() {
     if (!this.shown) return;
+    const { stream } = this;
     const box = this.canvas.parentElement.getBoundingClientRect();
     const small = FIT_PX / Math.max(box.width, box.height);
     const camera = this.orbit.camera(Math.round(box.width * small), Math.round(box.height * small));
     const bitmap = await createImageBitmap(await this.rendered({ camera, kinds: ["alpha"], format: "png" }));
+    if (this.stream !== stream) return; // another scene was opened meanwhile
     const context = new OffscreenCanvas(bitmap.width, bitmap.height).getContext("2d", { willReadFrequently: true });
     context.drawImage(bitmap, 0, 0);
     const { data, width, height } = context.getImageData(0, 0, bitmap.width, bitmap.height);
@@ -269,7 +273,7 @@ export class LiveView {
       if (data[4 * (y * width + x)] < COVERED) continue;
       Object.assign(seen, { left: Math.min(seen.left, x), right: Math.max(seen.right, x), top: Math.min(seen.top, y), bottom: y });
     }
-    if (seen.right < 0 || !this.stream) this.orbit?.from(this.rig[0]);
+    if (seen.right < 0) this.orbit.from(this.rig[0]);
     else this.orbit.fit(seen, camera);
     this.moved();
   }

@@ -118,9 +118,12 @@ def test_a_range_of_bytes(http, address, asked, part):
     assert (other.status_code, other.content) == (200, whole.content)
 
 
-@pytest.mark.parametrize("asked", ["bytes=9-3", "bytes=-", "bytes=0-1,4-5", "lines=0-1", "bytes=a-b", "nonsense"])
+NO_RANGES = ("bytes=9-3", "bytes=-", "bytes=0-1,4-5", "lines=0-1", "bytes=a-b", "nonsense", "bytes=0-٣")
+
+
+@pytest.mark.parametrize("asked", [*NO_RANGES, f"bytes=0-{'9' * 5000}", f"bytes={'9' * 5000}-"])
 def test_a_range_that_is_none_gets_the_whole(http, address, asked):
-    answer = http.get(f"{address}/cameras/{NAME}", headers={"Range": asked})
+    answer = http.get(f"{address}/cameras/{NAME}", headers={"Range": asked.encode()})
     assert (answer.status_code, answer.content) == (200, http.get(f"{address}/cameras/{NAME}").content)
 
 
@@ -130,6 +133,14 @@ def test_a_range_behind_the_end_is_refused(http, address, asked):
     assert problem(answer, 416)["field"] == "Range"
     whole = http.get(f"{address}/cameras/{NAME}").content
     assert answer.headers["content-range"] == f"bytes */{len(whole)}"
+
+
+@pytest.mark.parametrize("path", ["/viewer/main.js", "/", "/docs", "/docs/reference.js"])
+def test_files_of_the_pages_are_not_sent_again(http, path):
+    first = http.get(path)
+    again = http.get(path, headers={"If-None-Match": first.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    assert again.headers["content-security-policy"] == first.headers["content-security-policy"]
 
 
 def test_a_render_is_named(http, committed):

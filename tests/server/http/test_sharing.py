@@ -37,7 +37,7 @@ def scenes(running):
 
 
 def bearer(running, token):
-    return httpx.Client(base_url=running.url, headers={"Authorization": f"Bearer {token}"})
+    return httpx.Client(base_url=running.url, headers={"Authorization": f"Bearer {token}"}, timeout=60)
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +127,8 @@ def test_websockets(running, owner, scenes):
     token = owner.share(shown).token
     assert opened(running, f"/v1/scenes/{shown}/stream", token, [STREAM_PROTOCOL]) == 101
     assert opened(running, f"/v1/scenes/{hidden}/stream", token, [STREAM_PROTOCOL]) == 404
-    assert opened(running, f"/v1/scenes/{shown}/ingest", token, None) == 403
+    for address in ("ingest", "ingest%0A", "ingest%0D", "ingest/", "%69ngest", "stream%0A"):
+        assert opened(running, f"/v1/scenes/{shown}/{address}", token, None) in (400, 403), address
     with bearer(running, token) as http:  # a ticket opens what the token does that it was asked with
         for address, status in ((f"{shown}/stream", 101), (f"{hidden}/stream", 404), (f"{shown}/ingest", 403)):
             ticket = http.post("/v1/tickets").json()["subprotocol"]
@@ -141,6 +142,23 @@ def test_it_ends(running, owner, scenes, monkeypatch):
         now = sharing.time.time()
         monkeypatch.setattr(sharing.time, "time", lambda: now + 61)
         assert "has ended" in problem(http.get("/v1/scenes"), 401)["detail"]
+
+
+def test_a_stream_ends_with_its_link(running, owner, scenes):
+    async def run(seconds):
+        address = f"{running.url.replace('http', 'ws')}/v1/scenes/{scenes[0]}/stream"
+        headers = {"Authorization": f"Bearer {owner.share(scenes[0], seconds=seconds).token}"}
+        async with websockets.connect(address, subprotocols=[STREAM_PROTOCOL], additional_headers=headers) as socket:
+            while True:
+                try:
+                    await asyncio.wait_for(socket.recv(), 3)
+                except TimeoutError:
+                    return None
+                except websockets.ConnectionClosed as closed:
+                    return closed.rcvd.code, closed.rcvd.reason
+
+    assert asyncio.run(run(2)) == (1008, "the link has ended")
+    assert asyncio.run(run(60)) is None
 
 
 def test_a_token_that_was_changed_opens_nothing(running, owner, scenes):

@@ -88,3 +88,26 @@ def test_a_scene_with_frames_that_wait_is_not_archived(tmp_path):
 )
 def test_wrong_changes_are_refused(tmp_path_factory, quiet_scene, http, changes, field):
     assert field in str(problem(edit(http, quiet_scene, **changes), 422)["field"])
+
+
+def test_a_rule_for_states_needs_a_place(tmp_path):
+    with serving_with(tmp_path, max_scenes=1) as (running, http, _sdk):
+        ids = []
+        for _ in range(3):
+            ids.append(filled(http, 4))
+            put_to_sleep(http, ids[-1])
+        for id in ids:
+            assert edit(http, id, keep_states={"last": 3}).status_code in (200, 429)
+        scenes = running.app.state.scenes
+        with_processes = [scene for scene in scenes.by_id.values() if scene.updates.worker._process is not None]
+        assert len(with_processes) <= 1
+        assert all(scene.has_place for scene in with_processes)
+
+
+def test_an_archived_scene_is_not_begun_again(tmp_path):
+    with serving_with(tmp_path) as (_, http, _sdk):
+        id = filled(http, 2)
+        edit(http, id, archived=True)
+        document = problem(http.put(f"/v1/scenes/{id}/reconstructions/1", json={"discard": True}), 409)
+        assert document["field"] == "archived"
+        assert status(http, id)["committed"] == 2

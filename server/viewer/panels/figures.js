@@ -1,0 +1,43 @@
+// Accuracy and time of the frames: two charts, and the figures below them.
+
+import { Chart } from "./charts.js";
+import { reasonOf } from "./facts.js";
+import { $, inOrder } from "../page.js";
+
+export class Figures {
+  /** @param pick called with the index of a frame that is clicked */
+  constructor(pick) {
+    this.psnr = new Chart($("psnr"), "line", "dB", pick);
+    this.seconds = new Chart($("seconds"), "bars", "s", pick);
+    this.updates = []; // reports of all frames but the first
+  }
+
+  choose(index) {
+    this.psnr.choose(index);
+    this.seconds.choose(index);
+  }
+
+  draw() {
+    const reports = inOrder();
+    const fault = (one) => (one.state === "committed" ? "" : one.error ?? one.state);
+    this.psnr.set(reports.map((one) => ({ index: one.index, value: one.psnr ?? null, fault: fault(one), held: reasonOf(one) })));
+    // The first frame takes minutes and would flatten all others; it is written below the chart.
+    const first = reports.find((one) => one.state === "committed");
+    this.updates = reports.filter((one) => one !== first);
+    const budgets = this.updates.filter((one) => one.budget);
+    const changes = new Map(budgets.slice(1).map((one, i) => [one.index, change(budgets[i].budget, one.budget)]));
+    this.seconds.set(reports.map((one) => ({ index: one.index, fault: fault(one), held: reasonOf(one), change: changes.get(one.index),
+      value: one === first ? null : one.seconds?.total ?? null })));
+    const times = this.updates.map((one) => one.seconds?.total).filter((value) => value !== undefined).sort((a, b) => a - b);
+    $("figures").textContent = first
+      ? `First frame ${(first.seconds?.total ?? 0).toFixed(1)} s` + (times.length ? `; updates: median ${times[times.length >> 1].toFixed(2)} s, at most ${times.at(-1).toFixed(2)} s` : "")
+      : "";
+  }
+}
+
+/** A change of budget since the frame before, in words. */
+function change(before, now) {
+  if (JSON.stringify(before) === JSON.stringify(now)) return "";
+  if (now.budget_ms !== null) return `from here on ${now.budget_ms} ms`;
+  return now.iterations !== null ? `from here on ${now.iterations} iterations` : "from here on another budget";
+}
