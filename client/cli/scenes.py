@@ -129,13 +129,14 @@ def sleep(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
 def share(
     scene: Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene, or all.")],
     hours: Annotated[float, typer.Option(min=0.01, max=87_840, help="So long the link holds.")] = 168,
+    only_token: Annotated[bool, typer.Option("--only-token", help="Print the token alone, for a program.")] = False,
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:
     """Prints a link at which others may look at a scene, and change nothing; it cannot be taken back."""
     with Client(url, token=token) as client:
         made = client.share(None if scene == "all" else scene, round(3600 * hours))
-    _say(url.rstrip("/") + made.address, f"holds until {made.ends}; the token alone: {made.token}")
+    _say(made.token) if only_token else _say(url.rstrip("/") + made.address, f"holds until {made.ends}")
 
 
 @app.command()

@@ -84,8 +84,9 @@ def test_prometheus_may_read_the_metrics() -> None:
     environment = SERVICES[host]["environment"]
     assert host in environment["SCAS4D_ALLOWED_HOSTS"].split(",")
     assert SERVICES[host]["ports"] == [f"127.0.0.1:{port}:{port}"]
-    assert job["authorization"]["credentials_file"] == environment["SCAS4D_TOKEN_FILE"] == "/run/secrets/token"
-    assert "token" in SERVICES["prometheus"]["secrets"]
+    assert job["authorization"]["credentials_file"] == "/run/secrets/read_token"
+    assert SERVICES["prometheus"]["secrets"] == ["read_token"]  # it may read, and change nothing
+    assert environment["SCAS4D_TOKEN_FILE"] == "/run/secrets/token"
 
 
 def test_the_image_is_tried_with_the_limits_of_the_compose_file() -> None:

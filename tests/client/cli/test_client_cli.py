@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from running import HEIGHT, WIDTH, make_rig, pictures
+from running import HEIGHT, WIDTH, Running, fake_settings, make_rig, pictures
 from typer.testing import CliRunner
 
 from client.cli.changes import parse_changes
 from client.cli.commands import frame_line, out_of_step
 from client.cli.main import app
 from client.cli.pictures import coloured, comparison, psnr
+from client.errors import ServiceError
 from client.rig import push
 from client.sdk import Client
 from client.wire import FrameReportModel, part_colour
@@ -85,6 +86,23 @@ def test_watch_prints_frames_until_the_scene_is_gone(service, capture_folder):
     missing = scas4d("watch", "nowhere", "--url", service.url)
     assert missing.returncode == 1
     assert "Traceback" not in missing.stderr
+
+
+def test_a_link_is_printed(tmp_path):
+    token = "a-token-that-is-long-enough"
+    running = Running(fake_settings(tmp_path, token=token))
+    try:
+        given = ("scenes", "share", "all", "--url", running.url, "--token", token)
+        link, until = scas4d(*given, "--hours", "2").stdout.splitlines()
+        assert link.startswith(f"{running.url}/#token=scas4d.read.*.")
+        assert until.startswith("holds until 20")
+        reader = scas4d(*given, "--only-token").stdout.strip()
+        with Client(running.url, token=reader) as client:
+            assert client.scenes() == []
+            with pytest.raises(ServiceError, match="may only read"):
+                client.create_scene(make_rig())
+    finally:
+        running.stop()
 
 
 def test_scenes_are_managed(service):
