@@ -14,6 +14,7 @@ from dataclasses import asdict
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
+import imageio.v3 as imageio
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -229,16 +230,20 @@ def encode_view(
     if format == "float32":
         body, headers = float32(arrays)
         return body, FLOAT32, headers
-    picture, headers = _picture(kinds[0], arrays[kinds[0]])
-    file = io.BytesIO()
+    pixels, headers = _pixels(kinds[0], arrays[kinds[0]])
+    media_type = f"image/{format}"
+    if kinds[0] == "parts":  # imageio writes no palettes
+        picture, file = Image.fromarray(pixels), io.BytesIO()
+        picture.putpalette(_PART_COLOURS)
+        picture.save(file, "PNG", compress_level=1)
+        return file.getvalue(), media_type, headers
+    options: dict[str, Any] = {"compress_level": 1}
     if format == "jpeg":
-        picture.save(file, "JPEG", quality=quality or QUALITY, subsampling=0)
+        options = {"quality": quality or QUALITY, "subsampling": 0}
     elif format == "webp":
         # A live view: fast rather than small (method 0 takes a third of the time of the default).
-        picture.save(file, "WEBP", quality=quality or QUALITY, method=0)
-    else:
-        picture.save(file, "PNG", compress_level=1)
-    return file.getvalue(), f"image/{format}", headers
+        options = {"quality": quality or QUALITY, "method": 0}
+    return imageio.imwrite("<bytes>", pixels, extension=f".{format}", plugin="pillow", **options), media_type, headers
 
 
 def part_colours() -> list[int]:
@@ -249,15 +254,13 @@ def part_colours() -> list[int]:
 _PART_COLOURS = part_colours()
 
 
-def _picture(kind: str, array: NDArray[Any]) -> tuple[Image.Image, dict[str, str]]:
+def _pixels(kind: str, array: NDArray[Any]) -> tuple[NDArray[np.uint8 | np.uint16], dict[str, str]]:
+    """Returns the pixels of a picture: depth in 16 bits; parts as labels, which a palette shows; else in 8 bits."""
     if kind == "depth":
         met = np.isfinite(array)
         near, far = (float(array[met].min()), float(array[met].max())) if met.any() else (0.0, 0.0)
         steps = 1 + np.rint(65534 * (np.where(met, array, near) - near) / max(far - near, 1e-12))
-        levels = np.where(met, steps, 0).astype(np.uint16)
-        return Image.fromarray(levels), {"X-Depth-Near": repr(near), "X-Depth-Far": repr(far)}
+        return np.where(met, steps, 0).astype(np.uint16), {"X-Depth-Near": repr(near), "X-Depth-Far": repr(far)}
     if kind == "parts":
-        labels = Image.fromarray(array)  # pixels are the labels, and a browser shows their colours
-        labels.putpalette(_PART_COLOURS)
-        return labels, {}
-    return Image.fromarray(np.rint(255 * np.clip(array, 0, 1)).astype(np.uint8)), {}
+        return array, {}
+    return np.rint(255 * np.clip(array, 0, 1)).astype(np.uint8), {}
