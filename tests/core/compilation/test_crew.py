@@ -8,6 +8,7 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -31,6 +32,7 @@ def there(tmp_path, monkeypatch):
     monkeypatch.setattr(crew, "_end_with_parent", lambda: None)
     monkeypatch.setattr(crew, "_crew", [])
     monkeypatch.setattr(crew.os, "nice", lambda more: None)
+    monkeypatch.setattr(crew, "gc", SimpleNamespace(freeze=lambda: None, set_threshold=lambda *given: None))
     return mine
 
 
