@@ -202,7 +202,8 @@ class ServerSettings(BaseSettings):
     )
     warm_up: bool = Field(
         default=True,
-        description="Compile the kernels at start where the cache lacks them, in processes beside; /health/ready waits for those of a first frame.",
+        description="Compile the kernels at start where the cache lacks them, in processes beside; /health/ready waits "
+        "for those of a first frame.",
     )
 
     @classmethod

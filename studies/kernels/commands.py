@@ -1,4 +1,4 @@
-"""`scripts/bench kernels`, `device`, `moving` and `first-minutes`."""
+"""`scripts/bench kernels`, `device`, `moving` and `startup`."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def moving(
     write_page(out, text)
 
 
-def first_minutes(
+def startup(
     capture: Capture,
     against: Annotated[
         Path | None, typer.Option(help="Another checkout, measured in turns with this one; ratios are to it.")
@@ -74,7 +74,7 @@ def first_minutes(
     out: Page = None,
 ) -> None:
     """Measures a service from an empty cache of kernels to the first committed update, of one checkout or two."""
-    from studies.kernels import first_minutes as study
+    from studies.kernels import startup as study
 
     checkouts = [study.ROOT] if against is None else [against.resolve(), study.ROOT]
     text = study.table(study.measure(capture, checkouts, repeats, typer.echo))
