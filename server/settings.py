@@ -201,7 +201,9 @@ class ServerSettings(BaseSettings):
         default=600.0, gt=0, description="Before each such pass over a scene; a flipped bit is found a pass later."
     )
     warm_up: bool = Field(
-        default=True, description="Compile or load the kernels at start, in a process beside; /health/ready waits."
+        default=True,
+        description="Compile the kernels at start where the cache lacks them, in processes beside; /health/ready waits "
+        "for those of a first frame.",
     )
 
     @classmethod

@@ -7,7 +7,7 @@ import typer
 from studies.effort.commands import effort
 from studies.frontier.commands import frontier
 from studies.hard_cases.commands import stability, timing
-from studies.kernels.commands import device, kernels, moving
+from studies.kernels.commands import device, kernels, moving, startup
 from studies.paper.commands import paper
 from studies.quality.commands import (
     effects,
@@ -26,7 +26,7 @@ STUDIES = {
     "Quality": (quality, refit, effects, switches, targets, table, processors),
     "Rigs": (rigs, calibration, drift),
     "Accuracy against time": (frontier, effort, paper, variants),
-    "Speed of the code": (kernels, device, moving),
+    "Speed of the code": (kernels, device, moving, startup),
     "Hard cases": (stability, timing),
     "The running service": (faults, ingest, views, memory, sleeping, crossing),
 }

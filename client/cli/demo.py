@@ -22,15 +22,16 @@ from client.errors import ServiceError, ServiceUnreachable
 from client.sdk import Client
 from scas4d_core.captures import Capture
 
-POLL_S = 1.0
+POLL_S = 0.5
 """Between two questions whether the service is ready."""
+READYING = "making the kernels ready"
 
 
 @contextmanager
 def running_service(data: Path, log: Path, port: int = 8000) -> Iterator[str]:
     """Runs a service on the loopback, at `port` or, where that is taken, at a free one; yields its address.
 
-    The first start of all compiles the kernels: it is waited for as long as the process lives.
+    The first start of all compiles the kernels of a first frame: it is waited for as long as the process lives.
 
     Raises:
         RuntimeError: it ended, or cannot become ready; the message says why, and names its log.
@@ -44,13 +45,15 @@ def running_service(data: Path, log: Path, port: int = 8000) -> Iterator[str]:
         process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
     try:
         url = f"http://127.0.0.1:{port}"
+        total = 1
         with Bars() as bars:
-            while not _ready(url, log):
+            while (left := _unready(url, log)) is not None:
                 if process.poll() is not None:
                     raise RuntimeError(f"the service has ended: {_last_words(log)}; its log is {log}")
-                bars("making the kernels ready", 0, 1)
+                done, total = left
+                bars(READYING, done, total)
                 time.sleep(POLL_S)
-            bars("making the kernels ready", 1, 1)
+            bars(READYING, total, total)
         yield url
     finally:
         process.terminate()
@@ -71,18 +74,19 @@ def _free(port: int) -> int:
         return int(probe.getsockname()[1])
 
 
-def _ready(url: str, log: Path) -> bool:
+def _unready(url: str, log: Path) -> tuple[int, int] | None:
+    """Returns how many kernels are compiled, and of how many (0 of 1 where that is not known); None: it is ready."""
     try:
         with Client(url, token=_token(), outage=0) as client:
             client.ready()
     except ServiceUnreachable:
-        return False
+        return 0, 1
     except ServiceError as error:
         said = error.problem.model_extra or {}
         if said.get("warming_up") or said.get("recovering"):  # it will be, without anybody's doing
-            return False
+            return int(said.get("kernels_compiled", 0)), int(said.get("kernels", 1))
         raise RuntimeError(f"the service cannot become ready: {error}; its log is {log}") from None
-    return True
+    return None
 
 
 def _token() -> str | None:

@@ -175,8 +175,8 @@ def told(report: FrameReport | None) -> str:
 
 def compile_kernels(settings: Settings) -> None:
     """Compiles the CPU kernels in a process beside, unless the cache has them; nothing for another device."""
-    from scas4d_core.warm_up import warm_up_elsewhere
+    from scas4d_core.warm_up import EVERY, warm_up_elsewhere
 
     if settings.device == "cpu":
-        with console.status("compiling the kernels (once)"):
-            warm_up_elsewhere()
+        with Bars() as bars:
+            warm_up_elsewhere(EVERY, told=lambda done, total: bars("compiling the kernels", done, total))

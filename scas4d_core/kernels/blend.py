@@ -97,7 +97,8 @@ def blend_task(
         tile = tile_order[turn]
         x_first = (tile % tiles_x) * TILE
         y_first = (tile // tiles_x) * TILE
-        state[:] = ZERO
+        for k in range(state.size):
+            state[k] = ZERO
         for block in range(BLOCKS):
             lanes.store(state, base + block * step, lanes.fill(ONE))
         unfinished = wanted[tile]
@@ -154,7 +155,8 @@ def blend_task(
                     lanes.store(state, at, lanes.load(state, at) + weight * features[i, group + 3])
             covers[entry] = seen
             if unfinished == np.uint64(0):
-                covers[entry + 1 : starts[tile + 1]] = np.uint64(0)
+                for later in range(entry + 1, starts[tile + 1]):
+                    covers[later] = np.uint64(0)
                 break
         for block in range(BLOCKS):
             place = base + block * step
@@ -186,7 +188,7 @@ def blend(
     """
     for task in prange(tasks):
         blend_task(
-            task,
+            np.int64(task),
             splats,
             features,
             groups,
@@ -390,7 +392,7 @@ def blend_backward(
     """
     for task in prange(tasks):
         blend_backward_task(
-            task,
+            np.int64(task),
             splats,
             features,
             groups,

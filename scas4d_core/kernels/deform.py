@@ -14,7 +14,7 @@ from numba import prange
 from scas4d_core.kernels import lanes
 from scas4d_core.kernels.cascade import carry, carry_backward, cluster_gradient, cluster_table, moved
 from scas4d_core.kernels.deltas import apply_own, apply_own_backward
-from scas4d_core.kernels.jit import kernel, parallel_kernel
+from scas4d_core.kernels.jit import inline, kernel, parallel_kernel
 
 BLOCKS = 16
 """Blocks a task."""
@@ -58,7 +58,7 @@ def sum_block(block, points, layer, present, sums):
 def block_sums(points, present, sums):
     """Sums of the points as they enter the first layer: ``sums[0]`` of ``deform``."""
     for block in prange(points.shape[1]):
-        sum_block(block, points, 0, present, sums)
+        sum_block(np.int64(block), points, np.int64(0), present, sums)
 
 
 @parallel_kernel
@@ -75,12 +75,19 @@ def settle(
     for j in prange(offsets[layer], offsets[layer + 1]):
         cluster_table(parameters[j], sums[layer], ranges[j, 0], ranges[j, 1], ranges[j, 2], tables[j])
     for task in prange((blocks + BLOCKS - 1) // BLOCKS):
-        for block in range(task * BLOCKS, min(blocks, (task + 1) * BLOCKS)):
+        for block in range(np.int64(task * BLOCKS), min(blocks, np.int64((task + 1) * BLOCKS))):
             table, place = tables[clusters[block, layer]], 3 * lanes.COUNT * block
             here, below = place + layer * 3 * lanes.COUNT * blocks, place + (layer + 1) * 3 * lanes.COUNT * blocks
             carry(table, about_origin, separate, points, here, entering[block], present, block * lanes.COUNT, None)
             move_points(block, table, about_origin, points, layer, points, below)
             sum_block(block, points, layer + 1, present, sums)
+
+
+@inline
+def copy_row(rows, row, out, place):
+    """Copies the row of a block to flat index ``place`` of another array."""
+    for k in range(0, CARRIED, lanes.COUNT):
+        lanes.store(out, place + k, lanes.load(rows, row * CARRIED + k))
 
 
 @parallel_kernel
@@ -113,17 +120,18 @@ def deform(
             cluster_table(parameters[j], sums[layer], ranges[j, 0], ranges[j, 1], ranges[j, 2], tables[j])
         if layer + 1 < layers:
             for task in prange(tasks):
-                for block in range(task * BLOCKS, min(blocks, (task + 1) * BLOCKS)):
+                for block in range(np.int64(task * BLOCKS), min(blocks, np.int64((task + 1) * BLOCKS))):
                     place = ((layer + 1) * blocks + block) * 3 * lanes.COUNT
                     move_points(block, tables[clusters[block, layer]], about_origin, points, layer, points, place)
                     sum_block(block, points, layer + 1, present, sums)
     for task in prange(tasks):
-        acted[task] = 0
+        for k in range(acted.shape[1]):
+            acted[task, k] = 0
         v = np.empty(CARRIED, np.float32)
         moved_points = np.empty(3 * lanes.COUNT, np.float32)
-        for block in range(task * BLOCKS, min(blocks, (task + 1) * BLOCKS)):
+        for block in range(np.int64(task * BLOCKS), min(blocks, np.int64((task + 1) * BLOCKS))):
             prefetch(block + 1, rows, means, factors)
-            v[:] = entering[block]
+            copy_row(entering, block, v, 0)
             for layer in range(first, layers):
                 place = (layer * blocks + block) * 3 * lanes.COUNT
                 carry(
@@ -132,8 +140,9 @@ def deform(
                 )  # fmt: skip
             if layers > 0:
                 move_points(
-                    block, tables[clusters[block, layers - 1]], about_origin, points, layers - 1, moved_points, 0
-                )
+                    block, tables[clusters[block, layers - 1]], about_origin, points, layers - 1, moved_points,
+                    np.int64(0),
+                )  # fmt: skip
             else:
                 for k in range(3):
                     lanes.store(moved_points, lanes.COUNT * k, lanes.load(points, (3 * block + k) * lanes.COUNT))
@@ -161,12 +170,12 @@ def deform_backward(
     for task in prange((blocks + BLOCKS - 1) // BLOCKS):
         v = np.empty((layers + 1) * CARRIED, np.float32)
         g = np.empty(16 * lanes.COUNT, np.float32)
-        for block in range(task * BLOCKS, min(blocks, (task + 1) * BLOCKS)):
+        for block in range(np.int64(task * BLOCKS), min(blocks, np.int64((task + 1) * BLOCKS))):
             prefetch(block + 1, rows, g_means, g_factors)
-            v[first * CARRIED : (first + 1) * CARRIED] = entering[block]
+            copy_row(entering, block, v, first * CARRIED)
             for layer in range(first, layers):
                 leaving = v[(layer + 1) * CARRIED : (layer + 2) * CARRIED]
-                leaving[:] = v[layer * CARRIED : (layer + 1) * CARRIED]
+                copy_row(v, layer, leaving, 0)
                 place = (layer * blocks + block) * 3 * lanes.COUNT
                 carry(
                     tables[clusters[block, layer]], about_origin, separate, points, place, leaving, present,

@@ -105,8 +105,9 @@ def blend_features(splats, starts, items, slots, covers, learnt, tile_order, tas
     """
     for task in prange(tasks):
         blend_features_task(
-            task, splats, starts, items, slots, covers, learnt, tile_order, tasks, size, limits, g_image, records
-        )
+            np.int64(task), splats, starts, items, slots, covers, learnt, tile_order, tasks, size, limits, g_image,
+            records,
+        )  # fmt: skip
 
 
 @parallel_kernel

@@ -28,13 +28,21 @@ llvm.set_option("scas4d", "-hoist-runtime-checks=false")
 # Sums over many numbers are written in lanes instead. The cost is below what can be measured (docs/kernels.md).
 STRICT: dict[str, Any] = {"fastmath": False, "error_model": "numpy"}
 
-kernel: Any = njit(cache=True, **STRICT)
+
+def _compiler(**more: Any) -> Any:
+    """A decorator like Numba's; several processes may fill the cache of what it compiles."""
+    options = {**STRICT, **more, "cache": True, "no_cfunc_wrapper": True}  # nobody asks for C functions
+    decorate: Any = njit(**options)
+    return lambda function: cache.shared(decorate(function))
+
+
+kernel: Any = _compiler()
 """A function on one thread, or called from inside a kernel."""
 
-parallel_kernel: Any = njit(cache=True, parallel=True, **STRICT)
+parallel_kernel: Any = _compiler(parallel=True)
 """A function over ``prange`` tasks. Tasks write disjoint places: the result does not depend on the thread count."""
 
-inline: Any = njit(cache=True, inline="always", **STRICT)
+inline: Any = _compiler(inline="always")
 """A few lines shared by kernels."""
 
 ZERO = np.float32(0.0)

@@ -167,6 +167,58 @@ def project_group(first, means, factors, opacities, features, pose, lens, limits
         lanes.store(splats, SPLAT_COLUMNS * (place + k), rows[k])
 
 
+@kernel
+def padded_1(rows, first):
+    """Up to sixteen numbers of an array from ``first`` on, as sixteen; those beyond are 0."""
+    result = np.zeros(lanes.COUNT, np.float32)
+    for k in range(min(lanes.COUNT, rows.shape[0] - first)):
+        result[k] = rows[first + k]
+    return result
+
+
+@kernel
+def padded_2(rows, first):
+    """Up to sixteen rows of an array from ``first`` on, as sixteen; those beyond are 0."""
+    result = np.zeros((lanes.COUNT, rows.shape[1]), np.float32)
+    for k in range(min(lanes.COUNT, rows.shape[0] - first)):
+        for column in range(rows.shape[1]):
+            result[k, column] = rows[first + k, column]
+    return result
+
+
+@kernel
+def padded_3(rows, first):
+    """Up to sixteen 3×3 matrices of an array from ``first`` on, as sixteen; those beyond are 0."""
+    result = np.zeros((lanes.COUNT, 3, 3), np.float32)
+    for k in range(min(lanes.COUNT, rows.shape[0] - first)):
+        for i in range(3):
+            for j in range(3):
+                result[k, i, j] = rows[first + k, i, j]
+    return result
+
+
+@kernel
+def project_task(
+    task, means, factors, opacities, features, pose, lens, limits, splats, rects, counts, acted
+):  # fmt: skip
+    """Projects the Gaussians of one task of ``project``."""
+    count = means.shape[0]
+    acted[task, 0] = acted[task, 1] = 0
+    boxes = np.empty(5 * lanes.COUNT, np.float32)
+    for first in range(task * CHUNK, min(count, (task + 1) * CHUNK), lanes.COUNT):
+        some = min(lanes.COUNT, count - first)
+        place, m, f, o, c = first, means, factors, opacities, features
+        if some < lanes.COUNT:
+            place = 0
+            m, f = padded_2(means, first), padded_3(factors, first)
+            o, c = padded_1(opacities, first), padded_2(features, first)
+        project_group(place, m, f, o, c, pose, lens, limits, splats, first, boxes, acted[task])
+        for k in range(some):
+            for side in range(4):
+                rects[first + k, side] = np.int32(boxes[side * lanes.COUNT + k])
+            counts[first + k] = np.int32(boxes[4 * lanes.COUNT + k])
+
+
 @parallel_kernel
 def project(means, factors, opacities, features, pose, lens, limits, splats, rects, counts, acted):
     """Projects N Gaussians, sixteen at a time.
@@ -180,37 +232,10 @@ def project(means, factors, opacities, features, pose, lens, limits, splats, rec
         counts: out [N] int32, tiles in the box.
         acted: out [tasks of ``CHUNK``, 2] int64, for how many Gaussians the guards in ``ACTED`` acted.
     """
-    count = means.shape[0]
-    for task in prange((count + CHUNK - 1) // CHUNK):
-        acted[task] = 0
-        boxes = np.empty(5 * lanes.COUNT, np.float32)
-        for first in range(task * CHUNK, min(count, (task + 1) * CHUNK), lanes.COUNT):
-            some = min(lanes.COUNT, count - first)
-            if some == lanes.COUNT:
-                project_group(
-                    first, means, factors, opacities, features, pose, lens, limits, splats, first, boxes, acted[task]
-                )
-            else:
-                last_means = padded(means[first:])
-                last_factors = padded(factors[first:])
-                last_opacities = padded(opacities[first:])
-                last_features = padded(features[first:])
-                project_group(
-                    0, last_means, last_factors, last_opacities, last_features, pose, lens, limits, splats, first,
-                    boxes, acted[task],
-                )  # fmt: skip
-            for k in range(some):
-                for side in range(4):
-                    rects[first + k, side] = np.int32(boxes[side * lanes.COUNT + k])
-                counts[first + k] = np.int32(boxes[4 * lanes.COUNT + k])
-
-
-@kernel
-def padded(rows):
-    """Up to sixteen rows of an array, as sixteen; those beyond are 0."""
-    result = np.zeros((lanes.COUNT,) + rows.shape[1:], np.float32)  # noqa: RUF005 (Numba knows no starred tuples)
-    result[: len(rows)] = rows
-    return result
+    for task in prange((means.shape[0] + CHUNK - 1) // CHUNK):
+        project_task(
+            np.int64(task), means, factors, opacities, features, pose, lens, limits, splats, rects, counts, acted
+        )
 
 
 @kernel
@@ -300,9 +325,11 @@ def project_backward_group(
                 steep += abs(g_means[first + lane, k])
             if not steep <= STEEPEST:
                 sums[lane, columns - 1] = ZERO
-                g_factors[first + lane] = ZERO
-                g_means[first + lane] = ZERO
-                g_screen[first + lane] = ZERO
+                for k in range(9):
+                    g_factors[first + lane, k // 3, k % 3] = ZERO
+                for k in range(3):
+                    g_means[first + lane, k] = ZERO
+                g_screen[first + lane, 0] = g_screen[first + lane, 1] = ZERO
                 g_opacities[first + lane] = ZERO
         return True
     return False
@@ -311,13 +338,71 @@ def project_backward_group(
 @kernel
 def give_up_steep(sums, counts, first, some, used):
     """Clears the sums and the mark of those of sixteen Gaussians whose pairs add up to more than ``STEEPEST``."""
-    sums.shape[1] - 1
     for k in range(some):
         steep = ZERO
         for column in range(used):
             steep += abs(sums[k, column])
         if counts[first + k] > 0 and not steep <= STEEPEST:
-            sums[k] = ZERO
+            for column in range(sums.shape[1]):
+                sums[k, column] = ZERO
+
+
+@kernel
+def project_backward_task(
+    task, means, factors, pose, lens, limits, splats, counts, firsts, records, depth_channel, g_means, g_factors,
+    g_opacities, g_features, g_screen, acted,
+):  # fmt: skip
+    """Carries the gradients of the Gaussians of one task of ``project_backward``."""
+    channels = g_features.shape[1]
+    columns = records.shape[1]
+    count = means.shape[0]
+    sums = np.empty((lanes.COUNT, columns + 1), np.float32)
+    acted[task, 0] = 0
+    for first in range(task * CHUNK, min(count, (task + 1) * CHUNK), lanes.COUNT):
+        some = min(lanes.COUNT, count - first)
+        for k in range(lanes.COUNT):
+            sums[k, columns] = ZERO
+        worst = lanes.fill(ZERO)
+        for k in range(some):
+            i = first + k
+            sums[k, columns] = ONE if counts[i] > 0 else ZERO
+            ahead = min(i + AHEAD, count - 1)
+            if counts[ahead] > 0:
+                lanes.fetch(records, firsts[ahead])
+            for column in range(0, columns, lanes.COUNT):
+                total = lanes.fill(ZERO)
+                for pair in range(firsts[i], firsts[i] + counts[i]):
+                    total += lanes.load(records, pair * columns + column)
+                lanes.store(sums, k * (columns + 1) + column, total)
+                worst += lanes.magnitude(lanes.only_first(total, 6 + channels - column))
+            for channel in range(channels):
+                g_features[i, channel] = sums[k, 6 + channel]
+        steep = not lanes.sum_of(worst) <= STEEPEST
+        if steep:
+            give_up_steep(sums, counts, first, some, 6 + channels)
+        place, m, f, gm, gf, go, gs = first, means, factors, g_means, g_factors, g_opacities, g_screen
+        if some < lanes.COUNT:
+            place = 0
+            m, f = padded_2(means, first), padded_3(factors, first)
+            gm, gf = padded_2(g_means, first), padded_3(g_factors, first)
+            go, gs = padded_1(g_opacities, first), padded_2(g_screen, first)
+        lost = project_backward_group(
+            place, first, m, f, pose, lens, limits, splats, sums, columns + 1, depth_channel, gm, gf, go, gs
+        )
+        if some < lanes.COUNT:
+            for k in range(some):
+                for column in range(9):
+                    g_factors[first + k, column // 3, column % 3] = gf[k, column // 3, column % 3]
+                for column in range(3):
+                    g_means[first + k, column] = gm[k, column]
+                g_opacities[first + k] = go[k]
+                g_screen[first + k, 0], g_screen[first + k, 1] = gs[k, 0], gs[k, 1]
+        if steep or lost:
+            for k in range(some):
+                if counts[first + k] > 0 and sums[k, columns] == ZERO:
+                    for channel in range(channels):
+                        g_features[first + k, channel] = ZERO
+                    acted[task, 0] += 1
 
 
 @parallel_kernel
@@ -349,53 +434,8 @@ def project_backward(
             culled. ``g_screen`` is dL/d(projected centre) per pixel, which density control reads.
         acted: out [tasks of ``CHUNK``, 1] int64, for how many Gaussians the guard in ``ACTED_BACKWARD`` acted.
     """
-    channels = g_features.shape[1]
-    columns = records.shape[1]
-    count = means.shape[0]
-    for task in prange((count + CHUNK - 1) // CHUNK):
-        sums = np.empty((lanes.COUNT, columns + 1), np.float32)
-        acted[task] = 0
-        for first in range(task * CHUNK, min(count, (task + 1) * CHUNK), lanes.COUNT):
-            some = min(lanes.COUNT, count - first)
-            sums[:, columns] = ZERO
-            worst = lanes.fill(ZERO)
-            for k in range(some):
-                i = first + k
-                sums[k, columns] = ONE if counts[i] > 0 else ZERO
-                ahead = min(i + AHEAD, count - 1)
-                if counts[ahead] > 0:
-                    lanes.fetch(records, firsts[ahead])
-                for column in range(0, columns, lanes.COUNT):
-                    total = lanes.fill(ZERO)
-                    for pair in range(firsts[i], firsts[i] + counts[i]):
-                        total += lanes.load(records, pair * columns + column)
-                    lanes.store(sums, k * (columns + 1) + column, total)
-                    worst += lanes.magnitude(lanes.only_first(total, 6 + channels - column))
-                for channel in range(channels):
-                    g_features[i, channel] = sums[k, 6 + channel]
-            steep = not lanes.sum_of(worst) <= STEEPEST
-            if steep:
-                give_up_steep(sums, counts, first, some, 6 + channels)
-            if some == lanes.COUNT:
-                lost = project_backward_group(
-                    first, first, means, factors, pose, lens, limits, splats, sums, columns + 1, depth_channel,
-                    g_means, g_factors, g_opacities, g_screen,
-                )  # fmt: skip
-            else:
-                last = (
-                    padded(g_means[first:]), padded(g_factors[first:]),
-                    padded(g_opacities[first:]), padded(g_screen[first:]),
-                )  # fmt: skip
-                lost = project_backward_group(
-                    0, first, padded(means[first:]), padded(factors[first:]), pose, lens, limits, splats, sums,
-                    columns + 1, depth_channel, last[0], last[1], last[2], last[3],
-                )  # fmt: skip
-                g_means[first:] = last[0][:some]
-                g_factors[first:] = last[1][:some]
-                g_opacities[first:] = last[2][:some]
-                g_screen[first:] = last[3][:some]
-            if steep or lost:
-                for k in range(some):
-                    if counts[first + k] > 0 and sums[k, columns] == ZERO:
-                        g_features[first + k] = ZERO
-                        acted[task, 0] += 1
+    for task in prange((means.shape[0] + CHUNK - 1) // CHUNK):
+        project_backward_task(
+            np.int64(task), means, factors, pose, lens, limits, splats, counts, firsts, records, depth_channel,
+            g_means, g_factors, g_opacities, g_features, g_screen, acted,
+        )  # fmt: skip

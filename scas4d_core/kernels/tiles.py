@@ -88,7 +88,8 @@ def depth_order(splats, counts, keys, order, keys_too, order_too, histogram):
     shift = np.uint32(0)
     last = np.uint32(DIGITS - 1)
     while visible > 0 and (farthest - nearest) >> shift != 0:
-        histogram[:] = 0
+        for k in range(DIGITS):
+            histogram[k] = 0
         for k in range(visible):
             histogram[(keys[k] >> shift) & last] += 1
         total = 0
@@ -124,6 +125,43 @@ def share_pairs(order, visible, counts, begins):
     return total
 
 
+@kernel
+def cover_tiles_task(
+    task, splats, rects, order, visible, tiles_x, drawn, learnt, begins, ends, counts, firsts, pairs, covers,
+    tile_counts,
+):  # fmt: skip
+    """Lists the tiles of the Gaussians of one task of ``cover_tiles``."""
+    tasks = begins.shape[0]
+    for tile in range(tile_counts.shape[1]):
+        tile_counts[task, tile] = 0
+    pair = begins[task]
+    outside = 0
+    for k in range(visible * task // tasks, visible * (task + 1) // tasks):
+        i = order[k]
+        ahead = order[min(k + AHEAD, visible - 1)]
+        lanes.fetch(splats, ahead)
+        lanes.fetch(rects, ahead)
+        firsts[i] = pair
+        for tile_y in range(rects[i, 1], rects[i, 3]):
+            for tile_x in range(rects[i, 0], rects[i, 2]):
+                tile = tile_y * tiles_x + tile_x
+                if drawn[tile] == 0 and learnt[i] == 0:
+                    continue
+                blocks = cover(splats[i], tile_x, tile_y)
+                outside += np.int64(learnt[i] != 0 and (blocks & ~drawn[tile]) != 0)
+                blocks &= drawn[tile]
+                # Written in any case, kept if reached: without a branch that the processor could mispredict.
+                reached = np.int64(blocks != 0)
+                pairs[pair, 0] = i
+                pairs[pair, 1] = tile
+                covers[pair] = blocks
+                tile_counts[task, tile] += reached
+                pair += reached
+        counts[i] = pair - firsts[i]
+    ends[task] = pair
+    return outside
+
+
 @parallel_kernel
 def cover_tiles(
     splats, rects, order, visible, tiles_x, drawn, learnt, begins, ends, counts, firsts, pairs, covers, tile_counts
@@ -145,34 +183,14 @@ def cover_tiles(
     tasks = begins.shape[0]
     left = np.zeros(tasks, np.int64)
     for task in prange(tasks):
-        tile_counts[task] = 0
-        pair = begins[task]
-        outside = 0
-        for k in range(visible * task // tasks, visible * (task + 1) // tasks):
-            i = order[k]
-            ahead = order[min(k + AHEAD, visible - 1)]
-            lanes.fetch(splats, ahead)
-            lanes.fetch(rects, ahead)
-            firsts[i] = pair
-            for tile_y in range(rects[i, 1], rects[i, 3]):
-                for tile_x in range(rects[i, 0], rects[i, 2]):
-                    tile = tile_y * tiles_x + tile_x
-                    if drawn[tile] == 0 and learnt[i] == 0:
-                        continue
-                    blocks = cover(splats[i], tile_x, tile_y)
-                    outside += np.int64(learnt[i] != 0 and (blocks & ~drawn[tile]) != 0)
-                    blocks &= drawn[tile]
-                    # Written in any case, kept if reached: without a branch that the processor could mispredict.
-                    reached = np.int64(blocks != 0)
-                    pairs[pair, 0] = i
-                    pairs[pair, 1] = tile
-                    covers[pair] = blocks
-                    tile_counts[task, tile] += reached
-                    pair += reached
-            counts[i] = pair - firsts[i]
-        ends[task] = pair
-        left[task] = outside
-    return left.sum()
+        left[task] = cover_tiles_task(
+            np.int64(task), splats, rects, order, visible, tiles_x, drawn, learnt, begins, ends, counts, firsts, pairs,
+            covers, tile_counts,
+        )  # fmt: skip
+    outside = 0
+    for task in range(tasks):
+        outside += left[task]
+    return outside
 
 
 @kernel
@@ -241,7 +259,8 @@ def take_blocks(planes, base, blocks, tiles_x, box, part, shifts):
     for channel in range(part.shape[0]):
         shifts[channel] = 0.0
         for y in range(top, bottom):
-            part[channel, y - top] = base[channel, y, left:right]
+            for x in range(left, right):
+                part[channel, y - top, x - left] = base[channel, y, x]
             shift = 0.0
             for x in range(left // BLOCK * BLOCK, right, BLOCK):
                 if holds(blocks, tiles_x, y, x):

@@ -1,6 +1,7 @@
-"""Readiness of the service: a process beside it compiles the kernels, or loads them from the cache.
+"""Readiness of the service: a process beside it has the kernels compiled that the cache lacks.
 
-The process that answers requests never loads them. Workers find the compiled kernels in the cache.
+The service is ready once those of a first frame are compiled; those of updates follow while frame 0 runs. The process
+that answers requests never loads them. Workers find the compiled kernels in the cache, and wait for those of updates.
 """
 
 from __future__ import annotations
@@ -17,34 +18,46 @@ from typing import Any
 from scas4d_core.errors import message_of
 from server.problems import Problem
 from server.processes.messages import Stop
-from server.processes.placement import Placement, Process
+from server.processes.placement import Placement, Process, end_with_parent
 from server.settings import ServerSettings
 
 log = logging.getLogger("scas4d.server")
 
-ENDS_S = 2.0
+SAY_S = 5.0
+"""Between two lines of the log on how many kernels are compiled."""
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """So many of the kernels of a first frame are compiled."""
+
+    done: int
+    total: int
 
 
 @dataclass(frozen=True)
 class WarmedUp:
-    """The kernels are compiled; or not, for the reason in `fault`."""
+    """The kernels of a first frame are compiled; or not, for the reason in `fault`."""
 
     fault: str | None = None
 
 
 def main(spec: None, connection: Connection[Any, Any]) -> None:
-    """Runs the process: it warms up, reports, and ends."""
+    """Runs the process: it warms up, reports, has the kernels of updates compiled, and ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        from scas4d_core.warm_up import warm_up  # in this process only: the service stays light
-
-        warm_up()
-        found = WarmedUp()
-    except Exception as error:
-        log.exception("the kernels could not be warmed up")
-        found = WarmedUp(f"{type(error).__name__}: {message_of(error)}")
+    end_with_parent()
     with contextlib.suppress(EOFError, OSError):
-        connection.send(found)
+        try:
+            from scas4d_core.warm_up import warm_up, warm_up_more  # in this process only: the service stays light
+
+            warm_up(lambda done, total: connection.send(Compiled(done, total)))
+            connection.send(WarmedUp())
+            warm_up_more()
+        except (EOFError, OSError):
+            raise
+        except Exception as error:
+            log.exception("the kernels could not be warmed up")
+            connection.send(WarmedUp(f"{type(error).__name__}: {message_of(error)}"))
         connection.recv()  # until it is asked to end, or until the service is gone: by then the report is read
     os._exit(0)
 
@@ -55,6 +68,7 @@ class Readiness:
     Attributes:
         after: seconds from the start to being ready; None: not yet.
         fault: why the kernels could not be warmed up. The service works without, its first frame says what is wrong.
+        compiled: how many kernels of a first frame are compiled, and of how many; None: not known, or all were.
         stopping: the service ends.
     """
 
@@ -63,9 +77,11 @@ class Readiness:
         self.after: float | None = None
         self.fault: str | None = None
         self.stopping = False
+        self.compiled: Compiled | None = None
+        self._said = self._began
         self._process: Process | None = None
         if settings.warm_up:
-            log.info("warming up the kernels; the first time they are compiled, which takes about a minute")
+            log.info("warming up the kernels; the first time they are compiled, which takes half a minute")
             self._process = placement.start(main, None, self._received, self._ended)
         else:
             self.after = 0.0
@@ -87,13 +103,17 @@ class Readiness:
                 seconds=waited,
             )
         if self.after is None:
+            now = self.compiled
+            more: dict[str, Any] = {} if now is None else {"kernels_compiled": now.done, "kernels": now.total}
+            so_far = "" if now is None else f": {now.done} of {now.total}"
             raise Problem(
                 503,
-                f"kernels are being warmed up, for {waited:.1f} s so far; the first time they are compiled",
+                f"kernels are being warmed up, for {waited:.1f} s so far; the first time they are compiled{so_far}",
                 remedy="ask again",
                 headers={"Retry-After": "1"},
                 seconds=waited,
                 warming_up=True,
+                **more,
             )
         return self.after
 
@@ -102,9 +122,15 @@ class Readiness:
         self.stopping = True
         if self._process is not None:
             process, self._process = self._process, None
-            await process.stop(0.0 if self.after is None else ENDS_S)
+            await process.stop(0.0)  # it compiles, or has nothing left to do
 
-    def _received(self, message: WarmedUp) -> None:
+    def _received(self, message: Compiled | WarmedUp) -> None:
+        if isinstance(message, Compiled):
+            self.compiled = message
+            if (now := time.monotonic()) - self._said >= SAY_S:
+                self._said = now
+                log.info("compiling kernels: %d of %d", message.done, message.total)
+            return
         if message.fault is None:
             self.after = time.monotonic() - self._began
             log.info("ready after %.1f s", self.after, extra={"ready_after": round(self.after, 3)})

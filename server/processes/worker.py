@@ -24,6 +24,7 @@ from scas4d_core.captures.images import ImageError, decode_image, decode_mask
 from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.storage.npz import read_npz
+from server.processes.kernels import wait_for_first, wait_for_updates
 from server.processes.messages import (
     Broken,
     FrameCommitted,
@@ -118,7 +119,7 @@ class Worker:
             if history.indices:
                 from scas4d_core.reconstruction import Reconstruction  # in this process only: the service stays light
 
-                self._warm_up()
+                wait_for_updates(self.spec.settings, None)
                 self.reconstruction = Reconstruction.resume(
                     self.spec.rig, self.spec.settings, history, held=lambda index: holds(self._pictures, index)
                 )
@@ -222,7 +223,7 @@ class Worker:
         if self.reconstruction is None:
             from scas4d_core.reconstruction import Reconstruction
 
-            self._warm_up()
+            wait_for_first(self.spec.settings, self.spec.folder.points.exists(), self.connection)
             self.reconstruction = Reconstruction.start(
                 self.spec.rig,
                 frame,
@@ -234,6 +235,7 @@ class Worker:
                 started=began,
             )
         else:
+            began += wait_for_updates(self.spec.settings, self.connection)  # no time of the frame's
             if budget != self._budget:
                 self.reconstruction.set_budget(**budget.model_dump())
                 self._budget = budget
@@ -248,13 +250,6 @@ class Worker:
         committed = self.states.report(frame.index)
         self._publish_seconds = time.perf_counter() - ended
         return FrameCommitted(frame.index, committed, tuple(self.retain()))
-
-    def _warm_up(self) -> None:
-        """Compiles the kernels in a process beside, if nobody has: this one would keep the compiler's memory."""
-        from scas4d_core.warm_up import warm_up_elsewhere
-
-        if self.spec.settings.device == "cpu":
-            warm_up_elsewhere()
 
     def retain(self) -> list[int]:
         """Deletes old states by the scene's rule and returns their indices; failures are tried again next time."""

@@ -10,6 +10,7 @@ from typing import Any
 
 from client.wire import FrameState, ProgressModel, Retention
 from server.health import metrics
+from server.processes.kernels import STAGE
 from server.processes.messages import (
     Broken,
     FrameCommitted,
@@ -173,8 +174,13 @@ class Updates:
             case Ready():
                 self._background.run(self._resume(message))
             case Progressed():
-                self.progress = ProgressModel(
-                    stage=message.stage, done=message.done, total=message.total, detail=message.detail
+                over = message.stage == STAGE and message.done == message.total  # an update tells no other stage
+                self.progress = (
+                    None
+                    if over
+                    else ProgressModel(
+                        stage=message.stage, done=message.done, total=message.total, detail=message.detail
+                    )
                 )
                 self.clock.progress(message.stage, message.done, message.total, message.detail.get("seconds_left"))
                 self.tell(SceneChanged())

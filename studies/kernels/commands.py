@@ -1,4 +1,4 @@
-"""`scripts/bench kernels`, `device` and `moving`."""
+"""`scripts/bench kernels`, `device`, `moving` and `startup`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from studies.options import QUALITY, Changes, Page, write_page
+from studies.options import QUALITY, Capture, Changes, Page, write_page
 
 
 def kernels(
@@ -61,5 +61,22 @@ def moving(
 
     warm_up_elsewhere()
     text = study.table(study.measure(share or (0.05, 0.2, 1.0), frames))
+    typer.echo(text)
+    write_page(out, text)
+
+
+def startup(
+    capture: Capture,
+    against: Annotated[
+        Path | None, typer.Option(help="Another checkout, measured in turns with this one; ratios are to it.")
+    ] = None,
+    repeats: Annotated[int, typer.Option(min=1, help="Starts of each checkout.")] = 3,
+    out: Page = None,
+) -> None:
+    """Measures a service from an empty cache of kernels to the first committed update, of one checkout or two."""
+    from studies.kernels import startup as study
+
+    checkouts = [study.ROOT] if against is None else [against.resolve(), study.ROOT]
+    text = study.table(study.measure(capture, checkouts, repeats, typer.echo))
     typer.echo(text)
     write_page(out, text)

@@ -265,7 +265,8 @@ def replay(rig, settings, history, base, frames, iterations, over):
     )  # fmt: skip
 
 
-def warm_up():
+def warm_up(told):
+    told(1, 3)
     if "FAKE_FAULT" in os.environ:
         raise FloatingPointError("the fake was told to raise")
     until = os.environ.get("FAKE_WARM_UP_UNTIL")  # the name of a file that somebody makes
@@ -280,7 +281,13 @@ def install(**others):
         "scas4d_core.query.committed": {"CommittedScene": FakeCommitted},
         "scas4d_core.remake": {"remake": remake},
         "scas4d_core.replay": {"replay": replay},
-        "scas4d_core.warm_up": {"warm_up": warm_up, "warm_up_elsewhere": lambda: None},
+        "scas4d_core.warm_up": {
+            "warm_up": warm_up,
+            "warm_up_more": lambda: None,
+            "warm_up_elsewhere": lambda *groups, **more: None,
+            "first_frame_groups": lambda **given: (),
+            "update_groups": lambda covariance: (),
+        },
         "numba": {"set_num_threads": lambda count: None},  # nothing here needs it, and loading it takes a second
     }
     for name, members in of_core.items():

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from running import HEIGHT, WIDTH
 
-from client.cli.demo import _ready, running_service
+from client.cli.demo import _unready, running_service
 from client.errors import ServiceError
 from client.sdk import Client
 from client.wire.service import ProblemDetails
@@ -24,7 +24,7 @@ SLOW = """
 import time
 import fakes
 
-fakes.install(warm_up=lambda: time.sleep(3))
+fakes.install(warm_up=lambda told: time.sleep(3))
 """
 
 
@@ -74,17 +74,20 @@ def test_its_scene_can_be_looked_at_later_and_its_parts_have_the_colours_of_the_
         assert np.any(left)
 
 
-@pytest.mark.parametrize("said", [{"warming_up": True}, {"recovering": ["k3"]}, {}])
+@pytest.mark.parametrize(
+    "said",
+    [{"warming_up": True}, {"warming_up": True, "kernels_compiled": 3, "kernels": 18}, {"recovering": ["k3"]}, {}],
+)
 def test_it_waits_for_what_will_be_ready_without_anybodys_doing(said, tmp_path, monkeypatch):
     def not_ready(client):
         raise ServiceError(ProblemDetails(title="not ready", status=503, detail="not yet", **said))
 
     monkeypatch.setattr(Client, "ready", not_ready)
     if said:
-        assert not _ready("http://127.0.0.1:1", tmp_path)
+        assert _unready("http://127.0.0.1:1", tmp_path) == (said.get("kernels_compiled", 0), said.get("kernels", 1))
     else:
         with pytest.raises(RuntimeError, match="cannot become ready: 503: not yet"):
-            _ready("http://127.0.0.1:1", tmp_path)
+            _unready("http://127.0.0.1:1", tmp_path)
 
 
 def test_another_demo_takes_the_place_of_the_one_before(capture_folder, tmp_path):

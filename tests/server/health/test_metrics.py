@@ -107,6 +107,10 @@ def test_ready_says_how_long_the_kernels_took(tmp_path, monkeypatch):
         early = httpx.get(f"{running.url}/health/ready")
         assert "being warmed up" in problem(early, 503)["detail"]
         assert early.headers["retry-after"] == "1"
+        while "kernels" not in early.json():  # until the process beside has told how far it is
+            early = httpx.get(f"{running.url}/health/ready")
+        assert (early.json()["kernels_compiled"], early.json()["kernels"]) == (1, 3)
+        assert early.json()["detail"].endswith("compiled: 1 of 3")
         until.touch()
         answer = waited(running)
         assert answer.json()["ready_after"] > 0

@@ -1,4 +1,4 @@
-"""The worker has the kernels compiled in a process beside before it reconstructs or resumes."""
+"""The worker has the kernels compiled in processes beside before it reconstructs, updates or resumes, and says so."""
 
 from __future__ import annotations
 
@@ -12,18 +12,31 @@ from running import HEIGHT, WIDTH, make_rig
 
 from client.wire import Budget
 from scas4d_core.captures import Frame
+from scas4d_core.compilation.manifest import Group
 from scas4d_core.presets import preset
-from server.processes.messages import SceneSpec
+from server.processes.kernels import STAGE
+from server.processes.messages import Progressed, SceneSpec
 from server.processes.worker import Worker
 from server.storage.layout import SceneFolder
 
 
-@pytest.mark.parametrize(("device", "times"), [("cpu", 1), ("cuda", 0)])
-def test_kernels_are_compiled_elsewhere_before_a_start_and_a_resume(tmp_path, monkeypatch, device, times):
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+@pytest.mark.parametrize("points", [True, False])
+@pytest.mark.parametrize("covariance", ["entangled", "separate"])
+def test_kernels_are_compiled_before_they_are_called(tmp_path, monkeypatch, device, points, covariance):
     asked = []
-    monkeypatch.setattr("scas4d_core.warm_up.warm_up_elsewhere", lambda: asked.append(device))
+
+    def elsewhere(wanted, *, then=(), told=None):
+        asked.append((set(wanted), set(then)))
+        told(1, 2)
+
+    monkeypatch.setattr("scas4d_core.warm_up.warm_up_elsewhere", elsewhere)
     monkeypatch.setattr("scas4d_core.reconstruction.Reconstruction", fakes.FakeReconstruction)
-    spec = SceneSpec(SceneFolder(tmp_path), make_rig(), preset("scas4d", {"device": device}))
+    settings = preset("scas4d", {"device": device, "update": {"covariance": covariance}})
+    spec = SceneSpec(SceneFolder(tmp_path), make_rig(), settings)
+    if points:
+        spec.folder.points.touch()
+        monkeypatch.setattr(Worker, "points", lambda worker: None)
     ours, theirs = Pipe()
     with ours, theirs:
         first = Worker(spec, theirs)
@@ -31,6 +44,21 @@ def test_kernels_are_compiled_elsewhere_before_a_start_and_a_resume(tmp_path, mo
         assert asked == []  # nothing to reconstruct yet
         images = {name: np.zeros((HEIGHT, WIDTH, 3), np.uint8) for name in spec.rig.names}
         first.reconstruct(Frame(0, 0.0, images, {}), {}, Budget(), time.perf_counter())
-        assert len(asked) == times
+        first.reconstruct(Frame(1, 0.1, images, {}), {}, Budget(), time.perf_counter())
         assert Worker(spec, theirs).open()
-        assert len(asked) == 2 * times
+        said = []
+        while ours.poll():
+            said.append(ours.recv())
+    waits = [(one.done, one.total) for one in said if isinstance(one, Progressed) and one.stage == STAGE]
+    if device == "cuda":
+        assert asked == []
+        assert waits == []
+        return
+    of_updates = {Group.UPDATE, Group.SEPARATE if covariance == "separate" else Group.ENTANGLED}
+    of_first = {Group.FIRST_FRAME} if points else {Group.FIRST_FRAME, Group.STEREO}
+    assert asked == [
+        (of_first, of_updates),  # these while frame 0 is fitted
+        ({Group.FIRST_FRAME} | of_updates, set()),
+        ({Group.FIRST_FRAME} | of_updates, set()),
+    ]
+    assert waits == [(1, 2)] * 2

@@ -1,0 +1,116 @@
+"""The kernels that scenes call, with the types of their arguments, by what needs them.
+
+Numba compiles a kernel when it is first called, for the types it is called with. This list says them beforehand, so
+that processes can share the work; a test compares it with what a scene calls. A kernel that is missing here still
+works: the process that calls it compiles it, and waits.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Group(StrEnum):
+    """Groups of kernels, by what needs them."""
+
+    FIRST_FRAME = "first frame"
+    """Frame 0, and every view."""
+    UPDATE = "update"
+    """Updates, with whatever effects are on."""
+    ENTANGLED = "update, entangled covariance"
+    SEPARATE = "update, separate covariance"
+    STEREO = "stereo"
+    """First points from pictures alone."""
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A kernel for the types of its arguments.
+
+    Attributes:
+        group: what needs it.
+        module, name: of the function, within ``scas4d_core``.
+        arguments: a word each. f, i, b: float32, int64, truth value; none: None. d is float64, u and s are uint32 and
+            int32, w is uint64, y is uint8, and a number after the letter makes an array of as many axes. i*2: a tuple
+            of two.
+    """
+
+    group: Group
+    module: str
+    name: str
+    arguments: str
+
+    @property
+    def key(self) -> str:
+        """A name for files, of this kernel and these types alone."""
+        return f"{self.module}.{self.name}-{hashlib.sha256(self.arguments.encode()).hexdigest()[:8]}"
+
+
+def _of(group: Group, *rows: str) -> tuple[Kernel, ...]:
+    split = ((*function.rsplit(".", 1), arguments) for function, arguments in (row.split(" ", 1) for row in rows))
+    return tuple(Kernel(group, module, name, arguments) for module, name, arguments in split)
+
+
+# In each group those that take longest to compile come first: the work is then shared best.
+KERNELS = (
+    *_of(
+        Group.FIRST_FRAME,
+        "kernels.projection.project_backward f2 f3 f2 f1 f1 f2 s1 i1 f2 i f2 f3 f1 f2 f2 i2",
+        "kernels.image_loss.image_loss f3 f2 f3 f3 f3 f1 i f4 y2 f3 f3 f3",
+        "kernels.projection.project f2 f3 f1 f2 f2 f1 f1 f2 s2 s1 i2",
+        "kernels.blend.blend_backward f2 f2 i*1 i1 s1 s1 w1 y1 i1 i i*2 f1 f3 f2 f3 f2 f2",
+        "kernels.blend.blend f2 f2 i*1 i1 s1 w1 w1 i1 i i*2 f1 f1 f3 f2",
+        "kernels.appearance.direction.shade_rows_backward f2 f2 f2 f2 f2 f1 f2 f2 f3",
+        "kernels.image_loss.target_moments f3 f4 f3 f3",
+        "kernels.feature_gradients.blend_features f2 i1 s1 s1 w1 y1 i1 i i*2 f1 f3 f2",
+        "kernels.appearance.direction.shade_rows f2 f2 f2 f2 f2 f1 f2",
+        "kernels.tiles.cover_tiles f2 s2 s1 i i w1 y1 i1 i1 s1 i1 s2 w1 s2",
+        "kernels.activation.activate_backward f2 f3 f1 f2 f2 f3 f1 f2 f2",
+        "kernels.activation.activate_rows f2 f2 f3 f1 f2 i2",
+        "kernels.adam.adam_rows f2 f2 f2 f2 f1 f1 f f i i2",
+        "kernels.tiles.depth_order f2 s1 u1 s1 u1 s1 i1",
+        "kernels.feature_gradients.sum_features s1 i1 f2 f2 i2",
+        "kernels.tiles.fill_tiles i1 i1 s2 w1 i2 s1 s1 w1",
+        "kernels.tiles.tile_offsets s2 i1 i2",
+        "kernels.tiles.share_pairs s1 i s1 i1",
+    ),
+    *_of(
+        Group.ENTANGLED,
+        "kernels.deform.deform_backward i i1 i2 i2 i2 i2 f2 f2 f2 f none f4 f2 f f2 f2 f3 f2 f3 f2 f2 f1",
+        "kernels.deform.deform i f2 i1 i2 i2 i2 i2 f2 f2 f2 f none f4 f3 f2 f2 f3 f2 i2",
+        "kernels.deform.settle i f2 i1 i2 i2 f2 f2 f none f4 f3 f2",
+    ),
+    *_of(
+        Group.UPDATE,
+        "kernels.neighbour_terms.neighbour_terms f2 i1 s2 f2 f2 f1 f3 f2",
+        "kernels.deform.block_sums f4 f2 f3",
+        "kernels.tiles.mark_blocks f2 s2 y1 i w1",
+        "kernels.tiles.put_rows i1 i1 f2 f2",
+        "kernels.tiles.take_blocks f3 f3 w1 i i*4 f3 d1",
+        "kernels.tiles.find_meeting f2 s2 i w1 b1",
+        "kernels.tiles.put_blocks f3 w1 i i*4 f3",
+    ),
+    *_of(
+        Group.SEPARATE,
+        "kernels.deform.deform_backward i i1 i2 i2 i2 i2 f2 f2 f2 f b f4 f2 f f2 f2 f3 f2 f3 f2 f2 f1",
+        "kernels.deform.deform i f2 i1 i2 i2 i2 i2 f2 f2 f2 f b f4 f3 f2 f2 f3 f2 i2",
+        "kernels.deform.settle i f2 i1 i2 i2 f2 f2 f b f4 f3 f2",
+    ),
+    *_of(
+        Group.STEREO,
+        "first_frame.points.patch_match._sweep f2 b2 d2 d2 d3 d2 d1 f3 i2 d3 d2 d d i i i i",
+    ),
+)
+
+
+def kernels_of(groups: Iterable[Group]) -> list[Kernel]:
+    """Returns the kernels of some groups, group after group as they are asked for."""
+    return [kernel for group in groups for kernel in KERNELS if kernel.group == group]
+
+
+def groups_of_update(covariance: str) -> tuple[Group, ...]:
+    """Returns the groups that updates need; ``covariance`` as in the settings of updates."""
+    return (Group.SEPARATE if covariance == "separate" else Group.ENTANGLED), Group.UPDATE

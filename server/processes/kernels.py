@@ -1,0 +1,61 @@
+"""A worker waits here until the kernels that its next frame needs are compiled, and says so."""
+
+from __future__ import annotations
+
+import logging
+import time
+from multiprocessing.connection import Connection
+from typing import Any
+
+from scas4d_core.settings import Settings
+from server.processes.messages import Progressed
+
+STAGE = "compiling kernels"
+"""The stage of a frame's progress, while its worker waits for them."""
+
+log = logging.getLogger("scas4d.worker")
+
+
+def wait_for_first(settings: Settings, points: bool, connection: Connection[Any, Any]) -> float:
+    """Waits for the kernels of a first frame; those of updates are compiled after them, while it is fitted.
+
+    Args:
+        points: whether the scene was given points to start from. connection: is sent the progress.
+
+    Returns:
+        Seconds waited.
+    """
+    from scas4d_core import warm_up  # in this process only: the service stays light
+
+    if settings.device != "cpu":
+        return 0.0
+    first, updates = warm_up.first_frame_groups(points=points), warm_up.update_groups(settings.update.covariance)
+    return _waited(first, connection, then=updates)
+
+
+def wait_for_updates(settings: Settings, connection: Connection[Any, Any] | None) -> float:
+    """Waits for the kernels of updates and of the views in them; returns the seconds waited.
+
+    Args:
+        connection: is sent the progress; None: nothing is.
+    """
+    from scas4d_core import warm_up
+
+    if settings.device != "cpu":
+        return 0.0
+    groups = (*warm_up.first_frame_groups(points=True), *warm_up.update_groups(settings.update.covariance))
+    return _waited(groups, connection)
+
+
+def _waited(groups: tuple[Any, ...], connection: Connection[Any, Any] | None, **more: Any) -> float:
+    from scas4d_core.warm_up import warm_up_elsewhere
+
+    began = time.perf_counter()
+
+    def told(done: int, total: int) -> None:
+        log.info("compiling kernels: %d of %d", done, total)
+        if connection is not None:
+            connection.send(Progressed(STAGE, done, total, {}))
+
+    warm_up_elsewhere(groups, told=told, **more)
+    return time.perf_counter() - began

@@ -1,0 +1,173 @@
+"""The first minutes of a service: from an empty cache of kernels to the first committed update.
+
+A service starts with no compiled kernel. As soon as it is ready, as a rig would, the study sends it a capture's first
+two frames. Two checkouts are measured in turns, because the time of a shared machine drifts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import resource
+import signal
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from client.errors import ServiceError, ServiceUnreachable
+from client.importers.open_source import open_source
+from client.sdk import Client
+from scas4d_core.captures import Capture
+from studies.machine import in_words, machine
+from studies.options import Echo
+
+ROOT = Path(__file__).parents[2]
+EVERY_S = 0.1
+PATIENCE_S = 1800.0
+ADOPT = 36
+"""PR_SET_CHILD_SUBREAPER: processes whose parent has ended become ours, so that their processor time counts."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """One start of a service.
+
+    Attributes:
+        checkout: whose service. ready, first, update: seconds from the start of its process until it was ready, until
+            frame 0 was committed, and until the first update was. processor: seconds of all its processes.
+    """
+
+    checkout: Path
+    ready: float
+    first: float
+    update: float
+    processor: float
+
+
+def measure(capture: Path, checkouts: list[Path], repeats: int, echo: Echo) -> list[Start]:
+    """Starts a service of each checkout so many times, in turns.
+
+    Raises:
+        RuntimeError: a service ended, or no update came.
+    """
+    with contextlib.suppress(OSError, AttributeError):  # elsewhere than on Linux, compilers' time is missing
+        ctypes.CDLL(None).prctl(ADOPT, 1, 0, 0, 0)
+    source = open_source(capture)
+    starts = []
+    for turn in range(repeats):
+        for checkout in checkouts:
+            starts.append(start(source, checkout))
+            echo(f"turn {turn + 1}, {checkout.name}: {_words(starts[-1])}")
+    return starts
+
+
+def start(source: Capture, checkout: Path) -> Start:
+    """Starts a service of a checkout with an empty cache, and sends it two frames."""
+    with tempfile.TemporaryDirectory() as folder, _service(checkout, Path(folder)) as (url, process):
+        spent, began = _spent(), time.monotonic()
+        with Client(url, outage=0) as client:
+            while not _ready(client):
+                _check(process, began)
+            ready = time.monotonic() - began
+            scene = client.create_scene(source.rig).id
+            if source.points is not None:
+                client.put_points(scene, source.points)
+            for index in range(2):
+                client.put_frame(scene, index, {name: source.encoded(index, name) for name in source.rig.names})
+            committed = [0.0, 0.0]
+            for index in range(2):
+                while (client.scene(scene).last_committed or 0) < index or client.scene(scene).committed == 0:
+                    _check(process, began)
+                committed[index] = time.monotonic() - began
+        _end(process)
+    return Start(checkout, ready, committed[0], committed[1], _spent() - spent)
+
+
+def table(starts: list[Start]) -> str:
+    """Returns medians by checkout, and each one's ratio to the first, as Markdown."""
+    lines = [
+        f"{in_words(machine())}; medians of {sum(one.checkout == starts[0].checkout for one in starts)} starts each, "
+        "in turns.",
+        "",
+        "| checkout | ready | frame 0 | first update | processor | first update, ratio | processor, ratio |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    medians: dict[Path, list[float]] = {}
+    for one in starts:
+        mine = [other for other in starts if other.checkout == one.checkout]
+        columns = ([getattr(other, name) for other in mine] for name in ("ready", "first", "update", "processor"))
+        medians.setdefault(one.checkout, [statistics.median(column) for column in columns])
+    first = medians[starts[0].checkout]
+    for checkout, row in medians.items():
+        seconds = " | ".join(f"{value:.0f} s" for value in row)
+        lines.append(f"| {checkout.name} | {seconds} | {row[2] / first[2]:.2f} | {row[3] / first[3]:.2f} |")
+    return "\n".join(lines)
+
+
+def _words(one: Start) -> str:
+    return (
+        f"ready after {one.ready:.1f} s, frame 0 after {one.first:.1f} s, first update after {one.update:.1f} s, "
+        f"processor {one.processor:.1f} s"
+    )
+
+
+@contextlib.contextmanager
+def _service(checkout: Path, folder: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    environment = {**os.environ, "PYTHONPATH": _path(checkout), "NUMBA_CACHE_DIR": str(folder / "cache")}
+    command = [sys.executable, "-m", "client.cli.main", "serve", "--port", str(port), "--data", str(folder / "data")]
+    with (folder / "log").open("wb") as log:
+        process = subprocess.Popen(command, cwd=checkout, env=environment, stdout=log, stderr=log)
+    try:
+        yield f"http://127.0.0.1:{port}", process
+    finally:
+        _end(process)
+
+
+def _path(checkout: Path) -> str:
+    return str(checkout)
+
+
+def _ready(client: Client) -> bool:
+    try:
+        client.ready()
+    except ServiceUnreachable:
+        return False
+    except ServiceError as error:
+        if (error.problem.model_extra or {}).get("warming_up"):
+            return False
+        raise
+    return True
+
+
+def _check(process: subprocess.Popen[bytes], began: float) -> None:
+    if process.poll() is not None:
+        raise RuntimeError(f"the service ended with status {process.returncode}")
+    if time.monotonic() - began > PATIENCE_S:
+        raise RuntimeError(f"no update within {PATIENCE_S:.0f} s")
+    time.sleep(EVERY_S)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Ends the service, and waits for all that it started: their time counts once they have ended."""
+    if process.poll() is None:
+        process.send_signal(signal.SIGTERM)
+    process.wait()
+    with contextlib.suppress(ChildProcessError):  # there is none left
+        while True:
+            os.waitpid(-1, 0)
+
+
+def _spent() -> float:
+    """Seconds of processor time of all processes that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime

@@ -1,0 +1,204 @@
+"""Kernels are compiled side by side, in other processes than the one that computes, and into one cache."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from scas4d_core import warm_up
+from scas4d_core.compilation import crew, marks
+from scas4d_core.compilation.manifest import Group, Kernel, kernels_of
+from scas4d_core.compilation.marks import Marks
+from scas4d_core.kernels import jit
+
+ONE, TWO, THREE = (Kernel(Group.UPDATE, "nowhere", name, "f") for name in ("one", "two", "three"))
+LATER = Kernel(Group.STEREO, "nowhere", "later", "f")
+
+
+@pytest.fixture
+def there(tmp_path, monkeypatch):
+    """Marks in a folder of their own, and kernels that nobody compiles."""
+    mine = Marks(tmp_path / "marks")
+    found = {Group.UPDATE: [ONE, TWO, THREE], Group.STEREO: [LATER]}
+    monkeypatch.setattr(crew, "here", lambda: mine)
+    monkeypatch.setattr(crew, "kernels_of", lambda groups: [one for group in groups for one in found[group]])
+    monkeypatch.setattr(crew, "_end_with_parent", lambda: None)
+    monkeypatch.setattr(crew, "_crew", [])
+    monkeypatch.setattr(crew.os, "nice", lambda more: None)
+    monkeypatch.setattr(crew, "gc", SimpleNamespace(freeze=lambda: None, set_threshold=lambda *given: None))
+    return mine
+
+
+class Started:
+    """Stands in for a process of a crew: what `work` does, done at once."""
+
+    def __init__(self, command, **_):
+        self.groups = [given.split(";") if given else [] for given in command[3:5]]
+        assert command[5:] == sys.path  # it finds the same sources
+        self.ended = crew.work(*self.groups)
+
+    def poll(self):
+        return self.ended
+
+    wait = poll
+
+
+def test_a_crew_compiles_what_the_cache_lacks(there, monkeypatch):
+    done, said = [], []
+    there.add(TWO)
+    monkeypatch.setattr(crew, "compile_kernel", done.append)
+    monkeypatch.setattr(subprocess, "Popen", Started)
+    assert crew.compiled([Group.UPDATE], told=lambda *given: said.append(given))
+    assert done == [ONE, THREE]
+    assert said == [(1, 3), (3, 3)]
+    assert crew.compiled([Group.UPDATE], told=lambda *given: pytest.fail("there is nothing to wait for"))
+    assert done == [ONE, THREE]
+
+
+def test_a_crew_goes_on_with_what_nobody_waits_for(there, monkeypatch):
+    done, started = [], []
+    monkeypatch.setattr(crew, "compile_kernel", done.append)
+    monkeypatch.setattr(subprocess, "Popen", lambda command, **_: started.append(command) or Started(command))
+    for kernel in (ONE, TWO, THREE):
+        there.add(kernel)
+    assert crew.compiled([Group.UPDATE], then=[Group.STEREO])
+    assert started
+    assert done == [LATER]
+
+
+def test_each_kernel_is_compiled_once(there, monkeypatch):
+    done = []
+
+    def compile_kernel(kernel):
+        time.sleep(0.1)
+        done.append(kernel)
+
+    monkeypatch.setattr(crew, "compile_kernel", compile_kernel)
+    monkeypatch.setattr(crew, "processes", lambda: 3)
+    with ThreadPoolExecutor() as pool:  # flock is of the open file: threads are kept apart as processes are
+        assert list(pool.map(lambda _: crew.work([Group.UPDATE], []), range(3))) == [0, 0, 0]
+    assert sorted(done, key=lambda kernel: kernel.name) == [ONE, THREE, TWO]
+
+
+def test_no_more_compile_than_there_are_places(there, monkeypatch):
+    monkeypatch.setattr(marks, "PLACE_S", 0.0)
+    monkeypatch.setattr(crew, "compile_kernel", lambda kernel: pytest.fail("there is no place"))
+    assert not there.busy(1)
+    with there.place(1) as taken:
+        assert taken
+        assert there.busy(1)
+        monkeypatch.setattr(crew, "processes", lambda: 1)
+        assert crew.work([Group.UPDATE], []) == 0
+    assert not there.busy(1)
+
+
+def test_who_waits_takes_over_from_a_crew_that_was_killed(there, monkeypatch):
+    done, started = [], []
+
+    class Killed(Started):
+        def __init__(self, command, **_):
+            self.ended = -9
+
+    def popen(command, **_):
+        started.append(command)
+        return (Killed if len(started) == 1 else Started)(command)
+
+    monkeypatch.setattr(crew, "processes", lambda: 1)
+    monkeypatch.setattr(crew, "compile_kernel", done.append)
+    monkeypatch.setattr(subprocess, "Popen", popen)
+    assert crew.compiled([Group.UPDATE])
+    assert done == [ONE, TWO, THREE]
+
+
+def no_interpreter(command, **_):
+    raise FileNotFoundError(command[0])
+
+
+def cannot(kernel):
+    if kernel == TWO:
+        raise TypeError("the test says so")
+
+
+@pytest.mark.parametrize(("popen", "tried"), [(Started, 2), (no_interpreter, 1)])
+def test_where_it_fails_the_scene_is_not_kept_from_starting(there, monkeypatch, caplog, popen, tried):
+    monkeypatch.setattr(crew, "processes", lambda: 1)
+    monkeypatch.setattr(crew, "compile_kernel", cannot)
+    monkeypatch.setattr(subprocess, "Popen", popen)
+    with caplog.at_level(logging.WARNING):
+        assert not crew.compiled([Group.UPDATE])
+    assert "could not be compiled beforehand" in caplog.text
+    assert there.missing([ONE, TWO, THREE]) == ([TWO] if popen is Started else [ONE, TWO, THREE])
+
+
+def test_a_process_asks_once_for_each_group(monkeypatch):
+    asked = []
+    monkeypatch.setattr(warm_up, "_settled", set())
+    monkeypatch.setattr(warm_up, "compiled", lambda wanted, then, told: asked.append(wanted))
+    for _ in range(2):
+        warm_up.warm_up_elsewhere([Group.FIRST_FRAME])
+    warm_up.warm_up_elsewhere([Group.FIRST_FRAME, Group.UPDATE])
+    warm_up.warm_up_elsewhere()
+    assert asked == [
+        (Group.FIRST_FRAME,), (Group.UPDATE,), (Group.ENTANGLED, Group.SEPARATE, Group.STEREO),
+    ]  # fmt: skip
+
+
+def test_the_marks_are_in_the_cache_of_this_version_and_of_this_checkout(monkeypatch):
+    mine = marks.here()
+    assert mine is not None
+    assert mine.folder.parent.name.startswith("kernels-")
+    monkeypatch.setattr(jit, "__file__", "/elsewhere/scas4d_core/kernels/jit.py")
+    other = marks.here()
+    assert other is not None
+    other.folder.rmdir()
+    assert mine.folder != other.folder
+    assert mine.folder.parent == other.folder.parent
+
+
+def test_without_a_cache_kernels_are_compiled_where_they_are_called(monkeypatch):
+    def nowhere():
+        raise PermissionError("the test says so")
+
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("a process was started"))
+    for here in (lambda: None, nowhere):
+        monkeypatch.setattr(crew, "here", here)
+        assert not crew.compiled([Group.UPDATE])
+
+
+PROGRAM = """
+import sys
+from numba.core import event
+compiled = []
+class Heard(event.Listener):
+    def on_start(self, one): compiled.append(one.data["dispatcher"].py_func.__name__)
+    def on_end(self, one): pass
+event.register("numba:compile", Heard())
+from scas4d_core.compilation.compiling import compile_kernel
+from scas4d_core.compilation.manifest import Group, kernels_of
+small = [kernel for kernel in kernels_of([Group.FIRST_FRAME]) if kernel.name in sys.argv[1:]]
+for kernel in small: compile_kernel(kernel)
+print(len(compiled))
+"""
+
+
+def test_a_cache_that_two_processes_fill_serves_a_third(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    root = Path(__file__).parents[3]
+
+    def run(*names):
+        command = [sys.executable, "-c", PROGRAM, *names]
+        return subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, text=True)
+
+    names = ("tile_offsets", "share_pairs")
+    assert len([kernel for kernel in kernels_of([Group.FIRST_FRAME]) if kernel.name in names]) == 2
+    both = [run("tile_offsets"), run("share_pairs")]
+    assert [int(process.communicate()[0]) > 0 for process in both] == [True, True]
+    third = run(*names)
+    assert third.communicate()[0].strip() == "0"
