@@ -106,6 +106,7 @@ class Worker:
         self.reconstruction: Reconstruction | None = None
         self._progress_at = 0.0
         self._budget = Budget()
+        self._compiled = False  # the kernels of updates
         self._write_seconds: float | None = None
         self._publish_seconds = 0.0
         self._later: deque[Any] = deque()
@@ -120,6 +121,7 @@ class Worker:
                 from scas4d_core.reconstruction import Reconstruction  # in this process only: the service stays light
 
                 wait_for_updates(self.spec.settings, None)
+                self._compiled = True
                 self.reconstruction = Reconstruction.resume(
                     self.spec.rig, self.spec.settings, history, held=lambda index: holds(self._pictures, index)
                 )
@@ -235,7 +237,9 @@ class Worker:
                 started=began,
             )
         else:
-            began += wait_for_updates(self.spec.settings, self.connection)  # no time of the frame's
+            if not self._compiled:
+                began += wait_for_updates(self.spec.settings, self.connection)  # no time of the frame's
+                self._compiled = True
             if budget != self._budget:
                 self.reconstruction.set_budget(**budget.model_dump())
                 self._budget = budget
