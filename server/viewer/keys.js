@@ -8,7 +8,7 @@ const TYPED = "input[type=text], input[type=password], input[type=number], texta
 function isItsOwn(target, key) {
   if (target.closest("dialog") || target.matches(TYPED)) return true;
   if (target.matches("select")) return key.length > 1 || key === " "; // letters and digits are the page's
-  if (target.matches("input[type=range]") || target.closest("[role=radiogroup]")) return ARROWS.includes(key);
+  if (target.matches("input[type=range], .scroll") || target.closest("[role=radiogroup]")) return ARROWS.includes(key);
   if (target.matches("button, a, summary, input")) return key === " " || key === "Enter";
   return false;
 }

@@ -92,8 +92,8 @@ function closeScene() {
   view.close();
   beside.close();
   tradeoff.close();
-  timeline.stop();
   Object.assign(page, { stream: null, status: null, rig: null, scene: null, tracks: [], failed: null, lost: false });
+  timeline.stop(); // it would keep the address of the scene that is open
   page.reports.clear();
   tracks.show();
   manage.show();
