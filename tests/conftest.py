@@ -1,4 +1,4 @@
-"""Kernels are compiled once for all of pytest's processes; the longest tests come first."""
+"""Kernels are compiled once for all of pytest's processes; the longest tests come first; failures are named at once."""
 
 import os
 
@@ -45,3 +45,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_xdist_auto_num_workers() -> int:
     """Processes for ``-n auto``: many tests wait for a service or a clock, so that two share a core."""
     return min(8, 2 * len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)))
+
+
+def pytest_report_teststatus(report: pytest.CollectReport | pytest.TestReport) -> tuple[str, str, str] | None:
+    """Names a test that failed at once: a run that is ended from outside prints no summary."""
+    if not (isinstance(report, pytest.TestReport) and report.failed):
+        return None
+    crash = getattr(report.longrepr, "reprcrash", None)
+    said = f": {crash.message.splitlines()[0][:200]}" if crash and crash.message else ""
+    return ("failed" if report.when == "call" else "error"), f"\n{report.when} of {report.nodeid}{said}\n", "FAILED"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import multiprocessing
 import os
 import resource
 import signal
@@ -18,19 +19,20 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 from client.errors import ServiceError, ServiceUnreachable
 from client.importers.open_source import open_source
 from client.sdk import Client
-from scas4d_core.captures import Capture
 from studies.machine import in_words, machine
 from studies.options import Echo
 
 ROOT = Path(__file__).parents[2]
 EVERY_S = 0.1
 PATIENCE_S = 1800.0
+ENDING_S = 120.0
 ADOPT = 36
 """PR_SET_CHILD_SUBREAPER: processes whose parent has ended become ours, so that their processor time counts."""
 
@@ -55,21 +57,29 @@ def measure(capture: Path, checkouts: list[Path], repeats: int, echo: Echo) -> l
     """Starts a service of each checkout so many times, in turns.
 
     Raises:
-        RuntimeError: a service ended, or no update came.
+        RuntimeError: a service or what it started did not end, or no update came.
     """
-    with contextlib.suppress(OSError, AttributeError):  # elsewhere than on Linux, compilers' time is missing
-        ctypes.CDLL(None).prctl(ADOPT, 1, 0, 0, 0)
-    source = open_source(capture)
     starts = []
     for turn in range(repeats):
         for checkout in checkouts:
-            starts.append(start(source, checkout))
+            starts.append(start(capture, checkout))
             echo(f"turn {turn + 1}, {checkout.name}: {_words(starts[-1])}")
     return starts
 
 
-def start(source: Capture, checkout: Path) -> Start:
-    """Starts a service of a checkout with an empty cache, and sends it two frames."""
+def start(capture: Path, checkout: Path) -> Start:
+    """Starts a service of a checkout with an empty cache, and sends it two frames.
+
+    It does so in a process of its own: that one waits for all its children, and counts their time alone.
+    """
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as apart:
+        return apart.submit(_start, capture, checkout).result()
+
+
+def _start(capture: Path, checkout: Path) -> Start:
+    with contextlib.suppress(OSError, AttributeError):  # elsewhere than on Linux, compilers' time is missing
+        ctypes.CDLL(None).prctl(ADOPT, 1, 0, 0, 0)
+    source = open_source(capture)
     with tempfile.TemporaryDirectory() as folder, _service(checkout, Path(folder)) as (url, process):
         spent, began = _spent(), time.monotonic()
         with Client(url, outage=0) as client:
@@ -123,7 +133,8 @@ def _service(checkout: Path, folder: Path) -> Iterator[tuple[str, subprocess.Pop
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    environment = {**os.environ, "PYTHONPATH": _path(checkout), "NUMBA_CACHE_DIR": str(folder / "cache")}
+    path = os.pathsep.join([str(checkout), *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = {**os.environ, "PYTHONPATH": path, "NUMBA_CACHE_DIR": str(folder / "cache")}
     command = [sys.executable, "-m", "client.cli.main", "serve", "--port", str(port), "--data", str(folder / "data")]
     with (folder / "log").open("wb") as log:
         process = subprocess.Popen(command, cwd=checkout, env=environment, stdout=log, stderr=log)
@@ -131,10 +142,6 @@ def _service(checkout: Path, folder: Path) -> Iterator[tuple[str, subprocess.Pop
         yield f"http://127.0.0.1:{port}", process
     finally:
         _end(process)
-
-
-def _path(checkout: Path) -> str:
-    return str(checkout)
 
 
 def _ready(client: Client) -> bool:
@@ -162,9 +169,13 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     if process.poll() is None:
         process.send_signal(signal.SIGTERM)
     process.wait()
+    until = time.monotonic() + ENDING_S
     with contextlib.suppress(ChildProcessError):  # there is none left
         while True:
-            os.waitpid(-1, 0)
+            if os.waitpid(-1, os.WNOHANG) == (0, 0):
+                if time.monotonic() > until:
+                    raise RuntimeError(f"a process that the service started goes on {ENDING_S:.0f} s after its end")
+                time.sleep(EVERY_S)
 
 
 def _spent() -> float:

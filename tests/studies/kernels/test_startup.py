@@ -28,7 +28,7 @@ def test_the_table_has_medians_and_ratios_to_the_first() -> None:
 
 def test_checkouts_take_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     one, two = Path("/one"), Path("/two")
-    monkeypatch.setattr(startup, "start", lambda source, checkout: Start(checkout, 1, 2, 3, 4))
+    monkeypatch.setattr(startup, "start", lambda capture, checkout: Start(checkout, 1, 2, 3, 4))
     said: list[str] = []
     starts = measure(SAMPLE, [one, two], 2, said.append)
     assert [start.checkout for start in starts] == [one, two, one, two]
@@ -38,7 +38,6 @@ def test_checkouts_take_turns(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_service_is_started_and_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in fakes.environment().items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr(startup, "_path", lambda checkout: fakes.environment()["PYTHONPATH"])
     found = measure(SAMPLE, [startup.ROOT], 1, print)[0]
     assert 0 < found.ready <= found.first <= found.update
     assert found.processor > 0
