@@ -20,8 +20,7 @@ from server.connections.proxies import ClientLimit
 from server.health.readiness import Readiness
 from server.http import handlers
 from server.http.authentication import AuthMiddleware
-from server.http.encoding import HeadAsGet, compressed
-from server.http.middleware import AccessLog, BodyLimit
+from server.http.middleware import AccessLog, BodyLimit, HeadAsGet, compressed
 from server.http.tickets import Tickets
 from server.problems import Problem
 from server.processes.placement import Placement

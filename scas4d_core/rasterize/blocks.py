@@ -12,14 +12,9 @@ BLOCK = 4
 """Pixels of a block's side."""
 
 
-def tiles_of(camera: CameraArrays) -> tuple[int, int]:
-    """Columns and rows of tiles."""
-    return -(-camera.width // TILE), -(-camera.height // TILE)
-
-
 def as_grid(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bool_]:
     """[rows, columns] of blocks, from bits 8 x + y of each tile."""
-    tiles_x, tiles_y = tiles_of(camera)
+    tiles_x, tiles_y = camera.tiles
     side = TILE // BLOCK
     bits = np.unpackbits(blocks.astype("<u8").view(np.uint8).reshape(-1, 8), axis=1, bitorder="little")
     grid = bits.reshape(tiles_y, tiles_x, side, side).transpose(0, 3, 1, 2)
@@ -34,7 +29,7 @@ def pixels_of(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bo
 
 def as_blocks(grid: NDArray[np.bool_], camera: CameraArrays) -> NDArray[np.uint64]:
     """[tiles] bits, from a grid of blocks."""
-    tiles_x, tiles_y = tiles_of(camera)
+    tiles_x, tiles_y = camera.tiles
     side = TILE // BLOCK
     bits = grid.reshape(tiles_y, side, tiles_x, side).transpose(0, 2, 3, 1).reshape(-1, side * side)
     packed = np.packbits(bits, axis=1, bitorder="little")

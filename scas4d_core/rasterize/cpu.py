@@ -41,6 +41,11 @@ class CameraArrays(NamedTuple):
         lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], dtype=np.float32)
         return cls(pose, lens, camera.width, camera.height)
 
+    @property
+    def tiles(self) -> tuple[int, int]:
+        """Columns and rows of tiles."""
+        return -(-self.width // TILE), -(-self.height // TILE)
+
 
 class Picture(NamedTuple):
     """Result of a forward pass: views into the rasterizer's buffers, valid until the next forward pass.
@@ -195,8 +200,7 @@ class CpuRasterizer:
             drawing: what is drawn; None: the whole picture.
         """
         count, channels = features.shape
-        width, height = camera.width, camera.height
-        tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+        width, height, (tiles_x, tiles_y) = camera.width, camera.height, camera.tiles
         if depth_channel >= 0:
             features[:, depth_channel] = 0
         splats, rects, counts = self.project(means, factors, opacities, features, camera)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import SMALLEST_SQUARE
 from scas4d_core.kernels import image_loss, tiles
-from scas4d_core.rasterize.blocks import pixels_of, tiles_of, widened
+from scas4d_core.rasterize.blocks import pixels_of, widened
 from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Drawing, Gradients, Picture
 from scas4d_core.rasterize.limits import DEFAULT, Limits
 from scas4d_core.update.picture_loss import LABEL, PictureLoss, TrainingView, ViewFactory, means, no_lap
@@ -191,7 +191,7 @@ class ChangedPixels(PictureLoss):
         blocks, camera = widened(marks, view.camera, MARGIN), view.camera
         splats, rects, _ = self.rasterizer.project(*self._stood, camera)
         meets = np.empty(len(self._standing), bool)
-        tiles.find_meeting(splats, rects, tiles_of(camera)[0], blocks, meets)
+        tiles.find_meeting(splats, rects, camera.tiles[0], blocks, meets)
         rows = np.sort(np.concatenate([self._moving, self._standing[meets]]))
         learnt, shown = self._moves[rows].astype(np.uint8), pixels_of(blocks, camera)
         box = _box(shown)
@@ -227,7 +227,7 @@ class ChangedPixels(PictureLoss):
         base, (rows, columns) = self._base(view), region.box
         box = (rows.start, rows.stop, columns.start, columns.stop)
         part, g_part = self._part(len(base), box)
-        drawn, tiles_x = self.rasterizer.drawn, tiles_of(view.camera)[0]
+        drawn, tiles_x = self.rasterizer.drawn, view.camera.tiles[0]
         shifts = np.zeros(len(base))
         tiles.take_blocks(self.rasterizer.planes, base, drawn, tiles_x, box, part, shifts)
         sums = region.rest + self._losses(part, view, region.target, region.moments, region.near, g_part)
@@ -293,7 +293,7 @@ def reached(
 ) -> NDArray[np.uint64]:
     """[tiles] blocks of a picture that the supports of some Gaussians meet."""
     splats, rects, _ = rasterizer.project(*taken(state, rows), camera)
-    tiles_x, tiles_y = tiles_of(camera)
+    tiles_x, tiles_y = camera.tiles
     marks = np.zeros(tiles_x * tiles_y, np.uint64)
     tiles.mark_blocks(splats, rects, np.ones(len(rects), np.uint8), tiles_x, marks)
     return marks

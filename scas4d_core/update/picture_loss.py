@@ -19,7 +19,6 @@ from scas4d_core.captures.images import area_average, resize_area
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import SMALLEST_SQUARE
 from scas4d_core.kernels import image_loss
-from scas4d_core.rasterize.blocks import tiles_of
 from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Drawing, Gradients, Picture
 from scas4d_core.rasterize.limits import DEFAULT, Limits
 
@@ -316,7 +315,7 @@ class PictureLoss:
 
         Returns: [N, 3] RGB in pixels' worth, without the camera's exposure, and [N] pixels' worth.
         """
-        drawing = Drawing(np.full(prod(tiles_of(view.camera)), 2**64 - 1, np.uint64), learnt)
+        drawing = Drawing(np.full(prod(view.camera.tiles), 2**64 - 1, np.uint64), learnt)
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background, drawing=drawing)
         return self._lacking(view, most)
 

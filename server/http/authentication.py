@@ -120,7 +120,8 @@ class AuthMiddleware:
         )
 
     def _permit(self, permission: Permission, scope: Scope) -> None:
-        check(permission, scope)
+        if permission != ALL:
+            check(permission, scope)
         scope[PERMISSION] = permission
 
     def _ticket(self, scope: Scope, send: Send) -> Send:

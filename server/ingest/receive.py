@@ -184,7 +184,7 @@ async def read_framed(
 
 def _fill(start: bytearray, view: memoryview, size: int) -> memoryview:
     """Moves bytes from `view` until `start` has `size`; returns the rest of `view`."""
-    missing = size - len(start)
+    missing = max(0, size - len(start))
     start += view[:missing]
     return view[missing:]
 

@@ -36,7 +36,8 @@ LOSSY = (RenderFormat.JPEG, RenderFormat.WEBP)
 @router.post("/{id}/render", response_class=Response, responses=PICTURES)
 async def render(scene: TheScene, request: Request, view: RenderRequest) -> Response:
     """Renders a committed frame from any camera; this does not wait for an update at work."""
-    return await _answer(scene, request, view)
+    found = await ask(request, scene, query_of(scene, view))
+    return Response(found.body, media_type=found.media_type, headers={**found.headers, "Cache-Control": "no-store"})
 
 
 @router.get("/{id}/render", response_class=Response, responses=PICTURES)
@@ -63,11 +64,6 @@ async def render_by_name(
         background=None if background is None else _colour(background),
         parts=parts,
     )
-    return await _answer(scene, request, view)
-
-
-async def _answer(scene: Scene, request: Request, view: RenderRequest) -> Response:
-    """Checks the request and asks the reader."""
     query = query_of(scene, view)
     # The last frame is another one in a moment, and parts are found anew. A frame that was named stays what it is until
     # the reconstruction is begun anew, but for a damaged state that is made again, as good as before: the tag is a weak

@@ -23,7 +23,7 @@ from studies.service.process import Service
 
 PACKAGES = ("scas4d_core", "server", "client")
 MOST_OF_A_FRAME, MOST_OF_A_RENDER = 60, 26
-"""On a quiet machine they are 59 and 24; on a busy one the tail of what came before crosses two or three files more."""
+"""They are 60 and 25. The tail of what came before a frame would cross files of its own."""
 LATER = 3
 """The frame that is followed: frame 0 and the first updates have work of their own."""
 SETTINGS = {

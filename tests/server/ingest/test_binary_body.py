@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+from itertools import pairwise
 
 import httpx
 import pytest
+from blake3 import blake3
 from running import picture, pictures, problem
 from sending import FRAMED, create, finished, framed, put_framed, status
 
 from client.wire.framing import MAX_HEAD, PREFIX
+from server.ingest.receive import Receiving, read_framed
 
 
 def with_head(head, *files):
@@ -78,6 +82,27 @@ def test_the_body_of_one_camera_holds_that_camera(http, begun):
         assert problem(http.put(url, content=framed(1, images), headers=FRAMED), 422)["field"] == "head.files"
 
 
+@pytest.mark.parametrize("cuts", [(1,), (7,), (8,), (9,), (50,), (100, 101), (300,), range(1, 300)], ids=str)
+def test_a_body_is_read_in_whatever_pieces_it_arrives(tmp_path, cuts):
+    body = framed(0)
+
+    async def pieces():
+        for begin, end in pairwise((0, *cuts, len(body))):
+            yield body[begin:end]
+
+    def begin(head):
+        return Receiving(tmp_path, head, None, lambda file, data: None, keep=False)
+
+    async def read():
+        head, receiving = await read_framed(pieces(), begin, len(body))
+        return head, await receiving.finish()
+
+    head, received = asyncio.run(read())
+    assert [(file.camera, file.size) for file in head.files] == list(BOTH)
+    expected = {name: {"image": blake3(data).hexdigest()} for name, data in pictures().items()}
+    assert received.hashes == expected
+
+
 def test_the_order_of_files_is_free_and_optional_members_may_be_left_out(http, make):
     id = make()
     mask = picture(mode="L")
@@ -86,7 +111,7 @@ def test_the_order_of_files_is_free_and_optional_members_may_be_left_out(http, m
     body = with_head({"index": 0, "files": listed}, *(data for _, _, data in files))
     first = http.put(f"/v1/scenes/{id}/frames/0", content=body, headers=FRAMED)
     again = http.put(f"/v1/scenes/{id}/frames/0", content=iter([body[:50], body[50:]]), headers=FRAMED)  # in chunks
-    assert (first.status_code, again.status_code) == (202, 202)
+    assert (first.status_code, again.status_code) == (202, 202), again.text
     assert first.json() == again.json()
     ordered = http.put(f"/v1/scenes/{id}/frames/0", content=framed(0, masks={"c0": mask, "c1": mask}), headers=FRAMED)
     assert ordered.json() == first.json()
