@@ -35,10 +35,10 @@ export function listenToKeys(view, on, ready) {
   });
   // What was pressed with a pointer does not keep the keys: space plays after a click on any button of the view.
   const stage = document.getElementById("stage");
-  const back = () => setTimeout(() => document.getElementById("overlay").focus({ preventScroll: true }));
+  const back = () => document.getElementById("overlay").focus({ preventScroll: true });
   let pointer = false;
   stage.addEventListener("pointerdown", () => (pointer = true), true);
   stage.addEventListener("keydown", () => (pointer = false), true);
   stage.addEventListener("click", (event) => event.target.closest("button") && event.detail > 0 && back());
-  stage.addEventListener("change", () => pointer && back());
+  stage.addEventListener("change", () => pointer && setTimeout(back));
 }

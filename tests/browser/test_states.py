@@ -92,7 +92,7 @@ def test_first_frame(sized, service):
     with scene_of(service) as (sdk, id):
         opened(sized, service, id)
         title(sized, "Waiting for the first frame")
-        push(sdk, id, 0, red=fakes.SLOW)
+        push(sdk, id, 0, red=fakes.LOOKED_AT)
         title(sized, "Reconstructing the first frame")
         looked_at(sized, "first-frame")
         shown(sized, frame="0")
@@ -104,7 +104,7 @@ def test_updating(sized, service):
         sdk.wait(id, 0)
         opened(sized, service, id)
         shown(sized, frame="0")
-        push(sdk, id, 1, red=fakes.SLOW)
+        push(sdk, id, 1, red=fakes.LOOKED_AT)
         until(sized, "document.getElementById('state').innerText === 'Updating'")
         looked_at(sized, "updating")
         shown(sized, frame="1")

@@ -35,13 +35,22 @@ def opened(page, service, scene, frame=None):
 def shown(page, **wanted):
     """Waits until the picture that is shown has these properties; the picture."""
     tests = " && ".join(f"d.{name} === {value!r}" for name, value in wanted.items()) or "true"
-    page.wait_for_function(f"() => {{ const d = document.getElementById('view').dataset; return d.tag && ({tests}); }}")
+    until(page, f"{{ const d = document.getElementById('view').dataset; return d.tag && ({tests}); }}")
     return canvas(page)
 
 
 def until(page, condition):
     """Waits until an expression is true; as a function, because the page's policy forbids to evaluate text."""
-    page.wait_for_function(f"() => {condition}")
+    from playwright.sync_api import TimeoutError  # without it the tests of the page are skipped
+
+    try:
+        page.wait_for_function(f"() => {condition}")
+    except TimeoutError as error:
+        raise AssertionError(f"not within the time: {condition}; the page shows {_text(page)!r}") from error
+
+
+def _text(page):
+    return page.evaluate("() => document.body.innerText")[:1500]
 
 
 def canvas(page, id="picture"):

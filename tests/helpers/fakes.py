@@ -21,12 +21,14 @@ from scas4d_core.storage.history import History, HistoryError
 
 SLOW, SLOW_RAISES, RAISES, DIES = 200, 201, 250, 251
 HELD, LEAVES_OUT, STANDS, GUESSED, REFINES, LATE = 240, 241, 242, 243, 244, 245
+LOOKED_AT = 246
+"""A frame with that red takes long enough for a browser on a busy machine to show that it is at work."""
 PICKY, PICKED = 249, 77
 """A first frame with that red fails, unless static.iterations are those."""
 ITERATIONS = 100
 MS_EACH = 2.0
 RAISES_IN_REPLAY, DIES_IN_REPLAY = 666, 667
-SLOW_S = 2.0
+SLOW_S, LOOKED_AT_S = 2.0, 10.0
 STEP_M = 0.125
 HANGS, KILLS = 777_001, 777_002
 """Ids that the reader never finds, or dies of."""
@@ -57,6 +59,8 @@ def obey(frame):
     red = int(next(iter(frame.images.values()))[0, 0, 0])
     if red in (SLOW, SLOW_RAISES):
         time.sleep(SLOW_S)
+    if red == LOOKED_AT:
+        time.sleep(LOOKED_AT_S)
     if red in (RAISES, SLOW_RAISES):
         raise FloatingPointError("the fake was told to raise")
     if red == DIES:
