@@ -34,6 +34,7 @@ export function beforeFirstFrame(status, { resume, restore } = {}) {
       detail: `scas4d begin-again ${status.id}`, actions: [] };
   }
   if (status.progress) return progressWords(status.progress);
+  if (status.state === "initialising") return { title: "Reconstructing the first frame", words: "The pictures are being read.", share: null };
   if (status.paused && status.queued) {
     return { title: `${counted(status.queued, "frame")} waiting`, words: "The scene is paused: it takes frames and reconstructs none.",
       actions: resume ? [["Resume", resume]] : [] };
@@ -41,7 +42,6 @@ export function beforeFirstFrame(status, { resume, restore } = {}) {
   if (status.queued) {
     return { title: "The first frame is queued", words: `${counted(status.queued, "frame")} came; the worker of the scene is starting.`, share: null };
   }
-  if (status.state === "initialising") return { title: "Reconstructing the first frame", words: "The pictures are being read.", share: null };
   if (status.archived) return { title: "The scene is archived", words: "It takes no frames, and has none to show.", actions: restore ? [["Restore", restore]] : [] };
   return { title: "Waiting for the first frame",
     words: `The scene accepts frames of ${counted(status.cameras.length, "camera")}. Send frame ${status.next_frame}:`,
