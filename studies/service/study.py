@@ -74,7 +74,7 @@ def _files(capture: Capture, index: int) -> Files:
 
 
 def digests(states: Path) -> dict[int, str]:
-    """SHA-256 over every array of each committed state, and over what its report says of decisions."""
+    """SHA-256 over every array of each committed state, and what its report says of decisions."""
     history = History.load(states)
     found = {}
     for index in history.indices:
@@ -84,8 +84,7 @@ def digests(states: Path) -> dict[int, str]:
             digest.update(array.tobytes())
         report = history.report(index)
         decided = {name: report.get(name) for name in ("index", "time", "iterations", "loss", "used", "dropped")}
-        digest.update(repr(decided).encode())
-        found[index] = digest.hexdigest()
+        found[index] = f"{digest.hexdigest()} {decided}"
     return found
 
 
@@ -95,7 +94,10 @@ def compare(found: Mapping[int, str], expected: Mapping[int, str], but: Sequence
     missing = [index for index in wrong if index not in found]
     faults = [f"frames {missing} are not committed"] if missing else []
     others = [index for index in wrong if index in found]
-    return faults + ([f"states {others} are not bit-identical"] if others else [])
+    if others:
+        first = f"{found[others[0]]} in place of {expected[others[0]]}"
+        faults.append(f"states {others} are not bit-identical: {first}")
+    return faults
 
 
 class FrameSender:
