@@ -14,6 +14,7 @@ import fakes
 import pytest
 from browser_page import opened, push, shown, start_scene, until
 from running import Running, fake_settings
+from sending import wait_for
 
 from client.sdk import Client
 
@@ -252,8 +253,9 @@ def test_a_scene_is_begun_again_and_deleted_by_hand(sized, service):
         sized.click("#manage-open")
         for _ in range(2):
             sized.click("#manage-again")
+        wait_for(lambda: sdk.scene(id).reconstruction == 1)  # the frames of before stood there as committed, too
+        sdk.wait(id, 1)
         until(sized, "document.getElementById('facts').innerText.includes('2 committed')")
-        assert sdk.scene(id).reconstruction == 1
         if not sized.locator("#manage[open]").count():
             sized.click("#manage-open")
         for _ in range(2):
