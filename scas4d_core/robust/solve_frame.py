@@ -20,6 +20,7 @@ from scas4d_core.rasterize.shading import features_seen
 from scas4d_core.robust import outliers, timing
 from scas4d_core.robust.alarms import alarms_of, colours_by_camera
 from scas4d_core.robust.checks import EXPOSURE, evened, gain_of, relit, validated
+from scas4d_core.robust.first_motion import best_order
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.relocation import find_jump, shifted
 from scas4d_core.robust.update_input import UpdateInput
@@ -169,10 +170,23 @@ class FrameSolver:
     def _attempt(self, given: UpdateInput, template: AttemptOptions, attempts: list[str]) -> Validated:
         motion = None if template.cold else given.motion
         options = self._options(given, template)
-        result = self._run(given, given.state, motion, options)
+        if self._decides(given, template):
+            result, orders = best_order(lambda seed: self._first(given, seed), given.seed, len(given.views))
+            options = replace(options, name=f"{options.name}, the best of {orders} orders") if orders > 1 else options
+        else:
+            result = self._run(given, given.state, motion, options)
         result, fault = self._validated(given, given.state, result)
         attempts.append(options.name if fault is None else f"{options.name}: {fault}")
         return result, fault
+
+    def _decides(self, given: UpdateInput, template: AttemptOptions) -> bool:
+        """True for the first update of a scene, where it may take longer than others and as long as it needs."""
+        first = given.motion is None and given.past.updates == 0 and not given.past.held
+        return template is AS_SET and first and given.end is None and self._settings.cold_longer > 1
+
+    def _first(self, given: UpdateInput, seed: int) -> UpdateResult:
+        options = replace(self._options(given, AS_SET), several=True)
+        return self._run(replace(given, seed=seed), given.state, None, options)
 
     def _run(self, given: UpdateInput, start: Gaussians, motion: Motion | None, how: AttemptOptions) -> UpdateResult:
         return self._updater.run(start, given.views, motion, given.seconds, given.seed, how, given.carried)

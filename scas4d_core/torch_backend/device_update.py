@@ -130,7 +130,10 @@ class DeviceUpdate:
         best = BestState(probes, deformation, previous, motion, seconds, settings.momentum)
         best.start(options.step)
         rates = self._update.rates.tried(options.rates, options.rigid, options.hold_colours)
-        rates = rates.cold(settings.cold_start) if motion is None else rates.warm(best.unexplained(options.usual))
+        if motion is None:
+            rates = rates.cold(settings.cold_start, options.several)
+        else:
+            rates = rates.warm(best.unexplained(options.usual))
         work = Work(previous, deformation, rates, views, self._picture, dict(carried))
         for begin in self._hooks.start:
             begin(work)

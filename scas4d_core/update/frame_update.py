@@ -122,7 +122,10 @@ class FrameUpdate:
         best = BestState(probes, deformation, previous, motion, seconds, settings.momentum)
         best.start(options.step)
         rates = self._rates.tried(options.rates, options.rigid, options.hold_colours)
-        rates = rates.cold(settings.cold_start) if motion is None else rates.warm(best.unexplained(options.usual))
+        if motion is None:
+            rates = rates.cold(settings.cold_start, options.several)
+        else:
+            rates = rates.warm(best.unexplained(options.usual))
         work = Work(previous, deformation, rates, views, self._picture, dict(carried))
         work.tells = self.tells
         for start in self._hooks.start:

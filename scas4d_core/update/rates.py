@@ -31,8 +31,11 @@ LAYER_STARTS = (0.0, 0.2, 0.4)
 The coarse motion is found first: all at once, the finer layers take a part of it, each cluster another."""
 
 LAYER_RESTS = (0.5, 0.75, 1.0)
-"""Share of the iterations after which a layer rests, coarse to fine; of fewer layers the last ones, of more the first
-is repeated. 0.5 to 0.6 and 0.7 to 0.8 came out alike (docs/method.md)."""
+"""Share of the iterations after which a layer rests, coarse to fine. 0.5 to 0.6 and 0.7 to 0.8 came out alike
+(docs/method.md)."""
+FIRST_RESTS = (0.8, 0.9, 1.0)
+"""The same of the first update, which is tried in several orders of its views: what one has not found by then, another
+finds. It gained 0.0 to 0.5 dB (docs/method.md)."""
 LEAST_TIME = 0.3
 """Share of the iterations that a layer has at least before it rests."""
 NEAR = 0.6
@@ -111,10 +114,13 @@ class Rates:
         ends = (learning(self.start_of(k), self.rest_of(k), iterations).stop for k in range(len(self.rests)))
         return next((k for k, end in enumerate(ends) if iteration < end), len(self.rests))
 
-    def cold(self, factor: float) -> Rates:
-        """Without a motion to start from: layers turn and shift faster, as there is further to go, and none rests."""
+    def cold(self, factor: float, several: bool = False) -> Rates:
+        """Without a motion to start from: layers turn and shift faster, as there is further to go.
+
+        None rests but in an update that is tried in ``several`` orders of its views.
+        """
         layers = tuple((factor * r, factor * t, scaling) for r, t, scaling in self.layers)
-        return replace(self, layers=layers, rests=())
+        return replace(self, layers=layers, rests=_of_layers(FIRST_RESTS, self.starts) if several else ())
 
     def warm(self, unexplained: float) -> Rates:
         """From the motion before: no layer rests, unless that leaves little of what changed unexplained (``NEAR``)."""
@@ -151,12 +157,15 @@ class Rates:
             beta1=settings.beta1,
             beta2=settings.beta2,
             starts=starts,
-            rests=tuple(
-                min(1.0, max(LAYER_RESTS[max(k - layers, -len(LAYER_RESTS))], start + LEAST_TIME))
-                for k, start in enumerate(starts)
-            ),
+            rests=_of_layers(LAYER_RESTS, starts),
             start=settings.own_start,
         )
+
+
+def _of_layers(rests: tuple[float, ...], starts: tuple[float, ...]) -> tuple[float, ...]:
+    """When each layer rests: of fewer layers the last of ``rests``, of more the first is repeated; none too soon."""
+    ends = (rests[max(k - len(starts), -len(rests))] for k in range(len(starts)))
+    return tuple(min(1.0, max(end, start + LEAST_TIME)) for end, start in zip(ends, starts, strict=True))
 
 
 def all_begun(settings: UpdateSettings) -> float:

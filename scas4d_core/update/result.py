@@ -85,6 +85,7 @@ class AttemptOptions:
         name: as the report has it.
         rates: factor on all of Adam's rates. rigid: clusters turn and shift, nothing else. hold_colours: colours stay.
         cold: the motion of the update before is not used. longer: factor on the iterations.
+        several: other orders of the views are tried as well, and the best end is taken.
         usual: errors of the updates before at their end, ``best_state.by_size``; None: not known.
         stopping: decides how many iterations there are; None: those of the settings.
         gate: called with each camera's first PSNR (dB) once all were rendered; returns the cameras to drop, with the
@@ -100,6 +101,7 @@ class AttemptOptions:
     hold_colours: bool = False
     cold: bool = False
     longer: float = 1.0
+    several: bool = False
     stopping: Stopping | None = None
     gate: Callable[[Mapping[str, float]], Mapping[str, str]] | None = None
     compare: bool = False

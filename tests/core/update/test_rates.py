@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.settings import UpdateSettings
 from scas4d_core.update.best_state import BestState
-from scas4d_core.update.rates import LAYER_RESTS, NEAR, Rates
+from scas4d_core.update.rates import FIRST_RESTS, LAYER_RESTS, NEAR, Rates
 
 
 def rates(layers: int = 3) -> Rates:
@@ -56,6 +57,7 @@ def test_layers_rest_where_the_motion_before_leads_near_and_nowhere_else() -> No
 def test_without_a_motion_before_layers_are_faster_and_none_rests() -> None:
     cold = rates().cold(2.0)
     assert cold.rests == ()
+    assert rates().cold(2.0, several=True) == replace(cold, rests=FIRST_RESTS)
     assert [turn for turn, _, _ in cold.layers] == [2 * turn for turn, _, _ in rates().layers]
 
 
