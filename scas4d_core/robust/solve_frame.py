@@ -306,7 +306,7 @@ class FrameSolver:
         past = outliers.settle(given.past, psnr, given.brightness, result.exposure, len(trace.losses), moved)
         if trace.errors.get(Candidate.END):
             found = by_size(trace.errors[trace.kept], trace.whole)
-            past = replace(past, error=outliers.usual_errors(given.past.error, found))
+            past = replace(past, error=outliers.usual_errors(given.past.error, found | trace.committed))
         motion = result.motion if result.motion is not None and result.motion.finite else None
         return replace(result, motion=motion, offsets=outliers.offsets(given.past, psnr)), past
 

@@ -176,6 +176,8 @@ class DeviceUpdate:
         work.colours, work.kept = found.gaussians.colours, trace.kept
         for end in self._hooks.end:
             state = end(work, state)
+        if options.enough is not None:
+            trace.committed = best.committed(state)
         motion_found = Motion.of(deformation, best.seconds)
         watch.lap("commit")
         trace.seconds = watch.seconds

@@ -48,6 +48,8 @@ def mean_error(errors: Mapping[str, float], names: Sequence[str]) -> float:
 
 WHOLE = " whole"
 """Behind the names of views whose whole pictures were compared, where errors of several frames stand together."""
+COMMITTED = " committed"
+"""Behind the names of views in whose whole pictures a state was looked at as it was committed, with its last colours."""
 
 
 def by_size(errors: Mapping[str, float], whole: bool) -> dict[str, float]:
@@ -90,6 +92,10 @@ class ProbeViews:
             if small > ALIASED * whole:
                 self._views, self.whole = self._whole, True
         return {view.name: self._error(view, state, turns) for view in self._views}
+
+    def whole_errors(self, state: Gaussians, turns: Array | None = None) -> dict[str, float]:
+        """As ``errors``, in whole pictures."""
+        return {view.name: self._error(view, state, turns) for view in self._whole}
 
     def _error(self, view: TrainingView, state: Gaussians, turns: Array | None) -> float:
         features = features_seen(state, view.camera, turns)
@@ -157,7 +163,13 @@ class BestState:
             self._set(motion)
 
     def stands(self, enough: Mapping[str, float] | None) -> bool:
-        """True where Θ_{t−1} shows this frame as well as ``enough``, errors ``by_size``; None: never."""
+        """True where Θ_{t−1} shows this frame as well as ``enough``, in small pictures and in whole ones; None: never.
+
+        Small pictures alone do not tell: what they cannot show weighs more in them than a slow motion.
+
+        Args:
+            enough: errors ``by_size`` at the end of an update, and of what it ``committed``.
+        """
         still = self.errors.get(Candidate.STILL)
         if (
             enough is None
@@ -165,9 +177,7 @@ class BestState:
             or self._mean(Candidate.STILL) > self._mean(Candidate.WARM, otherwise=np.inf)
         ):
             return False
-        still = by_size(still, self.whole)
-        names = sorted(still.keys() & enough.keys())
-        return bool(names) and mean_error(still, names) <= mean_error(enough, names)
+        return _within(by_size(still, self.whole), enough) and _within(self.committed(self._previous), enough)
 
     def unexplained(self, usual: Mapping[str, float] | None) -> float:
         """Share of what changed since Θ_{t−1} that the motion before leaves: about 0 to 1.
@@ -196,6 +206,10 @@ class BestState:
         found = self._moved(look)
         return mean_error(found, list(found))
 
+    def committed(self, state: Gaussians) -> dict[str, float]:
+        """``ProbeViews.whole_errors`` of a committed state, by the camera's name and ``COMMITTED``."""
+        return {name + COMMITTED: error for name, error in self._probes.whole_errors(state).items()}
+
     def error_of(self, state: Gaussians) -> float:
         """Mean error on the probe views of a state."""
         found = self._probes.errors(state)
@@ -215,10 +229,20 @@ class BestState:
         names = [name for name in self.errors[Candidate.STILL] if name not in left_out]
         found = [candidate for candidate in Candidate if candidate in self.errors]  # of equal ones the first
         best = min(found, key=lambda candidate: _or_last(mean_error(self.errors[candidate], names)))
-        if best is not Candidate.END:
-            self._set(self._motion if best is Candidate.WARM else None)
-            self._deformation.forward()
-        return best
+        if best is Candidate.END:
+            return best
+        doubtful = iterations > 0 and not self.whole  # a slow motion may show in whole pictures alone
+        reached = self._in_whole(look, left_out) if doubtful else np.inf
+        tables = (*self._deformation.clusters, self._deformation.deltas)
+        ended = [values.copy() for values in tables]
+        self._set(self._motion if best is Candidate.WARM else None)
+        self._deformation.forward()
+        if not doubtful or self._in_whole(self._previous, left_out) <= reached:
+            return best
+        for values, at_end in zip(tables, ended, strict=True):
+            values[:] = at_end
+        self._deformation.forward()
+        return Candidate.END
 
     def _set(self, motion: Motion | None) -> None:
         self._deformation.rest(0)
@@ -230,6 +254,14 @@ class BestState:
 
     def _moved(self, look: Gaussians) -> dict[str, float]:
         """Errors of Θ_{t−1} under the deformation, with the looks of a state."""
+        return self._probes.errors(*self._deformed(look))
+
+    def _in_whole(self, look: Gaussians, left_out: Mapping[str, str]) -> float:
+        """The same in whole pictures, the mean but for cameras that have no say; not a number counts as infinite."""
+        found = self._probes.whole_errors(*self._deformed(look))
+        return _or_last(mean_error(found, [name for name in found if name not in left_out]))
+
+    def _deformed(self, look: Gaussians) -> tuple[Gaussians, Array | None]:
         found, turns = self._deformation, None
         if look.gloss is not None:
             turns = without_turn(len(look))
@@ -238,11 +270,21 @@ class BestState:
             means=found.means, factors=found.factors,
             colours=look.colours, gloss=look.gloss, environment=look.environment,
         )  # fmt: skip
-        return self._probes.errors(state, turns)
+        return state, turns
 
     def _mean(self, candidate: Candidate, otherwise: float = np.inf) -> float:
         errors = self.errors.get(candidate)
         return otherwise if errors is None else mean_error(errors, list(errors))
+
+
+def _within(errors: Mapping[str, float], limits: Mapping[str, float]) -> bool:
+    """True where the mean error of the views that have a limit is within the mean of these; false where none has.
+
+    >>> _within({"a": 1.0, "b": 3.0}, {"a": 2.0, "b": 2.0}), _within({"a": 1.0}, {"b": 2.0})
+    (True, False)
+    """
+    names = sorted(errors.keys() & limits.keys())
+    return bool(names) and mean_error(errors, names) <= mean_error(limits, names)
 
 
 def _or_last(value: float) -> float:

@@ -170,6 +170,8 @@ class FrameUpdate:
         state = previous if work.kept is Candidate.STILL else self._commit(previous)
         for end in self._hooks.end:
             state = end(work, state)
+        if options.enough is not None:
+            trace.committed = best.committed(state)
         found = Motion.of(deformation, best.seconds)
         counts = [deformation.guards, self._picture.rasterizer.guards, *self._hooks.guards]
         acted = summed([*counts, *(table.guards for table in tables)])

@@ -36,6 +36,10 @@ LAYER_RESTS = (0.5, 0.75, 1.0)
 FIRST_RESTS = (0.8, 0.9, 1.0)
 """The same of the first update, which is tried in several orders of its views: what one has not found by then, another
 finds. It gained 0.0 to 0.5 dB (docs/method.md)."""
+NEAR_FINEST = 3.0
+"""Times its rates that the finest layer learns by where the layers above it rest, ..."""
+NEAR_OWN = 2.0
+"""... and the Gaussians' own motion: what is left to find is theirs (docs/method.md)."""
 LEAST_TIME = 0.3
 """Share of the iterations that a layer has at least before it rests."""
 NEAR = 0.6
@@ -123,8 +127,18 @@ class Rates:
         return replace(self, layers=layers, rests=_of_layers(FIRST_RESTS, self.starts) if several else ())
 
     def warm(self, unexplained: float) -> Rates:
-        """From the motion before: no layer rests, unless that leaves little of what changed unexplained (``NEAR``)."""
-        return self if unexplained <= NEAR else replace(self, rests=())
+        """From the motion before, where that leaves so much of what changed unexplained.
+
+        Where it leads near (``NEAR``), layers rest, and what is below them learns faster; else none rests.
+        """
+        if unexplained > NEAR:
+            return replace(self, rests=())
+        layers = self.layers
+        if len(layers) > 1:
+            *above, (rotation, translation, scaling) = layers
+            layers = (*above, (NEAR_FINEST * rotation, NEAR_FINEST * translation, NEAR_FINEST * scaling))
+        position, rotation, scale = (NEAR_OWN * rate for rate in (self.position, self.rotation, self.scale))
+        return replace(self, layers=layers, position=position, rotation=rotation, scale=scale)
 
     def tried(self, factor: float, rigid: bool, hold_colours: bool) -> Rates:
         """All rates times a factor; ``rigid``: of clusters that turn and shift only; ``hold_colours``: colours stay."""

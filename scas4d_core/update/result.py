@@ -91,7 +91,8 @@ class AttemptOptions:
         gate: called with each camera's first PSNR (dB) once all were rendered; returns the cameras to drop, with the
             reason. None: all stay.
         compare: whether the candidates for Θ_t are compared on the probe views (``best_state``).
-        enough: image loss by probe view at which Θ_{t−1} needs no iteration; None: there is always one.
+        enough: errors on the probe views at which Θ_{t−1} needs no iteration (``BestState.stands``); None: there is
+            always one.
         step: seconds since the frame before, where nothing was learnt from that one (``BestState.start``); else None.
     """
 
@@ -146,7 +147,8 @@ class UpdateTrace:
         planned: (iteration, iterations in all) whenever the stopping rule planned otherwise.
         errors: image loss by candidate, then by probe view; empty where nothing was compared. kept: the candidate that
             became Θ_t.
-        whole: whether these errors are of whole pictures.
+        whole: whether these errors are of whole pictures. committed: errors of Θ_t, where the next frame may stand
+            (``BestState.committed``).
         shown: by camera, the renderings of the last ``SHOWN`` iterations: evidence is taken from them without another
             rendering. Empty on other devices, and where an update ended sooner than planned.
         guards: those that acted, how often.
@@ -163,6 +165,7 @@ class UpdateTrace:
     errors: dict[Candidate, dict[str, float]] = field(default_factory=dict)
     kept: Candidate = Candidate.END
     whole: bool = False
+    committed: dict[str, float] = field(default_factory=dict)
     shown: dict[str, Thinned] = field(default_factory=dict)
     guards: dict[str, int] = field(default_factory=dict)
 

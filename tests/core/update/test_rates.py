@@ -11,7 +11,7 @@ import pytest
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.settings import UpdateSettings
 from scas4d_core.update.best_state import BestState
-from scas4d_core.update.rates import FIRST_RESTS, LAYER_RESTS, NEAR, Rates
+from scas4d_core.update.rates import FIRST_RESTS, LAYER_RESTS, NEAR, NEAR_FINEST, NEAR_OWN, Rates
 
 
 def rates(layers: int = 3) -> Rates:
@@ -51,7 +51,22 @@ def test_layers_rest_where_the_motion_before_leads_near_and_nowhere_else() -> No
     assert near.rests == LAYER_RESTS
     assert far.rests == ()
     assert far.resting(99, 100) == 0
-    assert near.layers == far.layers
+    assert far == replace(rates(), rests=())
+
+
+@pytest.mark.parametrize("layers", [0, 1, 2, 3])
+def test_what_is_below_the_layers_that_rest_learns_faster(layers: int) -> None:
+    usual = rates(layers)
+    near = usual.warm(NEAR)
+    assert near.layers[:-1] == usual.layers[:-1]
+    if layers > 1:
+        assert near.layers[-1] == pytest.approx([NEAR_FINEST * rate for rate in usual.layers[-1]])
+    else:
+        assert near.layers == usual.layers
+    assert (near.position, near.rotation, near.scale) == pytest.approx(
+        [NEAR_OWN * rate for rate in (usual.position, usual.rotation, usual.scale)]
+    )
+    assert near.colour == usual.colour
 
 
 def test_without_a_motion_before_layers_are_faster_and_none_rests() -> None:
