@@ -36,9 +36,9 @@ LAYER_RESTS = (0.5, 0.75, 1.0)
 FIRST_RESTS = (0.8, 0.9, 1.0)
 """The same of the first update, which is tried in several orders of its views: what one has not found by then, another
 finds. It gained 0.0 to 0.5 dB (docs/method.md)."""
-NEAR_FINEST = 3.0
+NEAR_FINEST = 4.0
 """Times its rates that the finest layer learns by where the layers above it rest, ..."""
-NEAR_OWN = 2.0
+NEAR_OWN = 4.0
 """... and the Gaussians' own motion: what is left to find is theirs (docs/method.md)."""
 LEAST_TIME = 0.3
 """Share of the iterations that a layer has at least before it rests."""

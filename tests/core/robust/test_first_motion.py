@@ -33,7 +33,9 @@ def ends(*losses: float | Sequence[float]) -> Any:
     def run(seed: int) -> UpdateResult:
         given = losses[len(seeds)]
         seeds.append(seed)
-        trace = UpdateTrace([given] * 12 if isinstance(given, float) else list(given), seconds={"start": 2.0, "end": 1.0})
+        trace = UpdateTrace(
+            [given] * 12 if isinstance(given, float) else list(given), seconds={"start": 2.0, "end": 1.0}
+        )
         return UpdateResult(BOX, None, trace)
 
     return run, seeds
