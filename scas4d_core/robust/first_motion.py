@@ -26,7 +26,7 @@ STAGE = "other orders"
 
 
 def best_order(run: Callable[[int], UpdateResult], seed: int, views: int) -> tuple[UpdateResult, int]:
-    """Runs an update in two orders of its views, or three; returns the end with the least loss, and how many there were.
+    """Runs an update in two orders of its views, or three; returns the end with the least loss, and how many ran.
 
     Args:
         run: the update with a seed. seed: of the first order. views: that there are.

@@ -49,7 +49,7 @@ def mean_error(errors: Mapping[str, float], names: Sequence[str]) -> float:
 WHOLE = " whole"
 """Behind the names of views whose whole pictures were compared, where errors of several frames stand together."""
 COMMITTED = " committed"
-"""Behind the names of views in whose whole pictures a state was looked at as it was committed, with its last colours."""
+"""Behind the names of views in whose whole pictures a state was compared as it was committed."""
 
 
 def by_size(errors: Mapping[str, float], whole: bool) -> dict[str, float]:
