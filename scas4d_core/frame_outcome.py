@@ -11,6 +11,10 @@ HELD_TEXT = "held as it was: "
 """The beginning of the text for a frame whose state is the one before."""
 
 
+OTHER_ORDERS = "other orders"
+"""Stage of a report: the time that a first update took in orders of its views that were not kept."""
+
+
 class Candidate(StrEnum):
     """A state that may become Θ_t; the better one on the probe views does. The values are those on disk."""
 

@@ -20,12 +20,12 @@ from scas4d_core.rasterize.shading import features_seen
 from scas4d_core.robust import outliers, timing
 from scas4d_core.robust.alarms import alarms_of, colours_by_camera
 from scas4d_core.robust.checks import EXPOSURE, evened, gain_of, relit, validated
-from scas4d_core.robust.first_motion import best_order
+from scas4d_core.robust.first_motion import Ended, best_order
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.relocation import find_jump, shifted
 from scas4d_core.robust.update_input import UpdateInput
 from scas4d_core.settings import UpdateSettings
-from scas4d_core.update.best_state import by_size
+from scas4d_core.update.best_state import by_size, committed_errors, slow, within
 from scas4d_core.update.frame_update import Updater
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.rates import all_begun
@@ -170,23 +170,30 @@ class FrameSolver:
     def _attempt(self, given: UpdateInput, template: AttemptOptions, attempts: list[str]) -> Validated:
         motion = None if template.cold else given.motion
         options = self._options(given, template)
+        name = options.name
         if self._decides(given, template):
-            result, orders = best_order(lambda seed: self._first(given, seed), given.seed, len(given.views))
-            options = replace(options, name=f"{options.name}, the best of {orders} orders") if orders > 1 else options
+            (result, fault, _), orders = best_order(lambda seed, faster: self._first(given, seed, faster), given.seed)
+            name = f"{name}, the best of {orders} orders" if orders > 1 else name
         else:
-            result = self._run(given, given.state, motion, options)
-        result, fault = self._validated(given, given.state, result)
-        attempts.append(options.name if fault is None else f"{options.name}: {fault}")
+            result, fault = self._validated(given, given.state, self._run(given, given.state, motion, options))
+        attempts.append(name if fault is None else f"{name}: {fault}")
         return result, fault
 
     def _decides(self, given: UpdateInput, template: AttemptOptions) -> bool:
-        """True for the first update of a scene, where it may take longer than others and as long as it needs."""
-        first = given.motion is None and given.past.updates == 0 and not given.past.held
+        """True for the first motion of a scene, where it may take longer than others and as long as it needs.
+
+        A scene that goes on without its carry-over knows no camera; what was held was sought for longer already.
+        """
+        first = given.motion is None and given.past.updates == 0 and len(given.past.places) > 0 and not given.past.held
         return template is AS_SET and first and given.end is None and self._settings.cold_longer > 1
 
-    def _first(self, given: UpdateInput, seed: int) -> UpdateResult:
-        options = replace(self._options(given, AS_SET), several=True)
-        return self._run(replace(given, seed=seed), given.state, None, options)
+    def _first(self, given: UpdateInput, seed: int, faster: float) -> Ended:
+        options = replace(self._options(given, AS_SET), several=True, faster=faster)
+        result = self._run(replace(given, seed=seed), given.state, None, options)
+        result, fault = self._validated(given, given.state, result)
+        with self._timed():
+            views = [view for view in result.views or given.views if view.name not in result.trace.left_out]
+            return Ended(result, fault, self._measured(views, result.gaussians) if result.trace.losses else {})
 
     def _run(self, given: UpdateInput, start: Gaussians, motion: Motion | None, how: AttemptOptions) -> UpdateResult:
         return self._updater.run(start, given.views, motion, given.seconds, given.seed, how, given.carried)
@@ -216,6 +223,7 @@ class FrameSolver:
             gate=(lambda first: outliers.misfits(past, first, outliers.FIRST_DB)) if settings.judge else None,
             compare=settings.judge or settings.stop_gain > 0,
             enough=enough if settings.still > -1 and template is AS_SET else None,
+            confirm=lambda: within(self._in_whole(given.views, given.state), enough),
             usual=past.error,
             step=given.step if given.step < given.seconds else None,
         )
@@ -306,9 +314,15 @@ class FrameSolver:
         past = outliers.settle(given.past, psnr, given.brightness, result.exposure, len(trace.losses), moved)
         if trace.errors.get(Candidate.END):
             found = by_size(trace.errors[trace.kept], trace.whole)
-            past = replace(past, error=outliers.usual_errors(given.past.error, found | trace.committed))
+            if self._settings.still > -1 and slow(trace.errors, trace.kept):
+                found |= self._in_whole(result.views or given.views, result.gaussians)
+            past = replace(past, error=outliers.usual_errors(given.past.error, found))
         motion = result.motion if result.motion is not None and result.motion.finite else None
         return replace(result, motion=motion, offsets=outliers.offsets(given.past, psnr)), past
+
+    def _in_whole(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
+        with self._timed():
+            return committed_errors(self._factory.rig, self._picture, views, state)
 
     def _measured(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
         """DB of cameras as a state shows them; those that are left out come back so, once they fit."""

@@ -131,13 +131,13 @@ class DeviceUpdate:
         best.start(options.step)
         rates = self._update.rates.tried(options.rates, options.rigid, options.hold_colours)
         if motion is None:
-            rates = rates.cold(settings.cold_start, options.several)
+            rates = rates.cold(options.faster * settings.cold_start, options.several)
         else:
             rates = rates.warm(best.unexplained(options.usual))
         work = Work(previous, deformation, rates, views, self._picture, dict(carried))
         for begin in self._hooks.start:
             begin(work)
-        stands = not self._follows and best.stands(options.enough)
+        stands = not self._follows and best.stands(options.enough, options.confirm)
         if stands:
             stopping = Stopping(0)
         plan = ViewPlan(views, settings.views, most, rng)
@@ -176,8 +176,6 @@ class DeviceUpdate:
         work.colours, work.kept = found.gaussians.colours, trace.kept
         for end in self._hooks.end:
             state = end(work, state)
-        if options.enough is not None:
-            trace.committed = best.committed(state)
         motion_found = Motion.of(deformation, best.seconds)
         watch.lap("commit")
         trace.seconds = watch.seconds

@@ -6,7 +6,7 @@ views are the same in every frame; rendering them is a part of the update's time
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import nan
 
 import numpy as np
@@ -48,8 +48,14 @@ def mean_error(errors: Mapping[str, float], names: Sequence[str]) -> float:
 
 WHOLE = " whole"
 """Behind the names of views whose whole pictures were compared, where errors of several frames stand together."""
+
 COMMITTED = " committed"
-"""Behind the names of views in whose whole pictures a state was compared as it was committed."""
+"""Behind the names of views in whose whole pictures a committed state was looked at."""
+CONFIRMING = 2
+"""Such views: whole pictures have four times the pixels of small ones."""
+SLOW = 0.5
+"""Share that Θ_{t−1} has more error than Θ_t in small pictures, where the next frame may stand: only then are whole
+ones looked at."""
 
 
 def by_size(errors: Mapping[str, float], whole: bool) -> dict[str, float]:
@@ -59,6 +65,12 @@ def by_size(errors: Mapping[str, float], whole: bool) -> dict[str, float]:
     {'c0 whole': 0.1}
     """
     return {name + WHOLE if whole else name: error for name, error in errors.items()}
+
+
+def probe_views(rig: Rig, views: Sequence[TrainingView], count: int = VIEWS) -> list[TrainingView]:
+    """Those of the views that compare states, ``spread`` over the rig."""
+    chosen = set(spread(rig, [view.name for view in views], count))
+    return [view for view in views if view.name in chosen]
 
 
 class ProbeViews:
@@ -73,8 +85,7 @@ class ProbeViews:
     """
 
     def __init__(self, factory: ViewFactory, picture: PictureLoss, views: Sequence[TrainingView]) -> None:
-        chosen = set(spread(factory.rig, [view.name for view in views]))
-        self._whole = [view for view in views if view.name in chosen]
+        self._whole = probe_views(factory.rig, views)
         sides = [SCALE * min(view.camera.width, view.camera.height) for view in self._whole]
         self.whole = bool(sides) and min(sides) < FEWEST
         self._views = self._whole if self.whole else [factory.coarser(view, SCALE) for view in self._whole]
@@ -101,6 +112,31 @@ class ProbeViews:
         features = features_seen(state, view.camera, turns)
         self._picture.measure(state.means, state.factors, state.opacities, features, view)
         return self._picture.image_part
+
+
+def slow(errors: Mapping[Candidate, Mapping[str, float]], kept: Candidate) -> bool:
+    """True where Θ_{t−1} shows a frame nearly (``SLOW``) as well as what was kept; ``errors`` by probe view.
+
+    >>> slow({Candidate.STILL: {"a": 1.4}, Candidate.END: {"a": 1.0}}, Candidate.END)
+    True
+    """
+    still, ended = errors.get(Candidate.STILL, {}), errors.get(kept, {})
+    return mean_error(still, list(ended)) <= (1 + SLOW) * mean_error(ended, list(ended))
+
+
+def committed_errors(
+    rig: Rig, picture: PictureLoss, views: Sequence[TrainingView], state: Gaussians
+) -> dict[str, float]:
+    """The image loss of a committed state in a few whole pictures, by probe view, under names of their own.
+
+    Args:
+        rig: as it is given, not as cameras drift. picture: renders whole pictures. views: of the frame.
+    """
+    found = {}
+    for view in probe_views(rig, views, CONFIRMING):
+        picture.measure(state.means, state.factors, state.opacities, features_seen(state, view.camera), view)
+        found[view.name + COMMITTED] = picture.image_part
+    return found
 
 
 class BestState:
@@ -162,13 +198,10 @@ class BestState:
             self.seconds, self.errors[Candidate.WARM] = whole, errors
             self._set(motion)
 
-    def stands(self, enough: Mapping[str, float] | None) -> bool:
-        """True where Θ_{t−1} shows this frame as well as ``enough``, in small pictures and in whole ones; None: never.
+    def stands(self, enough: Mapping[str, float] | None, confirm: Callable[[], bool] | None = None) -> bool:
+        """True where Θ_{t−1} shows this frame as well as ``enough``, errors ``by_size``, and ``confirm`` agrees.
 
-        Small pictures alone do not tell: what they cannot show weighs more in them than a slow motion.
-
-        Args:
-            enough: errors ``by_size`` at the end of an update, and of what it ``committed``.
+        None: never, and without being asked.
         """
         still = self.errors.get(Candidate.STILL)
         if (
@@ -177,7 +210,7 @@ class BestState:
             or self._mean(Candidate.STILL) > self._mean(Candidate.WARM, otherwise=np.inf)
         ):
             return False
-        return _within(by_size(still, self.whole), enough) and _within(self.committed(self._previous), enough)
+        return within(by_size(still, self.whole), enough) and (confirm is None or confirm())
 
     def unexplained(self, usual: Mapping[str, float] | None) -> float:
         """Share of what changed since Θ_{t−1} that the motion before leaves: about 0 to 1.
@@ -206,10 +239,6 @@ class BestState:
         found = self._moved(look)
         return mean_error(found, list(found))
 
-    def committed(self, state: Gaussians) -> dict[str, float]:
-        """``ProbeViews.whole_errors`` of a committed state, by the camera's name and ``COMMITTED``."""
-        return {name + COMMITTED: error for name, error in self._probes.whole_errors(state).items()}
-
     def error_of(self, state: Gaussians) -> float:
         """Mean error on the probe views of a state."""
         found = self._probes.errors(state)
@@ -229,20 +258,31 @@ class BestState:
         names = [name for name in self.errors[Candidate.STILL] if name not in left_out]
         found = [candidate for candidate in Candidate if candidate in self.errors]  # of equal ones the first
         best = min(found, key=lambda candidate: _or_last(mean_error(self.errors[candidate], names)))
-        if best is Candidate.END:
-            return best
-        doubtful = iterations > 0 and not self.whole  # a slow motion may show in whole pictures alone
-        reached = self._in_whole(look, left_out) if doubtful else np.inf
+        if best is not Candidate.END and iterations and not self.whole:
+            best = self._best_in_whole(best, look, left_out)
+        if best is not Candidate.END:
+            self._put(best)
+        return best
+
+    def _best_in_whole(self, best: Candidate, look: Gaussians, left_out: Mapping[str, str]) -> Candidate:
+        """The best candidate in whole pictures: slow motion may show in them alone. Of equal ones ``best`` is taken.
+
+        The deformation is left as it ended.
+        """
         tables = (*self._deformation.clusters, self._deformation.deltas)
-        ended = [values.copy() for values in tables]
-        self._set(self._motion if best is Candidate.WARM else None)
-        self._deformation.forward()
-        if not doubtful or self._in_whole(self._previous, left_out) <= reached:
-            return best
+        errors, ended = {Candidate.END: self._in_whole(look, left_out)}, [values.copy() for values in tables]
+        for candidate in self.errors.keys() - {Candidate.END}:
+            self._put(candidate)
+            errors[candidate] = self._in_whole(self._previous, left_out)
         for values, at_end in zip(tables, ended, strict=True):
             values[:] = at_end
         self._deformation.forward()
-        return Candidate.END
+        return min(errors, key=lambda candidate: (errors[candidate], candidate is not best))
+
+    def _put(self, candidate: Candidate) -> None:
+        """Sets the deformation to the start that a candidate is."""
+        self._set(self._motion if candidate is Candidate.WARM else None)
+        self._deformation.forward()
 
     def _set(self, motion: Motion | None) -> None:
         self._deformation.rest(0)
@@ -277,10 +317,10 @@ class BestState:
         return otherwise if errors is None else mean_error(errors, list(errors))
 
 
-def _within(errors: Mapping[str, float], limits: Mapping[str, float]) -> bool:
+def within(errors: Mapping[str, float], limits: Mapping[str, float]) -> bool:
     """True where the mean error of the views that have a limit is within the mean of these; false where none has.
 
-    >>> _within({"a": 1.0, "b": 3.0}, {"a": 2.0, "b": 2.0}), _within({"a": 1.0}, {"b": 2.0})
+    >>> within({"a": 1.0, "b": 3.0}, {"a": 2.0, "b": 2.0}), within({"a": 1.0}, {"b": 2.0})
     (True, False)
     """
     names = sorted(errors.keys() & limits.keys())

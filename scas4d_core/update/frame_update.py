@@ -123,7 +123,7 @@ class FrameUpdate:
         best.start(options.step)
         rates = self._rates.tried(options.rates, options.rigid, options.hold_colours)
         if motion is None:
-            rates = rates.cold(settings.cold_start, options.several)
+            rates = rates.cold(options.faster * settings.cold_start, options.several)
         else:
             rates = rates.warm(best.unexplained(options.usual))
         work = Work(previous, deformation, rates, views, self._picture, dict(carried))
@@ -131,7 +131,7 @@ class FrameUpdate:
         for start in self._hooks.start:
             start(work)
         tables = free_tables(deformation, work.rates)  # a hook may have set where the layers start
-        if not self._follows and best.stands(options.enough):
+        if not self._follows and best.stands(options.enough, options.confirm):
             stopping = Stopping(0)
         watch.lap("start")
         while (iteration := trace.iterations) < (planned := stopping.planned(iteration)):
@@ -170,8 +170,6 @@ class FrameUpdate:
         state = previous if work.kept is Candidate.STILL else self._commit(previous)
         for end in self._hooks.end:
             state = end(work, state)
-        if options.enough is not None:
-            trace.committed = best.committed(state)
         found = Motion.of(deformation, best.seconds)
         counts = [deformation.guards, self._picture.rasterizer.guards, *self._hooks.guards]
         acted = summed([*counts, *(table.guards for table in tables)])

@@ -38,8 +38,9 @@ FIRST_RESTS = (0.8, 0.9, 1.0)
 finds. It gained 0.0 to 0.5 dB (docs/method.md)."""
 NEAR_FINEST = 4.0
 """Times its rates that the finest layer learns by where the layers above it rest, ..."""
-NEAR_OWN = 4.0
-"""... and the Gaussians' own motion: what is left to find is theirs (docs/method.md)."""
+NEAR_OWN = 2.0
+"""... and the Gaussians' own displacement: what is left to find is theirs. Turns and scales do not: they fit noise, and a
+rate of four made points of made-up scenes worse (docs/method.md)."""
 LEAST_TIME = 0.3
 """Share of the iterations that a layer has at least before it rests."""
 NEAR = 0.6
@@ -131,14 +132,13 @@ class Rates:
 
         Where it leads near (``NEAR``), layers rest, and what is below them learns faster; else none rests.
         """
-        if unexplained > NEAR:
+        if not unexplained <= NEAR:  # or not a number
             return replace(self, rests=())
-        layers = self.layers
-        if len(layers) > 1:
-            *above, (rotation, translation, scaling) = layers
-            layers = (*above, (NEAR_FINEST * rotation, NEAR_FINEST * translation, NEAR_FINEST * scaling))
-        position, rotation, scale = (NEAR_OWN * rate for rate in (self.position, self.rotation, self.scale))
-        return replace(self, layers=layers, position=position, rotation=rotation, scale=scale)
+        if len(self.layers) < 2:
+            return self
+        *above, (rotation, translation, scaling) = self.layers
+        layers = (*above, (NEAR_FINEST * rotation, NEAR_FINEST * translation, NEAR_FINEST * scaling))
+        return replace(self, layers=layers, position=NEAR_OWN * self.position)
 
     def tried(self, factor: float, rigid: bool, hold_colours: bool) -> Rates:
         """All rates times a factor; ``rigid``: of clusters that turn and shift only; ``hold_colours``: colours stay."""

@@ -85,14 +85,15 @@ class AttemptOptions:
         name: as the report has it.
         rates: factor on all of Adam's rates. rigid: clusters turn and shift, nothing else. hold_colours: colours stay.
         cold: the motion of the update before is not used. longer: factor on the iterations.
-        several: other orders of the views are tried as well, and the best end is taken.
+        several: other orders of the views are tried as well, and the best end is taken. faster: factor on the rates of
+            the layers where no motion leads.
         usual: errors of the updates before at their end, ``best_state.by_size``; None: not known.
         stopping: decides how many iterations there are; None: those of the settings.
         gate: called with each camera's first PSNR (dB) once all were rendered; returns the cameras to drop, with the
             reason. None: all stay.
         compare: whether the candidates for Θ_t are compared on the probe views (``best_state``).
-        enough: errors on the probe views at which Θ_{t−1} needs no iteration (``BestState.stands``); None: there is
-            always one.
+        enough: image loss by probe view at which Θ_{t−1} needs no iteration; None: there is always one.
+        confirm: asked where that is so; true where whole pictures show it, too. None: it is not asked.
         step: seconds since the frame before, where nothing was learnt from that one (``BestState.start``); else None.
     """
 
@@ -103,10 +104,12 @@ class AttemptOptions:
     cold: bool = False
     longer: float = 1.0
     several: bool = False
+    faster: float = 1.0
     stopping: Stopping | None = None
     gate: Callable[[Mapping[str, float]], Mapping[str, str]] | None = None
     compare: bool = False
     enough: Mapping[str, float] | None = None
+    confirm: Callable[[], bool] | None = None
     usual: Mapping[str, float] | None = None
     step: float | None = None
 
@@ -147,8 +150,7 @@ class UpdateTrace:
         planned: (iteration, iterations in all) whenever the stopping rule planned otherwise.
         errors: image loss by candidate, then by probe view; empty where nothing was compared. kept: the candidate that
             became Θ_t.
-        whole: whether these errors are of whole pictures. committed: errors of Θ_t, where the next frame may stand
-            (``BestState.committed``).
+        whole: whether these errors are of whole pictures.
         shown: by camera, the renderings of the last ``SHOWN`` iterations: evidence is taken from them without another
             rendering. Empty on other devices, and where an update ended sooner than planned.
         guards: those that acted, how often.
@@ -165,7 +167,6 @@ class UpdateTrace:
     errors: dict[Candidate, dict[str, float]] = field(default_factory=dict)
     kept: Candidate = Candidate.END
     whole: bool = False
-    committed: dict[str, float] = field(default_factory=dict)
     shown: dict[str, Thinned] = field(default_factory=dict)
     guards: dict[str, int] = field(default_factory=dict)
 

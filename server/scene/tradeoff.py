@@ -9,6 +9,7 @@ from statistics import fmean, median
 from typing import Any
 
 from client.wire import CurveMean, FrameReportModel, FrameState, PointKind, TimeModel, TradeoffPoint
+from scas4d_core.frame_outcome import OTHER_ORDERS
 
 NEWEST = 64
 """Frames whose reports are used: the newest."""
@@ -19,7 +20,10 @@ NEAR = 0.1
 
 
 def telling(reports: Iterable[FrameReportModel], first: int) -> list[FrameReportModel]:
-    """Selects the updates that measure their iterations: committed whole at the first attempt, and not frame 0."""
+    """Selects the updates that measure their iterations: committed whole at the first attempt, and not frame 0.
+
+    Nor the first update, which ran several times.
+    """
     return [
         report
         for report in reports
@@ -29,6 +33,7 @@ def telling(reports: Iterable[FrameReportModel], first: int) -> list[FrameReport
         and report.degraded is None
         and len(report.tries) <= 1
         and "total" in report.seconds
+        and OTHER_ORDERS not in report.seconds
     ]
 
 

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-from box_scene import make_box
+from box_scene import MOVING, make_box
 
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.structure.hierarchy import build_hierarchy
-from scas4d_core.update.best_state import COMMITTED, BestState
+from scas4d_core.update.best_state import BestState
 from scas4d_core.update.deformation import CpuDeformation, length_bounds
 from scas4d_core.update.warm_start import Motion
 
@@ -102,24 +102,27 @@ def test_an_end_that_is_not_finite_is_left() -> None:
     np.testing.assert_array_equal(deformation.means, BOX.means)
 
 
-ENOUGH = {"c0": 0.02, "c1": 0.02}
-
-
 @pytest.mark.parametrize(
-    ("enough", "stands"),
-    [
-        (ENOUGH, False),  # nothing is known of whole pictures
-        (ENOUGH | {"c0" + COMMITTED: 0.002}, False),  # they show that it moved
-        (ENOUGH | {"c0" + COMMITTED: 0.02}, True),
-        ({"c0" + COMMITTED: 0.02}, False),
-        ({"c0": 0.001, "c0" + COMMITTED: 0.02}, False),
-    ],
+    ("enough", "confirmed", "stands"),
+    [(0.02, True, True), (0.02, False, False), (0.02, None, True), (0.001, True, False)],
 )
-def test_a_frame_stands_where_whole_pictures_agree(enough: Mapping[str, float], stands: bool) -> None:
+def test_a_frame_stands_where_it_is_confirmed(enough: float, confirmed: bool | None, stands: bool) -> None:
+    asked = []
+
+    def confirm() -> bool:
+        asked.append(True)
+        return bool(confirmed)
+
     best, _ = ended(Probes(blind, sharp))
-    assert best.stands(enough) is stands
+    assert best.stands({"c0": enough}, None if confirmed is None else confirm) is stands
+    assert bool(asked) is (enough > 0.01 and confirmed is not None)  # whole pictures are rendered where it matters
+    assert not best.stands(None, confirm)
 
 
-def test_what_was_committed_is_the_measure_of_the_next_frame() -> None:
-    best, _ = ended(Probes(blind, sharp))
-    assert best.committed(BOX) == {name + COMMITTED: pytest.approx(0.001 + WAY) for name in NAMES}
+def test_the_motion_before_is_taken_where_whole_pictures_prefer_it() -> None:
+    """Small pictures prefer not moving to all else, and the end to going on; whole ones say how it is."""
+    motion = Motion([np.zeros((2, 3)), np.zeros((6, 3))], [np.full((2, 3), [WAY, 0, 0]), np.zeros((6, 3))],
+                    np.zeros((MOVING, 3)), np.zeros((MOVING, 3)), 1.0)  # fmt: skip
+    best, deformation = ended(Probes(blind, sharp), motion, at=0.6 * WAY)
+    assert best.end(BOX, 10, {}) is Candidate.WARM
+    np.testing.assert_allclose(deformation.clusters[0][:, 3], WAY, rtol=1e-6)
