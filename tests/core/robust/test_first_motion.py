@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import OTHER_ORDERS, Candidate
 from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.robust import first_motion
 from scas4d_core.robust.first_motion import ANOTHER_ORDER, FASTER, Ended, best_order
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import FrameSolver
@@ -121,6 +122,7 @@ def test_a_lost_order_is_not_what_a_scene_begins_with(monkeypatch: pytest.Monkey
         result = run(solver, given, start, motion, how)
         return result if len(ran) > 1 else replace(result, gaussians=start, motion=None)
 
+    monkeypatch.setattr(first_motion, "FASTER", (1.0, 1.0, 1.0))
     monkeypatch.setattr(FrameSolver, "_run", first)
     spoilt.step(take_frame(1, 0.1, FAR, RIG))
     assert len(ran) == 3

@@ -22,6 +22,7 @@ from scas4d_core.robust.solve_frame import FrameSolver
 from scas4d_core.robust.update_input import UpdateInput
 from scas4d_core.settings import UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
+from scas4d_core.update.best_state import COMMITTED, CONFIRMING
 from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
 from scas4d_core.update.result import AS_SET, AttemptOptions, UpdateResult, UpdateTrace, camera_fit
 from scas4d_core.update.warm_start import Motion
@@ -396,3 +397,38 @@ def _shown(view: TrainingView) -> float:
     features = np.concatenate([FITTED.colours, FITTED.foreground[:, None]], axis=1)
     PICTURE.measure(FITTED.means, FITTED.factors, FITTED.opacities, features, view)
     return PICTURE.psnr
+
+
+def errors(still: float, end: float) -> Callable[[UpdateTrace], UpdateTrace]:
+    shown = {Candidate.STILL: dict.fromkeys(NAMES[:2], still), Candidate.END: dict.fromkeys(NAMES[:2], end)}
+    return lambda trace: replace(trace, errors=shown)
+
+
+@pytest.mark.parametrize(
+    ("still", "end", "tolerance", "looked_at"),
+    [(0.021, 0.02, 0.0, CONFIRMING), (0.04, 0.02, 0.0, 0), (0.021, 0.02, -1.0, 0)],
+)
+def test_what_is_committed_is_looked_at_in_whole_where_the_next_frame_may_stand(
+    still: float, end: float, tolerance: float, looked_at: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake = Fake(met())
+    changed(fake, monkeypatch, errors(still, end))
+    _, past = solve(fake, given(), still=tolerance)
+    assert sum(name.endswith(COMMITTED) for name in past.error) == looked_at
+
+
+def test_whole_pictures_confirm_that_a_frame_stands(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The frame of the state itself is confirmed by its own errors, one that moved is not."""
+    fake = Fake(met(state=BEFORE))
+    changed(fake, monkeypatch, errors(0.021, 0.02))
+    still = FACTORY.views(FOOTAGE.frame(0), {})
+    _, past = solve(fake, given(views=still))
+    for views, stands in ((still, True), (VIEWS, False)):
+        solve(fake, given(views=views, past=past))
+        confirm = fake.options[-1].confirm
+        assert confirm is not None
+        assert confirm() is stands
+    solve(fake, given(views=still))
+    confirm = fake.options[-1].confirm
+    assert confirm is not None
+    assert not confirm()  # nothing is known of a state committed before

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
 
 import fakes
 import pytest
@@ -10,6 +11,8 @@ from running import Running, fake_settings, make_rig, pictures, problem
 
 from client.sdk import Client
 from client.wire import IngestSettings, Retention
+from scas4d_core.frame_outcome import OTHER_ORDERS
+from server.scene.tradeoff import telling
 
 
 def push(sdk, id, indices, red=0):
@@ -42,6 +45,15 @@ def ran(service):
         push(sdk, id, [7])
         yield sdk, id
         sdk.delete_scene(id)
+
+
+def test_a_first_update_in_several_orders_tells_nothing_of_its_iterations():
+    seconds = {"total": 2.0}
+    reports = [
+        SimpleNamespace(state="committed", index=index, iterations=300, degraded=None, tries=["as set"], seconds=taken)
+        for index, taken in ((1, {**seconds, OTHER_ORDERS: 1.0}), (2, seconds))
+    ]
+    assert [report.index for report in telling(reports, 0)] == [2]
 
 
 def test_a_scene_without_a_frame_has_nothing_to_tell(sdk, scene):
