@@ -39,8 +39,8 @@ finds. It gained 0.0 to 0.5 dB (docs/method.md)."""
 NEAR_FINEST = 4.0
 """Times its rates that the finest layer learns by where the layers above it rest, ..."""
 NEAR_OWN = 2.0
-"""... and the Gaussians' own displacement: what is left to find is theirs. Their turns and scales learn as ever: made-up
-scenes are met less well where they learn faster (docs/method.md)."""
+"""... and the Gaussians' own displacement: what is left to find is theirs. Their turns and scales learn as ever: where
+they learn faster, made-up scenes are met less well (docs/method.md)."""
 LEAST_TIME = 0.3
 """Share of the iterations that a layer has at least before it rests."""
 NEAR = 0.6
