@@ -244,9 +244,8 @@ class UpdateSettings(SettingsModel):
     still: float = Field(
         0.0,
         ge=-1,
-        description="A frame needs no iteration where the state before shows it, on four training views, with at most "
-        "1 + this times the error that the last update ended with, in small pictures and in whole ones. -1: every "
-        "frame is updated.",
+        description="A frame needs no iteration where the state before shows it, on some training views, small and "
+        "whole, with at most 1 + this times the error that the last update ended with. -1: every frame is updated.",
     )
     judge: bool = Field(
         True,
