@@ -66,6 +66,7 @@ def test_none(sized, tmp_path):
         sized.goto(service.url)
         title(sized, "No scene yet")
         looked_at(sized, "none")
+        assert [sized.is_disabled(f"#{control}") for control in ("play", "back", "forth", "live")] == [True] * 4
     finally:
         service.stop()
 
