@@ -168,14 +168,14 @@ class FrameSolver:
         return self._held(given, result.outcome, result.trace, lost, result.attempts, why, given.exposure)
 
     def _attempt(self, given: UpdateInput, template: AttemptOptions, attempts: list[str]) -> Validated:
-        motion = None if template.cold else given.motion
-        options = self._options(given, template)
-        name = options.name
+        name = template.name
         if self._decides(given, template):
             (result, fault, _), orders = best_order(lambda seed, faster: self._first(given, seed, faster), given.seed)
             name = f"{name}, the best of {orders} orders" if orders > 1 else name
         else:
-            result, fault = self._validated(given, given.state, self._run(given, given.state, motion, options))
+            motion = None if template.cold else given.motion
+            result = self._run(given, given.state, motion, self._options(given, template))
+            result, fault = self._validated(given, given.state, result)
         attempts.append(name if fault is None else f"{name}: {fault}")
         return result, fault
 

@@ -68,8 +68,7 @@ def test_a_later_update_without_a_motion_is_longer_too() -> None:
     one = scene()
     one.step(take_frame(1, 0.1, FAR, RIG))
     one._carried = replace(one._carried, motion=None)  # as where the motion that was found is not finite
-    report = one.step(take_frame(2, 0.2, FURTHER, RIG))
-    assert (report.attempts[0].split(":")[0], report.iterations >= 45) == ("as set", True)
+    assert one.step(take_frame(2, 0.2, FURTHER, RIG)).iterations == 45
 
 
 def test_while_the_light_changes_no_frame_stands() -> None:
