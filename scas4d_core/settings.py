@@ -154,9 +154,9 @@ class StaticSettings(SettingsModel):
     max_gaussians: Annotated[int, Field(ge=1, le=10_000_000)] | None = Field(
         None,
         description="Budget of Gaussians; densification stops there. None: 0.34 for each pixel of a training picture "
-        "and 0.27 more for each that is not background, at most 100,000: 25,000 for an object at 256x256, 40,000 for "
-        "a room.",
+        "and 0.27 more for each that is not background, at most 100,000: 25,000 for an object at 256x256.",
     )
+    detail: float = Field(1.0, gt=0, le=1, description="Share of that number of Gaussians where the budget is None.")
     exposure: bool | Literal["auto"] = Field(
         default="auto",
         description="Learn a colour gain and offset per training camera (held-out cameras are scored raw). 'auto': "

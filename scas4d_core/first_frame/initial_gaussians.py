@@ -19,9 +19,9 @@ MEAN, QUATERNION, SCALE, OPACITY, COLOUR, LABEL = (
 
 INITIAL_OPACITY = 0.1
 PER_PIXEL, PER_COVERED_PIXEL, LARGEST_BUDGET = 0.34, 0.27, 100_000
-"""The rule for the budget of Gaussians where ``StaticSettings.max_gaussians`` is not set. Detail lies on objects: a
-picture that is mostly background needs nearly as many Gaussians as a full one. Beyond the largest an update takes
-seconds."""
+"""The rule for the budget of Gaussians where ``StaticSettings.max_gaussians`` is not set; ``detail`` takes a share of it.
+Detail lies on objects: a picture that is mostly background needs nearly as many Gaussians as a full one. Beyond the
+largest an update takes seconds."""
 PLAIN = 2 / 255
 """A pixel this near the background's colour is background."""
 
@@ -33,7 +33,8 @@ def budget(views: list[TrainingView], scene: SceneSettings, settings: StaticSett
     background = np.array(scene.behind, np.float32)[:, None, None]
     pixels = float(np.mean([view.camera.width * view.camera.height for view in views]))
     covered = float(np.mean([(np.abs(view.target[:3] - background).max(axis=0) > PLAIN).mean() for view in views]))
-    return min(LARGEST_BUDGET, max(1, int(pixels * (PER_PIXEL + PER_COVERED_PIXEL * covered))))
+    whole = min(LARGEST_BUDGET, pixels * (PER_PIXEL + PER_COVERED_PIXEL * covered))
+    return max(1, int(whole * settings.detail))
 
 
 def logit(probability: NDArray[np.floating]) -> NDArray[np.floating]:

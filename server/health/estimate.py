@@ -56,7 +56,7 @@ def estimate(rig: RigModel, settings: Settings, server: ServerSettings, scale: f
     pixels = sum(sizes)
     scaled = round(pixels * scale * scale)
     most = max(1, round(MOST_PER_PIXEL * scaled / len(sizes)))
-    gaussians = settings.static.max_gaussians or min(LARGEST_BUDGET, most)
+    gaussians = settings.static.max_gaussians or max(1, round(min(LARGEST_BUDGET, most) * settings.static.detail))
     bears = any(settings.effects.get(name) != "off" for name in BEARING)
     pictures = pixels * PIXEL + scaled * (SCALED_PIXEL + NOVEL_PIXEL * bears)
     worker = PROCESS + pictures + gaussians * GAUSSIAN + VOXELS * bears

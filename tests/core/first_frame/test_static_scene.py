@@ -12,7 +12,7 @@ from scas4d_core.captures.frame import Frame
 from scas4d_core.first_frame import static_scene
 from scas4d_core.first_frame.exposures import SPREAD
 from scas4d_core.first_frame.fit_schedule import FitProgress
-from scas4d_core.first_frame.initial_gaussians import initial_parameters, logit
+from scas4d_core.first_frame.initial_gaussians import budget, initial_parameters, logit
 from scas4d_core.first_frame.start import fit_static_scene
 from scas4d_core.first_frame.static_scene import (
     STOP_ROUNDS,
@@ -120,6 +120,16 @@ def test_the_same_seed_gives_the_same_bits_and_another_others() -> None:
 def test_the_budget_is_kept_also_where_the_cloud_exceeds_it(limit: int) -> None:
     settings = SETTINGS.model_copy(update={"iterations": 160, "max_gaussians": limit})
     assert len(fit(settings).gaussians) <= limit
+
+
+def test_detail_is_a_share_of_what_the_rule_gives() -> None:
+    views = ViewFactory(RIG).views(take_frame(0, 0.0, BOX, RIG, True), {})
+    rule, few, tiny = (budget(views, SceneSettings(), StaticSettings(detail=d)) for d in (1.0, 0.3, 1e-9))
+    assert rule > 100
+    assert abs(few - 0.3 * rule) < 1
+    assert tiny == 1
+    given = StaticSettings(max_gaussians=70, detail=0.3)
+    assert budget(views, SceneSettings(), given) == 70
 
 
 def test_faint_gaussians_are_removed_but_never_all() -> None:

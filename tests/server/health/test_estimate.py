@@ -41,6 +41,8 @@ def test_an_estimate_creates_nothing(http):
     assert large["pixels"] == 2 * 2000**2
     assert large["gaussians"] == 100_000
     assert large["memory_mb"] > small["memory_mb"] > 500
+    coarse = {"rig": rig(2000), "preset": "fast"}
+    assert http.post("/v1/estimate", json=coarse).json()["gaussians"] == 30_000
     scaled = {"rig": rig(2000), "settings": {"scene": {"image_scale": 0.5}, "static": {"max_gaussians": 5000}}}
     found = http.post("/v1/estimate", json=scaled).json()
     assert (found["scaled_pixels"], found["gaussians"]) == (2 * 1000**2, 5000)
