@@ -19,7 +19,7 @@ MEAN, QUATERNION, SCALE, OPACITY, COLOUR, LABEL = (
 
 INITIAL_OPACITY = 0.1
 PER_PIXEL, PER_COVERED_PIXEL, LARGEST_BUDGET = 0.34, 0.27, 100_000
-"""The rule for the budget of Gaussians where ``StaticSettings.max_gaussians`` is not set; ``detail`` takes a share of it.
+"""The rule for the budget of Gaussians where ``StaticSettings.max_gaussians`` is not set; ``detail`` is a share of it.
 Detail lies on objects: a picture that is mostly background needs nearly as many Gaussians as a full one. Beyond the
 largest an update takes seconds."""
 PLAIN = 2 / 255
