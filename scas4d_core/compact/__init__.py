@@ -1,0 +1,8 @@
+"""The compact 4D file: key frames and, between them, what moved (docs/format.md). Needs numpy and zstandard alone."""
+
+from scas4d_core.compact.bounds import Bounds
+from scas4d_core.compact.head import Head
+from scas4d_core.compact.reader import CompactReader, DamagedFileError, FileError
+from scas4d_core.compact.writer import CompactWriter
+
+__all__ = ["Bounds", "CompactReader", "CompactWriter", "DamagedFileError", "FileError", "Head"]

@@ -1,0 +1,159 @@
+"""Gaussians as bytes without a reference: those of the first frame, and those that are born later.
+
+Other frames refer to them, so thin axes keep their direction: each axis is told in parts of its own length.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.compact.bounds import Bounds
+from scas4d_core.compact.cluster_motion import Clusters
+from scas4d_core.compact.columns import LABELS, Columns, label_of, levels_of, sizes_of, turns_of, vectors_of
+from scas4d_core.compact.frame_code import LARGEST, MARGIN, completed, lost_volume
+from scas4d_core.compact.planes import Ints, PlaneError, pack, unpack
+from scas4d_core.compact.sections import (
+    NONE,
+    SOME,
+    read_array,
+    read_exact,
+    read_kind,
+    read_mask,
+    read_residuals,
+    write_array,
+    write_exact,
+    write_mask,
+    write_residuals,
+)
+from scas4d_core.gaussians import Gaussians
+
+Float = NDArray[np.float64]
+
+OCTAVE = 8
+"""Steps of an axis' length in a factor of two."""
+FINEST = 0.02
+"""Error of an axis in parts of its own length, at most."""
+SHORTEST = 1e-30
+"""Metres; an axis is not shorter."""
+TINIEST, LARGEST_SIZE = 1e-18, 1e18
+"""Metres; a size outside is told exactly."""
+OPAQUE = 1e-4
+"""Opacities keep this far from 0 and 1."""
+MOST_CLUSTERS = 1 << 20
+"""In a file; more are damage."""
+COMPONENTS = {"lengths": 3, "axes": 9, "means": 3, "rotations": 3, "colours": 3, "labels": 1, "opacities": 1}
+
+
+def encode_born(state: Columns, clusters: Clusters, bounds: Bounds) -> tuple[bytes, Columns]:
+    """Codes Gaussians, with their ids and clusters; returns the bytes, and the Gaussians as a reader will have them.
+
+    >>> state = Columns.of(Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1))
+    >>> body, decoded = encode_born(state, Clusters(np.array([1, 1])), Bounds())
+    >>> again, clusters = decode_born(body, 2, Bounds())
+    >>> again.rest.ids, clusters.labels, bool((again.means == decoded.means).all())
+    (array([0, 1]), array([1, 1]), True)
+    """
+    found = _planes(state, bounds)
+    exact = np.zeros(len(state), np.bool_)
+    for planes in found.values():
+        outside = ~(np.abs(planes) < LARGEST)
+        exact |= outside.any(axis=0)
+        planes[outside] = 0
+    told = {name: planes.astype(np.int32) for name, planes in found.items()}
+    exact |= lost_volume(_columns(told, state.rest.ids, bounds), state)
+    rows = np.flatnonzero(exact)
+    gloss, retired = state.gloss, state.rest.retired
+    body = b"".join(
+        [
+            pack(np.diff(state.rest.ids, prepend=0)),
+            pack(clusters.labels),
+            *(write_residuals(planes) for planes in told.values()),
+            write_exact(rows, np.concatenate([state.means[:, rows], state.factors[:, rows]])),
+            bytes([SOME]) + write_mask(retired) if retired.any() else bytes([NONE]),
+            pack(np.array([0 if gloss is None else 1 + gloss.shape[1]])),
+            b"" if gloss is None else write_residuals(np.rint(gloss / (2 * bounds.gloss)).astype(np.int32)),
+            write_array(state.rest.environment),
+        ]
+    )
+    return body, decode_born(body, len(state), bounds)[0]
+
+
+def decode_born(body: bytes, count: int, bounds: Bounds) -> tuple[Columns, Clusters]:
+    """The Gaussians that were coded, and their clusters.
+
+    Raises:
+        PlaneError: the bytes are not ``count`` Gaussians.
+    """
+    steps, offset = unpack(body, count)
+    labels, offset = unpack(body, count, offset)
+    if labels.min(initial=0) < 0 or labels.max(initial=0) > MOST_CLUSTERS:
+        raise PlaneError(f"clusters {labels.min(initial=0)} to {labels.max(initial=0)} cannot be")
+    told = {}
+    for name, components in COMPONENTS.items():
+        told[name], offset = read_residuals(body, offset, components, count)
+    rows, values, offset = read_exact(body, offset, count, 12)
+    retired = np.zeros(count, np.bool_)
+    kind, offset = read_kind(body, offset)
+    if kind != NONE:
+        retired, offset = read_mask(body, offset, count)
+    (with_gloss,), offset = unpack(body, 1, offset)
+    state = _columns(told, np.cumsum(steps.astype(np.int64)), bounds)
+    if with_gloss:
+        if not 1 <= with_gloss <= count + 1:
+            raise PlaneError(f"{with_gloss - 1} of {count} Gaussians cannot have gloss")
+        planes, offset = read_residuals(body, offset, 3, int(with_gloss) - 1)
+        state = state.having(gloss=planes * np.float32(2 * bounds.gloss))
+    environment, offset = read_array(body, offset)
+    if offset != len(body):
+        raise PlaneError(f"{len(body) - offset} bytes follow the Gaussians")
+    return completed(state, rows, values, retired, environment), Clusters(labels.astype(np.int64))
+
+
+def _axis_step(bounds: Bounds) -> float:
+    return 2 * min(FINEST, bounds.axes / 2)
+
+
+def _planes(state: Columns, bounds: Bounds) -> dict[str, Float]:
+    """[P, N] of each attribute, in whole steps; what is no finite number or too large is found later."""
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        factors = state.factors.astype(np.float64).reshape(3, 3, -1)
+        lengths = np.rint(OCTAVE * np.log2(np.maximum(np.sqrt(np.square(factors).sum(axis=0)), SHORTEST)))
+        told = np.exp2(lengths / OCTAVE)
+        axes = np.rint(factors / told / _axis_step(bounds))
+        sizes = sizes_of((axes * _axis_step(bounds) * told).reshape(9, -1)).astype(np.float64)
+        usable = (sizes > TINIEST) & (sizes < LARGEST_SIZE)
+        means = np.rint(state.means / (2 * bounds.position * MARGIN * np.where(usable, sizes, 0)))
+        red, green, blue = np.rint(state.colours.astype(np.float64) / (2 * bounds.colour))
+        return {
+            "lengths": np.nan_to_num(lengths),
+            "axes": axes.reshape(9, -1),
+            "means": means,
+            "rotations": np.rint(vectors_of(state.rotations.astype(np.float64)) / (2 * bounds.rotation / 3**0.5)),
+            "colours": np.stack([green, red - green, blue - green]),
+            "labels": levels_of(state.foreground)[None].astype(np.float64),
+            "opacities": np.rint(state.rest.own_opacities.astype(np.float64) / (2 * bounds.opacity))[None],
+        }
+
+
+def _columns(told: dict[str, Ints], ids: NDArray[np.int64], bounds: Bounds) -> Columns:
+    lengths = np.exp2(np.clip(told["lengths"], -1000, 1000) / OCTAVE)
+    with np.errstate(over="ignore", invalid="ignore"):
+        factors = (told["axes"].reshape(3, 3, -1) * _axis_step(bounds) * lengths).reshape(9, -1)
+        sizes = sizes_of(factors).astype(np.float64)
+        green, red, blue = told["colours"]
+        means = (told["means"] * (2 * bounds.position * MARGIN * sizes)).astype(np.float32)
+    colours = (np.stack([red + green, green, blue + green]) * (2 * bounds.colour)).astype(np.float32)
+    rotations = turns_of(told["rotations"] * (2 * bounds.rotation / 3**0.5)).astype(np.float32)
+    foreground = label_of(np.clip(told["labels"][0], 0, LABELS - 1))
+    opacities = np.clip(told["opacities"][0] * (2 * bounds.opacity), OPAQUE, 1 - OPAQUE).astype(np.float32)
+    rest = Gaussians(
+        means=means.T,
+        factors=np.empty((0, 3, 3), np.float32),
+        rotations=np.empty((0, 4), np.float32),
+        opacities=opacities,
+        colours=np.empty((0, 3), np.float32),
+        foreground=foreground,
+        ids=ids,
+    )
+    return Columns(means, factors.astype(np.float32), rotations, colours, foreground, None, rest)

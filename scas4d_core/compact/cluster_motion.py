@@ -1,0 +1,219 @@
+"""What moves together between two states: one affine map for each cluster of Gaussians.
+
+As in the cascade, a map carries centres (x → x + A (x − c) + t), axes (F → (I + A) F) and, by the polar rotation of
+I + A, the material rotation. What remains is each Gaussian's own, and small. Numpy only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.compact.columns import Columns, products
+from scas4d_core.gaussians import Gaussians
+
+Array = NDArray[np.float32]
+Float = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+PER_CLUSTER, MOST_CLUSTERS = 100, 400
+"""Gaussians in a cluster on average, and most clusters: more cost more than they save (docs/format.md)."""
+ROUNDS, SAMPLE = 5, 20_000
+"""Of k-means: rounds, and Gaussians whose centres are averaged."""
+STANDS = 0
+"""Label of what does not move with a cluster; clusters count from 1."""
+SMALLEST = 1e-9
+"""Metres; smaller Gaussians weigh no more."""
+STILL = (1.0, 0.0, 0.0, 0.0)
+"""No turn."""
+RIDGE = 1e-3
+"""Pull of A to zero, in parts of the Gaussians' own size: a cluster that is flat or thin tells nothing across."""
+
+
+@dataclass(frozen=True, eq=False)
+class Clusters:
+    """Which Gaussians move together in a file.
+
+    Attributes:
+        labels: [N] int64, 0 for those that stand, else 1 + the cluster.
+
+    >>> clusters = Clusters(np.array([2, 0, 1, 2]))
+    >>> clusters.count, clusters.means(np.array([[1.0, 5.0, 7.0, 3.0]]))
+    (2, array([[7., 2.]]))
+    """
+
+    labels: Ints
+
+    @cached_property
+    def count(self) -> int:
+        """Of clusters."""
+        return int(self.labels.max(initial=0))
+
+    def sums(self, columns: Iterable[NDArray[Any]]) -> Float:
+        """[P, count] sums over each cluster of P columns [N]."""
+        found = [np.bincount(self.labels, column, minlength=self.count + 1)[1:] for column in columns]
+        return np.array(found, np.float64).reshape(-1, self.count)
+
+    @cached_property
+    def sizes(self) -> Float:
+        """[count] Gaussians of each cluster, 1 at least."""
+        return np.maximum(np.bincount(self.labels, minlength=self.count + 1)[1:], 1).astype(np.float64)
+
+    def means(self, columns: NDArray[Any]) -> Float:
+        """[P, count] means over each cluster of columns [P, N]."""
+        return self.sums(columns) / self.sizes
+
+    def spread(self, values: NDArray[Any], stands: float) -> Array:
+        """[N] float32, a value [count] of each Gaussian's cluster; ``stands`` for those that stand."""
+        table = np.empty(self.count + 1, np.float32)
+        table[STANDS], table[1:] = stands, values
+        return table[self.labels]
+
+    def joined(self, labels: Ints) -> Clusters:
+        """With those of more Gaussians after them."""
+        return Clusters(np.concatenate([self.labels, labels]))
+
+    @classmethod
+    def of(cls, state: Gaussians) -> Clusters:
+        """Clusters of the Gaussians that move, by their places."""
+        moving = np.flatnonzero(state.moving)
+        labels = np.zeros(len(state), np.int64)
+        count = min(MOST_CLUSTERS, -(-len(moving) // PER_CLUSTER))
+        if count:
+            labels[moving] = 1 + _k_means(state.means[moving].astype(np.float64), count)
+        return cls(labels)
+
+    def nearest(self, state: Columns, born: Gaussians) -> Ints:
+        """[B] labels of Gaussians that are born: that of the nearest cluster, for those that move.
+
+        Args:
+            state: of those that ``labels`` are about.
+        """
+        labels = np.zeros(len(born), np.int64)
+        moving = np.flatnonzero(born.moving)
+        if len(moving) and self.count:
+            centres = self.means(state.means).T
+            labels[moving] = 1 + _nearest(born.means[moving].astype(np.float64), centres)
+        return labels
+
+
+@dataclass(frozen=True, eq=False)
+class ClusterMotion:
+    """One affine map for each cluster.
+
+    Attributes:
+        matrices: [K, 3, 3] A. shifts: [K, 3] t, metres.
+    """
+
+    matrices: Float
+    shifts: Float
+
+    @classmethod
+    def between(cls, clusters: Clusters, reference: Columns, state: Columns) -> ClusterMotion:
+        """The maps of least squares, each Gaussian by its own size."""
+        means = reference.means
+        centres = clusters.means(means)
+        weights = 1 / np.square(np.maximum(reference.sizes(), SMALLEST).astype(np.float64))
+        arms = [mean - clusters.spread(centre, 0) for mean, centre in zip(means, centres, strict=True)]
+        arms.append(np.ones(len(reference), np.float32))
+        steps = state.means - means
+        weighted = [weights * arm for arm in arms]
+        pairs = [(i, j) for i in range(4) for j in range(i, 4)]
+        moments = np.zeros((clusters.count, 4, 4))
+        for (i, j), found in zip(pairs, clusters.sums(weighted[i] * arms[j] for i, j in pairs), strict=True):
+            moments[:, i, j] = moments[:, j, i] = found
+        right = clusters.sums(one * step for one in weighted for step in steps).reshape(4, 3, -1)
+        # In units of 1/size², the pull of one Gaussian's own extent: its weight times its size squared is 1.
+        moments[:, range(3), range(3)] += RIDGE * clusters.sizes[:, None]
+        moments[:, 3, 3] += 1e-12 + (moments[:, 3, 3] == 0)
+        maps = np.asarray(np.linalg.solve(moments, right.transpose(2, 0, 1)), np.float64)
+        return cls(np.ascontiguousarray(maps[:, :3].transpose(0, 2, 1)), maps[:, 3])
+
+    def carried(self, clusters: Clusters, reference: Columns) -> Columns:
+        """The state that the maps predict; what stands has the reference's bits."""
+        if not clusters.count:
+            return reference
+        centres = clusters.means(reference.means)
+        maps = np.eye(3) + self.matrices
+        spread = [[clusters.spread(maps[:, i, j], float(i == j)) for j in range(3)] for i in range(3)]
+        arms = [mean - clusters.spread(centre, 0) for mean, centre in zip(reference.means, centres, strict=True)]
+        means = np.stack(
+            [
+                row[0] * arms[0] + row[1] * arms[1] + row[2] * arms[2] + clusters.spread(shift + centre, 0)
+                for row, shift, centre in zip(spread, self.shifts.T, centres, strict=True)
+            ]
+        )
+        f = reference.factors
+        factors = np.stack([row[0] * f[j] + row[1] * f[3 + j] + row[2] * f[6 + j] for row in spread for j in range(3)])
+        turns = polar_rotations(maps)
+        own = np.stack(
+            [clusters.spread(one, stands) for one, stands in zip(quaternions_of(turns).T, STILL, strict=True)]
+        )
+        gloss = reference.gloss
+        if gloss is not None:
+            count = gloss.shape[1]
+            t = [[clusters.spread(turns[:, i, j], float(i == j))[:count] for j in range(3)] for i in range(3)]
+            gloss = np.stack([row[0] * gloss[0] + row[1] * gloss[1] + row[2] * gloss[2] for row in t])
+        rotations = products(own, reference.rotations)
+        return reference.having(means=means, factors=factors, rotations=rotations, gloss=gloss)
+
+
+def polar_rotations(matrices: Float) -> Float:
+    """[K, 3, 3] the rotation nearest to each matrix.
+
+    >>> polar_rotations(np.diag([2.0, 1.0, 1.0])[None])[0].round(6)
+    array([[1., 0., 0.],
+           [0., 1., 0.],
+           [0., 0., 1.]])
+    """
+    left, _, right = np.linalg.svd(matrices)
+    left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
+    return np.asarray(left @ right)
+
+
+def quaternions_of(turns: Float) -> Float:
+    """[K, 4] unit quaternions (w, x, y, z), w ≥ 0, of rotation matrices [K, 3, 3] (Bar-Itzhack 2000).
+
+    >>> quaternions_of(np.diag([-1.0, -1.0, 1.0])[None])  # a half turn about z
+    array([[0., 0., 0., 1.]])
+    """
+    m = turns
+    table = np.zeros((len(m), 4, 4))
+    table[:, 0, 0] = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
+    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        table[:, 0, 1 + i] = table[:, 1 + i, 0] = m[:, k, j] - m[:, j, k]
+        table[:, 1 + i, 1 + i] = m[:, i, i] - m[:, j, j] - m[:, k, k]
+        table[:, 1 + j, 1 + k] = table[:, 1 + k, 1 + j] = m[:, j, k] + m[:, k, j]
+    found = np.linalg.eigh(table)[1][:, :, 3]
+    first = np.argmax(np.abs(found) > 1e-9, axis=1)
+    signs = np.sign(found[np.arange(len(m)), first])[:, None]
+    return np.asarray(found * signs) + 0.0
+
+
+def _k_means(points: Float, count: int) -> Ints:
+    """[N] cluster of each point, from 0; the same points give the same clusters."""
+    draw = np.random.default_rng(0)
+    sample = points if len(points) <= SAMPLE else points[draw.choice(len(points), SAMPLE, replace=False)]
+    centres = sample[draw.choice(len(sample), count, replace=False)]
+    for _ in range(ROUNDS):
+        nearest = _nearest(sample, centres)
+        members = np.bincount(nearest, minlength=count)
+        sums = np.stack([np.bincount(nearest, sample[:, axis], minlength=count) for axis in range(3)], axis=1)
+        centres = np.where(members[:, None] > 0, sums / np.maximum(members, 1)[:, None], centres)
+    labels = _nearest(points, centres)
+    return np.unique(labels, return_inverse=True)[1].astype(np.int64)  # none empty
+
+
+def _nearest(points: Float, centres: Float, piece: int = 4096) -> Ints:
+    """[N] index of the nearest centre."""
+    squares = np.square(centres).sum(axis=1)
+    found = [
+        np.argmin(squares - 2 * points[begin : begin + piece] @ centres.T, axis=1)
+        for begin in range(0, len(points), piece)
+    ]
+    return np.concatenate(found).astype(np.int64)

@@ -1,0 +1,173 @@
+"""A state by component: [components, N] arrays, which small kernels of numpy go through fast."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.gaussians import Gaussians
+
+Array = NDArray[np.float32]
+Float = NDArray[np.float64]
+
+LABELS = 64
+"""Levels of the learnt label; 0.5, which tells what moves, is between two."""
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """N Gaussians, component by component; arrays are shared between states and must not be written to.
+
+    Attributes:
+        means: [3, N] metres. factors: [9, N], row by row of F. rotations: [4, N] (w, x, y, z). colours: [3, N].
+        foreground: [N]. gloss: [3, M] or None.
+        rest: ids, opacities, who is retired, environment; its other arrays are not this state's.
+
+    >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1)
+    >>> Columns.of(state).means
+    array([[0., 1.],
+           [0., 0.],
+           [2., 2.]], dtype=float32)
+    >>> bool((Columns.of(state).gaussians().factors == state.factors).all())
+    True
+    """
+
+    means: Array
+    factors: Array
+    rotations: Array
+    colours: Array
+    foreground: Array
+    gloss: Array | None
+    rest: Gaussians
+
+    @classmethod
+    def of(cls, state: Gaussians) -> Columns:
+        """The columns of a state."""
+        count = len(state)
+        return cls(
+            means=_planes(state.means),
+            factors=_planes(state.factors.reshape(count, 9)),
+            rotations=_planes(state.rotations),
+            colours=_planes(state.colours),
+            foreground=state.foreground,
+            gloss=None if state.gloss is None else _planes(state.gloss),
+            rest=state,
+        )
+
+    def __len__(self) -> int:
+        return int(self.means.shape[1])
+
+    def gaussians(self) -> Gaussians:
+        """The state."""
+        return self.rest.replace(
+            means=np.ascontiguousarray(self.means.T),
+            factors=np.ascontiguousarray(self.factors.T).reshape(-1, 3, 3),
+            rotations=np.ascontiguousarray(self.rotations.T),
+            colours=np.ascontiguousarray(self.colours.T),
+            foreground=self.foreground,
+            gloss=None if self.gloss is None else np.ascontiguousarray(self.gloss.T),
+        )
+
+    def having(self, **changes: Any) -> Columns:
+        """The same with some arrays exchanged."""
+        return replace(self, **changes)
+
+    def joined(self, born: Columns) -> Columns:
+        """With Gaussians after its own, which keep their ids and are dull."""
+        ids = np.concatenate([self.rest.ids, born.rest.ids])
+        return Columns(
+            means=np.concatenate([self.means, born.means], axis=1),
+            factors=np.concatenate([self.factors, born.factors], axis=1),
+            rotations=np.concatenate([self.rotations, born.rotations], axis=1),
+            colours=np.concatenate([self.colours, born.colours], axis=1),
+            foreground=np.concatenate([self.foreground, born.foreground]),
+            gloss=self.gloss,
+            rest=self.rest.joined(born.rest.replace(gloss=None, environment=None)).replace(ids=ids),
+        )
+
+    def after(self, count: int) -> Columns:
+        """The Gaussians from row ``count`` on."""
+        return Columns(
+            means=self.means[:, count:],
+            factors=self.factors[:, count:],
+            rotations=self.rotations[:, count:],
+            colours=self.colours[:, count:],
+            foreground=self.foreground[count:],
+            gloss=None,
+            rest=self.rest.rows(np.arange(count, len(self))),
+        )
+
+    def sizes(self) -> Array:
+        """[N] sizes, metres: the root mean square of the lengths of the axes.
+
+        >>> Columns.of(Gaussians.of_points([[0, 0, 2]], radius=0.1)).sizes()
+        array([0.1], dtype=float32)
+        """
+        return sizes_of(self.factors)
+
+    def volumes(self) -> Float:
+        """[N] determinants of F."""
+        a, b, c, d, e, f, g, h, i = self.factors.astype(np.float64)
+        return np.asarray(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
+
+
+def sizes_of(factors: Array) -> Array:
+    """[N] sizes of factors [9, N], metres."""
+    squares = np.zeros(factors.shape[1], np.float32)
+    for plane in factors:
+        squares += plane * plane
+    return np.asarray(np.sqrt(squares / np.float32(3)))
+
+
+def levels_of(labels: NDArray[Any]) -> NDArray[np.int32]:
+    """Level of each learnt label, 0…63; those above 0.5 have 32 or more.
+
+    >>> levels_of(np.array([0.0, 0.5, 0.501, 1.0]))
+    array([ 0, 31, 32, 63], dtype=int32)
+    """
+    levels = np.clip(np.ceil(labels.astype(np.float64) * LABELS) - 1, 0, LABELS - 1)
+    return np.asarray(levels, np.int32)
+
+
+def label_of(levels: NDArray[Any]) -> Array:
+    """Label in the middle of a level."""
+    return ((levels + 0.5) / LABELS).astype(np.float32)
+
+
+def products(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
+    """[4, N] a∘b of quaternions by component: first b, then a."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ]
+    )
+
+
+def turns_between(after: Array, before: Array) -> Float:
+    """[4, N] what turns one rotation to another."""
+    w, x, y, z = before.astype(np.float64)
+    return np.asarray(products(after.astype(np.float64), np.stack([w, -x, -y, -z])))
+
+
+def vectors_of(turns: NDArray[Any]) -> NDArray[Any]:
+    """[3, N] 2 tan(θ/2) about the axis of each turn [4, N]; near θ where it is small."""
+    w = turns[0]
+    return np.asarray(turns[1:] * (2 * np.where(w < 0, -1, 1) / np.maximum(np.abs(w), 1e-6)))
+
+
+def turns_of(vectors: NDArray[Any]) -> NDArray[Any]:
+    """[4, N] unit quaternions of ``vectors_of``."""
+    squares = 1 + np.square(vectors).sum(axis=0) / 4
+    return np.asarray(np.concatenate([np.ones_like(vectors[:1]), vectors / 2]) / np.sqrt(squares))
+
+
+def _planes(rows: NDArray[Any]) -> Array:
+    return np.ascontiguousarray(rows.T, np.float32)

@@ -1,0 +1,113 @@
+"""The head of a compact file: what its numbers mean. JSON, so that any language reads it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from scas4d_core.cameras import Camera, Rig, WorldFrame
+from scas4d_core.compact.bounds import Bounds
+from scas4d_core.compact.records import FileError
+
+VERSION = 1
+"""Of the format (docs/format.md); files of later ones are refused."""
+
+
+@dataclass(frozen=True)
+class Head:
+    """What holds for a whole file.
+
+    Attributes:
+        world: from the user's world to that of the states. bounds: of every state.
+        background: RGB in 0…1 behind everything. rig: the cameras in the user's world, None where it is not known.
+        frames_per_second: nominal, None where it is not known: each frame has its own time.
+        remark: about the file, JSON values.
+
+    >>> head = Head(WorldFrame(np.zeros(3)))
+    >>> Head.read(head.text(), "a file").bounds == head.bounds
+    True
+    """
+
+    world: WorldFrame
+    bounds: Bounds = field(default_factory=Bounds)
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rig: Rig | None = None
+    frames_per_second: float | None = None
+    remark: Mapping[str, Any] = field(default_factory=dict)
+
+    def text(self) -> bytes:
+        """As it is written."""
+        cameras = None if self.rig is None else [_camera_record(camera) for camera in self.rig.cameras]
+        record = {
+            "format": "scas4d",
+            "version": VERSION,
+            "axes": "opencv: x right, y down, z forward",
+            "colour": "sRGB values 0..1, plain RGB a Gaussian",
+            "world": {"origin": np.asarray(self.world.origin).tolist(), "metres_per_unit": self.world.metres_per_unit},
+            "bounds": self.bounds.record(),
+            "background": list(self.background),
+            "cameras": cameras,
+            "frames_per_second": self.frames_per_second,
+            "remark": dict(self.remark),
+        }
+        return json.dumps(record, allow_nan=False).encode()
+
+    @classmethod
+    def read(cls, text: bytes, name: str) -> Head:
+        """The head of a file of this name.
+
+        Raises:
+            FileError: it is none, or of a later version.
+        """
+        try:
+            record = json.loads(text)
+            version = record["version"]
+            if record["format"] != "scas4d" or not isinstance(version, int):
+                raise ValueError(f"format {record['format']!r}, version {version!r}")
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise FileError(f"{name}: its head is no head of a compact file ({error})") from None
+        if version > VERSION:
+            raise FileError(
+                f"{name}: version {version} of the format; this scas4d reads up to {VERSION}, take a later one"
+            )
+        try:
+            origin = np.array(record["world"]["origin"], np.float64).reshape(3)
+            metres = float(record["world"]["metres_per_unit"])
+            if not (np.isfinite(origin).all() and np.isfinite(metres) and metres > 0):
+                raise ValueError(f"world {record['world']}")
+            red, green, blue = (float(value) for value in record["background"])
+            cameras, rate = record["cameras"], record["frames_per_second"]
+            return cls(
+                WorldFrame(origin, metres),
+                Bounds.of_record(record["bounds"]),
+                (red, green, blue),
+                Rig(tuple(map(_camera, cameras))) if cameras else None,
+                None if rate is None else float(rate),
+                dict(record["remark"]),
+            )
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise FileError(f"{name}: its head lacks something or is wrong ({error})") from None
+
+
+def _camera_record(camera: Camera) -> dict[str, Any]:
+    return {
+        "name": camera.name,
+        "intrinsics": camera.intrinsics.tolist(),
+        "world_to_camera": camera.world_to_camera.tolist(),
+        "width": camera.width,
+        "height": camera.height,
+    }
+
+
+def _camera(record: Mapping[str, Any]) -> Camera:
+    return Camera(
+        str(record["name"]),
+        record["intrinsics"],
+        np.array(record["world_to_camera"], np.float64),
+        int(record["width"]),
+        int(record["height"]),
+    )

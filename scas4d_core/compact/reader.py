@@ -1,0 +1,240 @@
+"""Reads a compact file, also one that is being written or was cut. Needs numpy and zstandard alone."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.compact.birth_code import decode_born
+from scas4d_core.compact.cluster_motion import Clusters
+from scas4d_core.compact.columns import Columns
+from scas4d_core.compact.frame_code import decode
+from scas4d_core.compact.head import Head
+from scas4d_core.compact.index import read_index
+from scas4d_core.compact.planes import PlaneError, unpack
+from scas4d_core.compact.records import (
+    HEAD_SIZE,
+    MAGIC,
+    DamagedFileError,
+    FileError,
+    Kind,
+    Record,
+    read_body,
+    scan,
+)
+from scas4d_core.gaussians import Gaussians
+
+__all__ = ["CompactReader", "DamagedFileError", "FileError"]
+
+STATES = (Kind.KEY, Kind.DELTA)
+MOST_PER_BYTE = 4
+"""Gaussians for each byte that tells of them; a count that lies must not fill the memory."""
+
+
+class CompactReader:
+    """Reads the states of a file, in any order.
+
+    Args:
+        path: of the file.
+
+    Attributes:
+        head: world, bounds, background, cameras.
+        damage: what is damaged so that frames after it are not listed; None where nothing is.
+        about: what the index says of the whole file: the largest ``errors`` by attribute; empty where there is none.
+
+    Raises:
+        FileNotFoundError: it is not there.
+        FileError: it is no compact file. DamagedFileError: its head is damaged.
+
+    >>> CompactReader("README.md")
+    Traceback (most recent call last):
+    scas4d_core.compact.records.FileError: README.md: no compact 4D file: it does not begin with b's4dR'
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self.damage: str | None = None
+        self.about: dict[str, Any] = {}
+        self._file: BinaryIO = self.path.open("rb")
+        self._records: list[Record] = []
+        self._end = 0
+        self._whole = False
+        self._states: list[Record] = []
+        self._frames: list[int] = []
+        self._births: list[Record] = []
+        self._parts: list[Record] = []
+        self._born: tuple[int, Columns, Clusters] | None = None
+        self._last: tuple[int, Columns] | None = None
+        try:
+            if (begin := self._file.read(len(MAGIC))) != MAGIC[: len(begin)] or not begin:
+                raise FileError(f"{self.path.name}: no compact 4D file: it does not begin with {MAGIC!r}")
+            found = read_index(self._file, self.path.name)
+            if found is not None:
+                records, self.about = found
+                self._whole = True
+                for record in records:
+                    self._note(record)
+            else:
+                self.refresh()
+            if not self._records or self._records[0].kind is not Kind.HEAD:
+                raise FileError(
+                    f"{self.path.name}: its head is not there{self._why()}; it was cut, or is not written yet"
+                )
+            self.head = Head.read(read_body(self._file, self._records[0], self.path.name), self.path.name)
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._file.close()
+
+    def refresh(self) -> list[int]:
+        """Picks up what was written since; returns the frames that are new."""
+        if self._whole or self.damage is not None:
+            return []
+        known = len(self._frames)
+        try:
+            for record in scan(self._file, self._end, self.path.name):
+                self._note(record)
+                self._end = record.end
+                if record.kind is Kind.INDEX:
+                    self._whole = True
+                    break
+        except FileError as error:
+            self.damage = str(error)
+        return self._frames[known:]
+
+    @property
+    def frames(self) -> list[int]:
+        """Indices of the frames, rising."""
+        return list(self._frames)
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """[T] seconds, in the order of ``frames``."""
+        return np.array([record.time for record in self._states], np.float64)
+
+    @property
+    def count(self) -> int:
+        """Gaussians that there have been by the last frame."""
+        return sum(self._born_count(record) for record in self._births)
+
+    def state(self, index: int) -> Gaussians:
+        """The state of a frame, in the world of ``head.world``; its arrays must not be written to.
+
+        Raises:
+            FileError: there is no such frame. DamagedFileError: bytes that it needs are damaged.
+        """
+        place = bisect_right(self._frames, index) - 1
+        if place < 0 or self._frames[place] != index:
+            held = f"{self._frames[0]} to {self._frames[-1]}" if self._frames else "none"
+            raise FileError(f"{self.path.name}: frame {index} is not in the file{self._why()}; it has frames: {held}")
+        begin = place
+        while self._states[begin].kind is Kind.DELTA and begin > 0:
+            if self._last is not None and self._last[0] == begin:
+                break
+            begin -= 1
+        state = self._last[1] if self._last is not None and self._last[0] == begin else None
+        for one in range(begin if state is None else begin + 1, place + 1):
+            state = self._decoded(one, state)
+            self._last = (one, state)
+        assert state is not None
+        return state.gaussians()
+
+    def parts(self, index: int | None = None) -> NDArray[np.int64] | None:
+        """[N] part of each Gaussian, −1 for none, as it was last seen up to a frame; None where none was."""
+        found = [record for record in self._parts if index is None or record.frame <= index]
+        if not found:
+            return None
+        body = read_body(self._file, found[-1], self.path.name)
+        count = self._counted(body, found[-1])
+        try:
+            return unpack(body, count, 4)[0].astype(np.int64) - 1
+        except PlaneError as error:
+            raise self._damaged(found[-1], error) from None
+
+    def _note(self, record: Record) -> None:
+        self._records.append(record)
+        if record.kind is Kind.BORN:
+            self._births.append(record)
+            if not self._states:  # the first frame is the first born
+                self._states.append(record)
+                self._frames.append(record.frame)
+        elif record.kind in STATES:
+            self._states.append(record)
+            self._frames.append(record.frame)
+        elif record.kind is Kind.PARTS:
+            self._parts.append(record)
+
+    def _decoded(self, place: int, before: Columns | None) -> Columns:
+        record = self._states[place]
+        born, clusters = self._born_by(record.frame)
+        if record.kind is Kind.BORN:
+            return born
+        if record.kind is Kind.KEY or before is None:
+            before = born
+        elif len(before) < len(born):
+            before = before.joined(born.after(len(before)))
+        body = read_body(self._file, record, self.path.name)
+        try:
+            return decode(before, clusters, self.head.bounds, body)
+        except (PlaneError, ValueError) as error:
+            raise self._damaged(record, error) from None
+
+    def _born_by(self, index: int) -> tuple[Columns, Clusters]:
+        """All Gaussians that are born by a frame, as they were told then, and their clusters."""
+        wanted = [record for record in self._births if record.frame <= index]
+        if not wanted:
+            raise DamagedFileError(f"{self.path.name}: the Gaussians of frame {index} are not told")
+        count = len(wanted)
+        if self._born is None or self._born[0] > count:
+            self._born = None
+        known, state, clusters = self._born or (0, None, None)
+        for number in range(known, count):
+            record = wanted[number]
+            body = read_body(self._file, record, self.path.name)
+            try:
+                own, labels = decode_born(body[4:], self._counted(body, record), self.head.bounds)
+            except (PlaneError, ValueError) as error:
+                raise self._damaged(record, error) from None
+            state = own if state is None else state.joined(own)
+            clusters = labels if clusters is None else clusters.joined(labels.labels)
+        assert state is not None
+        assert clusters is not None
+        self._born = (count, state, clusters)
+        return state, clusters
+
+    def _born_count(self, record: Record) -> int:
+        self._file.seek(record.offset)
+        return int.from_bytes(self._file.read(4), "little")
+
+    def _counted(self, body: bytes, record: Record) -> int:
+        """The number of Gaussians that a body begins with; what it holds takes some bits each."""
+        count = int.from_bytes(body[:4], "little")
+        if len(body) < 4 or count > MOST_PER_BYTE * len(body) + 1024:
+            raise self._damaged(record, PlaneError(f"{count} Gaussians in {len(body)} bytes"))
+        return count
+
+    def _damaged(self, record: Record, error: Exception) -> DamagedFileError:
+        place = record.offset - HEAD_SIZE
+        return DamagedFileError(
+            f"{self.path.name}: the {record.kind.name.lower()} record of frame {record.frame} at byte {place} cannot "
+            f"be read ({error})"
+        )
+
+    def _why(self) -> str:
+        return "" if self.damage is None else f" ({self.damage})"

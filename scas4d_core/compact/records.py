@@ -1,0 +1,136 @@
+"""Records of a compact file: a head with checksum, so that a file is listed without its bodies, and a body with one.
+
+A file is read while it is written: what is not whole at its end is not there yet. What is damaged before is told with
+its place.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import BinaryIO
+
+MAGIC = b"s4dR"
+"""First bytes of each record; of the file, too."""
+_HEAD = struct.Struct("<4sB3xqdII")
+"""Magic, kind, frame, time in seconds, bytes of the body, CRC-32 of the body; then the CRC-32 of these."""
+_CHECKSUM = struct.Struct("<I")
+HEAD_SIZE = _HEAD.size + _CHECKSUM.size
+
+
+class Kind(IntEnum):
+    """What a record holds."""
+
+    HEAD = 1
+    """JSON: version, world, bounds."""
+    BORN = 2
+    """Gaussians without a reference: those of the first frame, or born in this one."""
+    KEY = 3
+    """A state, told by the born."""
+    DELTA = 4
+    """A state, told by the one before."""
+    PARTS = 5
+    """A part of each Gaussian."""
+    INDEX = 6
+    """Where all records are; the last."""
+
+
+class FileError(ValueError):
+    """A file that is no compact file, or of a later version; the message names the file and the fault."""
+
+
+class DamagedFileError(FileError):
+    """A compact file with damaged bytes; the message names the file and the place."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """Where a record is.
+
+    Attributes:
+        kind: of its body. frame: index, −1 for none. time: seconds. offset: of its body in the file. size: of the body,
+            bytes. checksum: CRC-32 of the body.
+    """
+
+    kind: Kind
+    frame: int
+    time: float
+    offset: int
+    size: int
+    checksum: int
+
+    @property
+    def end(self) -> int:
+        """Of its body, in the file."""
+        return self.offset + self.size
+
+    def at(self, offset: int) -> Record:
+        """The record in a file, where its head begins at an offset."""
+        return replace(self, offset=offset + HEAD_SIZE)
+
+
+def record_bytes(kind: Kind, body: bytes, frame: int = -1, time: float = 0.0) -> bytes:
+    """A record.
+
+    >>> import io
+    >>> file = io.BytesIO(record_bytes(Kind.KEY, b"abc", 7, 0.5))
+    >>> (found,) = scan(file, 0, "a file")
+    >>> found.kind.name, found.frame, read_body(file, found, "a file")
+    ('KEY', 7, b'abc')
+    """
+    head = _HEAD.pack(MAGIC, kind, frame, time, len(body), zlib.crc32(body))
+    return head + _CHECKSUM.pack(zlib.crc32(head)) + body
+
+
+def scan(file: BinaryIO, offset: int, name: str) -> Iterator[Record]:
+    """The whole records from an offset on; the rest of one that is not whole is not there yet.
+
+    Args:
+        name: of the file, for errors.
+
+    Raises:
+        DamagedFileError: bytes that are no record stand where one begins.
+    """
+    file.seek(0, 2)
+    size = file.tell()
+    while offset + HEAD_SIZE <= size:
+        file.seek(offset)
+        record = parse_head(file.read(HEAD_SIZE), offset, name)
+        if record.end > size:
+            return
+        yield record
+        offset = record.end
+
+
+def parse_head(data: bytes, offset: int, name: str) -> Record:
+    """The record whose head stands at an offset.
+
+    Raises:
+        DamagedFileError: it is none.
+    """
+    head = data[: _HEAD.size]
+    if len(data) < HEAD_SIZE or head[:4] != MAGIC or _CHECKSUM.unpack_from(data, _HEAD.size)[0] != zlib.crc32(head):
+        raise DamagedFileError(f"{name}: no record begins at byte {offset}; the file is damaged there")
+    _, kind, frame, time, size, checksum = _HEAD.unpack(head)
+    if kind not in Kind.__members__.values():
+        raise FileError(f"{name}: a record of kind {kind} is at byte {offset}; a later version of scas4d wrote it")
+    return Record(Kind(kind), frame, time, offset + HEAD_SIZE, size, checksum)
+
+
+def read_body(file: BinaryIO, record: Record, name: str) -> bytes:
+    """The body of a record.
+
+    Raises:
+        DamagedFileError: it fails its checksum, or the file ends within it.
+    """
+    file.seek(record.offset)
+    body = file.read(record.size)
+    if len(body) != record.size or zlib.crc32(body) != record.checksum:
+        about = f" of frame {record.frame}" if record.frame >= 0 else ""
+        raise DamagedFileError(
+            f"{name}: the {record.kind.name.lower()} record{about} at byte {record.offset - HEAD_SIZE} is damaged"
+        )
+    return body

@@ -1,0 +1,140 @@
+"""Sections of a coded state: residuals of rows, masks, exact arrays. Sizes are known before anything is allocated."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.compact.planes import Ints, PlaneError, deflated, inflated, pack, unpack
+
+Floats = NDArray[np.float32]
+
+SPARSE = 0.6
+"""Where a smaller share of the rows changed, a mask says which."""
+NONE, ALL, SOME = 0, 1, 2
+"""First byte of a section: nothing is told, of all rows, or of those that a mask names."""
+LARGEST_ARRAY = 1 << 24
+"""Bytes; no exact array is larger."""
+
+
+def write_residuals(planes: Ints) -> bytes:
+    """[P, N] residuals of an attribute: of no row, of all, or of those that a mask names; component by component.
+
+    >>> planes = np.array([[0, 0, 5, 0], [0, 0, 1, 0]])
+    >>> read_residuals(write_residuals(planes), 0, 2, 4)[0]
+    array([[0, 0, 5, 0],
+           [0, 0, 1, 0]], dtype=int32)
+    """
+    changed: NDArray[np.bool_] = np.any(planes, axis=0)
+    share = np.count_nonzero(changed) / max(len(changed), 1)
+    if share == 0:
+        return bytes([NONE])
+    if share >= SPARSE:
+        return bytes([ALL]) + b"".join(pack(plane) for plane in planes)
+    return bytes([SOME]) + write_mask(changed) + b"".join(pack(plane) for plane in planes[:, changed])
+
+
+def read_residuals(body: bytes, offset: int, components: int, rows: int) -> tuple[Ints, int]:
+    """[components, rows] residuals of a section, and where it ends; raises PlaneError."""
+    kind, offset = read_kind(body, offset)
+    planes = np.zeros((components, rows), np.int32)
+    if kind == NONE:
+        return planes, offset
+    chosen: Any = slice(None)
+    count = rows
+    if kind == SOME:
+        mask, offset = read_mask(body, offset, rows)
+        chosen, count = np.flatnonzero(mask), int(np.count_nonzero(mask))
+    for plane in planes:
+        plane[chosen], offset = unpack(body, count, offset)
+    return planes, offset
+
+
+def write_mask(mask: NDArray[np.bool_]) -> bytes:
+    """[N] bool, a bit each."""
+    return _sized(deflated(np.packbits(mask).tobytes()))
+
+
+def read_mask(body: bytes, offset: int, rows: int) -> tuple[NDArray[np.bool_], int]:
+    """[rows] bool, and where the mask ends."""
+    data, offset = _read_sized(body, offset, (rows + 7) // 8)
+    return np.unpackbits(np.frombuffer(data, np.uint8), count=rows).astype(np.bool_), offset
+
+
+def write_array(array: NDArray[Any] | None) -> bytes:
+    """A float32 array of any shape, exactly; None: nothing is told."""
+    if array is None:
+        return bytes([NONE])
+    shape = struct.pack(f"<B{array.ndim}I", array.ndim, *array.shape)
+    return bytes([ALL]) + shape + _sized(deflated(array.astype("<f4").tobytes()))
+
+
+def read_array(body: bytes, offset: int) -> tuple[Floats | None, int]:
+    """The array of a section, None where nothing is told, and where it ends."""
+    kind, offset = read_kind(body, offset)
+    if kind == NONE:
+        return None, offset
+    dimensions = body[offset] if offset < len(body) else 0
+    if not 0 < dimensions <= 4 or len(body) < offset + 1 + 4 * dimensions:
+        raise PlaneError(f"an array of {dimensions} dimensions cannot be at byte {offset}")
+    shape = struct.unpack_from(f"<{dimensions}I", body, offset + 1)
+    size = 4
+    for length in shape:
+        size *= length
+    if size > LARGEST_ARRAY:
+        raise PlaneError(f"an array of {size} bytes is none of a state")
+    data, offset = _read_sized(body, offset + 1 + 4 * dimensions, size)
+    return np.frombuffer(data, "<f4").reshape(shape).astype(np.float32), offset
+
+
+def write_exact(rows: NDArray[np.intp], values: NDArray[Any]) -> bytes:
+    """[E] rows with [P, E] float32 values that are told exactly."""
+    if not len(rows):
+        return bytes([NONE])
+    data = rows.astype("<u4").tobytes() + values.astype("<f4").tobytes()
+    return bytes([ALL]) + struct.pack("<I", len(rows)) + _sized(deflated(data))
+
+
+def read_exact(body: bytes, offset: int, most: int, width: int) -> tuple[NDArray[np.intp], Floats, int]:
+    """The rows, below ``most``, and values of a section, and where it ends."""
+    kind, offset = read_kind(body, offset)
+    if kind == NONE:
+        return np.zeros(0, np.intp), np.zeros((width, 0), np.float32), offset
+    if len(body) < offset + 4:
+        raise PlaneError(f"the data end at byte {len(body)}, within a count")
+    (count,) = struct.unpack_from("<I", body, offset)
+    if not 0 < count <= most:
+        raise PlaneError(f"{count} of {most} rows cannot be told exactly")
+    data, offset = _read_sized(body, offset + 4, 4 * count * (1 + width))
+    rows = np.frombuffer(data, "<u4", count).astype(np.intp)
+    if int(rows.max()) >= most:
+        raise PlaneError(f"row {int(rows.max())} of {most} is told")
+    values = np.frombuffer(data, "<f4", count * width, 4 * count).reshape(width, count).astype(np.float32)
+    return rows, values, offset
+
+
+def read_kind(body: bytes, offset: int) -> tuple[int, int]:
+    """The first byte of a section, and where the next is."""
+    if offset >= len(body):
+        raise PlaneError(f"the data end at byte {len(body)}, before a section")
+    kind = body[offset]
+    if kind not in (NONE, ALL, SOME):
+        raise PlaneError(f"a section of kind {kind} cannot be at byte {offset}")
+    return kind, offset + 1
+
+
+def _sized(data: bytes) -> bytes:
+    return struct.pack("<I", len(data)) + data
+
+
+def _read_sized(body: bytes, offset: int, size: int) -> tuple[bytes, int]:
+    """The ``size`` bytes that were ``deflated``, and where they end."""
+    if len(body) < offset + 4:
+        raise PlaneError(f"the data end at byte {len(body)}, within a size")
+    (length,) = struct.unpack_from("<I", body, offset)
+    if len(body) < offset + 4 + length:
+        raise PlaneError(f"{length} bytes at byte {offset + 4} end after the data, at {len(body)}")
+    return inflated(body[offset + 4 : offset + 4 + length], size), offset + 4 + length
