@@ -44,8 +44,8 @@ def pack(values: NDArray[Any]) -> bytes:
     if len(found) and (int(found.max()) >= MOST or int(found.min()) <= -MOST):
         raise OverflowError(f"values of a plane are below {MOST} in size, and one of these is not")
     small = found.astype(np.int32)
-    folded = np.asarray((small << 1) ^ (small >> 31), np.int32)
-    return _packed(folded.astype(np.uint32))
+    folded: NDArray[Any] = (small << 1) ^ (small >> 31)
+    return _packed(folded.view(np.uint32))
 
 
 def _packed(unsigned: Unsigned) -> bytes:
