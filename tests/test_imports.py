@@ -18,6 +18,8 @@ LIGHT_ROOMS = (
     "scas4d_core.settings",
     "scas4d_core.presets",
     "scas4d_core.rig_checks",
+    "scas4d_core.compact",
+    "scas4d_core.gaussians",
 )
 """What the client may import when it is imported; its heavy commands import the rest when they run."""
 
@@ -27,6 +29,7 @@ NUMPY_ONLY = (
     "scas4d_core.captures",
     "scas4d_core.settings",
     "scas4d_core.rig_checks",
+    "scas4d_core.compact",
 )
 
 

@@ -26,7 +26,6 @@ from scas4d_core.compact.sections import (
     write_mask,
     write_residuals,
 )
-from scas4d_core.gaussians import Gaussians
 
 Float = NDArray[np.float64]
 
@@ -48,10 +47,11 @@ COMPONENTS = {"lengths": 3, "axes": 9, "means": 3, "rotations": 3, "colours": 3,
 def encode_born(state: Columns, clusters: Clusters, bounds: Bounds) -> tuple[bytes, Columns]:
     """Codes Gaussians, with their ids and clusters; returns the bytes, and the Gaussians as a reader will have them.
 
+    >>> from scas4d_core.gaussians import Gaussians
     >>> state = Columns.of(Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1))
     >>> body, decoded = encode_born(state, Clusters(np.array([1, 1])), Bounds())
     >>> again, clusters = decode_born(body, 2, Bounds())
-    >>> again.rest.ids, clusters.labels, bool((again.means == decoded.means).all())
+    >>> again.ids, clusters.labels, bool((again.means == decoded.means).all())
     (array([0, 1]), array([1, 1]), True)
     """
     found = _planes(state, bounds)
@@ -61,19 +61,19 @@ def encode_born(state: Columns, clusters: Clusters, bounds: Bounds) -> tuple[byt
         exact |= outside.any(axis=0)
         planes[outside] = 0
     told = {name: planes.astype(np.int32) for name, planes in found.items()}
-    exact |= lost_volume(_columns(told, state.rest.ids, bounds), state)
+    exact |= lost_volume(_columns(told, state.ids, bounds), state)
     rows = np.flatnonzero(exact)
-    gloss, retired = state.gloss, state.rest.retired
+    gloss, retired = state.gloss, state.retired
     body = b"".join(
         [
-            pack(np.diff(state.rest.ids, prepend=0)),
+            pack(np.diff(state.ids, prepend=0)),
             pack(clusters.labels),
             *(write_residuals(planes) for planes in told.values()),
             write_exact(rows, np.concatenate([state.means[:, rows], state.factors[:, rows]])),
             bytes([SOME]) + write_mask(retired) if retired.any() else bytes([NONE]),
             pack(np.array([0 if gloss is None else 1 + gloss.shape[1]])),
             b"" if gloss is None else write_residuals(np.rint(gloss / (2 * bounds.gloss)).astype(np.int32)),
-            write_array(state.rest.environment),
+            write_array(state.environment),
         ]
     )
     return body, decode_born(body, len(state), bounds)[0]
@@ -132,7 +132,7 @@ def _planes(state: Columns, bounds: Bounds) -> dict[str, Float]:
             "rotations": np.rint(vectors_of(state.rotations.astype(np.float64)) / (2 * bounds.rotation / 3**0.5)),
             "colours": np.stack([green, red - green, blue - green]),
             "labels": levels_of(state.foreground)[None].astype(np.float64),
-            "opacities": np.rint(state.rest.own_opacities.astype(np.float64) / (2 * bounds.opacity))[None],
+            "opacities": np.rint(state.opacities.astype(np.float64) / (2 * bounds.opacity))[None],
         }
 
 
@@ -147,13 +147,13 @@ def _columns(told: dict[str, Ints], ids: NDArray[np.int64], bounds: Bounds) -> C
     rotations = turns_of(told["rotations"] * (2 * bounds.rotation / 3**0.5)).astype(np.float32)
     foreground = label_of(np.clip(told["labels"][0], 0, LABELS - 1))
     opacities = np.clip(told["opacities"][0] * (2 * bounds.opacity), OPAQUE, 1 - OPAQUE).astype(np.float32)
-    rest = Gaussians(
-        means=means.T,
-        factors=np.empty((0, 3, 3), np.float32),
-        rotations=np.empty((0, 4), np.float32),
-        opacities=opacities,
-        colours=np.empty((0, 3), np.float32),
+    return Columns(
+        means=means,
+        factors=factors.astype(np.float32),
+        rotations=rotations,
+        colours=colours,
         foreground=foreground,
         ids=ids,
+        opacities=opacities,
+        retired=np.zeros(len(ids), np.bool_),
     )
-    return Columns(means, factors.astype(np.float32), rotations, colours, foreground, None, rest)

@@ -57,7 +57,7 @@ class Clusters:
     def sums(self, columns: Iterable[NDArray[Any]]) -> Float:
         """[P, count] sums over each cluster of P columns [N]."""
         found = [np.bincount(self.labels, column, minlength=self.count + 1)[1:] for column in columns]
-        return np.array(found, np.float64).reshape(-1, self.count)
+        return np.array(found, np.float64)
 
     @cached_property
     def sizes(self) -> Float:
@@ -131,7 +131,11 @@ class ClusterMotion:
         # In units of 1/size², the pull of one Gaussian's own extent: its weight times its size squared is 1.
         moments[:, range(3), range(3)] += RIDGE * clusters.sizes[:, None]
         moments[:, 3, 3] += 1e-12 + (moments[:, 3, 3] == 0)
-        maps = np.asarray(np.linalg.solve(moments, right.transpose(2, 0, 1)), np.float64)
+        try:
+            maps = np.asarray(np.linalg.solve(moments, right.transpose(2, 0, 1)), np.float64)
+        except np.linalg.LinAlgError:  # numbers near the ends of float64: all is told as each Gaussian's own
+            maps = np.zeros((clusters.count, 4, 3))
+        maps[~np.isfinite(maps).all(axis=(1, 2))] = 0
         return cls(np.ascontiguousarray(maps[:, :3].transpose(0, 2, 1)), maps[:, 3])
 
     def carried(self, clusters: Clusters, reference: Columns) -> Columns:

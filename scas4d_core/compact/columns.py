@@ -23,8 +23,8 @@ class Columns:
 
     Attributes:
         means: [3, N] metres. factors: [9, N], row by row of F. rotations: [4, N] (w, x, y, z). colours: [3, N].
-        foreground: [N]. gloss: [3, M] or None.
-        rest: ids, opacities, who is retired, environment; its other arrays are not this state's.
+        foreground: [N]. ids: [N]. opacities: [N], those of the retired too. retired: [N] bool.
+        gloss: [3, M] or None. environment: what is mirrored, or None.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1)
     >>> Columns.of(state).means
@@ -40,21 +40,26 @@ class Columns:
     rotations: Array
     colours: Array
     foreground: Array
-    gloss: Array | None
-    rest: Gaussians
+    ids: NDArray[np.int64]
+    opacities: Array
+    retired: NDArray[np.bool_]
+    gloss: Array | None = None
+    environment: Array | None = None
 
     @classmethod
     def of(cls, state: Gaussians) -> Columns:
         """The columns of a state."""
-        count = len(state)
         return cls(
             means=_planes(state.means),
-            factors=_planes(state.factors.reshape(count, 9)),
+            factors=_planes(state.factors.reshape(len(state), 9)),
             rotations=_planes(state.rotations),
             colours=_planes(state.colours),
             foreground=state.foreground,
+            ids=state.ids,
+            opacities=state.own_opacities,
+            retired=state.retired,
             gloss=None if state.gloss is None else _planes(state.gloss),
-            rest=state,
+            environment=state.environment,
         )
 
     def __len__(self) -> int:
@@ -62,13 +67,17 @@ class Columns:
 
     def gaussians(self) -> Gaussians:
         """The state."""
-        return self.rest.replace(
+        return Gaussians(
             means=np.ascontiguousarray(self.means.T),
             factors=np.ascontiguousarray(self.factors.T).reshape(-1, 3, 3),
             rotations=np.ascontiguousarray(self.rotations.T),
+            opacities=self.opacities,
             colours=np.ascontiguousarray(self.colours.T),
             foreground=self.foreground,
+            ids=self.ids,
+            retired=self.retired,
             gloss=None if self.gloss is None else np.ascontiguousarray(self.gloss.T),
+            environment=self.environment,
         )
 
     def having(self, **changes: Any) -> Columns:
@@ -77,28 +86,14 @@ class Columns:
 
     def joined(self, born: Columns) -> Columns:
         """With Gaussians after its own, which keep their ids and are dull."""
-        ids = np.concatenate([self.rest.ids, born.rest.ids])
-        return Columns(
-            means=np.concatenate([self.means, born.means], axis=1),
-            factors=np.concatenate([self.factors, born.factors], axis=1),
-            rotations=np.concatenate([self.rotations, born.rotations], axis=1),
-            colours=np.concatenate([self.colours, born.colours], axis=1),
-            foreground=np.concatenate([self.foreground, born.foreground]),
-            gloss=self.gloss,
-            rest=self.rest.joined(born.rest.replace(gloss=None, environment=None)).replace(ids=ids),
+        return self.having(
+            **{name: np.concatenate([getattr(self, name), getattr(born, name)], axis=-1) for name in BY_ROW}
         )
 
     def after(self, count: int) -> Columns:
-        """The Gaussians from row ``count`` on."""
-        return Columns(
-            means=self.means[:, count:],
-            factors=self.factors[:, count:],
-            rotations=self.rotations[:, count:],
-            colours=self.colours[:, count:],
-            foreground=self.foreground[count:],
-            gloss=None,
-            rest=self.rest.rows(np.arange(count, len(self))),
-        )
+        """The Gaussians from row ``count`` on, dull."""
+        rows = {name: getattr(self, name)[..., count:] for name in BY_ROW}
+        return self.having(**rows, gloss=None, environment=None)
 
     def sizes(self) -> Array:
         """[N] sizes, metres: the root mean square of the lengths of the axes.
@@ -112,6 +107,10 @@ class Columns:
         """[N] determinants of F."""
         a, b, c, d, e, f, g, h, i = self.factors.astype(np.float64)
         return np.asarray(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
+
+
+BY_ROW = ("means", "factors", "rotations", "colours", "foreground", "ids", "opacities", "retired")
+"""Arrays with a column for each Gaussian."""
 
 
 def sizes_of(factors: Array) -> Array:

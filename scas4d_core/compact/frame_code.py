@@ -112,13 +112,13 @@ def encode(reference: Columns, state: Columns, clusters: Clusters, bounds: Bound
     rows = np.flatnonzero(exact)
     values = np.concatenate([state.means[:, rows], state.factors[:, rows]])
     sections.append(write_exact(rows, values))
-    retired, environment = state.rest.retired, state.rest.environment
-    if np.array_equal(reference.rest.retired, retired):
+    retired, environment = state.retired, state.environment
+    if np.array_equal(reference.retired, retired):
         sections.append(bytes([NONE]))
     else:
         sections.append(bytes([SOME]) + write_mask(retired))
-    if environment is not None and reference.rest.environment is not None:
-        environment = None if np.array_equal(environment, reference.rest.environment) else environment
+    if environment is not None and reference.environment is not None:
+        environment = None if np.array_equal(environment, reference.environment) else environment
     sections.append(write_array(environment))
     decoded = completed(told.state, rows, values, retired, environment)
     return Coded(b"".join(sections), decoded, errors_of(decoded, state))
@@ -146,7 +146,7 @@ def decode(reference: Columns, clusters: Clusters, bounds: Bounds, body: bytes) 
         residual, offset = read_residuals(body, offset, *told.shape(name))
         told = told.having(name, residual)
     rows, values, offset = read_exact(body, offset, len(reference), 12)
-    retired = reference.rest.retired
+    retired = reference.retired
     kind, offset = read_kind(body, offset)
     if kind != NONE:
         retired, offset = read_mask(body, offset, len(reference))
@@ -169,7 +169,7 @@ def errors_of(decoded: Columns, state: Columns) -> dict[str, float]:
         "axes": largest(decoded.factors, state.factors, sizes),
         "rotation": float(np.sqrt(np.square(turns).sum(axis=0)).max(initial=0)),
         "colour": largest(decoded.colours, state.colours),
-        "opacity": largest(decoded.rest.own_opacities, state.rest.own_opacities),
+        "opacity": largest(decoded.opacities, state.opacities),
     }
     if state.gloss is not None and decoded.gloss is not None:
         found["gloss"] = largest(decoded.gloss, state.gloss)
@@ -306,9 +306,6 @@ def completed(
         means, factors = state.means.copy(), state.factors.copy()
         means[:, rows], factors[:, rows] = values[:3], values[3:]
         state = state.having(means=means, factors=factors)
-    rest = state.rest
     if environment is not None:
-        rest = rest.replace(environment=environment)
-    if not np.array_equal(retired, rest.retired):
-        rest = rest.replace(retired=retired)
-    return state if rest is state.rest else state.having(rest=rest)
+        state = state.having(environment=environment)
+    return state if np.array_equal(retired, state.retired) else state.having(retired=retired)

@@ -44,8 +44,9 @@ def pack(values: NDArray[Any]) -> bytes:
     if len(found) and (int(found.max()) >= MOST or int(found.min()) <= -MOST):
         raise OverflowError(f"values of a plane are below {MOST} in size, and one of these is not")
     small = found.astype(np.int32)
-    folded: NDArray[Any] = (small << 1) ^ (small >> 31)
-    return _packed(folded.view(np.uint32))
+    folded = np.empty(len(small), np.uint32)
+    folded[:] = ((small << 1) ^ (small >> 31)).view(np.uint32)
+    return _packed(folded)
 
 
 def _packed(unsigned: Unsigned) -> bytes:
@@ -54,7 +55,7 @@ def _packed(unsigned: Unsigned) -> bytes:
     bits = _bits(unsigned)
     if bits == WIDE:
         squeezed = deflated((unsigned & 255).astype(np.uint8).tobytes())
-        return _HEAD.pack(WIDE, 0, len(squeezed)) + squeezed + _packed(unsigned >> 8)
+        return _HEAD.pack(WIDE, 0, len(squeezed)) + squeezed + _packed(unsigned >> np.uint32(8))
     most = (1 << bits) - 1
     escaped = unsigned[unsigned >= most]
     small = np.minimum(unsigned, most).astype(np.uint8)

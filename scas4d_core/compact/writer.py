@@ -91,18 +91,24 @@ class CompactWriter:
         if index <= last:
             raise FileError(f"{self.path.name}: frame {index} cannot follow frame {last}; add frames in rising order")
         known = 0 if self._born is None else len(self._born)
-        if len(state) < known or (
-            self._born is not None and not np.array_equal(state.ids[:known], self._born.rest.ids)
-        ):
+        if len(state) < known or (self._born is not None and not np.array_equal(state.ids[:known], self._born.ids)):
             raise FileError(
                 f"{self.path.name}: frame {index} has other Gaussians than frame {last}; they are never removed"
             )
+        if not len(state):
+            raise FileError(f"{self.path.name}: frame {index} has no Gaussian; begin with a frame that has some")
+        for name in ("means", "factors", "rotations", "colours"):
+            wrong = np.flatnonzero(~np.isfinite(getattr(state, name)).reshape(len(state), -1).all(axis=1))
+            if len(wrong):
+                raise FileError(
+                    f"{self.path.name}: frame {index}: {len(wrong)} Gaussians have {name} that are not finite, rows "
+                    f"{wrong[:5].tolist()}; leave the frame out, or mend them"
+                )
         first = self._born is None
         if len(state) > known:
             self._bear(index, time, state, known)
         born, before = self._born, self._last
-        if born is None:  # no Gaussian at all
-            raise FileError(f"{self.path.name}: frame {index} has no Gaussian")
+        assert born is not None
         if before is not None and len(before) < len(born):
             before = before.joined(born.after(len(before)))
         self._since_key += 1
