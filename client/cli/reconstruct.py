@@ -15,6 +15,7 @@ import numpy as np
 from client.cli import pictures
 from client.cli.progress import Bars, console
 from scas4d_core.captures import Capture
+from scas4d_core.compact import CompactWriter, Head
 from scas4d_core.frame_outcome import AlarmKind
 from scas4d_core.presets import preset as named
 from scas4d_core.rig_checks import check_rig, rig_warnings
@@ -96,7 +97,7 @@ def reconstruct(
     changes: Mapping[str, Any],
     videos: bool = False,
 ) -> None:
-    """Reconstructs every frame; `out` gets pictures beside the truth, `states/` and `last.ply`.
+    """Reconstructs every frame; `out` gets pictures beside the truth, `states/`, `states.s4d` and `last.ply`.
 
     The truth is that of the test cameras or, where there are none, of one training camera, and the last line says so.
 
@@ -108,6 +109,7 @@ def reconstruct(
         changes: what differs from the preset, nested.
         videos: the pictures of each camera are left as a video, too, at the capture's rate.
     """
+    from scas4d_core.query.parts import parts
     from scas4d_core.query.ply import write_ply
     from scas4d_core.storage.history import History
 
@@ -123,12 +125,24 @@ def reconstruct(
     cameras = rig.cameras if capture.test_rig is not None else rig.cameras[:1]
     if (out / "states" / "fixed.npz").exists():  # of an earlier run, like the pictures beside it
         shutil.rmtree(out / "states")
+    compact = out / "states.s4d"
+    compact.unlink(missing_ok=True)
     history = History(out / "states")
     compile_kernels(settings)
-    with Bars() as bars, ExitStack() as open_videos:
+    with Bars() as bars, ExitStack() as opened:
+        writer: CompactWriter | None = None
         add: dict[str, Callable[[pictures.Picture], None]] = {}
         for reconstruction, done in reconstruct_frames(given, settings, count, history=history, progress=bars):
             index = done.index
+            if writer is None:
+                head = Head(
+                    reconstruction.world,
+                    background=history.background,
+                    rig=reconstruction.calibrated,
+                    frames_per_second=given.fps,
+                )
+                writer = opened.enter_context(CompactWriter(compact, head))
+            writer.add(index, history.time(index), history.gaussians(index))
             truth = capture.test_frame(index) if capture.test_rig is not None else capture.frame(index)
             scores = []
             if index in (0, count - 1) and reconstruction.report is not None:
@@ -147,15 +161,17 @@ def reconstruct(
                 pictures.save(out / f"camera_{camera.name}" / f"{index:06d}.png", compared)
                 if videos and camera.name not in add:
                     file = out / f"camera_{camera.name}.mp4"
-                    add[camera.name] = open_videos.enter_context(pictures.video(file, given.fps))
+                    add[camera.name] = opened.enter_context(pictures.video(file, given.fps))
                 if videos:
                     add[camera.name](compared)
             console.print(f"frame {index}: {np.mean(scores):.2f} dB{told(done.report)}")
+        if writer is not None and history.newest.moving.any():
+            writer.add_parts(history.indices[-1], parts(history))
     write_ply(out / "last.ply", history.gaussians(history.indices[-1]), reconstruction.world)
     seen = (
         "" if capture.test_rig is not None else f" (dB of training camera {cameras[0].name}; --test holds out others)"
     )
-    console.print(f"pictures, states and last.ply: {out}{seen}")
+    console.print(f"pictures, states, states.s4d and last.ply: {out}{seen}")
 
 
 def told(report: FrameReport | None) -> str:

@@ -16,6 +16,7 @@ from client.cli.evaluate import evaluate
 from client.cli.pictures import psnr
 from client.cli.reconstruct import reconstruct
 from client.importers.open_source import CaptureOptions, open_source
+from scas4d_core.compact import CompactReader
 from scas4d_core.query.ply import read_ply
 from scas4d_core.storage.frame_aside import FrameAside, ScratchFile
 from scas4d_core.storage.history import History
@@ -29,6 +30,13 @@ def test_it_leaves_pictures_states_and_a_ply_each_time_it_is_run(capture_folder,
         history = History.load(tmp_path / "states")
         assert history.indices == list(range(frames))  # of this run alone
         assert len(read_ply(tmp_path / "last.ply")) == len(history.gaussians(0))
+        with CompactReader(tmp_path / "states.s4d") as compact:
+            assert compact.frames == list(range(frames))
+            assert compact.times.tolist() == history.times.tolist()
+            last, true = compact.state(frames - 1), history.newest
+            assert np.abs(last.means - true.means).max() < 0.1 * np.linalg.norm(true.factors, axis=(1, 2)).max()
+            assert compact.head.rig is not None
+            assert compact.head.world.to_user([0, 0, 0]) == pytest.approx(compact.head.rig.centre)
     assert [path.name for path in sorted((tmp_path / "camera_2").iterdir())] == [f"{t:06d}.png" for t in range(3)]
 
 
