@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import typer
 
+from studies.compact.commands import compact
 from studies.effort.commands import effort
 from studies.frontier.commands import frontier
 from studies.hard_cases.commands import stability, timing
@@ -25,6 +26,7 @@ from studies.variants.commands import variants
 STUDIES = {
     "Quality": (quality, refit, effects, switches, targets, table, processors),
     "Rigs": (rigs, calibration, drift),
+    "What comes out": (compact,),
     "Accuracy against time": (frontier, effort, paper, variants),
     "Speed of the code": (kernels, device, moving, startup),
     "Hard cases": (stability, timing),

@@ -217,7 +217,8 @@ takes slower ones while each doubling of the time gains {LIVE_GAIN_DB:g} dB; an 
 ## At equal seconds
 
 The budget is the time that the baseline `dynamic3dgs` needs for a number of iterations; the PSNR of `scas4d` in that
-time is interpolated between its measured iterations, linearly over the logarithm of time. Cells: lead of `scas4d` in dB
+time is interpolated between its measured iterations, linearly over the logarithm of time; a number of iterations that
+takes longer than a better one is left out. Cells: lead of `scas4d` in dB
 (its PSNR : the baseline's). {equal_words(compared)}
 
 {equal_table(compared)}

@@ -115,9 +115,13 @@ def undominated(points: Sequence[Point]) -> list[Point]:
 
 
 def psnr_at(points: Sequence[Point], seconds: float) -> float | None:
-    """PSNR (dB) of a curve at so many seconds, on straight lines over log time; None outside the curve."""
-    ordered = sorted(points, key=lambda point: point.seconds)
-    if not ordered or not ordered[0].seconds <= seconds <= ordered[-1].seconds:
+    """PSNR (dB) of a curve at so many seconds, on straight lines over log time; None outside the curve.
+
+    A setting that takes longer than a better one is no part of it: with very few iterations, updates end so far off
+    that the search for what was lost takes longer than the iterations that would have found it.
+    """
+    ordered = undominated(points)
+    if not ordered or not ordered[0].seconds <= seconds <= max(point.seconds for point in points):
         return None
     return float(np.interp(np.log(seconds), [np.log(p.seconds) for p in ordered], [p.psnr for p in ordered]))
 

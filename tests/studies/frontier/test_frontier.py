@@ -2,6 +2,7 @@
 
 import json
 import types
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -158,6 +159,8 @@ def test_at_equal_seconds_the_curve_is_read_between_its_points(tmp_path):
     at_75 = psnr_at(ours, np.sqrt(0.5 * 1.0))  # half way in the logarithm from 50 to 100 iterations
     assert at_75 == pytest.approx((made_psnr(Variant("", "scas4d", 50)) + made_psnr(DEFAULT)) / 2)
     assert psnr_at(ours, 0.05) is None
+    slow = replace(ours[0], seconds=0.71, scores={**ours[0].scores, "psnr": 1.0})  # longer than a better one
+    assert psnr_at([*ours, slow], np.sqrt(0.5 * 1.0)) == at_75
     compared = equal_seconds(points, ["robot", "wheel"])
     assert [one.iterations for one in compared] == [25, 50, 100, 200, 300] * 2
     at_100 = next(one for one in compared if one.iterations == 100)

@@ -1,0 +1,1 @@
+"""The compact 4D file: its size, its errors and its speed."""

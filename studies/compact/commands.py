@@ -1,0 +1,36 @@
+"""`scripts/bench compact`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from studies.options import Page, write_page
+
+
+def compact(
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of the capture.")],
+    states: Annotated[
+        Path, typer.Argument(metavar="STATES", help="Its committed states: `states` of `scas4d reconstruct`.")
+    ],
+    frames: Annotated[int, typer.Option(min=2, help="Frames of the file: the states back and forth.")] = 240,
+    key_every: Annotated[int | None, typer.Option(min=1, help="Frames from key to key.")] = None,
+    bounds: Annotated[
+        list[str] | None,
+        typer.Option("--bound", metavar="NAME=VALUE", help="Another bound, as colour=0.02. May be repeated."),
+    ] = None,
+    page: Page = None,
+) -> None:
+    """Writes states to a compact file: bytes a frame, dB and tracks lost, and what writing and reading take.
+
+    Example: scas4d reconstruct captures/robot --out out/robot; scripts/bench compact captures/robot out/robot/states
+    """
+    from studies.compact.compact import measure, told
+
+    changed = dict(one.split("=", 1) for one in bounds or ())
+    found = measure(capture, states, frames, {name: float(value) for name, value in changed.items()}, key_every)
+    text = told(found)
+    print(text)
+    write_page(page, text)

@@ -1,0 +1,218 @@
+"""``scripts/bench compact``: what a compact file takes and loses, against the exact states it is made of."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from client.importers.open_source import open_source
+from scas4d_core import metrics
+from scas4d_core.cameras import WorldFrame
+from scas4d_core.captures import Capture
+from scas4d_core.compact import Bounds, CompactReader, CompactWriter, Head
+from scas4d_core.compact.records import Kind, scan
+from scas4d_core.compact.writer import KEY_EVERY
+from scas4d_core.gaussians import UNBORN, Gaussians, moving_extent
+from scas4d_core.query.committed import CommittedScene
+from scas4d_core.settings import Settings
+from scas4d_core.storage.history import History
+
+POINTS = 1000
+"""Tracked, drawn from the Gaussians that move."""
+VIEWS = 6
+"""Frames whose test cameras are rendered, evenly spread over the capture."""
+READS = 40
+"""Frames that are read at random."""
+
+
+@dataclass(frozen=True)
+class CompactFigures:
+    """Of one capture.
+
+    Attributes:
+        gaussians, moving: how many. frames: of the file. exact: bytes a frame of the exact states on disk.
+        size: bytes a frame of the file, head, born and index shared. sizes: mean bytes of a record by its kind.
+        psnr: dB that the test cameras lose, mean over ``VIEWS`` frames; None without test cameras. worst: of one frame.
+        tracks: median over points and frames of the distance of tracks, % of the extent.
+        write: milliseconds of the processor to write a frame, median. read: of a frame at random, median; read_worst.
+        opening: milliseconds to open the file; unindexed: the same without its index.
+        errors: largest, by attribute.
+    """
+
+    capture: str
+    gaussians: int
+    moving: int
+    frames: int
+    exact: float
+    size: float
+    sizes: Mapping[str, float]
+    psnr: float | None
+    worst: float | None
+    tracks: float
+    write: float
+    read: float
+    read_worst: float
+    opening: float
+    unindexed: float
+    errors: Mapping[str, float]
+
+
+def back_and_forth(indices: Sequence[int], count: int) -> list[int]:
+    """So many indices, forwards, backwards, forwards …
+
+    >>> back_and_forth([0, 1, 2], 7)
+    [0, 1, 2, 1, 0, 1, 2]
+    """
+    if len(indices) == 1:
+        return list(indices) * count
+    period = [*indices, *reversed(indices[1:-1])]
+    return [period[place % len(period)] for place in range(count)]
+
+
+def measure(
+    folder: Path, states: Path, frames: int, bounds: Mapping[str, float], key_every: int | None
+) -> CompactFigures:
+    """Writes the states of a capture back and forth into a file, and compares it with them."""
+    capture = open_source(folder)
+    history = History.load(states)
+    world = capture.full_rig.world_frame(Settings().scene.metres_per_unit)
+    head = Head(world, Bounds(**bounds), background=history.background)
+    order = back_and_forth(history.indices, frames)
+    exact = float(np.mean([path.stat().st_size for path in states.glob("frame_*.npz")]))
+    with TemporaryDirectory() as temporary:
+        file = Path(temporary) / "states.s4d"
+        written = _write(file, head, (history.gaussians(index) for index in order), key_every or KEY_EVERY)
+        with file.open("rb") as opened:
+            records = list(scan(opened, 0, file.name))
+        kinds = {
+            kind.name.lower(): float(np.mean(found))
+            for kind in Kind
+            if (found := [record.size for record in records if record.kind is kind])
+        }
+        opening = _seconds(lambda: CompactReader(file).close())
+        cut = file.with_suffix(".cut")
+        cut.write_bytes(file.read_bytes()[:-8])
+        unindexed = _seconds(lambda: CompactReader(cut).close())
+        with CompactReader(file) as reader:
+            reads = _reads(reader)
+            first = {index: reader.state(place) for place, index in enumerate(history.indices)}
+            psnr, worst = _pictures(capture, world, history, first)
+            tracks = _tracks(world, history, first)
+            errors = reader.about["errors"]
+        state = history.gaussians(history.indices[0])
+        return CompactFigures(
+            capture=capture.name,
+            gaussians=len(state),
+            moving=int(state.moving.sum()),
+            frames=frames,
+            exact=exact,
+            size=file.stat().st_size / frames,
+            sizes=kinds,
+            psnr=psnr,
+            worst=worst,
+            tracks=tracks,
+            write=1e3 * float(np.median(written)),
+            read=1e3 * float(np.median(reads)),
+            read_worst=1e3 * max(reads),
+            opening=1e3 * opening,
+            unindexed=1e3 * unindexed,
+            errors=errors,
+        )
+
+
+def told(found: CompactFigures) -> str:
+    """The figures as Markdown."""
+    kinds = ", ".join(f"{name} {size / 1e3:.1f}" for name, size in found.sizes.items())
+    errors = ", ".join(f"{name} {value:.4f}" for name, value in found.errors.items())
+    pictures = "–" if found.psnr is None else f"{found.psnr:+.3f} (worst frame {found.worst:+.3f})"
+    return "\n".join(
+        [
+            f"**{found.capture}**: {found.gaussians:,} Gaussians, {found.moving:,} move; {found.frames} frames",
+            "",
+            "| kB a frame | exact | dB of the test cameras | tracks, % of the extent | write ms | read ms | open ms |",
+            "|---|---|---|---|---|---|---|",
+            f"| {found.size / 1e3:.1f} | {found.exact / 1e3:.0f} | {pictures} | {found.tracks:.4f} | {found.write:.1f} "
+            f"| {found.read:.1f} (worst {found.read_worst:.1f}) "
+            f"| {found.opening:.1f} ({found.unindexed:.1f} without index) |",
+            "",
+            f"kB of a record: {kinds}. Largest errors: {errors}.",
+        ]
+    )
+
+
+def _write(file: Path, head: Head, states: Iterator[Gaussians], key_every: int) -> list[float]:
+    """Seconds of the processor for each frame after the first."""
+    seconds = []
+    with CompactWriter(file, head, key_every) as writer:
+        for place, state in enumerate(states):
+            began = time.process_time()
+            writer.add(place, place / 30, state)
+            seconds.append(time.process_time() - began)
+    return seconds[1:]
+
+
+def _seconds(call: Callable[[], Any]) -> float:
+    began = time.perf_counter()
+    call()
+    return time.perf_counter() - began
+
+
+def _reads(reader: CompactReader) -> list[float]:
+    """Seconds of the processor to read frames at random; those that are born are read before."""
+    draw = np.random.default_rng(0)
+    seconds = []
+    reader.state(reader.frames[-1])
+    for index in draw.choice(reader.frames, min(READS, len(reader.frames)), replace=False).tolist():
+        began = time.process_time()
+        reader.state(int(index))
+        seconds.append(time.process_time() - began)
+    return seconds
+
+
+def _pictures(
+    capture: Capture, world: WorldFrame, history: History, decoded: Mapping[int, Gaussians]
+) -> tuple[float | None, float | None]:
+    rig = capture.test_rig
+    if rig is None:
+        return None, None
+    chosen = [history.indices[k] for k in np.linspace(1, len(history.indices) - 1, VIEWS).astype(int)]
+    losses = []
+    for index in chosen:
+        truth = capture.test_frame(index)
+        scores = []
+        for state in (decoded[index], history.gaussians(index)):
+            scene = _scene(world, {index: state})
+            found = [
+                metrics.psnr(scene.render(camera, background=history.background).colour, truth.images[camera.name])
+                for camera in rig.cameras
+            ]
+            scores.append(float(np.mean(found)))
+        losses.append(scores[0] - scores[1])
+    return float(np.mean(losses)), float(min(losses))
+
+
+def _tracks(world: WorldFrame, history: History, decoded: Mapping[int, Gaussians]) -> float:
+    indices, state = history.indices, history.gaussians(history.indices[0])
+    rows = np.flatnonzero(state.moving)
+    rows = np.random.default_rng(0).choice(rows, min(POINTS, len(rows)), replace=False)
+    points = world.to_user(state.means[rows])
+    exact = _scene(world, {index: history.gaussians(index) for index in indices})
+    found = _scene(world, decoded)
+    tracks = [one.tracks_of_points(points, indices[0], indices).positions for one in (exact, found)]
+    extent = moving_extent(state) / world.metres_per_unit
+    return float(100 * np.nanmedian(np.linalg.norm(tracks[0] - tracks[1], axis=-1)) / extent)
+
+
+def _scene(world: WorldFrame, states: Mapping[int, Gaussians]) -> CommittedScene:
+    history = History()
+    for index, state in states.items():
+        known = history.ids if len(history) else state.ids
+        born = np.full(len(state) - len(known), UNBORN, np.int64)  # they get ids of this history
+        history.append(index, float(index), state.replace(ids=np.concatenate([known, born])))
+    return CommittedScene(history, world)
