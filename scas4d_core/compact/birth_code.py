@@ -31,7 +31,9 @@ Float = NDArray[np.float64]
 
 OCTAVE = 8
 """Steps of an axis' length in a factor of two."""
-FINEST = 0.02
+FINER = 4
+"""Bounds of centres, axes and colours are divided by this: what stands has these errors for ever, and they are told once."""
+COARSEST = 0.02
 """Error of an axis in parts of its own length, at most."""
 SHORTEST = 1e-30
 """Metres; an axis is not shorter."""
@@ -111,7 +113,7 @@ def decode_born(body: bytes, count: int, bounds: Bounds) -> tuple[Columns, Clust
 
 
 def _axis_step(bounds: Bounds) -> float:
-    return 2 * min(FINEST, bounds.axes / 2)
+    return 2 * min(COARSEST, bounds.axes / FINER)
 
 
 def _planes(state: Columns, bounds: Bounds) -> dict[str, Float]:
@@ -123,8 +125,8 @@ def _planes(state: Columns, bounds: Bounds) -> dict[str, Float]:
         axes = np.rint(factors / told / _axis_step(bounds))
         sizes = sizes_of((axes * _axis_step(bounds) * told).reshape(9, -1)).astype(np.float64)
         usable = (sizes > TINIEST) & (sizes < LARGEST_SIZE)
-        means = np.rint(state.means / (2 * bounds.position * MARGIN * np.where(usable, sizes, 0)))
-        red, green, blue = np.rint(state.colours.astype(np.float64) / (2 * bounds.colour))
+        means = np.rint(state.means / (2 * bounds.position / FINER * MARGIN * np.where(usable, sizes, 0)))
+        red, green, blue = np.rint(state.colours.astype(np.float64) / (2 * bounds.colour / FINER))
         return {
             "lengths": np.nan_to_num(lengths),
             "axes": axes.reshape(9, -1),
@@ -142,8 +144,8 @@ def _columns(told: dict[str, Ints], ids: NDArray[np.int64], bounds: Bounds) -> C
         factors = (told["axes"].reshape(3, 3, -1) * _axis_step(bounds) * lengths).reshape(9, -1)
         sizes = sizes_of(factors).astype(np.float64)
         green, red, blue = told["colours"]
-        means = (told["means"] * (2 * bounds.position * MARGIN * sizes)).astype(np.float32)
-    colours = (np.stack([red + green, green, blue + green]) * (2 * bounds.colour)).astype(np.float32)
+        means = (told["means"] * (2 * bounds.position / FINER * MARGIN * sizes)).astype(np.float32)
+    colours = (np.stack([red + green, green, blue + green]) * (2 * bounds.colour / FINER)).astype(np.float32)
     rotations = turns_of(told["rotations"] * (2 * bounds.rotation / 3**0.5)).astype(np.float32)
     foreground = label_of(np.clip(told["labels"][0], 0, LABELS - 1))
     opacities = np.clip(told["opacities"][0] * (2 * bounds.opacity), OPAQUE, 1 - OPAQUE).astype(np.float32)

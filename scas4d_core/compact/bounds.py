@@ -30,7 +30,7 @@ class Bounds:
     scas4d_core.errors.InputError: bound colour=0 is out of its range; give a number from 1e-06 to 1
     """
 
-    position: float = 0.06
+    position: float = 0.04
     axes: float = 0.06
     rotation: float = 0.05
     colour: float = 0.012
