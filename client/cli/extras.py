@@ -11,6 +11,8 @@ SERVER = (
 """Modules of the extra `server`."""
 CUDA = ("torch", "gsplat")
 """Modules of the extra `cuda`."""
+EXPORTS = ("gsply", "pxr")
+"""Modules of the extra `exports`."""
 
 
 def need_server() -> None:
@@ -27,7 +29,8 @@ def need_server() -> None:
 def remedy(missing: ModuleNotFoundError) -> str | None:
     """Says what to install, in a sentence; None where the module belongs to no extra."""
     package = (missing.name or "").partition(".")[0]
-    extra = "server" if package in SERVER else "cuda" if package in CUDA else None
+    extras = {"server": SERVER, "cuda": CUDA, "exports": EXPORTS}
+    extra = next((name for name, packages in extras.items() if package in packages), None)
     if extra is None:
         return None
     return f"this needs {package}, which is not installed; in the project's folder: pip install -e '.[{extra}]'"

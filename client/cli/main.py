@@ -132,6 +132,31 @@ def evaluate(
     run(capture, out, options=options, frames=frames, preset_name=preset, changes=given, again=again)
 
 
+@app.command()
+def export(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A compact file (.s4d), or the folder of `scas4d reconstruct`.")
+    ],
+    format: Annotated[
+        str, typer.Option(help="ply, splat, spz, spz4, glb, glb-parts, usd, tracks or poses; docs/exports.md.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder or .zip for a file a frame, else a file. [beside FILE]")
+    ] = None,
+    frames: Annotated[str | None, typer.Option(metavar="A:B", help="Only these frames, both ends counted in.")] = None,
+    ids: Annotated[
+        list[int] | None, typer.Option("--id", help="Only this Gaussian, for tracks. May be repeated.")
+    ] = None,
+) -> None:
+    """Writes reconstructed frames in the formats of other tools: splats, glTF, USD, tables.
+
+    Example: scas4d reconstruct samples/robot --out out/robot; scas4d export out/robot --format usd
+    """
+    from client.cli.export import export as run
+
+    run(file, format, out, frames, ids)
+
+
 def _version(wanted: bool) -> None:
     if wanted:
         console.print(__version__)
