@@ -7,7 +7,7 @@ is numpy.
 
 from client.calls.budgets import budget, end_replay, replay, set_budget, tradeoff
 from client.calls.call import Call
-from client.calls.frames import close_frame, declare_missing, frame, frames, picture, ply, put_camera, put_frame
+from client.calls.frames import close_frame, declare_missing, frame, frames, picture, ply, put_camera, put_frame, states
 from client.calls.gaussians import gaussians
 from client.calls.parts import parts
 from client.calls.scenes import (
@@ -64,6 +64,7 @@ __all__ = [
     "scenes",
     "set_budget",
     "share",
+    "states",
     "ticket",
     "tracks",
     "tracks_arrays",

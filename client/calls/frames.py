@@ -136,6 +136,22 @@ def ply(id: str, index: int) -> Call[bytes]:
     return Call("GET", path(id, "frames", index, "splat.ply"), lambda response: response.content)
 
 
+def states(id: str, first: int = 0, limit: int = 120, parts: bool = False) -> Call[tuple[bytes, int | None]]:
+    """Reads committed frames from `first` on as a compact 4D file, and the frame to go on with, or None.
+
+    >>> data, following = client.states(scene)
+    >>> data[:4], following
+    (b's4dR', None)
+    """
+
+    def read(response: Any) -> tuple[bytes, int | None]:
+        following = response.headers.get("X-Next-Frame")
+        return response.content, None if following is None else int(following)
+
+    arguments = {"params": {"first": first, "limit": limit, "parts": parts}}
+    return Call("GET", path(id, "states.s4d"), read, arguments=arguments)
+
+
 def picture(id: str, index: int, camera: str, kind: FileKind = FileKind.IMAGE) -> Call[bytes]:
     """Reads one camera's picture of a frame, or its mask, byte for byte as it was sent.
 

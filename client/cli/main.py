@@ -134,19 +134,24 @@ def evaluate(
 
 @app.command()
 def export(
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="A compact file (.s4d), or the folder of `scas4d reconstruct`.")
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="SOURCE", help="A compact file (.s4d), the folder of `scas4d reconstruct`, or a scene's id."
+        ),
     ],
     format: Annotated[
         str, typer.Option(help="ply, splat, spz, spz4, glb, glb-parts, usd, tracks or poses; docs/exports.md.")
     ],
     out: Annotated[
-        Path | None, typer.Option(help="Folder or .zip for a file a frame, else a file. [beside FILE]")
+        Path | None, typer.Option(help="Folder or .zip for a file a frame, else a file. [named after SOURCE]")
     ] = None,
     frames: Annotated[str | None, typer.Option(metavar="A:B", help="Only these frames, both ends counted in.")] = None,
     ids: Annotated[
         list[int] | None, typer.Option("--id", help="Only this Gaussian, for tracks. May be repeated.")
     ] = None,
+    url: commands.Url = DEFAULT_URL,
+    token: commands.Token = None,
 ) -> None:
     """Writes reconstructed frames in the formats of other tools: splats, glTF, USD, tables.
 
@@ -154,7 +159,7 @@ def export(
     """
     from client.cli.export import export as run
 
-    run(file, format, out, frames, ids)
+    run(source, format, out, frames, ids, url=url, token=token)
 
 
 def _version(wanted: bool) -> None:

@@ -32,7 +32,7 @@ Float = NDArray[np.float64]
 OCTAVE = 8
 """Steps of an axis' length in a factor of two."""
 FINER = 4
-"""Bounds of centres, axes and colours are divided by this: what stands has these errors for ever, and they are told once."""
+"""Bounds of centres, axes and colours are divided by this: they are told once, and what stands keeps their errors."""
 COARSEST = 0.02
 """Error of an axis in parts of its own length, at most."""
 SHORTEST = 1e-30

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, ClassVar, Literal
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from client.wire import Budget, Retention
-from scas4d_core.cameras import Camera, Rig
+from scas4d_core.cameras import Rig
 from scas4d_core.settings import Settings
 from server.storage.layout import SceneFolder
 
@@ -226,124 +223,3 @@ class ReplayEnded:
     """The replay has ended; `fault` is None if all numbers of iterations were measured."""
 
     fault: str | None = None
-
-
-# To the readers.
-
-
-@dataclass(frozen=True, eq=False)
-class RenderQuery:
-    """A view of a committed frame.
-
-    `background` None is the one that frame 0 has found. `parts` is their number where they are asked for and it is
-    given; `labels` [N] are then the parts themselves.
-    """
-
-    kind: ClassVar[str] = "render"
-    camera: Camera
-    frame: int
-    kinds: tuple[str, ...]
-    format: Literal["png", "jpeg", "webp", "npz", "float32"]
-    background: tuple[float, float, float] | None
-    parts: int | None = None
-    quality: int | None = None
-    labels: NDArray[np.int16] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class TracksQuery:
-    """Trajectories over `frames` of ids, of pixels [Q, 2] of a camera, or of points [Q, 3], the latter two at `at`.
-
-    `project` are the cameras into which the trajectories are projected, with visibility.
-    """
-
-    kind: ClassVar[str] = "tracks"
-    frames: tuple[int, ...]
-    at: int
-    ids: tuple[int, ...] | None = None
-    camera: Camera | None = None
-    pixels: NDArray[np.float64] | None = None
-    points: NDArray[np.float64] | None = None
-    project: tuple[Camera, ...] = ()
-    format: Literal["json", "npz"] = "json"
-
-
-@dataclass(frozen=True)
-class PartsQuery:
-    """Labels of all Gaussians."""
-
-    kind: ClassVar[str] = "parts"
-    count: int | None
-
-
-@dataclass(frozen=True)
-class LabelsQuery:
-    """Labels of all Gaussians as little-endian int16, in the order of the states."""
-
-    kind: ClassVar[str] = "labels"
-    count: int | None
-
-
-@dataclass(frozen=True)
-class GaussiansQuery:
-    """Lives of Gaussians by id."""
-
-    kind: ClassVar[str] = "gaussians"
-    ids: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class PlyQuery:
-    """A committed frame as a 3DGS .ply."""
-
-    kind: ClassVar[str] = "ply"
-    frame: int
-
-
-Query = RenderQuery | TracksQuery | PartsQuery | LabelsQuery | GaussiansQuery | PlyQuery
-
-
-def asked(query: Query) -> tuple[str, object]:
-    """Returns field and value of the part of a query that only the reader can check."""
-    if isinstance(query, TracksQuery | GaussiansQuery) and query.ids is not None:
-        return "ids", list(query.ids)
-    if isinstance(query, TracksQuery):
-        return "at", query.at
-    if isinstance(query, LabelsQuery | PartsQuery):
-        return "count", query.count if query.count is not None else "chosen by rule"
-    return "frame", query.frame
-
-
-@dataclass(frozen=True)
-class AskedQuery:
-    """A query with a number to find its answer by.
-
-    `stale` are frames that were committed, deleted or taken back since the query before; None: any may have been.
-    """
-
-    number: int
-    query: Query
-    stale: frozenset[int] | None = frozenset()
-
-
-# From the readers.
-
-
-@dataclass(frozen=True)
-class Answer:
-    """The body of an HTTP answer, encoded."""
-
-    number: int
-    body: bytes
-    media_type: str
-    headers: dict[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Refused:
-    """The query cannot be answered. `status` is that of the HTTP answer; `remedy` may be empty."""
-
-    number: int
-    fault: str
-    remedy: str = ""
-    status: int = 422

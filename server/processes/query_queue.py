@@ -14,8 +14,9 @@ from functools import partial
 
 from server.health import metrics
 from server.problems import Problem, counted
-from server.processes.messages import Answer, AskedQuery, Damaged, Query, Refused, SceneSpec
+from server.processes.messages import Damaged, SceneSpec
 from server.processes.placement import Entry, Placement, Process
+from server.processes.queries import Answer, AskedQuery, Query, Refused
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
 """Pause before a process that ended by itself is started again; it doubles with each end without an answer."""

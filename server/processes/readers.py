@@ -19,18 +19,18 @@ from numpy.typing import NDArray
 from server.health import metrics
 from server.problems import SERVICE_FAULT, Problem
 from server.processes import renderer, track_answers
-from server.processes.messages import (
+from server.processes.messages import SceneSpec
+from server.processes.placement import STOP_SECONDS, Placement
+from server.processes.queries import (
     Answer,
     GaussiansQuery,
     LabelsQuery,
     Query,
     Refused,
     RenderQuery,
-    SceneSpec,
     TracksQuery,
     asked,
 )
-from server.processes.placement import STOP_SECONDS, Placement
 from server.processes.query_queue import Noticed, QueryQueue
 
 GRACE_VIEWS_S, GRACE_BULK_S = 10.0, 1.0

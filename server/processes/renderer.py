@@ -26,10 +26,14 @@ from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.storage.frame_files import frame_file
 from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFrameError
 from server.processes import track_answers
-from server.processes.messages import (
+from server.processes.compact_answers import compact_head, write_compact
+from server.processes.messages import Damaged, SceneSpec, Stop
+from server.processes.part_labels import PartLabels, fitted
+from server.processes.placement import use_one_thread
+from server.processes.queries import (
     Answer,
     AskedQuery,
-    Damaged,
+    CompactQuery,
     GaussiansQuery,
     LabelsQuery,
     PartsQuery,
@@ -37,12 +41,8 @@ from server.processes.messages import (
     Query,
     Refused,
     RenderQuery,
-    SceneSpec,
-    Stop,
     TracksQuery,
 )
-from server.processes.part_labels import PartLabels, fitted
-from server.processes.placement import use_one_thread
 
 if TYPE_CHECKING:
     from scas4d_core.query.committed import CommittedScene, View
@@ -135,7 +135,7 @@ class Renderer:
 
     def _note_missing(self, query: Query) -> None:
         """Notes frames that the service takes for committed and that are missing; it knows if they were deleted."""
-        frames = query.frames if isinstance(query, TracksQuery) else (getattr(query, "frame", None),)
+        frames = query.frames if isinstance(query, TracksQuery | CompactQuery) else (getattr(query, "frame", None),)
         history = self._history
         if history is not None and history.files is not None:
             known = set(history.indices)
@@ -199,6 +199,11 @@ class Renderer:
             case PlyQuery():
                 file = self.spec.folder.export
                 self.reader.write_ply(file, query.frame)
+                return Answer(number, file.read_bytes(), "application/octet-stream")
+            case CompactQuery():
+                file = self.spec.folder.export
+                parts = self.labels(None) if query.parts else None
+                write_compact(file, self.history, query.frames, compact_head(self.spec, self.history), parts)
                 return Answer(number, file.read_bytes(), "application/octet-stream")
 
 

@@ -15,7 +15,7 @@ from fastapi.routing import APIRoute
 from starlette.requests import HTTPConnection
 
 from server.problems import Problem
-from server.processes.messages import Answer, Query
+from server.processes.queries import Answer, Query
 from server.scene.scene import Scene
 from server.scene.scenes import Scenes
 from server.settings import ServerSettings

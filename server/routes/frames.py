@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from bisect import bisect_left
 from collections.abc import AsyncIterator
 from typing import Annotated, Any
 
@@ -21,7 +22,7 @@ from server.http.unchanging import unchanging
 from server.ingest.camera_files import receive_camera, receive_file, receive_form
 from server.ingest.receive import receive_frame
 from server.problems import Problem
-from server.processes.messages import PlyQuery
+from server.processes.queries import CompactQuery, PlyQuery
 from server.routes.access import FrameIndex, TheRecord, TheScene, ask
 from server.scene.scene import Scene
 from server.storage.frame_store import FrameDamage, read_pictures
@@ -56,6 +57,8 @@ PICTURE: dict[str, Any] = {
         },
     }
 }
+MOST_STATES = 120
+"""Frames of one compact file that is asked for: some seconds of the reader, some megabytes."""
 SENT_AS = {b"\xff\xd8": ("image/jpeg", ".jpg"), b"\x89P": ("image/png", ".png"), b"RI": ("image/webp", ".webp")}
 """Media type and ending of a picture's file by its first bytes."""
 FILE: dict[int | str, dict[str, Any]] = {
@@ -173,6 +176,48 @@ async def ply(scene: TheScene, n: FrameIndex, request: Request) -> Response:
     """Exports a committed frame in the file format of 3D Gaussian Splatting."""
     answer = await ask(request, scene, PlyQuery(scene.committed_frame(n, "n")))
     return unchanging(request, answer.body, media_type=answer.media_type, name=f"{scene.id[:8]}-{n:06d}.ply")
+
+
+@router.get(
+    "/{id}/states.s4d",
+    response_class=Response,
+    responses={
+        200: {
+            "content": {"application/octet-stream": {}},
+            "description": "A compact 4D file (docs/format.md).",
+            "headers": {
+                "X-Next-Frame": {
+                    "schema": {"type": "integer"},
+                    "description": "The committed frame to go on with as `first`; absent where there is none.",
+                }
+            },
+        }
+    },
+)
+async def compact(
+    scene: TheScene,
+    request: Request,
+    first: Annotated[int, Query(ge=0, le=1_000_000_000, description="The first frame; later ones follow.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=MOST_STATES, description="Frames at most.")] = MOST_STATES,
+    parts: Annotated[bool, Query(description="With the parts of all Gaussians, as they are seen now.")] = False,
+) -> Response:
+    """Exports committed frames as a compact 4D file, which `scas4d export` turns into other formats."""
+    scene.committed_frame(None, "first")
+    begin = bisect_left(scene.committed, first)
+    frames = tuple(scene.committed[begin : begin + limit])
+    if not frames:
+        raise Problem(
+            404,
+            f"no committed frame from {first} on",
+            field="first",
+            value=first,
+            remedy=f"ask within {scene.committed[0]} to {scene.committed[-1]}",
+        )
+    following = scene.committed[begin + limit : begin + limit + 1]
+    answer = await ask(request, scene, CompactQuery(frames, parts))
+    headers = {"X-Next-Frame": str(following[0])} if len(following) else {}
+    name = f"{scene.id[:8]}-{frames[0]:06d}.s4d"
+    return unchanging(request, answer.body, media_type=answer.media_type, name=name, headers=headers)
 
 
 async def _stored(scene: Scene, n: int, c: str, kind: FileKind) -> memoryview:

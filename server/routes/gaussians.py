@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 
 from client.wire import GaussiansModel
-from server.processes.messages import GaussiansQuery
+from server.processes.queries import GaussiansQuery
 from server.routes.access import TheScene, ask
 from server.routes.tracks import check_ids, ids_in
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 
 from client.wire import PartsModel
-from server.processes.messages import PartsQuery
+from server.processes.queries import PartsQuery
 from server.routes.access import TheScene, ask
 
 router = APIRouter(prefix="/v1/scenes", tags=["parts"])

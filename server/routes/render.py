@@ -11,7 +11,7 @@ from client import __version__
 from client.wire import MAX_PIXELS_A_SIDE, RenderFormat, RenderKind, RenderRequest
 from server.http.unchanging import disposition, is_known
 from server.problems import Problem, counted
-from server.processes.messages import RenderQuery
+from server.processes.queries import RenderQuery
 from server.routes.access import TheScene, ask
 from server.scene.scene import Scene
 

@@ -14,7 +14,7 @@ from client.wire import CameraModel, TracksModel, TracksRequest
 from scas4d_core.cameras import Camera
 from server.problems import Problem, counted
 from server.processes import track_answers
-from server.processes.messages import TracksQuery
+from server.processes.queries import TracksQuery
 from server.routes import render
 from server.routes.access import TheScene, ask
 from server.scene.scene import Scene

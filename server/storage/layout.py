@@ -142,8 +142,8 @@ class SceneFolder:
 
     @property
     def export(self) -> Path:
-        """A 3DGS export while it is being answered."""
-        return self.path / "splat.ply"
+        """An export while it is being answered."""
+        return self.path / "export.part"
 
 
 def _suffix(reconstruction: int) -> str:

@@ -17,7 +17,7 @@ from client.wire import RenderRequest, TracksRequest
 from client.wire.base import Model
 from client.wire.stream import BulkHead, PartsSubscription, StreamProblem, pack
 from server.problems import SERVICE_FAULT, Problem
-from server.processes.messages import PartsQuery, Query, RenderQuery, TracksQuery
+from server.processes.queries import PartsQuery, Query, RenderQuery, TracksQuery
 from server.routes import render, tracks
 from server.scene.scene import Scene
 from server.stream.outbox import Outbox

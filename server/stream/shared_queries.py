@@ -10,7 +10,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from server.processes.messages import Answer, Query, RenderQuery
+from server.processes.queries import Answer, Query, RenderQuery
 
 QUERIES_AT_ONCE = 2
 """Queries of a lane that a scene's reader has for subscribers: one at work and one that follows at once; the others are

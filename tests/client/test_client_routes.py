@@ -39,6 +39,7 @@ CALLS = [
     calls.frame("s", 7),
     calls.frames("s"),
     calls.ply("s", 7),
+    calls.states("s"),
     calls.picture("s", 7, "c0"),
     calls.render("s", "c0"),
     calls.render_file("s", "c0"),

@@ -14,7 +14,7 @@ from client.sdk import Client
 from client.wire import CameraModel
 from scas4d_core.storage.history import History
 from server.processes import track_answers
-from server.processes.messages import TracksQuery
+from server.processes.queries import TracksQuery
 from server.routes import tracks
 
 FRAMES = 6

@@ -14,7 +14,7 @@ from websockets.asyncio.client import connect
 from client.wire import CameraModel, RenderRequest
 from client.wire.stream import STREAM_PROTOCOL, Subscribed, unpack
 from server.problems import Problem
-from server.processes.messages import Answer, PartsQuery, RenderQuery
+from server.processes.queries import Answer, PartsQuery, RenderQuery
 from server.stream import shared_queries
 from server.stream.live_queries import LiveRender
 from server.stream.outbox import UNSENT_REPLIES, Outbox
