@@ -18,6 +18,7 @@ from client.wire import FRAME_MEDIA_TYPE, FrameFile, FrameHead, RenderRequest, S
 from client.wire.base import MAX_CAMERAS
 from client.wire.framing import MAGIC, MAX_HEAD, MAX_INDEX
 from scas4d_core.captures import open_capture
+from scas4d_core.compact import CompactReader
 from scas4d_core.metrics.image import psnr
 from server.settings import ServerSettings
 
@@ -105,6 +106,9 @@ def test_tracks_parts_and_the_export_have_content(made):
     assert list(tracks["pixels"]) == list(tracks["visible"]) == ["north"]
     assert json.loads((made / "parts.json").read_text())["count"] == 3
     assert (made / "frame3.ply").read_bytes().startswith(b"ply\n")
+    with CompactReader(made / "states.s4d") as compact:
+        assert compact.frames == [0, 1, 2, 3]
+        assert len(set(compact.parts().tolist()) - {-1}) > 1
 
 
 def test_the_token_does_not_stay_behind(made):

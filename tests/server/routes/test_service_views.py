@@ -5,11 +5,16 @@ import io
 import fakes
 import numpy as np
 import pytest
+from fakes import STEP_M
 from PIL import Image
 from running import HEIGHT, WIDTH, make_rig, pictures, problem
+from typer.testing import CliRunner
 
+from client.cli.main import app
 from client.sdk import Client, ServiceError
 from client.wire import CameraModel
+from scas4d_core.compact import CompactReader
+from scas4d_core.query.ply import read_ply
 from server.routes import tracks as routes
 
 
@@ -151,6 +156,50 @@ def test_parts_and_ply(sdk, finished):
     parts = sdk.parts(finished, 2)
     assert (parts.count, parts.ids, parts.labels) == (2, [0, 1], [0, 1])
     assert sdk.ply(finished, 1) == b"ply\n1"
+
+
+def test_states_come_as_compact_files(sdk, http, finished, tmp_path):
+    whole, following = sdk.states(finished, parts=True)
+    assert following is None
+    (tmp_path / "whole.s4d").write_bytes(whole)
+    with CompactReader(tmp_path / "whole.s4d") as reader:
+        assert reader.frames == [0, 1, 2]
+        assert reader.head.rig.names == ("c0", "c1")
+        assert reader.parts().tolist() == [0, 1]
+        moved = reader.state(2).means - reader.state(0).means
+        assert moved[:, 0] == pytest.approx([2 * STEP_M] * 2, abs=0.01)
+        one = reader.state(1)
+    part, following = sdk.states(finished, first=1, limit=1)
+    assert following == 2
+    (tmp_path / "part.s4d").write_bytes(part)
+    with CompactReader(tmp_path / "part.s4d") as reader:
+        assert reader.frames == [1]
+        assert reader.parts() is None
+        assert np.abs(reader.state(1).means - one.means).max() < 0.01
+    for wrong, status in (("first=3", 404), ("limit=121", 422), ("first=-1", 422), ("frame=1", 422)):
+        problem(http.get(f"/v1/scenes/{finished}/states.s4d?{wrong}"), status)
+
+
+def test_a_scene_is_exported_by_the_command(service, finished, tmp_path):
+    def run(*more):
+        given = ["export", finished, "--url", service.url, *more]
+        return CliRunner().invoke(app, given, env={"COLUMNS": "200"})
+
+    told = run("--format", "ply", "--out", str(tmp_path / "a"), "--frames", "1:")
+    assert told.exit_code == 0, told.output
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["frame_000001.ply", "frame_000002.ply"]
+    assert len(read_ply(tmp_path / "a" / "frame_000001.ply")) == 2
+    poses = run("--format", "poses", "--out", str(tmp_path / "a.csv"))
+    assert poses.exit_code == 0, poses.output
+    assert len((tmp_path / "a.csv").read_text().splitlines()) == 1 + 3 * 2
+    for wrong, says in (
+        (("--format", "obj"), "is not known"),
+        (("--format", "ply", "--frames", "7:9"), "7"),
+        (("--format", "ply", "--frames", "x"), "no range"),
+    ):
+        failed = run(*wrong)
+        assert failed.exit_code != 0
+        assert says in str(failed.exception)
 
 
 def test_lives_of_gaussians(sdk, finished):

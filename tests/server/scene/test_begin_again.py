@@ -335,6 +335,7 @@ ADDRESSES = {
     "/frames/{n}": ["/frames/0"],
     "/frames/{n}/cameras/{c}": ["/frames/0/cameras/c0"],
     "/frames/{n}/splat.ply": ["/frames/0/splat.ply"],
+    "/states.s4d": ["/states.s4d", "/states.s4d?limit=1&parts=true"],
     "/gaussians": ["/gaussians?ids=0"],
     "/parts": ["/parts", "/parts?count=2"],
     "/render": [
