@@ -123,7 +123,7 @@ _FORMATS = (
         opacity="linear, float32; 0 while absent",
         shape="quaternion (USD's quatf), 3 scales",
         ids="`primvars:scas4d:id`",
-        lost="indices of frames but the first (time codes follow the times)",
+        lost="indices of frames but the first (time codes follow the times); which Gaussians move",
         package="usd-core",
     ),
     Format(

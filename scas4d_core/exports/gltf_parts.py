@@ -25,6 +25,7 @@ from scas4d_core.exports.cloud import HALF_TURN, Cloud, cloud_of
 from scas4d_core.exports.glb import Binary
 from scas4d_core.exports.gltf import EXTENSION, asset_extras, splat_primitive
 from scas4d_core.exports.part_motion import PartMotion, PartPose, quaternion_of
+from scas4d_core.exports.whole_files import check_writable
 from scas4d_core.gaussians import Gaussians
 
 Float = NDArray[np.float64]
@@ -57,6 +58,9 @@ class PartAsset:
     Args:
         path: of the file. world: user's world to inside. labels: [N] part of each Gaussian by row, negative for none.
 
+    Raises:
+        InputError: the folder cannot be written.
+
     >>> from tempfile import TemporaryDirectory
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2], [0, 1, 2]], radius=0.1)
     >>> with TemporaryDirectory() as folder:
@@ -71,6 +75,7 @@ class PartAsset:
 
     def __init__(self, path: Path | str, world: WorldFrame, labels: NDArray[Any]) -> None:
         self.path = Path(path)
+        check_writable(self.path)
         self._world = world
         self._labels = labels
         self._motion: PartMotion | None = None

@@ -1,4 +1,8 @@
-"""Fits the rigid motion of parts since the first frame: weighted Kabsch over the means of their Gaussians."""
+"""Fits the rigid motion of parts since the first frame: weighted Kabsch over the means of their Gaussians.
+
+A Gaussian weighs as much as it covers of a picture. Where the means leave a turn open, as on a thin rod that turns
+about itself, the material rotations of the Gaussians decide.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.errors import InputError
-from scas4d_core.gaussians import Gaussians, moving_extent
+from scas4d_core.gaussians import Gaussians, moving_extent, quaternions_to_matrices
 from scas4d_core.query.parts import coverage
 
 Float = NDArray[np.float64]
@@ -76,7 +80,7 @@ class PartMotion:
         if not self.parts:
             raise InputError("parts: no Gaussian of the first frame belongs to one", "ask for the parts of this scene")
         self.origins = {part: self._centre(self._start, self.rows(part)) for part in self.parts}
-        self._turns = {part: np.eye(3) for part in self.parts}
+        self._first_turns = first.rotations
 
     def rows(self, part: int) -> NDArray[np.intp]:
         """Rows of a part that are there in the first frame."""
@@ -90,11 +94,18 @@ class PartMotion:
             rows = self.rows(part)
             rows = rows[gaussians.present[rows]]
             if rows.size:
-                before = self._start[rows] - self.origins[part]
-                turn, position, residual = rigid_motion(before, means[rows], self._weights[rows], self._turns[part])
-                self._turns[part] = turn
-                found.append(PartPose(part, turn, position, residual))
+                before, weights = self._start[rows] - self.origins[part], self._weights[rows]
+                material = self._material_turn(gaussians, rows, weights)
+                found.append(PartPose(part, *rigid_motion(before, means[rows], weights, material)))
         return found
+
+    def _material_turn(self, gaussians: Gaussians, rows: NDArray[np.intp], weights: Float) -> Float:
+        """[3, 3] weighted mean of the Gaussians' rotations since the first frame; about a rotation."""
+        now = quaternions_to_matrices(gaussians.rotations[rows].astype(np.float64))
+        then = quaternions_to_matrices(self._first_turns[rows].astype(np.float64))
+        turn: Float = np.einsum("n,nik,njk->ij", weights, now, then)
+        size = np.linalg.norm(turn)
+        return turn * (np.sqrt(3) / size) if size > 0 else np.eye(3)
 
     def _centre(self, points: Float, rows: NDArray[np.intp]) -> Float:
         weights = self._weights[rows]
@@ -110,7 +121,8 @@ def rigid_motion(
     a plane do not: a mirror image is no rotation, and the determinant of R is +1.
 
     Args:
-        before, after: [M, 3], M ≥ 1. weights: [M], not negative; None: all the same. near: [3, 3]; None: no turn.
+        before, after: [M, 3], M ≥ 1. weights: [M], not negative; None: all the same.
+        near: [3, 3] a rotation, or about one; None: no turn.
 
     Returns:
         R [3, 3], t [3], and the weighted RMS distance that is left.

@@ -133,7 +133,7 @@ class UsdSequence:
             self._first_index, self._begin = index, time
             self._define(gaussians, cloud)
         elif self._rate is None:
-            self._rate = 1 / (time - self._begin)
+            self._rate = float(f"{1 / (time - self._begin):.5g}")  # times of the day are rounded; 29.97 stays
         self._latest = time
         code = self._code(time)
         of = cloud.splats
@@ -177,7 +177,7 @@ class UsdSequence:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _code(self, time: float) -> float:
-        return round((time - self._begin) * (self._rate or DEFAULT_RATE), 6)
+        return round((time - self._begin) * (self._rate or DEFAULT_RATE), 4)
 
     def _save(self) -> None:
         """Writes what is new to the disk and frees it: USD reads saved arrays from the file when it needs them."""

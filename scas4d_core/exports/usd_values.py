@@ -56,7 +56,7 @@ class Channel:
         self._last, self._unwritten = given, None
 
     def _is_told(self, before: Array, after: Array) -> bool:
-        """Whether the samples before, lengthened, have these values already."""
+        """True where the samples before, lengthened, have these values already."""
         grown = len(after) > len(before)
         return not (grown and self._unborn is not None) and np.array_equal(before, after[: len(before)])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,25 @@ def whole_file(path: Path | str) -> Iterator[Path]:
             yield beside
             beside.replace(target)
     finally:
-        beside.unlink(missing_ok=True)
+        with suppress(OSError):  # the error that matters is on its way
+            beside.unlink(missing_ok=True)
+
+
+def check_writable(path: Path | str) -> None:
+    """Makes and removes a file beside ``path``, so that a long export fails at its start.
+
+    Raises:
+        InputError: the folder cannot be written.
+
+    >>> check_writable("no_such_folder/a.glb")
+    Traceback (most recent call last):
+    scas4d_core.errors.InputError: out 'no_such_folder/a.glb' cannot be written (...); give a path in a ...
+    """
+    target = Path(path)
+    with writing(target):
+        beside = target.with_name(f".part{os.getpid()}-{target.name}")
+        beside.touch()
+        beside.unlink()
 
 
 @contextmanager
