@@ -20,6 +20,15 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "scas4d_core.captures.frame": ("Frame", "InitialPoints"),
     "scas4d_core.captures.ground_truth": ("GroundTruth",),
     "scas4d_core.captures.images": ("decode_image", "decode_mask", "decode_labels", "resize_area", "picture_size"),
+    "scas4d_core.exports.formats": ("format_of",),
+    "scas4d_core.exports.gltf": ("write_glb",),
+    "scas4d_core.exports.gltf_parts": ("PartAsset",),
+    "scas4d_core.exports.part_motion": ("PartMotion", "rigid_motion"),
+    "scas4d_core.exports.sequence": ("export_sequence",),
+    "scas4d_core.exports.splat": ("read_splat", "write_splat"),
+    "scas4d_core.exports.spz": ("read_spz", "write_spz"),
+    "scas4d_core.exports.tables": ("PoseTable", "TrackTable", "write_tracks"),
+    "scas4d_core.exports.usd": ("UsdSequence",),
     "scas4d_core.errors": ("message_of", "without_paths"),
     "scas4d_core.first_frame.initial_points": ("initial_points",),
     "scas4d_core.first_frame.start": ("fit_static_scene",),
@@ -63,6 +72,9 @@ PUBLIC: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 """By module, the functions and classes whose docstring, or that of a method, holds an example."""
 
+PACKAGES = {"scas4d_core.exports.spz": "gsply", "scas4d_core.exports.usd": "pxr"}
+"""Packages of the extra ``exports`` that the examples of a module need."""
+
 
 def module_path(name: str) -> Path:
     path = ROOT.joinpath(*name.split("."))
@@ -83,6 +95,8 @@ WITH_EXAMPLES = sorted(
 def test_the_examples_of_a_module_run(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if "import torch\n" in module_path(name).read_text(encoding="utf-8") and importlib.util.find_spec("torch") is None:
         pytest.skip("torch is not installed")
+    if name in PACKAGES and importlib.util.find_spec(PACKAGES[name]) is None:
+        pytest.skip(f"{PACKAGES[name]} is not installed: pip install 'scas4d[exports]'")
     monkeypatch.chdir(ROOT)  # examples name the sample by its path in a checkout
     failed, tried = doctest.testmod(importlib.import_module(name), optionflags=FLAGS)
     assert tried > 0

@@ -57,7 +57,7 @@ def export(
         if path.exists():
             files: CompactStates = opened.enter_context(of_file(path / STATES if path.is_dir() else path))
         elif path.suffix or len(path.parts) > 1:
-            raise InputError(f"source {source!r} is not there", "give a compact file, a folder that holds one, or a scene")
+            raise InputError(f"source {source!r} is not there", "give a compact file, its folder, or a scene's id")
         else:
             files = opened.enter_context(of_scene(source, low, high, wanted.needs_parts or format == "usd", url, token))
         target = out or files.beside / f"{files.name}-{format}{'' if wanted.numbered else wanted.suffixes[0]}"

@@ -226,8 +226,8 @@ def _columns(of: Splats) -> dict[str, Float]:
 
 def _refuse(gaussians: Gaussians) -> None:
     for name in ("means", "factors", "opacities", "colours"):
-        values = getattr(gaussians, name).reshape(len(gaussians), -1)
-        _name_rows(gaussians, ~np.isfinite(values).all(axis=1), f"{name} not finite")
+        finite = np.isfinite(getattr(gaussians, name))
+        _name_rows(gaussians, ~finite.all(axis=tuple(range(1, finite.ndim))), f"{name} not finite")
     volume = np.abs(np.linalg.det(gaussians.factors.astype(np.float64)))
     _name_rows(gaussians, ~(volume > 0), "no volume (an axis of length 0)")
 

@@ -112,3 +112,8 @@ def test_retired_ones_are_left_out(tmp_path):
     write_ply(tmp_path / "frame.ply", theta.retire([1, 4]), WORLD)
     write_ply(tmp_path / "others.ply", theta.rows([0, 2, 3, 5]), WORLD)
     assert (tmp_path / "frame.ply").read_bytes() == (tmp_path / "others.ply").read_bytes()
+
+
+def test_a_frame_of_which_all_are_retired_is_an_empty_file(tmp_path):
+    write_ply(tmp_path / "frame.ply", state(random_factors(2)).retire([0, 1]), WORLD)
+    assert len(read_ply(tmp_path / "frame.ply")) == 0

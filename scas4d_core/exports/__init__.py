@@ -1,0 +1,6 @@
+"""Writes frames and sequences for other programs (docs/exports.md has the formats)."""
+
+from scas4d_core.exports.formats import FORMATS, Format, format_of
+from scas4d_core.exports.sequence import export_sequence
+
+__all__ = ["FORMATS", "Format", "export_sequence", "format_of"]

@@ -1,0 +1,112 @@
+"""The Gaussians of one frame as the formats need them: split, in the user's world, with harmonics and ids.
+
+The half turn about x leads from OpenCV axes (x right, y down, z forward) to those of glTF, SPZ and USD (x right, y up,
+z towards the viewer). It is a rotation, so nothing is mirrored, and it is its own inverse.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import WorldFrame
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.query.harmonics import basis_of, harmonics
+from scas4d_core.query.ply import SH_DEGREE_0, Splats, splats
+
+Float = NDArray[np.float64]
+
+HALF_TURN = np.diag([1.0, -1.0, -1.0])
+"""[3, 3] rotation by 180° about x."""
+_SOME_DIRECTION = np.array([[0.48, 0.6, 0.64]])
+"""A direction at which no harmonic up to degree 3 is 0."""
+HARMONIC_SIGNS: Float = np.sign(basis_of(_SOME_DIRECTION @ HALF_TURN) / basis_of(_SOME_DIRECTION))[0]
+"""[16] factors of the harmonics' coefficients under the half turn: each harmonic is even or odd in (y, z)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """The Gaussians of one frame that are to be written.
+
+    Attributes:
+        splats: means, scales, rotations, opacities and colours; those of degree 0 where colours depend on direction.
+        harmonics: [N, K, 3] coefficients of RGB − 0.5, K = 1, or 16 where colours depend on direction.
+        ids: [N] int64.
+    """
+
+    splats: Splats
+    harmonics: Float
+    ids: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def turned(self) -> Cloud:
+        """The same Gaussians in axes that are turned by 180° about x: y up, z towards the viewer.
+
+        >>> seen = cloud_of(Gaussians.of_points([[1, 2, 3]], radius=0.1), WorldFrame(np.zeros(3)))
+        >>> seen.turned().splats.means
+        array([[ 1., -2., -3.]])
+        """
+        w, x, y, z = self.splats.rotations.T
+        return replace(
+            self,
+            splats=replace(
+                self.splats,
+                means=self.splats.means @ HALF_TURN,
+                rotations=np.stack([-x, w, -z, y], axis=1),  # (0, 1, 0, 0) ∘ q
+            ),
+            harmonics=self.harmonics * HARMONIC_SIGNS[: self.harmonics.shape[1], None],
+        )
+
+    def in_units(self, length: float) -> Cloud:
+        """The same Gaussians with all lengths multiplied by ``length``, as by metres in one of the user's units.
+
+        >>> seen = cloud_of(Gaussians.of_points([[1, 2, 3]], radius=0.5), WorldFrame(np.zeros(3)))
+        >>> seen.in_units(100).splats.scales
+        array([[50., 50., 50.]])
+        """
+        return replace(
+            self, splats=replace(self.splats, means=self.splats.means * length, scales=self.splats.scales * length)
+        )
+
+    def rows(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> Cloud:
+        """The Gaussians of some rows ([N] bool, or indices)."""
+        kept = {name: getattr(self.splats, name)[chosen] for name in Splats.__dataclass_fields__}
+        return Cloud(Splats(**kept), self.harmonics[chosen], self.ids[chosen])
+
+
+def cloud_of(gaussians: Gaussians, world: WorldFrame, *, retired: bool = False) -> Cloud:
+    """Converts a state to what is written of it, in the user's world and units, OpenCV axes.
+
+    Args:
+        gaussians: N Gaussians in the inside world. world: user's world to inside.
+        retired: whether those that are retired are kept, with opacity 0; else they are left out.
+
+    Raises:
+        InputError: rows that are not finite or have no volume, named by row and id.
+
+    >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1).retire([0])
+    >>> found = cloud_of(state, WorldFrame(np.zeros(3), metres_per_unit=0.5))
+    >>> found.ids, found.splats.means
+    (array([1]), array([[2., 0., 4.]]))
+    """
+    if gaussians.retired.any() and not retired:
+        gaussians = gaussians.rows(gaussians.present)
+    split = splats(gaussians, world)
+    if gaussians.gloss is None:
+        return Cloud(split, (split.colours[:, None] - 0.5) / SH_DEGREE_0, gaussians.ids)
+    sums = harmonics(gaussians)
+    return Cloud(replace(split, colours=0.5 + SH_DEGREE_0 * sums[:, 0]), sums, gaussians.ids)
+
+
+def linear_light(colours: NDArray[np.floating]) -> Float:
+    """Decodes colours from the sRGB curve (IEC 61966-2-1) to linear light; they are first clipped to 0…1.
+
+    >>> linear_light(np.array([0.0, 0.5, 1.0])).round(4)
+    array([0.   , 0.214, 1.   ])
+    """
+    clipped = np.clip(np.asarray(colours, np.float64), 0, 1)
+    return np.where(clipped <= 0.04045, clipped / 12.92, ((clipped + 0.055) / 1.055) ** 2.4)

@@ -1,0 +1,211 @@
+"""The formats of exports: their names, suffixes, conventions, and what each loses. docs/exports.md shows this table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+from scas4d_core.errors import InputError
+from scas4d_core.exports.usd import SUFFIXES as USD_SUFFIXES
+
+USER_AXES = "the user's: x right, y down, z forward"
+Y_UP = "x right, y up, z towards the viewer"
+
+
+@dataclass(frozen=True)
+class Format:
+    """The conventions of one format.
+
+    Attributes:
+        name: as it is asked for. suffixes: of its files; the first is that of numbered files.
+        numbered: a sequence is a numbered file a frame; else it is one file.
+        needs_parts: it cannot be written without parts.
+        axes, unit: of positions. colour: its space and form. scale, opacity: linear, or their logarithm or logit.
+        shape: how a covariance is told. ids: where the ids are, or "lost". lost: what a reader cannot get back.
+        package: to be installed beside those that a reconstruction needs, or "".
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    numbered: bool
+    axes: str
+    unit: str
+    colour: str
+    scale: str
+    opacity: str
+    shape: str
+    ids: str
+    lost: str
+    needs_parts: bool = False
+    package: str = ""
+
+
+_SPZ = Format(
+    name="spz",
+    suffixes=(".spz",),
+    numbered=True,
+    axes=Y_UP,
+    unit="metre",
+    colour="sRGB, harmonics to degree 3, 8 bits",
+    scale="log, 8 bits (±3.2 %)",
+    opacity="linear, 8 bits",
+    shape="quaternion (smallest three, 10 bits each), 3 scales",
+    ids="lost",
+    lost="scales below 45 µm or above 379 m; harmonics beyond −1…1; which Gaussians move",
+    package="gsply",
+)
+_FORMATS = (
+    Format(
+        name="ply",
+        suffixes=(".ply",),
+        numbered=True,
+        axes=USER_AXES,
+        unit="the user's",
+        colour="sRGB, harmonics to degree 3, float32",
+        scale="log, float32",
+        opacity="logit, float32",
+        shape="quaternion (w, x, y, z), 3 scales",
+        ids="lost (rows keep their order)",
+        lost="which Gaussians move",
+    ),
+    Format(
+        name="splat",
+        suffixes=(".splat",),
+        numbered=True,
+        axes=USER_AXES,
+        unit="the user's",
+        colour="sRGB, degree 0, 8 bits, cut to 0…1",
+        scale="linear, float32",
+        opacity="linear, 8 bits",
+        shape="quaternion (w, x, y, z) in 8 bits each, 3 scales",
+        ids="lost (rows are sorted by size · opacity)",
+        lost="gloss; row order; which Gaussians move",
+    ),
+    _SPZ,
+    Format(**{**vars(_SPZ), "name": "spz4", "package": "gsply, zstandard"}),
+    Format(
+        name="glb",
+        suffixes=(".glb",),
+        numbered=True,
+        axes=Y_UP,
+        unit="metre",
+        colour="sRGB (`srgb_rec709_display`), harmonics to degree 3, float32; `COLOR_0` linear",
+        scale="linear, float32",
+        opacity="linear, float32",
+        shape="quaternion (x, y, z, w), 3 scales",
+        ids="attribute `_ID`",
+        lost="which Gaussians move",
+    ),
+    Format(
+        name="glb-parts",
+        suffixes=(".glb",),
+        numbered=False,
+        axes=Y_UP,
+        unit="metre; residuals in the user's",
+        colour="as glb, of the first frame",
+        scale="linear, float32",
+        opacity="linear, float32",
+        shape="as glb, in the part's own frame; an animation turns it",
+        ids="attribute `_ID`",
+        lost="bending within parts; what is born later; changes of colour and size; highlights turn with the part",
+        needs_parts=True,
+    ),
+    Format(
+        name="usd",
+        suffixes=USD_SUFFIXES,
+        numbered=False,
+        axes=Y_UP,
+        unit="the user's (`metersPerUnit`)",
+        colour="sRGB, harmonics to degree 3, float32; tracks linear",
+        scale="linear, float32",
+        opacity="linear, float32; 0 while absent",
+        shape="quaternion (USD's quatf), 3 scales",
+        ids="`primvars:scas4d:id`",
+        lost="indices of frames but the first (time codes follow the times); which Gaussians move",
+        package="usd-core",
+    ),
+    Format(
+        name="tracks",
+        suffixes=(".csv",),
+        numbered=False,
+        axes=USER_AXES,
+        unit="the user's",
+        colour="–",
+        scale="–",
+        opacity="–",
+        shape="–",
+        ids="column `id`",
+        lost="all but the centres of what moves",
+    ),
+    Format(
+        name="poses",
+        suffixes=(".csv",),
+        numbered=False,
+        axes=USER_AXES,
+        unit="the user's",
+        colour="–",
+        scale="–",
+        opacity="–",
+        shape="–",
+        ids="–",
+        lost="all but the rigid motion of the parts",
+        needs_parts=True,
+    ),
+)
+FORMATS: Mapping[str, Format] = MappingProxyType({each.name: each for each in _FORMATS})
+"""All formats by name."""
+
+COLUMNS = ("name", "suffixes", "axes", "unit", "colour", "scale", "opacity", "shape", "ids", "lost")
+"""Columns of the table."""
+
+
+def format_of(name: str) -> Format:
+    """The format of a name.
+
+    Raises:
+        InputError: there is none.
+
+    >>> format_of("glb").scale
+    'linear, float32'
+    >>> format_of("obj")
+    Traceback (most recent call last):
+    scas4d_core.errors.InputError: format 'obj' is not known; give one of ply, splat, spz, spz4, glb, glb-parts, ...
+    """
+    if name not in FORMATS:
+        raise InputError(f"format {name!r} is not known", f"give one of {', '.join(FORMATS)}")
+    return FORMATS[name]
+
+
+def check_suffix(path: Path, format: Format) -> None:
+    """Refuses a path for one file whose suffix is another format's.
+
+    Raises:
+        InputError: it has no suffix of this format.
+
+    >>> check_suffix(Path("a.txt"), FORMATS["tracks"])
+    Traceback (most recent call last):
+    scas4d_core.errors.InputError: out 'a.txt' is no name of a file for format 'tracks'; let it end in .csv
+    """
+    if path.suffix.lower() not in format.suffixes:
+        raise InputError(
+            f"out {str(path)!r} is no name of a file for format {format.name!r}",
+            f"let it end in {' or '.join(format.suffixes)}",
+        )
+
+
+def table() -> str:
+    """The table as Markdown, one line a format.
+
+    >>> print(table().splitlines()[0])
+    | name | suffixes | sequence | axes | unit | colour | scale | opacity | shape | ids | lost |
+    """
+    heads = [*COLUMNS[:2], "sequence", *COLUMNS[2:]]
+    lines = [f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
+    for each in FORMATS.values():
+        cells = {column: str(getattr(each, column)) for column in COLUMNS}
+        cells |= {"name": f"`{each.name}`", "suffixes": " ".join(f"`{suffix}`" for suffix in each.suffixes)}
+        cells["sequence"] = "a file a frame" if each.numbered else "one file"
+        lines.append(f"| {' | '.join(cells[head] for head in heads)} |")
+    return "\n".join(lines)

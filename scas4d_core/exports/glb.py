@@ -1,0 +1,117 @@
+"""The container ``.glb`` (glTF 2.0, section 4): a JSON chunk and a binary chunk, with accessors into the latter.
+
+Written by hand: a document of splats needs a tenth of glTF, and no package.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.errors import InputError
+from scas4d_core.exports.whole_files import whole_file
+
+COMPONENTS = {np.dtype("<f4"): 5126, np.dtype("<u2"): 5123, np.dtype("u1"): 5121}
+"""Component types of glTF by dtype."""
+SHAPES = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4"}
+"""Types of glTF by the shape of an element."""
+ARRAY_BUFFER = 34962
+"""Target of the views of vertex attributes."""
+LONGEST = 2**32 - 1
+"""Bytes of a file: its header counts them in 32 bits."""
+GENERATOR = "SCas4D"
+
+
+class Binary:
+    """Collects the arrays of one file.
+
+    Attributes:
+        accessors, views: of the document.
+        length: bytes of the binary chunk so far.
+
+    >>> binary = Binary()
+    >>> binary.add(np.float32([[0, 0, 2], [1, 0, 2]]), vertices=True, bounds=True)
+    0
+    >>> binary.accessors[0]["type"], binary.accessors[0]["max"], binary.length
+    ('VEC3', [1.0, 0.0, 2.0], 24)
+    """
+
+    def __init__(self) -> None:
+        self.accessors: list[dict[str, Any]] = []
+        self.views: list[dict[str, Any]] = []
+        self.length = 0
+        self._arrays: list[NDArray[Any]] = []
+
+    def add(
+        self, array: NDArray[Any], *, vertices: bool = False, bounds: bool = False, normalized: bool = False
+    ) -> int:
+        """Adds an array as an accessor with a view of its own; returns its index.
+
+        Args:
+            array: [N, …] of a dtype in ``COMPONENTS`` and N ≥ 1; its rows must fill a multiple of 4 bytes where it
+                holds vertices.
+            vertices: whether it is an attribute of a primitive. bounds: whether min and max are told, as glTF asks
+                for positions and times. normalized: whether integers stand for 0…1.
+        """
+        given = np.ascontiguousarray(array)
+        accessor: dict[str, Any] = {
+            "bufferView": len(self.views),
+            "componentType": COMPONENTS[given.dtype],
+            "count": len(given),
+            "type": SHAPES[given.shape[1:]],
+        }
+        if normalized:
+            accessor["normalized"] = True
+        if bounds:
+            flat = given.reshape(len(given), -1)
+            accessor |= {"min": flat.min(axis=0).tolist(), "max": flat.max(axis=0).tolist()}
+        view = {"buffer": 0, "byteOffset": self.length, "byteLength": given.nbytes}
+        self.accessors.append(accessor)
+        self.views.append(view | {"target": ARRAY_BUFFER} if vertices else view)
+        self._arrays.append(given)
+        self.length += given.nbytes + -given.nbytes % 4
+        return len(self.accessors) - 1
+
+    def write(self, path: Path | str, document: Mapping[str, Any]) -> None:
+        """Writes a document with these arrays, whole or not at all.
+
+        Args:
+            path: of the file. document: the JSON without asset, buffers, views and accessors; ``asset_extras`` in it
+                becomes the asset's ``extras``.
+
+        Raises:
+            InputError: more than 4 GiB, or the file cannot be written.
+
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     Binary().write(f"{folder}/a.glb", {"scenes": [{}], "scene": 0})
+        ...     Path(f"{folder}/a.glb").read_bytes()[:4]
+        b'glTF'
+        """
+        content = dict(document)
+        asset: dict[str, Any] = {"version": "2.0", "generator": GENERATOR}
+        if extras := content.pop("asset_extras", None):
+            asset["extras"] = extras
+        content = {"asset": asset, **content}
+        if self._arrays:
+            content["buffers"] = [{"byteLength": self.length}]
+            content |= {"bufferViews": self.views, "accessors": self.accessors}
+        text = json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        total = 12 + 8 + len(text) + (8 + self.length if self._arrays else 0)
+        if total > LONGEST:
+            raise InputError(f"out {str(path)!r} would have {total:,} bytes, and a .glb ends at 4 GiB", "export as ply")
+        with whole_file(path) as beside, beside.open("wb") as file:
+            file.write(struct.pack("<4sII", b"glTF", 2, total))
+            file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+            if self._arrays:
+                file.write(struct.pack("<I4s", self.length, b"BIN\0"))
+            for array in self._arrays:
+                file.write(array.data)
+                file.write(b"\0" * (-array.nbytes % 4))

@@ -1,0 +1,180 @@
+"""Writes an articulated asset: one ``.glb`` whose nodes are the parts, each with its splats and its rigid motion.
+
+Each node has the Gaussians of the first frame in the part's own frame, and an animation of translation and rotation
+(linear; seconds since the first frame). Gaussians without a part, which do not move, are in the node ``standing``.
+Axes, units and attributes are those of ``gltf``. Lost are bending within a part, Gaussians that are born later, changes
+of colour and size, and that highlights stay with the world: here they turn with the part.
+
+``extras`` of a node tell what the rigid motion leaves: ``residual_rms``, the weighted RMS distance between the rigid
+prediction and the means over all frames after the first, ``residual_worst``, that of the worst frame, and its index
+``worst_frame``. They are in the user's units, and ``…_percent`` in percent of the extent of what moves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import WorldFrame
+from scas4d_core.errors import InputError
+from scas4d_core.exports.cloud import HALF_TURN, Cloud, cloud_of
+from scas4d_core.exports.glb import Binary
+from scas4d_core.exports.gltf import EXTENSION, asset_extras, splat_primitive
+from scas4d_core.exports.part_motion import PartMotion, PartPose, quaternion_of
+from scas4d_core.exports.whole_files import check_writable
+from scas4d_core.gaussians import Gaussians
+
+Float = NDArray[np.float64]
+
+
+@dataclass
+class _Keys:
+    """The keys of one part's animation, in the axes and the unit of glTF, and its residuals in the user's."""
+
+    times: list[float] = field(default_factory=list)
+    frames: list[int] = field(default_factory=list)
+    positions: list[Float] = field(default_factory=list)
+    quaternions: list[Float] = field(default_factory=list)
+    residuals: list[float] = field(default_factory=list)
+
+    def add(self, index: int, seconds: float, pose: PartPose, metres: float) -> None:
+        quaternion = quaternion_of(HALF_TURN @ pose.rotation @ HALF_TURN)
+        if self.quaternions and quaternion @ self.quaternions[-1] < 0:
+            quaternion = -quaternion  # the short way between keys
+        self.times.append(seconds)
+        self.frames.append(index)
+        self.positions.append(HALF_TURN @ pose.position * metres)
+        self.quaternions.append(quaternion)
+        self.residuals.append(pose.residual)
+
+
+class PartAsset:
+    """Writes the asset of a sequence; holds the first frame, and 64 bytes a part of each later one.
+
+    Args:
+        path: of the file. world: user's world to inside. labels: [N] part of each Gaussian by row, negative for none.
+
+    Raises:
+        InputError: the folder cannot be written.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2], [0, 1, 2]], radius=0.1)
+    >>> with TemporaryDirectory() as folder:
+    ...     asset = PartAsset(f"{folder}/a.glb", WorldFrame(np.zeros(3)), np.zeros(3, int))
+    ...     for index in range(3):
+    ...         moved = state.replace(means=state.means + np.float32([0, 0, index]))
+    ...         asset.add(index, index / 30, moved)
+    ...     asset.finish()
+    ...     b'"animations"' in Path(f"{folder}/a.glb").read_bytes()
+    True
+    """
+
+    def __init__(self, path: Path | str, world: WorldFrame, labels: NDArray[Any]) -> None:
+        self.path = Path(path)
+        check_writable(self.path)
+        self._world = world
+        self._labels = labels
+        self._motion: PartMotion | None = None
+        self._first: Gaussians | None = None
+        self._begin = self._latest = 0.0
+        self._keys: dict[int, _Keys] = {}
+
+    def add(self, index: int, time: float, gaussians: Gaussians) -> None:
+        """Adds a frame.
+
+        Args:
+            index: of the frame. time: seconds, later than those before. gaussians: in the inside world.
+
+        Raises:
+            InputError: the time does not rise, or no Gaussian of the first frame belongs to a part.
+        """
+        if self._motion is None:
+            self._motion = PartMotion(self._labels, gaussians, self._world)
+            self._first, self._begin = gaussians, time
+            self._keys = {part: _Keys() for part in self._motion.parts}
+        elif not time > self._latest:
+            raise InputError(
+                f"time {time:g} s of frame {index} is not later than {self._latest:g} s of the frame before",
+                "give frames in the order of their times",
+            )
+        self._latest = time
+        for pose in self._motion.poses(gaussians):
+            self._keys[pose.part].add(index, time - self._begin, pose, self._world.metres_per_unit)
+
+    def finish(self) -> None:
+        """Writes the file, whole or not at all.
+
+        Raises:
+            InputError: there was no frame, or the file cannot be written.
+        """
+        if self._motion is None or self._first is None:
+            raise InputError("there is no frame to export", "give at least one frame")
+        cloud = cloud_of(self._first, self._world, retired=True).in_units(self._world.metres_per_unit).turned()
+        binary = Binary()
+        nodes: list[dict[str, Any]] = []
+        meshes: list[dict[str, Any]] = []
+        samplers: list[dict[str, Any]] = []
+        channels: list[dict[str, Any]] = []
+        times: dict[tuple[float, ...], int] = {}  # parts that are always there share one accessor
+        left = self._first.present.copy()
+        for part, keys in self._keys.items():
+            rows = self._motion.rows(part)
+            left[rows] = False
+            node = {
+                "name": f"part {part}",
+                "mesh": len(meshes),
+                "translation": keys.positions[0].tolist(),
+                "rotation": np.roll(keys.quaternions[0], -1).tolist(),
+                "extras": {"part": part, **self._residuals(keys)},
+            }
+            meshes.append({"primitives": [splat_primitive(binary, _moved(cloud.rows(rows), -keys.positions[0]))]})
+            if tuple(keys.times) not in times:
+                times[tuple(keys.times)] = binary.add(np.asarray(keys.times, "<f4"), bounds=True)
+            rotations = np.roll(np.stack(keys.quaternions), -1, axis=1)
+            for name, values in (("translation", np.stack(keys.positions)), ("rotation", rotations)):
+                channels.append({"sampler": len(samplers), "target": {"node": len(nodes), "path": name}})
+                output = binary.add(np.asarray(values, "<f4"))
+                samplers.append({"input": times[tuple(keys.times)], "output": output, "interpolation": "LINEAR"})
+            nodes.append(node)
+        if left.any():
+            nodes.append({"name": "standing", "mesh": len(meshes)})
+            meshes.append({"primitives": [splat_primitive(binary, cloud.rows(left))]})
+        binary.write(
+            self.path,
+            {
+                "scene": 0,
+                "scenes": [{"nodes": list(range(len(nodes)))}],
+                "nodes": nodes,
+                "meshes": meshes,
+                "animations": [{"name": "motion", "samplers": samplers, "channels": channels}],
+                "extensionsUsed": [EXTENSION],
+                "asset_extras": asset_extras(self._world) | {"first_time_s": self._begin},
+            },
+        )
+
+    def discard(self) -> None:
+        """Gives the frames up; nothing was written."""
+        self._first, self._motion, self._keys = None, None, {}
+
+    def _residuals(self, keys: _Keys) -> dict[str, Any]:
+        """The extras of a part: what its rigid motion leaves."""
+        assert self._motion is not None
+        after = np.array(keys.residuals[1:] or [0.0])
+        rms, worst = float(np.sqrt(np.mean(np.square(after)))), int(after.argmax())
+        percent = 100 / self._motion.extent if self._motion.extent > 0 else 0.0
+        return {
+            "residual_rms": rms,
+            "residual_rms_percent": rms * percent,
+            "residual_worst": float(after[worst]),
+            "residual_worst_percent": float(after[worst]) * percent,
+            "worst_frame": (keys.frames[1:] or keys.frames)[worst],
+            "frames": len(keys.frames),
+        }
+
+
+def _moved(cloud: Cloud, by: Float) -> Cloud:
+    return replace(cloud, splats=replace(cloud.splats, means=cloud.splats.means + by))

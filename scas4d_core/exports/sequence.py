@@ -1,0 +1,217 @@
+"""Exports a sequence of frames: numbered files in a folder or a ``.zip``, or one file, by the format."""
+
+from __future__ import annotations
+
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from itertools import islice
+from pathlib import Path
+from typing import Any, Protocol
+
+from numpy.typing import ArrayLike, NDArray
+
+from scas4d_core.cameras import Rig, WorldFrame
+from scas4d_core.errors import InputError
+from scas4d_core.exports.formats import Format, check_suffix, format_of
+from scas4d_core.exports.gltf import write_glb
+from scas4d_core.exports.gltf_parts import PartAsset
+from scas4d_core.exports.splat import write_splat
+from scas4d_core.exports.spz import write_spz
+from scas4d_core.exports.tables import PoseTable, TrackTable
+from scas4d_core.exports.usd import UsdSequence
+from scas4d_core.exports.whole_files import whole_file, writing
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.query.ply import write_ply
+
+Progress = Callable[[int, int], None]
+"""Called after each frame with its index and the number of frames that are done."""
+
+FRAME_WRITERS: dict[str, Callable[[Path, Gaussians, WorldFrame], None]] = {
+    "ply": write_ply,
+    "splat": write_splat,
+    "spz": write_spz,
+    "spz4": lambda path, gaussians, world: write_spz(path, gaussians, world, version=4),
+    "glb": write_glb,
+}
+"""Writers of a frame, by format."""
+
+
+class SequenceWriter(Protocol):
+    """Writes a sequence to one output, frame by frame."""
+
+    def add(self, index: int, time: float, gaussians: Gaussians) -> None:
+        """Adds a frame."""
+
+    def finish(self) -> None:
+        """Completes the output."""
+
+    def discard(self) -> None:
+        """Removes what is not complete."""
+
+
+def export_sequence(
+    states: Iterable[tuple[int, float, Gaussians]],
+    format: str,
+    out: Path | str,
+    *,
+    world: WorldFrame,
+    rig: Rig | None = None,
+    parts: NDArray[Any] | None = None,
+    ids: ArrayLike | None = None,
+    frames_per_second: float | None = None,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Writes frames in a format; holds one state at a time.
+
+    Numbered files are ``frame_000012.ply`` for the frame of index 12. Each is written under a temporary name and
+    renamed; those that are there already are replaced. A ``.zip`` and a single file appear when they are whole. Where
+    an error ends the export, numbered files that are whole stay in a folder; of other outputs nothing is left.
+
+    Args:
+        states: index, time in seconds and state of each frame, rising; the states in the inside world. With a
+            ``CompactReader``: ``((i, t, reader.state(i)) for i, t in zip(reader.frames, reader.times))``.
+        format: a name in ``FORMATS``.
+        out: for numbered files a folder, which is made, or a ``.zip``; else a file with the format's suffix.
+        world: user's world to inside. rig: in the user's world; only USD has cameras.
+        parts: [N] part of each Gaussian by row, negative for none; for ``glb-parts``, ``poses`` and USD.
+        ids: the Gaussians of ``tracks``; None: all that move.
+        frames_per_second: of USD's time codes; None: by the first two frames.
+        progress: told each frame.
+
+    Returns:
+        The paths of the numbered files, or of the one file.
+
+    Raises:
+        InputError: unknown format, no frame, parts missing, a package missing, an output that cannot be written, or
+            Gaussians that cannot be exported. Errors of ``states`` pass unchanged.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
+    >>> with TemporaryDirectory() as folder:
+    ...     frames = ((index, index / 30, state) for index in (3, 4))
+    ...     paths = export_sequence(frames, "ply", f"{folder}/out", world=WorldFrame(np.zeros(3)))
+    ...     [path.name for path in paths]
+    ['frame_000003.ply', 'frame_000004.ply']
+    """
+    wanted = format_of(format)
+    target = Path(out)
+    if wanted.needs_parts and parts is None:
+        raise InputError(f"parts is None, and format {format!r} is made of parts", "give the part of each Gaussian")
+    if frames_per_second is not None and not 0 < frames_per_second < float("inf"):
+        raise InputError(f"frames_per_second is {frames_per_second!r}", "give a positive number, or None")
+    if not wanted.numbered:
+        check_suffix(target, wanted)
+    coming = iter(states)
+    waiting = list(islice(coming, 1))
+    if not waiting:
+        raise InputError("states has no frame", "give a range that holds at least one committed frame")
+    writer = _writer(wanted, target, world, rig, parts, ids, frames_per_second)
+    done = 0
+    paths: list[Path] = []
+    try:
+        for index, time, state in _chained(waiting, coming):
+            writer.add(index, float(time), state)
+            done += 1
+            if isinstance(writer, _Folder):
+                paths.append(writer.path_of(index))
+            if progress is not None:
+                progress(index, done)
+        writer.finish()
+    except BaseException:
+        writer.discard()
+        raise
+    return paths or [target]
+
+
+def _chained(
+    waiting: list[tuple[int, float, Gaussians]], coming: Iterator[tuple[int, float, Gaussians]]
+) -> Iterator[tuple[int, float, Gaussians]]:
+    """The frame that waits and then the others; no reference to a frame is kept."""
+    yield waiting.pop()
+    yield from coming
+
+
+def _writer(
+    wanted: Format,
+    target: Path,
+    world: WorldFrame,
+    rig: Rig | None,
+    parts: NDArray[Any] | None,
+    ids: ArrayLike | None,
+    frames_per_second: float | None,
+) -> SequenceWriter:
+    if wanted.numbered:
+        return (_Zip if target.suffix.lower() == ".zip" else _Folder)(target, wanted, world)
+    if wanted.name == "usd":
+        return UsdSequence(target, world, rig, parts, frames_per_second)
+    if wanted.name == "tracks":
+        return TrackTable(target, world, ids)
+    assert parts is not None  # the others need them
+    return PartAsset(target, world, parts) if wanted.name == "glb-parts" else PoseTable(target, world, parts)
+
+
+class _Folder:
+    """Numbered files in a folder."""
+
+    def __init__(self, folder: Path, format: Format, world: WorldFrame) -> None:
+        self.folder, self._format, self._world = folder, format, world
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+
+    def path_of(self, index: int) -> Path:
+        """The file of a frame."""
+        return self.folder / f"frame_{index:06d}{self._format.suffixes[0]}"
+
+    def add(self, index: int, time: float, gaussians: Gaussians) -> None:
+        """Writes the file of a frame."""
+        with writing(self.folder):
+            FRAME_WRITERS[self._format.name](self.path_of(index), gaussians, self._world)
+
+    def finish(self) -> None:
+        """Nothing is left to do."""
+
+    def discard(self) -> None:
+        """Files that are whole stay."""
+
+
+class _Zip:
+    """Numbered files in a ``.zip``, stored as they are; each is written to a folder first, so one is held on disk."""
+
+    def __init__(self, path: Path, format: Format, world: WorldFrame) -> None:
+        self._path = path
+        self._output = _zip_written(path)
+        self._archive = self._output.__enter__()
+        try:
+            with writing(path):
+                self._beside = tempfile.TemporaryDirectory(prefix=".part-", dir=path.parent)
+            self._folder = _Folder(Path(self._beside.name), format, world)
+        except BaseException as error:
+            self._output.__exit__(type(error), error, error.__traceback__)
+            raise
+
+    def add(self, index: int, time: float, gaussians: Gaussians) -> None:
+        """Adds the file of a frame."""
+        self._folder.add(index, time, gaussians)
+        file = self._folder.path_of(index)
+        with writing(self._path):
+            self._archive.write(file, file.name)
+            file.unlink()
+
+    def finish(self) -> None:
+        """Gives the archive its name."""
+        self._beside.cleanup()
+        self._output.__exit__(None, None, None)
+
+    def discard(self) -> None:
+        """Removes the archive that is not whole."""
+        self._beside.cleanup()
+        self._output.__exit__(Exception, Exception("given up"), None)
+
+
+@contextmanager
+def _zip_written(path: Path) -> Iterator[zipfile.ZipFile]:
+    with whole_file(path) as beside, zipfile.ZipFile(beside, "w", zipfile.ZIP_STORED) as archive:
+        yield archive

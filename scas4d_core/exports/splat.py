@@ -1,0 +1,88 @@
+"""Writes and reads the ``.splat`` format of antimatter15/splat (its ``convert.py`` and ``main.js``).
+
+No header; 32 bytes a Gaussian, little-endian: position 3×float32, scale 3×float32 (linear standard deviations), RGBA
+4×uint8, rotation 4×uint8 (w, x, y, z) as q·128 + 128. The axes and the unit are those of the 3DGS ``.ply``: the user's.
+Colour is that of degree 0, opacity is linear. Viewers draw a file while it loads, so the largest and most opaque
+Gaussians come first, as ``convert.py`` sorts them; row order and ids are lost.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from scas4d_core.cameras import WorldFrame
+from scas4d_core.errors import InputError
+from scas4d_core.exports.cloud import cloud_of
+from scas4d_core.exports.whole_files import whole_file
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.query.ply import Splats
+
+ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
+"""One Gaussian, 32 bytes."""
+
+
+def write_splat(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None:
+    """Writes one frame, whole or not at all, without the Gaussians that are retired in it.
+
+    Of q and −q, which are the same rotation, the one with a negative largest component is written: +1 has no byte, −1
+    has.
+
+    Args:
+        path: of the file. gaussians: in the inside world. world: user's world to inside.
+
+    Raises:
+        InputError: rows that are not finite or have no volume, or the file cannot be written.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
+    >>> with TemporaryDirectory() as folder:
+    ...     write_splat(f"{folder}/a.splat", state, WorldFrame(np.zeros(3), metres_per_unit=0.5))
+    ...     back = read_splat(f"{folder}/a.splat")
+    >>> back.means, back.colours
+    (array([[0., 0., 4.]]), array([[1., 0., 0.]]))
+    """
+    of = cloud_of(gaussians, world).splats
+    order = np.argsort(-np.prod(of.scales, axis=1) * of.opacities, kind="stable")
+    rows = np.zeros(len(of), ROW)
+    rows["means"], rows["scales"] = of.means[order], of.scales[order]
+    rgba = np.concatenate([of.colours, of.opacities[:, None]], axis=1)[order]
+    rows["rgba"] = np.clip(np.rint(rgba * 255), 0, 255)
+    turns = of.rotations[order]
+    largest = np.take_along_axis(turns, np.abs(turns).argmax(axis=1)[:, None], axis=1)
+    rows["rotation"] = np.clip(np.rint(turns * np.where(largest > 0, -128, 128) + 128), 0, 255)
+    with whole_file(path) as beside:
+        rows.tofile(beside)
+
+
+def read_splat(path: Path | str) -> Splats:
+    """Reads a file, in its own order; rotations are normalized.
+
+    Raises:
+        InputError: it is not there, or no multiple of 32 bytes.
+
+    >>> read_splat("README.md")
+    Traceback (most recent call last):
+    scas4d_core.errors.InputError: README.md: no .splat file (... bytes are no multiple of 32); ...
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: no .splat file ({error.strerror})", "give a path that can be read") from error
+    if len(content) % ROW.itemsize:
+        raise InputError(
+            f"{path}: no .splat file ({len(content)} bytes are no multiple of {ROW.itemsize})",
+            "give a whole file, one that no program compressed",
+        )
+    rows = np.frombuffer(content, ROW)
+    turns = rows["rotation"].astype(np.float64) - 128
+    length = np.linalg.norm(turns, axis=1, keepdims=True)
+    rgba = rows["rgba"].astype(np.float64) / 255
+    return Splats(
+        means=rows["means"].astype(np.float64),
+        scales=rows["scales"].astype(np.float64),
+        rotations=np.where(length > 0, turns / np.where(length > 0, length, 1), [1.0, 0, 0, 0]),
+        opacities=rgba[:, 3],
+        colours=rgba[:, :3],
+    )

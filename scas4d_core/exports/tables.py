@@ -1,0 +1,173 @@
+"""Writes tracks and the poses of parts as CSV, for spreadsheets and scripts. World, axes and units are the user's.
+
+Times are in seconds. Frames are rows in the order in which they come; a Gaussian or a part that is not there in a frame
+has no row for it. Coordinates have 12 significant digits: the origin of a world may be far away.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scas4d_core.cameras import WorldFrame
+from scas4d_core.exports.part_motion import PartMotion
+from scas4d_core.exports.whole_files import whole_file, writing
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.query.tracks import Tracks
+
+TRACK_COLUMNS = ("frame", "time", "id", "x", "y", "z", "confidence")
+POSE_COLUMNS = ("frame", "time", "part", "tx", "ty", "tz", "qw", "qx", "qy", "qz", "residual")
+
+
+class _Table:
+    """A CSV file that is written row by row under a temporary name."""
+
+    def __init__(self, path: Path | str, columns: Sequence[str]) -> None:
+        self.path = Path(path)
+        self._stack = ExitStack()
+        try:
+            beside = self._stack.enter_context(whole_file(self.path))
+            self._file = self._stack.enter_context(beside.open("w", newline="", encoding="utf-8"))
+            self._rows = csv.writer(self._file, lineterminator="\n")
+            self._rows.writerow(columns)
+        except BaseException as error:
+            if not self._stack.__exit__(type(error), error, error.__traceback__):
+                raise
+
+    def write(self, rows: Iterable[Sequence[Any]]) -> None:
+        with writing(self.path):
+            self._rows.writerows(rows)
+
+    def finish(self) -> None:
+        """Gives the file its name."""
+        self._stack.close()
+
+    def discard(self) -> None:
+        """Removes what was written."""
+        self._stack.__exit__(Exception, Exception("given up"), None)
+
+
+class TrackTable(_Table):
+    """Writes the means of Gaussians, frame by frame; the column ``confidence`` is empty, because it is not known.
+
+    Args:
+        path: of the file. world: user's world to inside.
+        ids: the Gaussians; None: in each frame all that move.
+
+    Raises:
+        InputError: the file cannot be written.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     table = TrackTable(f"{folder}/a.csv", WorldFrame(np.zeros(3)))
+    ...     table.add(7, 0.5, Gaussians.of_points([[0, 0, 2]], radius=0.1))
+    ...     table.finish()
+    ...     print(Path(f"{folder}/a.csv").read_text(), end="")
+    frame,time,id,x,y,z,confidence
+    7,0.5,0,0,0,2,
+    """
+
+    def __init__(self, path: Path | str, world: WorldFrame, ids: ArrayLike | None = None) -> None:
+        super().__init__(path, TRACK_COLUMNS)
+        self._world = world
+        self._ids = None if ids is None else np.asarray(ids, np.int64).reshape(-1)
+
+    def add(self, index: int, time: float, gaussians: Gaussians) -> None:
+        """Adds a frame: its index, its time in seconds, and its state in the inside world."""
+        chosen = gaussians.moving if self._ids is None else gaussians.present & np.isin(gaussians.ids, self._ids)
+        ids = gaussians.ids[chosen].tolist()
+        means = self._world.to_user(gaussians.means[chosen])
+        self.write(
+            (index, _text(time, 15), identity, *map(_text, mean), "") for identity, mean in zip(ids, means, strict=True)
+        )
+
+
+class PoseTable(_Table):
+    """Writes the rigid motion of parts since the first frame (``part_motion``), frame by frame.
+
+    A point x of a part, in the user's world at the first frame, is at R (x − t₀) + t in a later one: t is (tx, ty, tz),
+    R the rotation of the unit quaternion (qw, qx, qy, qz), and t₀ the translation of the first frame.
+    ``residual`` is the weighted RMS distance between this and the means of the part's Gaussians, user's units.
+
+    Args:
+        path: of the file. world: user's world to inside. labels: [N] part of each Gaussian by row, negative for none.
+
+    Raises:
+        InputError: the file cannot be written.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> state = Gaussians.of_points([[0, 0, 2], [0, 0, 4]], radius=0.1)
+    >>> with TemporaryDirectory() as folder:
+    ...     table = PoseTable(f"{folder}/a.csv", WorldFrame(np.zeros(3)), np.zeros(2, int))
+    ...     table.add(0, 0.0, state)
+    ...     table.finish()
+    ...     print(Path(f"{folder}/a.csv").read_text(), end="")
+    frame,time,part,tx,ty,tz,qw,qx,qy,qz,residual
+    0,0,0,0,0,3,1,0,0,0,0
+    """
+
+    def __init__(self, path: Path | str, world: WorldFrame, labels: NDArray[Any]) -> None:
+        super().__init__(path, POSE_COLUMNS)
+        self._world, self._labels = world, labels
+        self._motion: PartMotion | None = None
+
+    def add(self, index: int, time: float, gaussians: Gaussians) -> None:
+        """Adds a frame: its index, its time in seconds, and its state in the inside world.
+
+        Raises:
+            InputError: no Gaussian of the first frame belongs to a part.
+        """
+        if self._motion is None:
+            self._motion = PartMotion(self._labels, gaussians, self._world)
+        self.write(
+            (index, _text(time, 15), pose.part, *map(_text, (*pose.position, *pose.quaternion, pose.residual)))
+            for pose in self._motion.poses(gaussians)
+        )
+
+
+def write_tracks(path: Path | str, tracks: Tracks, times: ArrayLike) -> None:
+    """Writes tracks that were asked for, with their confidence; what is not there in a frame has no row.
+
+    The column ``id`` has the Gaussian that carries the point most, so that two points may have the same.
+
+    Args:
+        path: of the file. tracks: T frames, Q points. times: [T] seconds.
+
+    Raises:
+        InputError: the file cannot be written.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> tracks = Tracks(np.array([[[0.0, 1, 2]]]), np.array([[0.5]]), np.array([3]), np.array([7]))
+    >>> with TemporaryDirectory() as folder:
+    ...     write_tracks(f"{folder}/a.csv", tracks, [0.25])
+    ...     Path(f"{folder}/a.csv").read_text().splitlines()[1]
+    '7,0.25,3,0,1,2,0.5'
+    """
+    table = _Table(path, TRACK_COLUMNS)
+    try:
+        for t, (index, time) in enumerate(zip(tracks.indices.tolist(), np.asarray(times, np.float64), strict=True)):
+            there = np.flatnonzero(np.isfinite(tracks.positions[t]).all(axis=1))
+            table.write(
+                (
+                    index,
+                    _text(time),
+                    int(tracks.ids[q]),
+                    *map(_text, (*tracks.positions[t, q], tracks.confidence[t, q])),
+                )
+                for q in there
+            )
+        table.finish()
+    except BaseException:
+        table.discard()
+        raise
+
+
+def _text(value: float, digits: int = 12) -> str:
+    """A number with so many significant digits; −0 is 0."""
+    return f"{value:.{digits}g}" if value else "0"

@@ -1,0 +1,291 @@
+"""Writes a sequence as USD (usd-core 26.03 or later): UsdVol.ParticleField3DGaussianSplat with samples over time.
+
+``/World/Gaussians`` has one fixed set of Gaussians for all frames: opacity is 0 before the birth of one and while it is
+retired. By the schema, scales and opacities are linear, harmonics lie together by Gaussian. Colours are values of
+pictures (sRGB); the schema has no place for that, so ``colorSpace`` of the harmonics tells it. ``primvars:scas4d:id``
+and ``primvars:scas4d:part`` have the ids and the parts. ``/World/Parts/part_k`` are Xforms with the rigid motion of
+each part since the first frame, and its residual (``part_motion``). ``/World/Tracks`` are the centres of up to
+``MOST_TRACKS`` moving Gaussians as UsdGeomPoints, a guide. ``/World/Cameras`` are those of the rig.
+
+The stage is y up: the user's world is turned by 180° about x. Its unit is the user's, ``metersPerUnit`` tells it. A
+time code is seconds since the first frame times ``timeCodesPerSecond``.
+
+Frames are saved one by one, so that memory does not grow with their number; a copy beside the target takes the room
+of the file on disk meanwhile.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Rig, WorldFrame
+from scas4d_core.errors import InputError
+from scas4d_core.exports.cloud import Cloud, cloud_of, linear_light
+from scas4d_core.exports.part_motion import PartMotion, part_labels, quaternion_of
+from scas4d_core.exports.usd_values import (
+    Channel,
+    floats_of,
+    points_of,
+    quaternions_of,
+    reported,
+    set_camera,
+    turned_pose,
+)
+from scas4d_core.exports.whole_files import package, whole_file, writing
+from scas4d_core.gaussians import Gaussians
+
+SUFFIXES = (".usdc", ".usda", ".usdz", ".usd")
+MOST_TRACKS = 500
+"""Gaussians that are shown as tracks, evenly over the rows of those that move in the first frame."""
+TRACK_WIDTH = 0.005
+"""Diameter of a track's point, of the extent of the tracks."""
+REACH = 3.0
+"""Standard deviations to which the extent of the Gaussians goes."""
+COLOUR_SPACE = "srgb_rec709_scene"
+"""USD's name for the primaries and the curve of sRGB."""
+DEFAULT_RATE = 24.0
+"""Time codes a second where nothing tells a rate, as with a single frame; USD's own default."""
+
+
+class UsdSequence:
+    """Writes a sequence, frame by frame; the file appears whole, with ``finish``, or not at all.
+
+    Args:
+        path: ``.usdc`` (or ``.usd``, the same), ``.usda`` (text, about three times as large), ``.usdz``.
+        world: user's world to inside. rig: in the user's world, or None.
+        labels: [N] part of each Gaussian by row, negative for none; None: no parts.
+        frames_per_second: time codes a second; None: by the first two frames.
+
+    Raises:
+        InputError: usd-core is missing or older, another suffix, or the folder cannot be written.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
+    >>> with TemporaryDirectory() as folder:
+    ...     sequence = UsdSequence(f"{folder}/a.usda", WorldFrame(np.zeros(3)))
+    ...     for index in range(2):
+    ...         sequence.add(index, index / 30, state.replace(means=state.means + np.float32(index)))
+    ...     sequence.finish()
+    ...     'def ParticleField3DGaussianSplat "Gaussians"' in Path(f"{folder}/a.usda").read_text()
+    True
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        world: WorldFrame,
+        rig: Rig | None = None,
+        labels: NDArray[Any] | None = None,
+        frames_per_second: float | None = None,
+    ) -> None:
+        self.path = Path(path)
+        if self.path.suffix not in SUFFIXES:
+            raise InputError(f"out {self.path.name!r} has no suffix of USD", f"give one of {', '.join(SUFFIXES)}")
+        self._usd = package("pxr.Usd", "usd")
+        self._geometry, volume = package("pxr.UsdGeom", "usd"), package("pxr.UsdVol", "usd")
+        self._sdf, self._tf, self._vt, self._gf = (package(f"pxr.{name}", "usd") for name in ("Sdf", "Tf", "Vt", "Gf"))
+        if not hasattr(volume, "ParticleField3DGaussianSplat"):
+            raise InputError("usd-core has no ParticleField3DGaussianSplat", "pip install 'usd-core>=26.3'")
+        self._world, self._labels, self._rate = world, labels, frames_per_second
+        self._rig = rig
+        self._splat = volume.ParticleField3DGaussianSplat
+        with writing(self.path):
+            self._folder = Path(tempfile.mkdtemp(prefix=f".part-{self.path.stem}-", dir=self.path.parent))
+        try:
+            with reported(self.path):
+                self._layer = self._sdf.Layer.CreateNew(str(self._folder / f"{self.path.stem}.usdc"))
+                self._stage = self._usd.Stage.Open(self._layer)
+            self._motion: PartMotion | None = None
+            self._channels: dict[str, Channel] = {}
+            self._poses: dict[int, tuple[Any, Any, Any]] = {}
+            self._tracked, self._width = np.zeros(0, np.intp), 0.0
+            self._begin = self._latest = 0.0
+            self._first_index: int | None = None
+            self._ids = np.zeros(0, np.int64)
+            self._head()
+        except BaseException:
+            self.discard()
+            raise
+
+    def add(self, index: int, time: float, gaussians: Gaussians) -> None:
+        """Adds a frame.
+
+        Args:
+            index: of the frame. time: seconds, later than those before. gaussians: in the inside world; rows keep
+                their meaning, and their number never falls.
+
+        Raises:
+            InputError: the time does not rise, rows that are not finite or have no volume, or the disk is full.
+        """
+        if self._first_index is not None and not time > self._latest:
+            raise InputError(
+                f"time {time:g} s of frame {index} is not later than {self._latest:g} s of the frame before",
+                "give frames in the order of their times",
+            )
+        cloud = cloud_of(gaussians, self._world, retired=True).turned()
+        if self._first_index is None:
+            self._first_index, self._begin = index, time
+            self._define(gaussians, cloud)
+        elif self._rate is None:
+            self._rate = float(f"{1 / (time - self._begin):.5g}")  # times of the day are rounded; 29.97 stays
+        self._latest = time
+        code = self._code(time)
+        of = cloud.splats
+        self._ids = cloud.ids
+        tracked = of.means[self._tracked]
+        for name, values in (
+            ("positions", of.means),
+            ("orientations", np.roll(of.rotations, -1, axis=1)),
+            ("scales", of.scales),
+            ("opacities", np.where(gaussians.present, np.clip(of.opacities, 0, 1), 0)),
+            ("harmonics", cloud.harmonics.reshape(-1, 3)),
+            ("extent", _extent(of.means, REACH * of.scales.max(axis=1, initial=0))),
+            ("tracks", tracked),
+            ("widths", np.where(gaussians.present[self._tracked], self._width, 0)),
+            ("track extent", _extent(tracked, np.full(len(tracked), self._width / 2))),
+        ):
+            if name in self._channels:
+                self._channels[name].set(values, code)
+        self._add_poses(gaussians, code)
+        self._save()
+
+    def finish(self) -> None:
+        """Completes the stage and gives the file its name.
+
+        Raises:
+            InputError: there was no frame, or the file cannot be written.
+        """
+        try:
+            if self._first_index is None:
+                raise InputError("there is no frame to export", "give at least one frame")
+            with reported(self.path):
+                self._complete()
+                with whole_file(self.path) as beside:
+                    self._convert(beside)
+        finally:
+            self.discard()
+
+    def discard(self) -> None:
+        """Removes what is beside the target."""
+        self._channels, self._poses, self._stage, self._layer = {}, {}, None, None
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _code(self, time: float) -> float:
+        return round((time - self._begin) * (self._rate or DEFAULT_RATE), 4)
+
+    def _save(self) -> None:
+        """Writes what is new to the disk and frees it: USD reads saved arrays from the file when it needs them."""
+        with reported(self.path):
+            self._layer.Save()
+
+    def _head(self) -> None:
+        """Defines the world, the axes, the unit and the cameras."""
+        geometry, names = self._geometry, self._tf.MakeValidIdentifier
+        geometry.SetStageUpAxis(self._stage, geometry.Tokens.y)
+        geometry.SetStageMetersPerUnit(self._stage, self._world.metres_per_unit)
+        world = geometry.Xform.Define(self._stage, "/World")
+        self._stage.SetDefaultPrim(world.GetPrim())
+        if self._rig is not None:
+            geometry.Scope.Define(self._stage, "/World/Cameras")
+            taken: set[str] = set()
+            for number, camera in enumerate(self._rig.cameras):
+                name = names(camera.name)
+                name = f"{name}_{number}" if name in taken else name
+                taken.add(name)
+                prim = geometry.Camera.Define(self._stage, f"/World/Cameras/{name}")
+                set_camera(prim, camera, self._world.metres_per_unit)
+
+    def _define(self, first: Gaussians, cloud: Cloud) -> None:
+        """Defines the Gaussians, the tracks and the parts by the first frame."""
+        gaussians = self._splat.Define(self._stage, "/World/Gaussians")
+        gaussians.CreateRadianceSphericalHarmonicsDegreeAttr(round(cloud.harmonics.shape[1] ** 0.5) - 1)
+        gaussians.CreateProjectionModeHintAttr("perspective")
+        gaussians.CreateSortingModeHintAttr("zDepth")
+        harmonics = gaussians.CreateRadianceSphericalHarmonicsCoefficientsAttr()
+        harmonics.SetColorSpace(COLOUR_SPACE)
+        primvar = self._geometry.Primvar(harmonics)
+        primvar.SetElementSize(cloud.harmonics.shape[1])
+        primvar.SetInterpolation(self._geometry.Tokens.vertex)
+        self._channels = {
+            "positions": Channel(gaussians.CreatePositionsAttr(), points_of),
+            "orientations": Channel(gaussians.CreateOrientationsAttr(), quaternions_of),
+            "scales": Channel(gaussians.CreateScalesAttr(), points_of),
+            "opacities": Channel(gaussians.CreateOpacitiesAttr(), floats_of, unborn=0),
+            "harmonics": Channel(harmonics, points_of),
+            "extent": Channel(gaussians.CreateExtentAttr(), points_of),
+        }
+        moving = np.flatnonzero(first.moving)
+        even = np.linspace(0, len(moving) - 1, min(MOST_TRACKS, len(moving))).round().astype(np.intp)
+        self._tracked = moving[even]
+        if self._tracked.size:
+            means = cloud.splats.means[self._tracked]
+            self._width = max(TRACK_WIDTH * float(np.ptp(means, axis=0).max()), float(np.finfo(np.float32).tiny))
+            tracks = self._geometry.Points.Define(self._stage, "/World/Tracks")
+            tracks.CreatePurposeAttr(self._geometry.Tokens.guide)
+            tracks.CreateIdsAttr(self._vt.Int64Array.FromNumpy(cloud.ids[self._tracked]))
+            colours = tracks.CreateDisplayColorPrimvar(self._geometry.Tokens.vertex)
+            colours.Set(points_of(linear_light(cloud.splats.colours[self._tracked])))  # displayColor is linear
+            tracks.SetWidthsInterpolation(self._geometry.Tokens.vertex)
+            self._channels["tracks"] = Channel(tracks.CreatePointsAttr(), points_of)
+            self._channels["widths"] = Channel(tracks.CreateWidthsAttr(), floats_of)
+            self._channels["track extent"] = Channel(tracks.CreateExtentAttr(), points_of)
+        if self._labels is not None:
+            self._motion = PartMotion(self._labels, first, self._world)
+            self._geometry.Scope.Define(self._stage, "/World/Parts")
+            for part in self._motion.parts:
+                xform = self._geometry.Xform.Define(self._stage, f"/World/Parts/part_{part}")
+                precise = self._geometry.XformOp.PrecisionDouble
+                residual = xform.GetPrim().CreateAttribute("scas4d:residual", self._sdf.ValueTypeNames.Double)
+                self._poses[part] = (xform.AddTranslateOp(precise), xform.AddOrientOp(precise), residual)
+
+    def _add_poses(self, gaussians: Gaussians, code: float) -> None:
+        """Sets the transforms of the parts at a time code."""
+        for pose in self._motion.poses(gaussians) if self._motion is not None else ():
+            translate, orient, residual = self._poses[pose.part]
+            rotation, position = turned_pose(pose.rotation, pose.position)
+            translate.Set(self._gf.Vec3d(*position.tolist()), code)
+            orient.Set(self._gf.Quatd(*quaternion_of(rotation).tolist()), code)
+            residual.Set(pose.residual, code)
+
+    def _complete(self) -> None:
+        """Lengthens early samples, tells ids, parts and the range of time."""
+        for channel in self._channels.values():
+            for _ in channel.lengthen():
+                self._layer.Save()
+            channel.settle()
+        primvars = self._geometry.PrimvarsAPI(self._stage.GetPrimAtPath("/World/Gaussians"))
+        told = {"scas4d:id": (self._sdf.ValueTypeNames.Int64Array, self._vt.Int64Array.FromNumpy(self._ids))}
+        if self._labels is not None:
+            parts = part_labels(self._labels, len(self._ids)).astype(np.int32)
+            told["scas4d:part"] = (self._sdf.ValueTypeNames.IntArray, self._vt.IntArray.FromNumpy(parts))
+        for name, (kind, values) in told.items():
+            primvars.CreatePrimvar(name, kind, self._geometry.Tokens.vertex).Set(values)
+        self._stage.SetTimeCodesPerSecond(self._rate or DEFAULT_RATE)
+        self._stage.SetFramesPerSecond(self._rate or DEFAULT_RATE)
+        self._stage.SetStartTimeCode(0)
+        self._stage.SetEndTimeCode(self._code(self._latest))
+        origin = {"first_frame": self._first_index, "first_time_s": self._begin}
+        self._layer.customLayerData = {"scas4d": origin}
+        self._layer.Save()
+
+    def _convert(self, beside: Path) -> None:
+        """Brings the stage to the format of the target."""
+        if beside.suffix == ".usdz":
+            done = package("pxr.UsdUtils", "usd").CreateNewUsdzPackage(self._layer.realPath, str(beside))
+        else:
+            done = self._layer.Export(str(beside))  # without the samples that were replaced
+        if not done:
+            raise InputError(f"out {str(self.path)!r} cannot be written by USD", "give a path that may be written to")
+
+
+def _extent(means: NDArray[Any], reach: NDArray[Any]) -> NDArray[Any]:
+    """[2, 3] lowest and highest corner of the box around points [N, 3] with radii [N]; 0 where there are none."""
+    if not len(means):
+        return np.zeros((2, 3))
+    return np.stack([np.min(means - reach[:, None], axis=0), np.max(means + reach[:, None], axis=0)])

@@ -1,0 +1,140 @@
+"""Values of USD: arrays of Gaussians as typed attributes, poses and cameras in USD's axes, and samples over time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Camera
+from scas4d_core.errors import InputError, message_of
+from scas4d_core.exports.cloud import HALF_TURN
+from scas4d_core.exports.whole_files import package, writing
+
+Array = NDArray[Any]
+
+FOCAL_LENGTH = 50.0
+"""Of every camera, tenths of the stage's unit as USD has it; the apertures follow from it, and only ratios matter."""
+NEAREST, FARTHEST = 0.01, 1000.0
+"""Clipping range of cameras, metres."""
+
+
+class Channel:
+    """Samples of one attribute with a value a Gaussian; a sample is written only where it tells something new.
+
+    USD interpolates between samples, so before a change the value of the frame before is written as well. Gaussians
+    that are born later make a sample longer: earlier ones are lengthened in the end (``lengthen``).
+
+    Args:
+        attribute: of USD. typed: turns an array of numpy into one of USD.
+        unborn: the value before the birth; None: that of the birth.
+    """
+
+    def __init__(self, attribute: Any, typed: Callable[[Array], Any], unborn: float | None = None) -> None:
+        self._attribute, self._typed, self._unborn = attribute, typed, unborn
+        self._last: Array | None = None
+        self._unwritten: float | None = None
+        self._births: list[Array] = []
+        self._born = 0
+
+    def set(self, values: Array, code: float) -> None:
+        """Sets the values [N, …] at a time code; N never falls."""
+        given = np.asarray(values, np.float32)
+        if len(given) > self._born:
+            self._births.append(given[self._born :].copy())
+            self._born = len(given)
+        if self._last is not None and self._is_told(self._last, given):
+            self._last, self._unwritten = given, code
+            return
+        if self._unwritten is not None and self._last is not None:
+            self._attribute.Set(self._typed(self._last), self._unwritten)
+        self._attribute.Set(self._typed(given), code)
+        self._last, self._unwritten = given, None
+
+    def _is_told(self, before: Array, after: Array) -> bool:
+        """True where the samples before, lengthened, have these values already."""
+        grown = len(after) > len(before)
+        return not (grown and self._unborn is not None) and np.array_equal(before, after[: len(before)])
+
+    def lengthen(self) -> Iterator[None]:
+        """Gives all samples the full length; pauses after each, so that it can be saved."""
+        if len(self._births) < 2:
+            return
+        full = np.concatenate(self._births)
+        if self._unborn is not None:
+            full[:] = self._unborn
+        for code in self._attribute.GetTimeSamples():
+            sample = np.asarray(self._attribute.Get(code), np.float32).reshape(-1, *full.shape[1:])
+            if len(sample) < len(full):
+                self._attribute.Set(self._typed(np.concatenate([sample, full[len(sample) :]])), code)
+                yield
+
+    def settle(self) -> None:
+        """Makes a lone sample the default value, which readers without time see."""
+        codes = self._attribute.GetTimeSamples()
+        if len(codes) == 1:
+            value = self._attribute.Get(codes[0])
+            self._attribute.Clear()
+            self._attribute.Set(value)
+
+
+def points_of(values: Array) -> Any:
+    """[N, 3] as an array of USD."""
+    return package("pxr.Vt", "usd").Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
+
+
+def floats_of(values: Array) -> Any:
+    """[N] as an array of USD."""
+    return package("pxr.Vt", "usd").FloatArray.FromNumpy(np.ascontiguousarray(values, np.float32))
+
+
+def quaternions_of(values: Array) -> Any:
+    """[N, 4] (x, y, z, w), as USD has them in memory, as an array of USD."""
+    return package("pxr.Vt", "usd").QuatfArray.FromNumpy(np.ascontiguousarray(values, np.float32))
+
+
+def turned_pose(rotation: Array, position: Array) -> tuple[Array, Array]:
+    """A pose in the user's world, [3, 3] and [3], in the axes of the stage; the part's own axes turn as well.
+
+    >>> turned_pose(np.eye(3), np.array([1.0, 2, 3]))[1]
+    array([ 1., -2., -3.])
+    """
+    return HALF_TURN @ rotation @ HALF_TURN, HALF_TURN @ position
+
+
+def set_camera(prim: Any, camera: Camera, metres_per_unit: float) -> None:
+    """Fills a UsdGeomCamera from a camera in the user's world.
+
+    A camera of USD looks along −z with y up, the half turn of one of OpenCV. Its window at the focal length f has the
+    size (w/fx, h/fy)·f and lies off the axis by ((w/2 − cx)/fx, (cy − h/2)/fy)·f.
+    """
+    gf, geometry = package("pxr.Gf", "usd"), package("pxr.UsdGeom", "usd")
+    pose = np.eye(4)
+    pose[:3, :3] = HALF_TURN @ camera.rotation.T @ HALF_TURN
+    pose[:3, 3] = HALF_TURN @ camera.centre
+    prim.AddTransformOp().Set(gf.Matrix4d(*pose.T.ravel().tolist()))  # USD multiplies rows from the left
+    prim.CreateProjectionAttr(geometry.Tokens.perspective)
+    prim.CreateFocalLengthAttr(FOCAL_LENGTH)
+    prim.CreateHorizontalApertureAttr(FOCAL_LENGTH * camera.width / camera.fx)
+    prim.CreateVerticalApertureAttr(FOCAL_LENGTH * camera.height / camera.fy)
+    prim.CreateHorizontalApertureOffsetAttr(FOCAL_LENGTH * (camera.width / 2 - camera.cx) / camera.fx)
+    prim.CreateVerticalApertureOffsetAttr(FOCAL_LENGTH * (camera.cy - camera.height / 2) / camera.fy)
+    prim.CreateClippingRangeAttr(gf.Vec2f(NEAREST / metres_per_unit, FARTHEST / metres_per_unit))
+    prim.GetPrim().SetDisplayName(camera.name)
+
+
+@contextmanager
+def reported(path: Path) -> Iterator[None]:
+    """Turns errors of USD and of the system, while a file is written, into an ``InputError`` that names the output."""
+    failure = package("pxr.Tf", "usd").ErrorException
+    try:
+        with writing(path):
+            yield
+    except failure as error:
+        raise InputError(
+            f"out {str(path)!r} cannot be written (USD: {message_of(error)})", "give a path that may be written to"
+        ) from error

@@ -1,0 +1,89 @@
+"""Writes files whole or not at all, and imports packages that only an export needs. Standard library only."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from scas4d_core.errors import InputError, message_of
+
+
+@contextmanager
+def whole_file(path: Path | str) -> Iterator[Path]:
+    """Gives a temporary name beside ``path``; in the end that file is renamed to ``path``, or removed on an error.
+
+    The temporary name keeps the suffix, by which some libraries choose the format.
+
+    Raises:
+        InputError: the folder or the file cannot be written, or the disk is full.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     with whole_file(f"{folder}/a.txt") as beside:
+    ...         written = beside.write_text("whole")
+    ...     [file.name for file in Path(folder).iterdir()]
+    ['a.txt']
+    """
+    target = Path(path)
+    beside = target.with_name(f".part{os.getpid()}-{target.name}")
+    try:
+        with writing(target):
+            yield beside
+            beside.replace(target)
+    finally:
+        with suppress(OSError):  # the error that matters is on its way
+            beside.unlink(missing_ok=True)
+
+
+def check_writable(path: Path | str) -> None:
+    """Makes and removes a file beside ``path``, so that a long export fails at its start.
+
+    Raises:
+        InputError: the folder cannot be written.
+
+    >>> check_writable("no_such_folder/a.glb")
+    Traceback (most recent call last):
+    scas4d_core.errors.InputError: out 'no_such_folder/a.glb' cannot be written (...); give a path in a ...
+    """
+    target = Path(path)
+    with writing(target):
+        beside = target.with_name(f".part{os.getpid()}-{target.name}")
+        beside.touch()
+        beside.unlink()
+
+
+@contextmanager
+def writing(path: Path | str) -> Iterator[None]:
+    """Turns an ``OSError`` into an ``InputError`` that names the output."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"out {str(path)!r} cannot be written ({message_of(error)})",
+            "give a path in a folder that exists and may be written to, on a disk with room",
+        ) from error
+
+
+def package(name: str, export: str) -> Any:
+    """Imports a package of the extra ``exports``.
+
+    Args:
+        name: of the module. export: the format, for the message.
+
+    Raises:
+        InputError: it is not installed; the remedy is the command that installs it.
+
+    >>> package("no_such_package", "usd")
+    Traceback (most recent call last):
+    scas4d_core.errors.InputError: format 'usd' needs the package no_such_package, which is not installed; pip ...
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(
+            f"format {export!r} needs the package {name}, which is not installed", "pip install 'scas4d[exports]'"
+        ) from error
