@@ -172,9 +172,9 @@ class StaticSettings(SettingsModel):
 class LayerRates(SettingsModel):
     """Adam rates of one layer of clusters."""
 
+    constants: ClassVar[Mapping[str, Constant]] = {"scaling": Constant(0.002, "scas4d_core.update.rates.RATE_SCALING")}
     rotation: Positive = Field(description="Per iteration, in units of tan(angle/2).")
     translation: Positive = Field(description="Metres per iteration, for a scene radius of 4 m.")
-    scaling: Positive = Field(description="Of c (1/m) and s.")
 
 
 class Weights(SettingsModel):
@@ -274,9 +274,9 @@ class UpdateSettings(SettingsModel):
     )
     layer_rates: tuple[LayerRates, ...] = Field(
         (
-            LayerRates(rotation=0.04, translation=0.008, scaling=0.002),
-            LayerRates(rotation=0.01, translation=0.002, scaling=0.002),
-            LayerRates(rotation=0.002, translation=0.0004, scaling=0.002),
+            LayerRates(rotation=0.04, translation=0.008),
+            LayerRates(rotation=0.01, translation=0.002),
+            LayerRates(rotation=0.002, translation=0.0004),
         ),
         min_length=1,
         description="One per layer, coarse to fine; with more layers the last is repeated.",

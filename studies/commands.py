@@ -6,6 +6,7 @@ import typer
 
 from studies.compact.commands import compact
 from studies.effort.commands import effort
+from studies.exports.commands import exports
 from studies.frontier.commands import frontier
 from studies.hard_cases.commands import stability, timing
 from studies.kernels.commands import device, kernels, moving, startup
@@ -26,7 +27,7 @@ from studies.variants.commands import variants
 STUDIES = {
     "Quality": (quality, refit, effects, switches, targets, table, processors),
     "Rigs": (rigs, calibration, drift),
-    "What comes out": (compact,),
+    "What comes out": (compact, exports),
     "Accuracy against time": (frontier, effort, paper, variants),
     "Speed of the code": (kernels, device, moving, startup),
     "Hard cases": (stability, timing),

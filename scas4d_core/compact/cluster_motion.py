@@ -1,4 +1,4 @@
-"""What moves together between two states: one affine map for each cluster of Gaussians.
+"""One affine map for each cluster of Gaussians carries a state to the next.
 
 As in the cascade, a map carries centres (x → x + A (x − c) + t), axes (F → (I + A) F) and, by the polar rotation of
 I + A, the material rotation. What remains is each Gaussian's own, and small. Numpy only.
@@ -37,7 +37,7 @@ RIDGE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """Which Gaussians move together in a file.
+    """Clusters of Gaussians that move together in a file.
 
     Attributes:
         labels: [N] int64, 0 for those that stand, else 1 + the cluster.

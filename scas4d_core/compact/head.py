@@ -19,7 +19,7 @@ VERSION = 1
 
 @dataclass(frozen=True)
 class Head:
-    """What holds for a whole file.
+    """Facts that hold for a whole file.
 
     Attributes:
         world: from the user's world to that of the states. bounds: of every state.

@@ -22,7 +22,7 @@ HEAD_SIZE = _HEAD.size + _CHECKSUM.size
 
 
 class Kind(IntEnum):
-    """What a record holds."""
+    """Kinds of records, by what their body holds."""
 
     HEAD = 1
     """JSON: version, world, bounds."""
@@ -48,7 +48,7 @@ class DamagedFileError(FileError):
 
 @dataclass(frozen=True)
 class Record:
-    """Where a record is.
+    """Place of a record in a file.
 
     Attributes:
         kind: of its body. frame: index, −1 for none. time: seconds. offset: of its body in the file. size: of the body,

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float32]
 
+RATE_SCALING = 0.002
+"""Of c (1/m) and s of a cluster, per iteration."""
 STANDARD_RADIUS_M = 4.0
 """The scene radius for which the translation rates of the layers are given."""
 
@@ -161,7 +163,7 @@ class Rates:
         starts = tuple(LAYER_STARTS[min(k, len(LAYER_STARTS) - 1)] for k in range(layers))
         named = [settings.layer_rates[min(k, len(settings.layer_rates) - 1)] for k in range(layers)]
         return cls(
-            layers=tuple((r.rotation, r.translation * radius / STANDARD_RADIUS_M, r.scaling) for r in named),
+            layers=tuple((r.rotation, r.translation * radius / STANDARD_RADIUS_M, RATE_SCALING) for r in named),
             position=settings.rate_position * radius,
             rotation=settings.rate_rotation,
             scale=settings.rate_scale,

@@ -40,7 +40,7 @@ RIG = make_rig()
 EXPOSURES = {name: np.array([[1.05, 0.02], [0.97, -0.01], [1, 0.01]], np.float32) for name in RIG.names}
 SETTINGS = UpdateSettings(
     iterations=8, clusters=(2, 12, 48), rate_end=0.1, beta1=0.9, beta2=0.999, weights=Weights(mask=3),
-    layer_rates=tuple(LayerRates(rotation=r, translation=0.2 * r, scaling=0.002) for r in (0.02, 0.01, 0.005)),
+    layer_rates=tuple(LayerRates(rotation=r, translation=0.2 * r) for r in (0.02, 0.01, 0.005)),
 )  # fmt: skip
 """Everything that an update can be asked for, in few iterations: the dense twin is slow."""
 

@@ -1,0 +1,201 @@
+"""``scripts/bench exports``: every format of splats, read by a reader that is not ours, rendered against the state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import imageio.v3 as imageio
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from client.cli import pictures
+from client.importers.open_source import open_source
+from scas4d_core import metrics
+from scas4d_core.cameras import WorldFrame
+from scas4d_core.exports.formats import FORMATS
+from scas4d_core.exports.sequence import export_sequence
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.query.committed import CommittedScene
+from scas4d_core.query.ply import SH_DEGREE_0
+from scas4d_core.settings import Settings
+from scas4d_core.storage.history import History
+
+Float = NDArray[np.float64]
+Y_UP = np.array([1.0, -1.0, -1.0])
+SPLAT = "KHR_gaussian_splatting"
+
+
+@dataclass(frozen=True)
+class Found:
+    """Gaussians as a reader gives them: [N, 3] means, scales, colours; [N, 4] rotations (x, y, z, w); [N] opacities."""
+
+    means: Float
+    rotations: Float
+    scales: Float
+    colours: Float
+    opacities: Float
+
+    def gaussians(self, axes: Float, world: WorldFrame, metres: bool) -> Gaussians:
+        """In the inside world.
+
+        Args:
+            axes: signs of the file's axes in ours. metres: the file is in metres, not in the user's unit.
+        """
+        unit = 1.0 if metres else world.metres_per_unit
+        turned = Rotation.from_quat(self.rotations).as_matrix() * self.scales[:, None, :] * unit
+        means = self.means * axes / (world.metres_per_unit if metres else 1.0)
+        state = Gaussians.of_points(world.to_inside(means), 1.0, self.colours)
+        return state.replace(
+            factors=(turned * axes[:, None]).astype(np.float32), opacities=self.opacities.astype(np.float32)
+        )
+
+
+@dataclass(frozen=True)
+class ExportFigures:
+    """Of one format: bytes of the file, dB of its rendering against the state's (mean over cameras), and the reader."""
+
+    format: str
+    size: int
+    psnr: float
+    reader: str
+
+
+def measure(folder: Path, states: Path, leave: Path | None = None) -> list[ExportFigures]:
+    """Exports the last committed state of a capture and renders what readers get of it in all test cameras."""
+    capture = open_source(folder)
+    history = History.load(states)
+    index, state = history.indices[-1], history.newest
+    world = capture.full_rig.world_frame(Settings().scene.metres_per_unit)
+    cameras = (capture.test_rig or capture.rig).cameras
+    exact = _rendered(state, world, history, cameras)
+    figures = []
+    with TemporaryDirectory() as temporary:
+        for name, (reader, read, y_up) in READERS.items():
+            single = FORMATS[name].numbered
+            out = Path(temporary) / (name if single else f"{name}{FORMATS[name].suffixes[0]}")
+            (file,) = export_sequence([(index, 0.0, state)], name, out, world=world)
+            metres = FORMATS[name].unit.startswith("metre")
+            found = read(file).gaussians(Y_UP if y_up else np.ones(3), world, metres)
+            views = _rendered(found, world, history, cameras)
+            psnr = float(np.mean([metrics.psnr(b, a) for a, b in zip(exact, views, strict=True)]))
+            figures.append(ExportFigures(name, file.stat().st_size, psnr, reader))
+            if leave is not None:
+                leave.mkdir(parents=True, exist_ok=True)
+                left, right = (pictures.eight_bit(each[0]) for each in (exact, views))
+                imageio.imwrite(leave / f"{name}.png", pictures.comparison(left, right))
+    return figures
+
+
+def told(figures: list[ExportFigures]) -> str:
+    """The figures as Markdown."""
+    rows = [f"| `{one.format}` | {one.size / 1e6:.2f} MB | {one.psnr:.1f} | {one.reader} |" for one in figures]
+    return "\n".join(["| format | a frame | dB against the state | read by |", "|---|---|---|---|", *rows])
+
+
+def _rendered(state: Gaussians, world: WorldFrame, of: History, cameras: Any) -> list[NDArray[np.float32]]:
+    history = History()
+    ids = np.arange(len(state), dtype=np.int64)
+    history.append(0, 0.0, state.replace(ids=ids))
+    scene = CommittedScene(history, world)
+    return [scene.render(camera, background=of.background).colour for camera in cameras]
+
+
+def _sigmoid(values: NDArray[Any]) -> Float:
+    return np.asarray(1 / (1 + np.exp(-np.asarray(values, np.float64))))
+
+
+def _by_plyfile(file: Path) -> Found:
+    from plyfile import PlyData
+
+    vertex = PlyData.read(str(file))["vertex"]
+
+    def column(*names: str) -> Float:
+        return np.stack([np.asarray(vertex[name], np.float64) for name in names], axis=-1)
+
+    return Found(
+        column("x", "y", "z"),
+        column("rot_1", "rot_2", "rot_3", "rot_0"),
+        np.exp(column("scale_0", "scale_1", "scale_2")),
+        0.5 + SH_DEGREE_0 * column("f_dc_0", "f_dc_1", "f_dc_2"),
+        _sigmoid(vertex["opacity"]),
+    )
+
+
+def _by_layout(file: Path) -> Found:
+    content = file.read_bytes()
+    floats = np.frombuffer(content, "<f4").reshape(-1, 8)[:, :6].astype(np.float64)
+    numbers = np.frombuffer(content, np.uint8).reshape(-1, 32)
+    w, x, y, z = (numbers[:, 28:].T.astype(np.float64) - 128) / 128
+    return Found(
+        floats[:, :3], np.stack([x, y, z, w], axis=1), floats[:, 3:6], numbers[:, 24:27] / 255, numbers[:, 27] / 255
+    )
+
+
+def _by_gsply(file: Path) -> Found:
+    import gsply
+
+    data = gsply.read_spz(str(file))
+    return Found(
+        np.asarray(data.means, np.float64),
+        np.roll(np.float64(data.quats), -1, axis=1),
+        np.exp(np.float64(data.scales)),
+        0.5 + SH_DEGREE_0 * np.float64(data.sh0).reshape(-1, 3),
+        _sigmoid(data.opacities).reshape(-1),
+    )
+
+
+def _by_pygltflib(file: Path) -> Found:
+    from pygltflib import GLTF2
+
+    document = GLTF2().load(str(file))
+    blob = document.binary_blob()
+    attributes = vars(document.meshes[0].primitives[0].attributes)
+
+    def values(name: str, width: int) -> Float:
+        accessor = document.accessors[attributes[name]]
+        view = document.bufferViews[accessor.bufferView]
+        begin = (view.byteOffset or 0) + (accessor.byteOffset or 0)
+        found = np.frombuffer(blob, "<f4", accessor.count * width, begin).astype(np.float64)
+        return found.reshape(-1, width) if width > 1 else found
+
+    return Found(
+        values("POSITION", 3),
+        values(f"{SPLAT}:ROTATION", 4),
+        values(f"{SPLAT}:SCALE", 3),
+        0.5 + SH_DEGREE_0 * values(f"{SPLAT}:SH_DEGREE_0_COEF_0", 3),
+        values(f"{SPLAT}:OPACITY", 1),
+    )
+
+
+def _by_pxr(file: Path) -> Found:
+    from pxr import Usd, UsdVol
+
+    stage = Usd.Stage.Open(str(file))
+    prim = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/World/Gaussians"))
+    code = stage.GetStartTimeCode()
+    degree = prim.GetRadianceSphericalHarmonicsDegreeAttr().Get()
+    harmonics = np.array(prim.GetRadianceSphericalHarmonicsCoefficientsAttr().Get(code), np.float64)
+    quaternions = prim.GetOrientationsAttr().Get(code)
+    return Found(
+        np.array(prim.GetPositionsAttr().Get(code), np.float64),
+        np.array([[*q.GetImaginary(), q.GetReal()] for q in quaternions], np.float64),
+        np.array(prim.GetScalesAttr().Get(code), np.float64),
+        0.5 + SH_DEGREE_0 * harmonics.reshape(-1, (degree + 1) ** 2, 3)[:, 0],
+        np.array(prim.GetOpacitiesAttr().Get(code), np.float64),
+    )
+
+
+READERS: Mapping[str, tuple[str, Callable[[Path], Found], bool]] = {
+    "ply": ("plyfile", _by_plyfile, False),
+    "splat": ("numpy, by the layout", _by_layout, False),
+    "spz": ("gsply", _by_gsply, True),
+    "spz4": ("gsply", _by_gsply, True),
+    "glb": ("pygltflib", _by_pygltflib, True),
+    "usd": ("pxr", _by_pxr, True),
+}
+"""By format: the reader's name, the reader, and whether the file's y axis is up."""

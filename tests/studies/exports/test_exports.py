@@ -1,0 +1,30 @@
+"""The study of exports: every format of splats, read back and rendered, a little of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from client.cli.reconstruct import reconstruct
+from client.importers.open_source import open_source
+from studies.exports.exports import READERS, measure, told
+
+for package in ("gsply", "pxr", "pygltflib"):
+    pytest.importorskip(package, reason=f"the study reads with {package}")
+
+SAMPLE = Path(__file__).parents[3] / "samples" / "robot"
+CHANGES = {
+    "scene": {"image_scale": 0.25},
+    "static": {"iterations": 20, "max_gaussians": 500},
+    "update": {"iterations": 4},
+}
+
+
+def test_each_format_shows_the_state(tmp_path: Path) -> None:
+    reconstruct(open_source(SAMPLE), tmp_path, frames=2, preset="scas4d", changes=CHANGES)
+    found = measure(SAMPLE, tmp_path / "states", tmp_path / "pictures")
+    assert [one.format for one in found] == list(READERS)
+    assert all(one.psnr > (60 if one.format in ("ply", "glb", "usd") else 38) for one in found), found
+    assert sorted(path.stem for path in (tmp_path / "pictures").iterdir()) == sorted(READERS)
+    assert told(found).count("|\n") >= len(READERS)
