@@ -43,7 +43,7 @@ from scas4d_core.compact.sections import (
 Array = NDArray[np.float32]
 Float = NDArray[np.float64]
 
-FLAT = 0.5
+FLAT = 0.1
 """A decoded Gaussian whose volume is not between this part of the true one and its inverse is told exactly: thin ones,
 whose error in an axis is as large as the axis, would lose their volume or turn inside out."""
 SCALE_STEP = 0.08
