@@ -10,7 +10,7 @@ from typing import Any
 from client.cli.evaluate import Job, Report
 from client.cli.scores import Row, Store
 from scas4d_core.presets import preset
-from scas4d_core.settings import Constant, Settings, StaticSettings, UpdateSettings, Weights
+from scas4d_core.settings import Constant, LayerRates, Settings, StaticSettings, UpdateSettings, Weights
 from studies.quality.quality import OBJECT_CAPTURES, run_jobs
 from studies.quality.settings import settings_of
 
@@ -21,7 +21,7 @@ CAPTURE_CHANGES: Mapping[str, tuple[str, ...]] = {}
 """What a scene itself asks for in every run of it (its budget of Gaussians, its floor), never what tunes a method."""
 
 LATER: Mapping[str, Mapping[str, Any]] = {
-    "static": {"stop_gain": 0.0, "seconds": None, "refine_calibration": False},
+    "static": {"stop_gain": 0.0, "seconds": None, "refine_calibration": False, "detail": 1.0},
     "update": {"budget_ms": None, "stop_gain": 0.0, "cold_longer": 1.0, "views": 1, "covariance": "entangled"},
 }
 """Settings that rows measured before do not name, by group, with the value that they had in effect."""
@@ -155,6 +155,13 @@ def completed(settings: Mapping[str, Any], today: Mapping[str, Any]) -> dict[str
         for group, given in settings.items()
     }
     varied = dict(told.get("constants", {}))
+    update = told.get("update")
+    if isinstance(update, dict) and "layer_rates" in update:
+        (scaling,) = LayerRates.constants.values()
+        layers = [dict(layer) for layer in update["layer_rates"]]
+        rates = {layer.pop("scaling", scaling.value) for layer in layers}
+        told["update"] = update | {"layer_rates": layers}
+        varied |= {scaling.place: max(rates)} if rates != {scaling.value} else {}
     for path, constants in FORMER.items():
         inner = told
         for group in path:
