@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.compact.bounds import Bounds
-from scas4d_core.compact.cluster_motion import Clusters
+from scas4d_core.compact.cluster_motion import MOST_CLUSTERS, Clusters
 from scas4d_core.compact.columns import LABELS, Columns, label_of, levels_of, sizes_of, turns_of, vectors_of
 from scas4d_core.compact.frame_code import LARGEST, MARGIN, completed, lost_volume
 from scas4d_core.compact.planes import Ints, PlaneError, pack, unpack
@@ -41,8 +41,6 @@ TINIEST, LARGEST_SIZE = 1e-18, 1e18
 """Metres; a size outside is told exactly."""
 OPAQUE = 1e-4
 """Opacities keep this far from 0 and 1."""
-MOST_CLUSTERS = 1 << 20
-"""In a file; more are damage."""
 COMPONENTS = {"lengths": 3, "axes": 9, "means": 3, "rotations": 3, "colours": 3, "labels": 1, "opacities": 1}
 
 

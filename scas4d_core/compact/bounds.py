@@ -21,7 +21,7 @@ class Bounds:
         colour: of a channel, where colours are 0…1. gloss: of a component. opacity: in 0…1.
 
     Raises:
-        InputError: a bound that is not between 1e-6 and 1.
+        InputError: a bound that is not between 1e-6 (rotation: 0.002) and 1.
 
     >>> Bounds(position=0.1).position
     0.1
@@ -39,9 +39,9 @@ class Bounds:
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            value = getattr(self, item.name)
-            if not LEAST <= value <= 1:
-                raise InputError(f"bound {item.name}={value} is out of its range", f"give a number from {LEAST} to 1")
+            value, least = getattr(self, item.name), LEAST_ROTATION if item.name == "rotation" else LEAST
+            if not least <= value <= 1:
+                raise InputError(f"bound {item.name}={value} is out of its range", f"give a number from {least} to 1")
 
     def record(self) -> dict[str, float]:
         """The bounds by name, for the head of a file."""
@@ -55,3 +55,5 @@ class Bounds:
 
 LEAST = 1e-6
 """Below it float32 has no digits left."""
+LEAST_ROTATION = 0.002
+"""Below it the steps of a half turn are more than a plane holds."""

@@ -89,7 +89,7 @@ class Head:
                 None if rate is None else float(rate),
                 dict(record["remark"]),
             )
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
             raise FileError(f"{name}: its head lacks something or is wrong ({error})") from None
 
 

@@ -10,13 +10,15 @@ from typing import Any, BinaryIO
 import numpy as np
 import zstandard
 
-from scas4d_core.compact.planes import PlaneError, deflated, inflated
-from scas4d_core.compact.records import HEAD_SIZE, FileError, Kind, Record, parse_head, read_body
+from scas4d_core.compact.planes import deflated, inflated
+from scas4d_core.compact.records import HEAD_SIZE, Kind, Record, parse_head, read_body
 
 FOOTER_MAGIC = b"s4dINDEX"
 _FOOTER = struct.Struct("<Q8s")
 """Place of the record of the index; the last bytes of the file."""
 _COUNT = struct.Struct("<I")
+NO_INDEX = (ValueError, TypeError, OverflowError, RecursionError, struct.error, zstandard.ZstdError)
+"""Errors of bytes that are no index; the file is listed by its records then."""
 _ROW = np.dtype(
     [("kind", "u1"), ("frame", "<i8"), ("time", "<f8"), ("offset", "<u8"), ("size", "<u4"), ("checksum", "<u4")]
 )
@@ -49,7 +51,7 @@ def read_index(file: BinaryIO, name: str) -> tuple[list[Record], dict[str, Any]]
             return None
         body = read_body(file, record, name)
         return _parsed(body, offset)
-    except (FileError, PlaneError, ValueError, TypeError):
+    except NO_INDEX:
         return None
 
 
@@ -60,7 +62,7 @@ def _parsed(body: bytes, end: int) -> tuple[list[Record], dict[str, Any]] | None
         return None
     data = inflated(body[_COUNT.size :], size)
     rows = np.frombuffer(data, _ROW, count)
-    if (rows["offset"] + rows["size"].astype(np.uint64) > end).any():
+    if (rows["offset"] > end).any() or (rows["offset"] + rows["size"].astype(np.uint64) > end).any():
         return None
     records = [
         Record(Kind(int(kind)), int(frame), float(time), int(offset), int(size), int(checksum))

@@ -24,6 +24,7 @@ from scas4d_core.compact.records import (
     FileError,
     Kind,
     Record,
+    checksum_bytes,
     read_body,
     scan,
 )
@@ -77,8 +78,11 @@ class CompactReader:
             if found is not None:
                 records, self.about = found
                 self._whole = True
-                for record in records:
-                    self._note(record)
+                try:
+                    for record in records:
+                        self._note(record)
+                except DamagedFileError as error:
+                    self.damage = str(error)
             else:
                 self.refresh()
             if not self._records or self._records[0].kind is not Kind.HEAD:
@@ -113,6 +117,8 @@ class CompactReader:
                 self._end = record.end
                 if record.kind is Kind.INDEX:
                     self._whole = True
+                    if (whole := read_index(self._file, self.path.name)) is not None:
+                        self.about = whole[1]
                     break
         except FileError as error:
             self.damage = str(error)
@@ -161,7 +167,9 @@ class CompactReader:
         if not found:
             return None
         body = read_body(self._file, found[-1], self.path.name)
-        count = self._counted(body, found[-1])
+        count = int.from_bytes(body[:4], "little")
+        if count > self.count:
+            raise self._damaged(found[-1], PlaneError(f"parts of {count} Gaussians, there are {self.count}"))
         try:
             return unpack(body, count, 4)[0].astype(np.int64) - 1
         except PlaneError as error:
@@ -175,6 +183,10 @@ class CompactReader:
                 self._states.append(record)
                 self._frames.append(record.frame)
         elif record.kind in STATES:
+            if not self._frames or record.frame <= self._frames[-1]:
+                before = f"frame {self._frames[-1]}" if self._frames else "no frame"
+                place = record.offset - HEAD_SIZE
+                raise DamagedFileError(f"{self.path.name}: frame {record.frame} follows {before} at byte {place}")
             self._states.append(record)
             self._frames.append(record.frame)
         elif record.kind is Kind.PARTS:
@@ -190,6 +202,11 @@ class CompactReader:
         elif len(before) < len(born):
             before = before.joined(born.after(len(before)))
         body = read_body(self._file, record, self.path.name)
+        if record.kind is Kind.DELTA:
+            told = checksum_bytes(self._states[place - 1])
+            if body[: len(told)] != told:
+                raise self._damaged(record, PlaneError("the state before it is another one"))
+            body = body[len(told) :]
         try:
             return decode(before, clusters, self.head.bounds, body)
         except (PlaneError, ValueError) as error:

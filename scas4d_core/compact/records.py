@@ -85,6 +85,11 @@ def record_bytes(kind: Kind, body: bytes, frame: int = -1, time: float = 0.0) ->
     return head + _CHECKSUM.pack(zlib.crc32(head)) + body
 
 
+def checksum_bytes(record: Record) -> bytes:
+    """The checksum of a record's body, as a delta begins with that of the state before."""
+    return _CHECKSUM.pack(record.checksum)
+
+
 def scan(file: BinaryIO, offset: int, name: str) -> Iterator[Record]:
     """The whole records from an offset on; the rest of one that is not whole is not there yet.
 

@@ -1,4 +1,4 @@
-"""Sections of a coded state: residuals of rows, masks, exact arrays. Sizes are known before anything is allocated."""
+"""Sections of a coded state: residuals of rows, masks, exact arrays; none is unpacked to more than the rows need."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from scas4d_core.compact.frame_code import encode, errors_of
 from scas4d_core.compact.head import Head
 from scas4d_core.compact.index import footer, index_body
 from scas4d_core.compact.planes import pack
-from scas4d_core.compact.records import FileError, Kind, Record, parse_head, record_bytes
+from scas4d_core.compact.records import FileError, Kind, Record, checksum_bytes, parse_head, record_bytes
 from scas4d_core.gaussians import Gaussians
 
 KEY_EVERY = 8
@@ -54,6 +54,7 @@ class CompactWriter:
     def __init__(self, path: Path | str, head: Head, key_every: int = KEY_EVERY) -> None:
         if key_every < 1:
             raise FileError(f"key_every is {key_every}; give 1 or more")
+        text = head.text()  # a head that is no JSON leaves no file
         self.path = Path(path)
         self.head = head
         self.errors: dict[str, float] = {}
@@ -64,7 +65,10 @@ class CompactWriter:
         self._clusters = Clusters(np.zeros(0, np.int64))
         self._last: Columns | None = None
         self._since_key = 0
-        self._append(record_bytes(Kind.HEAD, head.text()))
+        self._opacities = np.zeros(0, np.float32)
+        self._told = Record(Kind.HEAD, -1, 0.0, 0, 0, 0)
+        """The record of the last state."""
+        self._append(record_bytes(Kind.HEAD, text))
 
     def __enter__(self) -> Self:
         return self
@@ -87,73 +91,95 @@ class CompactWriter:
         Raises:
             FileError: the frame cannot follow those before.
         """
-        last = self._records[-1].frame
-        if index <= last:
-            raise FileError(f"{self.path.name}: frame {index} cannot follow frame {last}; add frames in rising order")
-        known = 0 if self._born is None else len(self._born)
-        if len(state) < known or (self._born is not None and not np.array_equal(state.ids[:known], self._born.ids)):
-            raise FileError(
-                f"{self.path.name}: frame {index} has other Gaussians than frame {last}; they are never removed"
-            )
-        if not len(state):
-            raise FileError(f"{self.path.name}: frame {index} has no Gaussian; begin with a frame that has some")
-        for name in ("means", "factors", "rotations", "colours"):
-            wrong = np.flatnonzero(~np.isfinite(getattr(state, name)).reshape(len(state), -1).all(axis=1))
-            if len(wrong):
-                raise FileError(
-                    f"{self.path.name}: frame {index}: {len(wrong)} Gaussians have {name} that are not finite, rows "
-                    f"{wrong[:5].tolist()}; leave the frame out, or mend them"
-                )
-        first = self._born is None
-        if len(state) > known:
-            self._bear(index, time, state, known)
-        born, before = self._born, self._last
+        self._check(index, state)
+        before = self._last
+        if before is None or len(state) > len(before):
+            self._bear(index, time, state)
+        born = self._born
         assert born is not None
-        if before is not None and len(before) < len(born):
+        if before is None:  # the state that was just told
+            self._told, self._last = self._records[-1], born
+            return self._noted(errors_of(born, Columns.of(state)))
+        if len(before) < len(born):
             before = before.joined(born.after(len(before)))
         self._since_key += 1
-        key = before is None or self._since_key >= self._key_every
-        reference = born if key or before is None else before
-        if first:  # the state that was just told
-            self._last, self._since_key = born, 0
-            return self._noted(errors_of(born, Columns.of(state)))
-        coded = encode(reference, Columns.of(state), self._clusters, self.head.bounds)
+        key = self._since_key >= self._key_every
+        coded = encode(born if key else before, Columns.of(state), self._clusters, self.head.bounds)
         if key:
             self._since_key = 0
-        self._append(record_bytes(Kind.KEY if key else Kind.DELTA, coded.body, index, time))
-        self._last = coded.decoded
+            self._append(record_bytes(Kind.KEY, coded.body, index, time))
+        else:  # a reader must not tell it by another state
+            self._append(record_bytes(Kind.DELTA, checksum_bytes(self._told) + coded.body, index, time))
+        self._told, self._last = self._records[-1], coded.decoded
         return self._noted(coded.errors)
 
     def add_parts(self, index: int, labels: NDArray[np.integer]) -> None:
-        """Writes the part of each Gaussian, as it is seen from a frame on.
+        """Writes the part of each Gaussian, as it is seen from the last frame on.
 
         Args:
-            labels: [N], −1 for none.
+            index: of the last frame. labels: [N], −1 for none.
+
+        Raises:
+            FileError: another frame, or labels of another number of Gaussians.
         """
         values = np.asarray(labels, np.int64)
+        known = 0 if self._born is None else len(self._born)
+        if index != self._told.frame or values.shape != (known,):
+            raise FileError(
+                f"{self.path.name}: parts {values.shape} of frame {index} cannot follow frame {self._told.frame} of "
+                f"{known} Gaussians"
+            )
         self._append(record_bytes(Kind.PARTS, len(values).to_bytes(4, "little") + pack(values + 1), index))
+
+    def _check(self, index: int, state: Gaussians) -> None:
+        """Refuses a state that cannot follow those before; nothing is written then."""
+        last, name = self._told.frame, self.path.name
+        if index <= last:
+            raise FileError(f"{name}: frame {index} cannot follow frame {last}; add frames in rising order")
+        if not len(state):
+            raise FileError(f"{name}: frame {index} has no Gaussian; begin with a frame that has some")
+        if (born := self._born) is not None:
+            known = len(born)
+            if len(state) < known or not np.array_equal(state.ids[:known], born.ids):
+                raise FileError(f"{name}: frame {index} has other Gaussians than frame {last}; they are never removed")
+            if not np.array_equal(state.own_opacities[:known], self._opacities):
+                raise FileError(f"{name}: frame {index} has other opacities than frame {last}; they are fixed at birth")
+            if _glossy(state.gloss) != (0 if born.gloss is None else born.gloss.shape[1]):
+                raise FileError(f"{name}: frame {index} has gloss of {_glossy(state.gloss)} Gaussians, others before")
+        for field in ("means", "factors", "rotations", "colours", "own_opacities", "gloss"):
+            if (array := getattr(state, field)) is None:
+                continue
+            wrong = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))
+            if len(wrong):
+                raise FileError(
+                    f"{name}: frame {index}: {len(wrong)} Gaussians have {field} that are not finite, rows "
+                    f"{wrong[:5].tolist()}; leave the frame out, or mend them"
+                )
 
     def close(self) -> None:
         """Writes the index. A file without it is read all the same, after a look at each record."""
         if self._file.closed:
             return
         body = index_body(self._records, json.dumps({"errors": self.errors}).encode())
-        offset = self._file.tell()
-        self._file.write(record_bytes(Kind.INDEX, body) + footer(offset))
-        self._file.close()
+        try:
+            offset = self._file.tell()
+            self._file.write(record_bytes(Kind.INDEX, body) + footer(offset))
+        finally:
+            self._file.close()
 
-    def _bear(self, index: int, time: float, state: Gaussians, known: int) -> None:
+    def _bear(self, index: int, time: float, state: Gaussians) -> None:
         """Writes the Gaussians that are not known yet."""
-        born = state.rows(np.arange(known, len(state)))
-        if self._born is None:
-            clusters = Clusters.of(state)
+        if self._last is None:
+            born, clusters = state, Clusters.of(state)
         else:
-            clusters = Clusters(self._clusters.nearest(self._born, born))
+            born = state.rows(np.arange(len(self._last), len(state)))
             born = born.replace(gloss=None, environment=None)  # those born later are dull
+            clusters = Clusters(self._clusters.nearest(self._last, born))
         body, decoded = encode_born(Columns.of(born), clusters, self.head.bounds)
         self._append(record_bytes(Kind.BORN, len(born).to_bytes(4, "little") + body, index, time))
         self._born = decoded if self._born is None else self._born.joined(decoded)
-        self._clusters = clusters if not known else self._clusters.joined(clusters.labels)
+        self._clusters = self._clusters.joined(clusters.labels)
+        self._opacities = state.own_opacities.copy()
 
     def _noted(self, errors: Mapping[str, float]) -> Mapping[str, float]:
         for name, value in errors.items():
@@ -165,3 +191,7 @@ class CompactWriter:
         self._file.write(data)
         self._file.flush()
         self._records.append(parse_head(data, 0, self.path.name).at(offset))
+
+
+def _glossy(gloss: NDArray[np.float32] | None) -> int:
+    return 0 if gloss is None else len(gloss)

@@ -93,7 +93,7 @@ def write_ply(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None
     if gaussians.gloss is not None:
         sums = harmonics(gaussians)
         columns |= {f"f_dc_{channel}": sums[:, 0, channel] for channel in range(3)}
-        rest = sums[:, 1:].transpose(0, 2, 1).reshape(len(gaussians), -1)
+        rest = sums[:, 1:].transpose(0, 2, 1).reshape(len(gaussians), 3 * (sums.shape[1] - 1))
         columns |= {f"f_rest_{k}": column for k, column in enumerate(rest.T)}
     fields = (*_FIELDS, *(name for name in columns if name not in _FIELDS))
     data = np.zeros(len(gaussians), dtype=[(name, "<f4") for name in fields])

@@ -10,14 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera, Rig, WorldFrame
 from scas4d_core.compact import Bounds, CompactReader, CompactWriter, DamagedFileError, FileError, Head
 from scas4d_core.compact.columns import Columns
 from scas4d_core.compact.frame_code import errors_of
+from scas4d_core.compact.index import footer
+from scas4d_core.compact.planes import deflated
 from scas4d_core.compact.records import HEAD_SIZE, Kind, parse_head, record_bytes, scan
 from scas4d_core.compact.writer import KEY_EVERY
-from scas4d_core.gaussians import Gaussians
+from scas4d_core.gaussians import Gaussians, quaternion_products
 
 RIG = Rig((Camera("front", [[100.0, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48),))
 HEAD = Head(WorldFrame(np.array([1.0, 2, 3]), 0.5), background=(0.1, 0.2, 0.3), rig=RIG, frames_per_second=30.0)
@@ -29,10 +32,18 @@ def states() -> Iterator[tuple[int, float, Gaussians]]:
     """A cloud that drifts; some are born, some leave and come back."""
     rng = np.random.default_rng(0)
     state = Gaussians.of_points(rng.uniform(-1, 1, (250, 3)), 0.03, rng.uniform(size=(250, 3)))
+    gloss, mirrored = rng.normal(0, 0.2, (200, 3)), rng.uniform(size=(2, 4, 3))
+    state = state.replace(gloss=gloss.astype(np.float32), environment=mirrored.astype(np.float32))
+    turn = Rotation.from_rotvec([0.0, 0.05, 0.0])
     for index in FRAMES:
-        moved = state.means + rng.normal(0, 0.01, state.means.shape) + [0.02, 0, 0]
+        moved = turn.apply(state.means) + rng.normal(0, 0.01, state.means.shape) + [0.02, 0, 0]
+        assert state.gloss is not None
         state = state.replace(
             means=moved.astype(np.float32),
+            gloss=turn.apply(state.gloss).astype(np.float32),
+            rotations=quaternion_products(
+                np.tile(np.roll(turn.as_quat(), 1), (len(state), 1)), state.rotations.astype(float)
+            ).astype(np.float32),
             colours=(state.colours + rng.normal(0, 0.01, state.colours.shape)).astype(np.float32),
         )
         if index == BORN_AT:
@@ -53,6 +64,7 @@ def write(path: Path, frames: tuple[int, ...] = FRAMES, close: bool = True) -> C
     for index in frames:
         writer.add(index, *TRUE[index])
     if close:
+        writer.add_parts(frames[-1], np.zeros(len(TRUE[frames[-1]][1]), np.int64))
         writer.add_parts(frames[-1], np.arange(len(TRUE[frames[-1]][1])) % 3 - 1)
         writer.close()
     return writer
@@ -72,6 +84,9 @@ def near(reader: CompactReader, index: int) -> None:
     assert all(value <= 1.001 * limits[name] for name, value in errors.items()), (index, errors)
     assert np.array_equal(state.ids, true.ids)
     assert np.array_equal(state.retired, true.retired)
+    assert "gloss" in errors
+    assert np.array_equal(state.environment, true.environment)
+    assert np.allclose(np.linalg.norm(state.rotations, axis=1), 1, atol=1e-6)
 
 
 def test_frames_are_read_in_any_order(file: Path) -> None:
@@ -200,7 +215,10 @@ def test_any_damage_is_an_error_or_the_truth(file: Path, tmp_path: Path, indexed
                 reader.parts()
                 for index in reader.frames:
                     try:
-                        reader.state(index)
+                        if turn % 2:
+                            reader.state(index)
+                        else:
+                            near(reader, index)
                     except FileError as error:
                         said.add(str(error))
         except FileError as error:
@@ -210,6 +228,77 @@ def test_any_damage_is_an_error_or_the_truth(file: Path, tmp_path: Path, indexed
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 100e6
+
+
+def test_a_file_that_begins_after_a_birth_is_glossy_still(tmp_path: Path) -> None:
+    write(tmp_path / "a.s4d", tuple(index for index in FRAMES if index >= 8))
+    with CompactReader(tmp_path / "a.s4d") as reader:
+        for index in reader.frames:
+            near(reader, index)
+        assert reader.state(8).gloss is not None
+
+
+def test_parts_of_many_take_few_bytes_and_are_read(tmp_path: Path) -> None:
+    state = Gaussians.of_points(np.random.default_rng(0).uniform(-1, 1, (5000, 3)), 0.03)
+    with CompactWriter(tmp_path / "a.s4d", HEAD) as writer:
+        writer.add(0, 0.0, state)
+        writer.add_parts(0, np.zeros(5000, np.int64))
+    with CompactReader(tmp_path / "a.s4d") as reader:
+        assert reader.parts() is not None
+        assert reader.parts().tolist() == [0] * 5000
+
+
+def test_a_lost_or_exchanged_record_is_noticed(file: Path, tmp_path: Path) -> None:
+    data = file.read_bytes()
+    with file.open("rb") as opened:
+        records = list(scan(opened, 0, "a"))[:-2]
+    pieces = [data[record.offset - HEAD_SIZE : record.end] for record in records]
+    place = next(k for k, record in enumerate(records) if record.frame == 8)
+    lost, exchanged = tmp_path / "lost.s4d", tmp_path / "exchanged.s4d"
+    lost.write_bytes(b"".join(pieces[:place] + pieces[place + 1 :]))
+    with CompactReader(lost) as reader, pytest.raises(DamagedFileError, match="the state before it is another one"):
+        reader.state(records[place + 1].frame)
+    pieces[place], pieces[place + 1] = pieces[place + 1], pieces[place]
+    exchanged.write_bytes(b"".join(pieces))
+    with CompactReader(exchanged) as reader:
+        assert "frame 8 follows frame 9" in str(reader.damage)
+        near(reader, 7)
+
+
+def test_parts_that_cannot_be_are_refused(tmp_path: Path) -> None:
+    writer = write(tmp_path / "a.s4d", FRAMES[:4], close=False)
+    for index, labels in ((FRAMES[3], np.zeros(7, np.int64)), (1, np.zeros(250, np.int64))):
+        with pytest.raises(FileError, match="cannot follow"):
+            writer.add_parts(index, labels)
+    state = TRUE[6][1]
+    for changed, says in (
+        (state.replace(gloss=None), "gloss of 0 Gaussians"),
+        (state.replace(opacities=state.own_opacities * np.float32(0.5)), "opacities"),
+    ):
+        with pytest.raises(FileError, match=says):
+            writer.add(7, 0.7, changed)
+    writer.close()
+
+
+@pytest.mark.parametrize("index", [b"", b"abc", (5).to_bytes(4, "little") + b"junk", "json"])
+def test_an_index_that_is_none_is_passed_over(file: Path, tmp_path: Path, index: bytes | str) -> None:
+    with file.open("rb") as opened:
+        records = list(scan(opened, 0, "a"))
+    data = file.read_bytes()[: records[-1].offset - HEAD_SIZE]
+    if index == "json":
+        index = (0).to_bytes(4, "little") + deflated(b"[" * 100_000)
+    assert isinstance(index, bytes)
+    path = tmp_path / "a.s4d"
+    path.write_bytes(data + record_bytes(Kind.INDEX, index) + footer(len(data)))
+    with CompactReader(path) as reader:
+        assert reader.frames == list(FRAMES)
+        near(reader, 12)
+
+
+def test_a_head_that_is_no_json_leaves_no_file(tmp_path: Path) -> None:
+    with pytest.raises((TypeError, ValueError)):
+        CompactWriter(tmp_path / "a.s4d", Head(WorldFrame(np.zeros(3)), remark={"a": object()}))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_count_that_lies_fills_no_memory(tmp_path: Path) -> None:
@@ -231,6 +320,7 @@ def test_a_count_that_lies_fills_no_memory(tmp_path: Path) -> None:
         (json.dumps(json.loads(HEAD.text()) | {"world": {"origin": [0] * 3, "metres_per_unit": 0}}).encode(), "wrong"),
         (json.dumps(json.loads(HEAD.text()) | {"cameras": [{"name": "a"}]}).encode(), "wrong"),
         (json.dumps(json.loads(HEAD.text()) | {"bounds": {"position": -1}}).encode(), "wrong"),
+        (json.dumps(json.loads(HEAD.text()) | {"background": [10**400, 0, 0]}).encode(), "wrong"),
     ],
 )
 def test_heads_that_are_none_are_refused(text: bytes, says: str, tmp_path: Path) -> None:
