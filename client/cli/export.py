@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,86 +47,98 @@ def export(
     Raises:
         InputError: a format, a range or an output that cannot be.
     """
-    from scas4d_core.exports.formats import format_of
+    from scas4d_core.exports.formats import check_suffix, format_of
     from scas4d_core.exports.sequence import export_sequence
 
     wanted = format_of(format)
     low, high = frame_range(frames)
+    if ids and format != "tracks":
+        raise InputError(f"id is given for format {format!r}", "leave --id out; it chooses the Gaussians of tracks")
+    if out is not None and not wanted.numbered:
+        check_suffix(out, wanted)
+    with_parts = wanted.needs_parts or format == "usd"
     path = Path(source)
     with ExitStack() as opened, Bars() as bars:
         if path.exists():
-            files: CompactStates = opened.enter_context(of_file(path / STATES if path.is_dir() else path))
+            given = of_file(path / STATES if path.is_dir() else path)
         elif path.suffix or len(path.parts) > 1:
             raise InputError(f"source {source!r} is not there", "give a compact file, its folder, or a scene's id")
         else:
-            files = opened.enter_context(of_scene(source, low, high, wanted.needs_parts or format == "usd", url, token))
-        target = out or files.beside / f"{files.name}-{format}{'' if wanted.numbered else wanted.suffixes[0]}"
-        if files.damage is not None:
-            console.print(f"only a part can be read: {files.damage}", soft_wrap=True)
-        chosen = [index for index in files.frames if low <= index <= high]
-        if not chosen:
-            held = f"{files.frames[0]} to {files.frames[-1]}" if files.frames else "none"
-            raise InputError(f"frames {frames!r} holds no frame of {source}", f"it has frames {held}")
+            given = opened.enter_context(of_scene(source, low, high, with_parts, url, token))
+        target = out or given.beside / f"{given.name}-{format}{'' if wanted.numbered else wanted.suffixes[0]}"
+        if given.damage is not None:
+            console.print(f"only a part can be read: {given.damage}", soft_wrap=True)
+        count = sum(low <= index <= high for index in given.frames)
+        if not count:
+            held = f"frames {given.frames[0]} to {given.frames[-1]}" if given.frames else "no frame"
+            raise InputError(f"frames {frames or 'of all'} are not in {source}", f"it has {held}")
         paths = export_sequence(
-            files.states(chosen),
+            given.states(low, high),
             format,
             target,
-            world=files.head.world,
-            rig=files.head.rig,
-            parts=files.parts,
+            world=given.head.world,
+            rig=given.head.rig,
+            parts=given.parts() if with_parts else None,
             ids=ids,
-            frames_per_second=files.head.frames_per_second,
-            progress=lambda index, done: bars("exporting", done, len(chosen)),
+            frames_per_second=given.head.frames_per_second,
+            progress=lambda index, done: bars("exporting", done, count),
         )
-    what = f"{len(paths)} files in {target}" if wanted.numbered else f"{len(chosen)} frames in {target}"
+    what = f"{len(paths)} files in {target}" if len(paths) > 1 else f"{count} frames in {target}"
     console.print(f"{what} ({format}; docs/exports.md says what each format holds)", soft_wrap=True)
 
 
 @dataclass(frozen=True)
 class CompactStates:
-    """States of one compact file or of several, one after the other.
+    """States of one compact file or of several, one after the other; one file is open at a time.
 
     Attributes:
-        name, beside: of outputs. readers: in the order of their frames.
+        name, beside: of outputs. files: in the order of their frames. head: of the first. frames: of all.
+        damage: of the first file that has any.
     """
 
     name: str
     beside: Path
-    readers: Sequence[CompactReader]
+    files: Sequence[Path]
+    head: Head
+    frames: Sequence[int]
+    damage: str | None
 
-    @property
-    def head(self) -> Head:
-        """Of the first file."""
-        return self.readers[0].head
+    @classmethod
+    def of(cls, name: str, beside: Path, files: Sequence[Path]) -> CompactStates:
+        """Looks at each file."""
+        heads, frames, damages = [], [], []
+        for file in files:
+            with CompactReader(file) as reader:
+                heads.append(reader.head)
+                frames += reader.frames
+                damages += [] if reader.damage is None else [reader.damage]
+        return cls(name, beside, files, heads[0], frames, damages[0] if damages else None)
 
-    @property
-    def frames(self) -> list[int]:
-        """Of all files."""
-        return [index for reader in self.readers for index in reader.frames]
-
-    @property
     def parts(self) -> NDArray[np.int64] | None:
-        """Of the last file."""
-        return self.readers[-1].parts()
+        """[N] part of each Gaussian, by the last file."""
+        with CompactReader(self.files[-1]) as reader:
+            return reader.parts()
 
-    @property
-    def damage(self) -> str | None:
-        """Of the first file that has any."""
-        return next((reader.damage for reader in self.readers if reader.damage is not None), None)
-
-    def states(self, chosen: Collection[int]) -> Iterator[tuple[int, float, Gaussians]]:
-        """Index, time in seconds and state of the chosen frames."""
-        for reader in self.readers:
-            for index, time in zip(reader.frames, reader.times.tolist(), strict=True):
-                if index in chosen:
-                    yield index, time, reader.state(index)
+    def states(self, low: int, high: int) -> Iterator[tuple[int, float, Gaussians]]:
+        """Index, time in seconds and state of the frames from ``low`` to ``high``."""
+        for file in self.files:
+            with CompactReader(file) as reader:
+                for index, time in zip(reader.frames, reader.times.tolist(), strict=True):
+                    if low <= index <= high:
+                        yield index, time, reader.state(index)
 
 
-@contextmanager
-def of_file(path: Path) -> Iterator[CompactStates]:
-    """The states of a compact file."""
-    with CompactReader(path) as reader:
-        yield CompactStates(path.stem, path.parent, [reader])
+def of_file(path: Path) -> CompactStates:
+    """The states of a compact file.
+
+    Raises:
+        InputError: it is not there.
+    """
+    if not path.exists():
+        raise InputError(
+            f"source {str(path.parent)!r} holds no {path.name}", "give a folder that scas4d reconstruct left"
+        )
+    return CompactStates.of(path.stem, path.parent, [path])
 
 
 @contextmanager
@@ -134,19 +146,19 @@ def of_scene(id: str, low: int, high: int, parts: bool, url: str, token: str | N
     """The states of a scene, fetched from the service to temporary files.
 
     Args:
-        low, high: first and last frame. parts: with the part of each Gaussian.
+        low, high: first and last frame. parts: with the part of each Gaussian, in the last file.
     """
-    with ExitStack() as opened:
-        client = opened.enter_context(Client(url, token=token, outage=0))
-        folder = Path(opened.enter_context(TemporaryDirectory()))
-        readers: list[CompactReader] = []
+    with Client(url, token=token, outage=0) as client, TemporaryDirectory() as folder:
+        files: list[Path] = []
         following: int | None = low
         while following is not None and following <= high:
-            data, following = client.states(id, following, min(MOST, high - following + 1), parts)
-            file = folder / f"{len(readers)}.s4d"
-            file.write_bytes(data)
-            readers.append(opened.enter_context(CompactReader(file)))
-        yield CompactStates(id[:8], Path(), readers)
+            first = following
+            data, following = client.states(id, first, min(MOST, high - first + 1))
+            if parts and (following is None or following > high):
+                data, _ = client.states(id, first, min(MOST, high - first + 1), parts=True)
+            files.append(Path(folder) / f"{len(files)}.s4d")
+            files[-1].write_bytes(data)
+        yield CompactStates.of(id[:8], Path(), files)
 
 
 def frame_range(text: str | None) -> tuple[int, int]:

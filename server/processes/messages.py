@@ -21,6 +21,7 @@ class SceneSpec:
     settings: Settings
     minimum_cameras: int = 1
     keep_states: Retention = field(default_factory=Retention)
+    frames_per_second: float | None = None
 
 
 # To the worker.

@@ -198,13 +198,19 @@ class Renderer:
                 return Answer(number, told.model_dump_json().encode(), "application/json")
             case PlyQuery():
                 file = self.spec.folder.export
-                self.reader.write_ply(file, query.frame)
-                return Answer(number, file.read_bytes(), "application/octet-stream")
+                try:
+                    self.reader.write_ply(file, query.frame)
+                    return Answer(number, file.read_bytes(), "application/octet-stream")
+                finally:
+                    file.unlink(missing_ok=True)
             case CompactQuery():
                 file = self.spec.folder.export
-                parts = self.labels(None) if query.parts else None
-                write_compact(file, self.history, query.frames, compact_head(self.spec, self.history), parts)
-                return Answer(number, file.read_bytes(), "application/octet-stream")
+                parts = self.labels(None) if query.parts and self.history.newest.moving.any() else None
+                try:
+                    write_compact(file, self.history, query.frames, compact_head(self.spec, self.history), parts)
+                    return Answer(number, file.read_bytes(), "application/octet-stream")
+                finally:
+                    file.unlink(missing_ok=True)
 
 
 def float32(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, str]]:

@@ -79,7 +79,14 @@ class Scene:
             part_seconds=asked.part_seconds,
         )
         kept = content.ledger.edited.rules(asked)
-        self.spec = SceneSpec(folder, rig, definition.settings, self.rules.minimum_cameras, kept.keep_states)
+        self.spec = SceneSpec(
+            folder,
+            rig,
+            definition.settings,
+            self.rules.minimum_cameras,
+            kept.keep_states,
+            definition.request.frames_per_second,
+        )
         self.points_sha256 = found.points_sha256
         self.warnings = found.warnings
         self._definition = definition

@@ -18,6 +18,7 @@ from scas4d_core.captures import Capture
 from scas4d_core.compact import Bounds, CompactReader, CompactWriter, Head
 from scas4d_core.compact.records import Kind, scan
 from scas4d_core.compact.writer import KEY_EVERY
+from scas4d_core.errors import InputError
 from scas4d_core.gaussians import UNBORN, Gaussians, moving_extent
 from scas4d_core.query.committed import CommittedScene
 from scas4d_core.settings import Settings
@@ -38,7 +39,8 @@ class CompactFigures:
     Attributes:
         gaussians, moving: how many. frames: of the file. exact: bytes a frame of the exact states on disk.
         size: bytes a frame of the file, head, born and index shared. sizes: mean bytes of a record by its kind.
-        psnr: dB that the test cameras lose, mean over ``VIEWS`` frames; None without test cameras. worst: of one frame.
+        psnr: dB of the test cameras over those of the exact states, mean of ``VIEWS`` frames; None without any.
+        worst: of one frame.
         tracks: median over points and frames of the distance of tracks, % of the extent.
         write: milliseconds of the processor to write a frame, median. read: of a frame at random, median; read_worst.
         opening: milliseconds to open the file; unindexed: the same without its index.
@@ -83,7 +85,10 @@ def measure(
     history = History.load(states)
     world = capture.full_rig.world_frame(Settings().scene.metres_per_unit)
     head = Head(world, Bounds(**bounds), background=history.background)
-    order = back_and_forth(history.indices, frames)
+    if frames < len(history):
+        raise InputError(f"frames is {frames}", f"give {len(history)} at least: every state is compared")
+    grows = history.count > len(history.gaussians(history.indices[0]))
+    order = history.indices if grows else back_and_forth(history.indices, frames)  # the born are not unborn
     exact = float(np.mean([path.stat().st_size for path in states.glob("frame_*.npz")]))
     with TemporaryDirectory() as temporary:
         file = Path(temporary) / "states.s4d"
@@ -110,9 +115,9 @@ def measure(
             capture=capture.name,
             gaussians=len(state),
             moving=int(state.moving.sum()),
-            frames=frames,
+            frames=len(order),
             exact=exact,
-            size=file.stat().st_size / frames,
+            size=file.stat().st_size / len(order),
             sizes=kinds,
             psnr=psnr,
             worst=worst,

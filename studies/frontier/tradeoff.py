@@ -132,7 +132,7 @@ class EqualSeconds:
 
     Attributes:
         psnr: dB of ``scas4d``, interpolated; None where its curve does not reach there.
-        baseline_psnr: dB, measured.
+        baseline_psnr: dB, measured: the best within these seconds.
     """
 
     capture: str
@@ -153,10 +153,12 @@ def equal_seconds(points: Sequence[Point], captures: Sequence[str]) -> list[Equa
     found = []
     for capture in captures:
         own_curve = curve(points, own, capture)
-        for base in curve(points, other, capture):
+        others = curve(points, other, capture)
+        for base in others:
             if base.variant.iterations in BUDGETS:
                 psnr = psnr_at(own_curve, base.seconds)
-                found.append(EqualSeconds(capture, base.variant.iterations, base.seconds, psnr, base.psnr))
+                best = max(each.psnr for each in others if each.seconds <= base.seconds)
+                found.append(EqualSeconds(capture, base.variant.iterations, base.seconds, psnr, best))
     return found
 
 

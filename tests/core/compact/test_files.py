@@ -197,7 +197,7 @@ def test_any_damage_is_an_error_or_the_truth(file: Path, tmp_path: Path, indexed
     path = tmp_path / "a.s4d"
     said: set[str] = set()
     tracemalloc.start()
-    for turn in range(100):
+    for turn in range(50):
         data = bytearray(whole)
         record = records[int(rng.integers(len(records)))]
         for _ in range(int(rng.integers(1, 4))):
@@ -223,7 +223,7 @@ def test_any_damage_is_an_error_or_the_truth(file: Path, tmp_path: Path, indexed
                         said.add(str(error))
         except FileError as error:
             said.add(str(error))
-    assert len(said) > 25
+    assert len(said) > 15
     assert all("a.s4d: " in text for text in said)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()

@@ -10,6 +10,7 @@ from PIL import Image
 from running import HEIGHT, WIDTH, make_rig, pictures, problem
 from typer.testing import CliRunner
 
+from client.cli import export
 from client.cli.main import app
 from client.sdk import Client, ServiceError
 from client.wire import CameraModel
@@ -180,7 +181,7 @@ def test_states_come_as_compact_files(sdk, http, finished, tmp_path):
         problem(http.get(f"/v1/scenes/{finished}/states.s4d?{wrong}"), status)
 
 
-def test_a_scene_is_exported_by_the_command(service, finished, tmp_path):
+def test_a_scene_is_exported_by_the_command(service, finished, tmp_path, monkeypatch):
     def run(*more):
         given = ["export", finished, "--url", service.url, *more]
         return CliRunner().invoke(app, given, env={"COLUMNS": "200"})
@@ -189,6 +190,11 @@ def test_a_scene_is_exported_by_the_command(service, finished, tmp_path):
     assert told.exit_code == 0, told.output
     assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["frame_000001.ply", "frame_000002.ply"]
     assert len(read_ply(tmp_path / "a" / "frame_000001.ply")) == 2
+    monkeypatch.setattr(export, "MOST", 2)  # two files
+    whole = run("--format", "usd", "--out", str(tmp_path / "a.usda"))
+    assert whole.exit_code == 0, whole.output
+    assert "3 frames in" in whole.output
+    assert "timeCodesPerSecond = 10" in (tmp_path / "a.usda").read_text()
     poses = run("--format", "poses", "--out", str(tmp_path / "a.csv"))
     assert poses.exit_code == 0, poses.output
     assert len((tmp_path / "a.csv").read_text().splitlines()) == 1 + 3 * 2
@@ -196,6 +202,8 @@ def test_a_scene_is_exported_by_the_command(service, finished, tmp_path):
         (("--format", "obj"), "is not known"),
         (("--format", "ply", "--frames", "7:9"), "7"),
         (("--format", "ply", "--frames", "x"), "no range"),
+        (("--format", "ply", "--id", "3"), "leave --id out"),
+        (("--format", "usd", "--out", "a.ply"), ".usdc"),
     ):
         failed = run(*wrong)
         assert failed.exit_code != 0
