@@ -79,14 +79,8 @@ class Scene:
             part_seconds=asked.part_seconds,
         )
         kept = content.ledger.edited.rules(asked)
-        self.spec = SceneSpec(
-            folder,
-            rig,
-            definition.settings,
-            self.rules.minimum_cameras,
-            kept.keep_states,
-            definition.request.frames_per_second,
-        )
+        least, rate = self.rules.minimum_cameras, definition.request.frames_per_second
+        self.spec = SceneSpec(folder, rig, definition.settings, least, kept.keep_states, rate)
         self.points_sha256 = found.points_sha256
         self.warnings = found.warnings
         self._definition = definition
