@@ -367,7 +367,7 @@ def test_no_answer_that_a_cache_kept_is_shown_for_another_reconstruction(http, s
         assert allowed & {"no-store", "no-cache"}, address
         if "no-store" not in allowed:
             kept[address] = answer
-    assert len(kept) == 5
+    assert len(kept) == 7
     for number in (1, 2):
         begun(http, id, number)
         sdk.wait(id, 0)
