@@ -192,28 +192,34 @@ def quaternions_to_matrices(quaternions: NDArray[Any]) -> NDArray[Any]:
            [ 0., -1.,  0.],
            [ 0.,  0.,  1.]])
     """
-    w, x, y, z = np.moveaxis(quaternions, -1, 0)
-    rows = [
+    return np.stack([np.stack(row, axis=-1) for row in rotation_rows(np.moveaxis(quaternions, -1, 0))], axis=-2)
+
+
+def rotation_rows(quaternion: NDArray[Any]) -> list[list[NDArray[Any]]]:
+    """The rows of the rotation matrices of unit quaternions, by component: [4, ...] to three rows of three [...]."""
+    w, x, y, z = quaternion
+    return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def quaternion_products(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
     """[M, 4] a∘b (w, x, y, z): first b, then a."""
-    aw, ax, ay, az = a.T
-    bw, bx, by, bz = b.T
-    return np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=1,
-    )
+    return np.stack(product_components(a.T, b.T), axis=1)
+
+
+def product_components(a: NDArray[Any], b: NDArray[Any]) -> list[NDArray[Any]]:
+    """The components (w, x, y, z) of a∘b, [M] each, of quaternions by component, [4, M]: first b, then a."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return [
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    ]
 
 
 def moving_extent(gaussians: Gaussians) -> float:

@@ -146,16 +146,13 @@ def of_scene(id: str, low: int, high: int, parts: bool, url: str, token: str | N
     """The states of a scene, fetched from the service to temporary files.
 
     Args:
-        low, high: first and last frame. parts: with the part of each Gaussian, in the last file.
+        low, high: first and last frame. parts: with the part of each Gaussian.
     """
     with Client(url, token=token, outage=0) as client, TemporaryDirectory() as folder:
         files: list[Path] = []
         following: int | None = low
         while following is not None and following <= high:
-            first = following
-            data, following = client.states(id, first, min(MOST, high - first + 1))
-            if parts and (following is None or following > high):
-                data, _ = client.states(id, first, min(MOST, high - first + 1), parts=True)
+            data, following = client.states(id, following, min(MOST, high - following + 1), parts)
             files.append(Path(folder) / f"{len(files)}.s4d")
             files[-1].write_bytes(data)
         yield CompactStates.of(id[:8], Path(), files)

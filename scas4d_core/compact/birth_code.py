@@ -10,15 +10,22 @@ from numpy.typing import NDArray
 
 from scas4d_core.compact.bounds import Bounds
 from scas4d_core.compact.cluster_motion import MOST_CLUSTERS, Clusters
-from scas4d_core.compact.columns import LABELS, Columns, label_of, levels_of, sizes_of, turns_of, vectors_of
-from scas4d_core.compact.frame_code import LARGEST, MARGIN, completed, lost_volume
+from scas4d_core.compact.columns import (
+    LABELS,
+    Columns,
+    by_green,
+    label_of,
+    levels_of,
+    of_green,
+    sizes_of,
+    turns_of,
+    vectors_of,
+)
+from scas4d_core.compact.frame_code import MARGIN, completed, lost_volume, whole_steps
 from scas4d_core.compact.planes import Ints, PlaneError, pack, unpack
 from scas4d_core.compact.sections import (
-    NONE,
-    SOME,
     read_array,
     read_exact,
-    read_kind,
     read_mask,
     read_residuals,
     write_array,
@@ -54,13 +61,11 @@ def encode_born(state: Columns, clusters: Clusters, bounds: Bounds) -> tuple[byt
     >>> again.ids, clusters.labels, bool((again.means == decoded.means).all())
     (array([0, 1]), array([1, 1]), True)
     """
-    found = _planes(state, bounds)
+    told: dict[str, Ints] = {}
     exact = np.zeros(len(state), np.bool_)
-    for planes in found.values():
-        outside = ~(np.abs(planes) < LARGEST)
-        exact |= outside.any(axis=0)
-        planes[outside] = 0
-    told = {name: planes.astype(np.int32) for name, planes in found.items()}
+    for name, planes in _planes(state, bounds).items():
+        told[name], beyond = whole_steps(planes)
+        exact |= beyond
     exact |= lost_volume(_columns(told, state.ids, bounds), state)
     rows = np.flatnonzero(exact)
     gloss, retired = state.gloss, state.retired
@@ -70,7 +75,7 @@ def encode_born(state: Columns, clusters: Clusters, bounds: Bounds) -> tuple[byt
             pack(clusters.labels),
             *(write_residuals(planes) for planes in told.values()),
             write_exact(rows, np.concatenate([state.means[:, rows], state.factors[:, rows]])),
-            bytes([SOME]) + write_mask(retired) if retired.any() else bytes([NONE]),
+            write_mask(retired if retired.any() else None),
             pack(np.array([0 if gloss is None else 1 + gloss.shape[1]])),
             b"" if gloss is None else write_residuals(np.rint(gloss / (2 * bounds.gloss)).astype(np.int32)),
             write_array(state.environment),
@@ -93,10 +98,7 @@ def decode_born(body: bytes, count: int, bounds: Bounds) -> tuple[Columns, Clust
     for name, components in COMPONENTS.items():
         told[name], offset = read_residuals(body, offset, components, count)
     rows, values, offset = read_exact(body, offset, count, 12)
-    retired = np.zeros(count, np.bool_)
-    kind, offset = read_kind(body, offset)
-    if kind != NONE:
-        retired, offset = read_mask(body, offset, count)
+    retired, offset = read_mask(body, offset, count)
     (with_gloss,), offset = unpack(body, 1, offset)
     state = _columns(told, np.cumsum(steps.astype(np.int64)), bounds)
     if with_gloss:
@@ -124,13 +126,12 @@ def _planes(state: Columns, bounds: Bounds) -> dict[str, Float]:
         sizes = sizes_of((axes * _axis_step(bounds) * told).reshape(9, -1)).astype(np.float64)
         usable = (sizes > TINIEST) & (sizes < LARGEST_SIZE)
         means = np.rint(state.means / (2 * bounds.position / FINER * MARGIN * np.where(usable, sizes, 0)))
-        red, green, blue = np.rint(state.colours.astype(np.float64) / (2 * bounds.colour / FINER))
         return {
             "lengths": np.nan_to_num(lengths),
             "axes": axes.reshape(9, -1),
             "means": means,
-            "rotations": np.rint(vectors_of(state.rotations.astype(np.float64)) / (2 * bounds.rotation / 3**0.5)),
-            "colours": np.stack([green, red - green, blue - green]),
+            "rotations": np.rint(vectors_of(state.rotations.astype(np.float64)) / bounds.rotation_step),
+            "colours": by_green(np.rint(state.colours.astype(np.float64) / (2 * bounds.colour / FINER))),
             "labels": levels_of(state.foreground)[None].astype(np.float64),
             "opacities": np.rint(state.opacities.astype(np.float64) / (2 * bounds.opacity))[None],
         }
@@ -141,10 +142,9 @@ def _columns(told: dict[str, Ints], ids: NDArray[np.int64], bounds: Bounds) -> C
     with np.errstate(over="ignore", invalid="ignore"):
         factors = (told["axes"].reshape(3, 3, -1) * _axis_step(bounds) * lengths).reshape(9, -1)
         sizes = sizes_of(factors).astype(np.float64)
-        green, red, blue = told["colours"]
         means = (told["means"] * (2 * bounds.position / FINER * MARGIN * sizes)).astype(np.float32)
-    colours = (np.stack([red + green, green, blue + green]) * (2 * bounds.colour / FINER)).astype(np.float32)
-    rotations = turns_of(told["rotations"] * (2 * bounds.rotation / 3**0.5)).astype(np.float32)
+    colours = (of_green(told["colours"]) * (2 * bounds.colour / FINER)).astype(np.float32)
+    rotations = turns_of(told["rotations"] * bounds.rotation_step).astype(np.float32)
     foreground = label_of(np.clip(told["labels"][0], 0, LABELS - 1))
     opacities = np.clip(told["opacities"][0] * (2 * bounds.opacity), OPAQUE, 1 - OPAQUE).astype(np.float32)
     return Columns(

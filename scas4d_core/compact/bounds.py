@@ -43,6 +43,11 @@ class Bounds:
             if not least <= value <= 1:
                 raise InputError(f"bound {item.name}={value} is out of its range", f"give a number from {least} to 1")
 
+    @property
+    def rotation_step(self) -> float:
+        """The step of each component of ``vectors_of``; the bound is of the angle that three of them make."""
+        return 2 * self.rotation / 3**0.5
+
     def record(self) -> dict[str, float]:
         """The bounds by name, for the head of a file."""
         return asdict(self)

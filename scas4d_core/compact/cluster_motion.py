@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.compact.columns import Columns, products
+from scas4d_core.compact.columns import Columns, mapped, products
 from scas4d_core.gaussians import Gaussians
 
 Array = NDArray[np.float32]
@@ -88,7 +88,7 @@ class Clusters:
             labels[moving] = 1 + _k_means(state.means[moving].astype(np.float64), count)
         return cls(labels)
 
-    def nearest(self, state: Columns, born: Gaussians) -> Ints:
+    def nearest(self, state: Columns, born: Columns) -> Ints:
         """[B] labels of Gaussians that are born: that of the nearest cluster, for those that move.
 
         Args:
@@ -98,7 +98,7 @@ class Clusters:
         moving = np.flatnonzero(born.moving)
         if len(moving) and self.count:
             centres = self.means(state.means).T
-            labels[moving] = 1 + _nearest(born.means[moving].astype(np.float64), centres)
+            labels[moving] = 1 + _nearest(born.means[:, moving].T.astype(np.float64), centres)
         return labels
 
 
@@ -146,14 +146,9 @@ class ClusterMotion:
         maps = np.eye(3) + self.matrices
         spread = [[clusters.spread(maps[:, i, j], float(i == j)) for j in range(3)] for i in range(3)]
         arms = [mean - clusters.spread(centre, 0) for mean, centre in zip(reference.means, centres, strict=True)]
-        means = np.stack(
-            [
-                row[0] * arms[0] + row[1] * arms[1] + row[2] * arms[2] + clusters.spread(shift + centre, 0)
-                for row, shift, centre in zip(spread, self.shifts.T, centres, strict=True)
-            ]
-        )
-        f = reference.factors
-        factors = np.stack([row[0] * f[j] + row[1] * f[3 + j] + row[2] * f[6 + j] for row in spread for j in range(3)])
+        ends = [clusters.spread(shift + centre, 0) for shift, centre in zip(self.shifts.T, centres, strict=True)]
+        means = np.stack([arm + end for arm, end in zip(mapped(spread, np.stack(arms)), ends, strict=True)])
+        factors = np.stack(mapped(spread, reference.factors))
         turns = polar_rotations(maps)
         own = np.stack(
             [clusters.spread(one, stands) for one, stands in zip(quaternions_of(turns).T, STILL, strict=True)]
@@ -162,7 +157,7 @@ class ClusterMotion:
         if gloss is not None:
             count = gloss.shape[1]
             t = [[clusters.spread(turns[:, i, j], float(i == j))[:count] for j in range(3)] for i in range(3)]
-            gloss = np.stack([row[0] * gloss[0] + row[1] * gloss[1] + row[2] * gloss[2] for row in t])
+            gloss = np.stack(mapped(t, gloss))
         rotations = products(own, reference.rotations)
         return reference.having(means=means, factors=factors, rotations=rotations, gloss=gloss)
 

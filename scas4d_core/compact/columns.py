@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.gaussians import Gaussians
+from scas4d_core.gaussians import Gaussians, product_components
 
 Array = NDArray[np.float32]
 Float = NDArray[np.float64]
@@ -95,6 +96,11 @@ class Columns:
         rows = {name: getattr(self, name)[..., count:] for name in BY_ROW}
         return self.having(**rows, gloss=None, environment=None)
 
+    @property
+    def moving(self) -> NDArray[np.bool_]:
+        """[N] bool: the Gaussians that move, by their label; none that is retired."""
+        return np.asarray((self.foreground > 0.5) & ~self.retired)
+
     def sizes(self) -> Array:
         """[N] sizes, metres: the root mean square of the lengths of the axes.
 
@@ -138,16 +144,41 @@ def label_of(levels: NDArray[Any]) -> Array:
 
 def products(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
     """[4, N] a∘b of quaternions by component: first b, then a."""
-    aw, ax, ay, az = a
-    bw, bx, by, bz = b
-    return np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ]
-    )
+    return np.stack(product_components(a, b))
+
+
+def mapped(rows: Sequence[Sequence[NDArray[Any]]], planes: NDArray[Any]) -> list[NDArray[Any]]:
+    """The components, [N] each, of a matrix times vectors or matrices, one of each a Gaussian.
+
+    Args:
+        rows: of the matrices, three of three [N]. planes: [3, N] of vectors, or [9, N] of matrices row by row.
+
+    >>> one, zero = np.ones(1), np.zeros(1)
+    >>> mapped([[zero, one, zero], [one, zero, zero], [zero, zero, one]], np.array([[5.0], [6], [7]]))
+    [array([6.]), array([5.]), array([7.])]
+    """
+    width = len(planes) // 3
+    return [
+        row[0] * planes[column] + row[1] * planes[width + column] + row[2] * planes[2 * width + column]
+        for row in rows
+        for column in range(width)
+    ]
+
+
+def by_green(colours: NDArray[Any]) -> NDArray[Any]:
+    """[3, N] green, and what red and blue have more of it: channels change alike.
+
+    >>> by_green(np.array([[5], [3], [2]])).ravel(), of_green(np.array([[3], [2], [-1]])).ravel()
+    (array([ 3,  2, -1]), array([5, 3, 2]))
+    """
+    red, green, blue = colours
+    return np.stack([green, red - green, blue - green])
+
+
+def of_green(planes: NDArray[Any]) -> NDArray[Any]:
+    """[3, N] red, green and blue of ``by_green``."""
+    green, red, blue = planes
+    return np.stack([red + green, green, blue + green])
 
 
 def turns_between(after: Array, before: Array) -> Float:

@@ -18,8 +18,11 @@ from scas4d_core.compact.cluster_motion import ClusterMotion, Clusters
 from scas4d_core.compact.columns import (
     LABELS,
     Columns,
+    by_green,
     label_of,
     levels_of,
+    mapped,
+    of_green,
     products,
     turns_between,
     turns_of,
@@ -27,11 +30,8 @@ from scas4d_core.compact.columns import (
 )
 from scas4d_core.compact.planes import Ints, PlaneError, pack, unpack
 from scas4d_core.compact.sections import (
-    NONE,
-    SOME,
     read_array,
     read_exact,
-    read_kind,
     read_mask,
     read_residuals,
     write_array,
@@ -39,6 +39,7 @@ from scas4d_core.compact.sections import (
     write_mask,
     write_residuals,
 )
+from scas4d_core.gaussians import rotation_rows
 
 Array = NDArray[np.float32]
 Float = NDArray[np.float64]
@@ -100,12 +101,8 @@ def encode(reference: Columns, state: Columns, clusters: Clusters, bounds: Bound
     exact = np.zeros(len(state), np.bool_)
     sections = [_STEPS.pack(*steps), *(pack(plane) for plane in planes)]
     for name in told.names:
-        found = told.residual(name, state)
-        outside = ~(np.abs(found) < LARGEST)
-        if outside.any():
-            exact[: found.shape[1]] |= outside.any(axis=0)
-            found = np.where(outside, 0, found)
-        residual = found.astype(np.int32)
+        residual, beyond = whole_steps(told.residual(name, state))
+        exact[: len(beyond)] |= beyond
         sections.append(write_residuals(residual))
         told = told.having(name, residual)
     exact |= _beyond(told.state, state, bounds)
@@ -113,10 +110,7 @@ def encode(reference: Columns, state: Columns, clusters: Clusters, bounds: Bound
     values = np.concatenate([state.means[:, rows], state.factors[:, rows]])
     sections.append(write_exact(rows, values))
     retired, environment = state.retired, state.environment
-    if np.array_equal(reference.retired, retired):
-        sections.append(bytes([NONE]))
-    else:
-        sections.append(bytes([SOME]) + write_mask(retired))
+    sections.append(write_mask(None if np.array_equal(reference.retired, retired) else retired))
     if environment is not None and reference.environment is not None:
         environment = None if np.array_equal(environment, reference.environment) else environment
     sections.append(write_array(environment))
@@ -146,10 +140,7 @@ def decode(reference: Columns, clusters: Clusters, bounds: Bounds, body: bytes) 
         residual, offset = read_residuals(body, offset, *told.shape(name))
         told = told.having(name, residual)
     rows, values, offset = read_exact(body, offset, len(reference), 12)
-    retired = reference.retired
-    kind, offset = read_kind(body, offset)
-    if kind != NONE:
-        retired, offset = read_mask(body, offset, len(reference))
+    retired, offset = read_mask(body, offset, len(reference))
     environment, offset = read_array(body, offset)
     if offset != len(body):
         raise PlaneError(f"{len(body) - offset} bytes follow the state")
@@ -209,7 +200,7 @@ class _Told:
             part = bounds.position if name == "means" else bounds.axes
             return np.asarray(np.float32(2 * part * MARGIN) * self.sizes, np.float32)
         if name == "rotations":
-            return np.float32(2 * bounds.rotation / 3**0.5)  # of an angle, in each of three components
+            return np.float32(bounds.rotation_step)
         return np.float32(2 * (bounds.colour if name == "colours" else bounds.gloss))
 
     def residual(self, name: str, state: Columns) -> NDArray[Any]:
@@ -224,10 +215,7 @@ class _Told:
                 vectors = vectors_of(turns_between(state.rotations, self.state.rotations))
                 return np.asarray(np.rint(vectors / self._step(name)))
             found = np.rint((getattr(state, name) - getattr(self.state, name)) / self._step(name))
-        if name == "colours":  # channels change alike: red and blue are told by how they differ from green
-            red, green, blue = found
-            found = np.stack([green, red - green, blue - green])
-        return np.asarray(found)
+        return np.asarray(by_green(found) if name == "colours" else found)
 
     def having(self, name: str, residual: Ints) -> _Told:
         """The same with another attribute."""
@@ -244,23 +232,22 @@ class _Told:
         if name == "rotations":
             return self._turned(residual.astype(np.float32) * self._step(name))
         if name == "colours":
-            green, red, blue = residual
-            residual = np.stack([red + green, green, blue + green])
+            residual = of_green(residual)
         changed = getattr(self.state, name) + residual.astype(np.float32) * self._step(name)
         return replace(self, state=self.state.having(**{name: changed}))
 
     def _turned(self, vectors: Array) -> _Told:
-        w, x, y, z = turns = turns_of(vectors)
-        f = self.state.factors
-        rows = (
-            (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-            (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-            (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-        )
-        factors = np.stack([row[0] * f[j] + row[1] * f[3 + j] + row[2] * f[6 + j] for row in rows for j in range(3)])
+        turns = turns_of(vectors)
+        factors = np.stack(mapped(rotation_rows(turns), self.state.factors))
         rotations = products(turns, self.state.rotations)
         rotations /= np.sqrt(np.square(rotations).sum(axis=0))
         return replace(self, state=self.state.having(rotations=rotations, factors=factors))
+
+
+def whole_steps(found: NDArray[Any]) -> tuple[Ints, NDArray[np.bool_]]:
+    """[P, N] as whole numbers, 0 for those that are none or too large, and [N] whether a row has any of these."""
+    outside = ~(np.abs(found) < LARGEST)
+    return np.where(outside, 0, found).astype(np.int32), outside.any(axis=0)
 
 
 def _moved(reference: Columns, clusters: Clusters, planes: NDArray[np.int64], steps: tuple[float, float]) -> Columns:
@@ -299,13 +286,17 @@ def lost_volume(found: Columns, true: Columns) -> NDArray[np.bool_]:
 
 
 def completed(
-    state: Columns, rows: NDArray[np.intp], values: Array, retired: NDArray[np.bool_], environment: Array | None
+    state: Columns, rows: NDArray[np.intp], values: Array, retired: NDArray[np.bool_] | None, environment: Array | None
 ) -> Columns:
-    """A state with what is told exactly: centres and axes [12, E] of some rows, who is retired, what is mirrored."""
+    """A state with what is told exactly: centres and axes [12, E] of some rows, who is retired, what is mirrored.
+
+    Args:
+        retired, environment: None where the state's own hold.
+    """
     if len(rows):
         means, factors = state.means.copy(), state.factors.copy()
         means[:, rows], factors[:, rows] = values[:3], values[3:]
         state = state.having(means=means, factors=factors)
     if environment is not None:
         state = state.having(environment=environment)
-    return state if np.array_equal(retired, state.retired) else state.having(retired=retired)
+    return state if retired is None else state.having(retired=retired)

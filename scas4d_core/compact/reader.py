@@ -218,9 +218,7 @@ class CompactReader:
         if not wanted:
             raise DamagedFileError(f"{self.path.name}: the Gaussians of frame {index} are not told")
         count = len(wanted)
-        if self._born is None or self._born[0] > count:
-            self._born = None
-        known, state, clusters = self._born or (0, None, None)
+        known, state, clusters = (0, None, None) if self._born is None or self._born[0] > count else self._born
         for number in range(known, count):
             record = wanted[number]
             body = read_body(self._file, record, self.path.name)

@@ -34,32 +34,37 @@ def write_residuals(planes: Ints) -> bytes:
         return bytes([NONE])
     if share >= SPARSE:
         return bytes([ALL]) + b"".join(pack(plane) for plane in planes)
-    return bytes([SOME]) + write_mask(changed) + b"".join(pack(plane) for plane in planes[:, changed])
+    return write_mask(changed) + b"".join(pack(plane) for plane in planes[:, changed])
 
 
 def read_residuals(body: bytes, offset: int, components: int, rows: int) -> tuple[Ints, int]:
     """[components, rows] residuals of a section, and where it ends; raises PlaneError."""
-    kind, offset = read_kind(body, offset)
+    kind, offset = _read_kind(body, offset)
     planes = np.zeros((components, rows), np.int32)
     if kind == NONE:
         return planes, offset
     chosen: Any = slice(None)
     count = rows
     if kind == SOME:
-        mask, offset = read_mask(body, offset, rows)
+        mask, offset = _read_bits(body, offset, rows)
         chosen, count = np.flatnonzero(mask), int(np.count_nonzero(mask))
     for plane in planes:
         plane[chosen], offset = unpack(body, count, offset)
     return planes, offset
 
 
-def write_mask(mask: NDArray[np.bool_]) -> bytes:
-    """[N] bool, a bit each."""
-    return _sized(deflated(np.packbits(mask).tobytes()))
+def write_mask(mask: NDArray[np.bool_] | None) -> bytes:
+    """[N] bool, a bit each; None: nothing is told."""
+    return bytes([NONE]) if mask is None else bytes([SOME]) + _sized(deflated(np.packbits(mask).tobytes()))
 
 
-def read_mask(body: bytes, offset: int, rows: int) -> tuple[NDArray[np.bool_], int]:
-    """[rows] bool, and where the mask ends."""
+def read_mask(body: bytes, offset: int, rows: int) -> tuple[NDArray[np.bool_] | None, int]:
+    """[rows] bool of a section, None where nothing is told, and where it ends."""
+    kind, offset = _read_kind(body, offset)
+    return (None, offset) if kind == NONE else _read_bits(body, offset, rows)
+
+
+def _read_bits(body: bytes, offset: int, rows: int) -> tuple[NDArray[np.bool_], int]:
     data, offset = _read_sized(body, offset, (rows + 7) // 8)
     return np.unpackbits(np.frombuffer(data, np.uint8), count=rows).astype(np.bool_), offset
 
@@ -74,7 +79,7 @@ def write_array(array: NDArray[Any] | None) -> bytes:
 
 def read_array(body: bytes, offset: int) -> tuple[Floats | None, int]:
     """The array of a section, None where nothing is told, and where it ends."""
-    kind, offset = read_kind(body, offset)
+    kind, offset = _read_kind(body, offset)
     if kind == NONE:
         return None, offset
     dimensions = body[offset] if offset < len(body) else 0
@@ -100,7 +105,7 @@ def write_exact(rows: NDArray[np.intp], values: NDArray[Any]) -> bytes:
 
 def read_exact(body: bytes, offset: int, most: int, width: int) -> tuple[NDArray[np.intp], Floats, int]:
     """The rows, below ``most``, and values of a section, and where it ends."""
-    kind, offset = read_kind(body, offset)
+    kind, offset = _read_kind(body, offset)
     if kind == NONE:
         return np.zeros(0, np.intp), np.zeros((width, 0), np.float32), offset
     if len(body) < offset + 4:
@@ -116,7 +121,7 @@ def read_exact(body: bytes, offset: int, most: int, width: int) -> tuple[NDArray
     return rows, values, offset
 
 
-def read_kind(body: bytes, offset: int) -> tuple[int, int]:
+def _read_kind(body: bytes, offset: int) -> tuple[int, int]:
     """The first byte of a section, and where the next is."""
     if offset >= len(body):
         raise PlaneError(f"the data end at byte {len(body)}, before a section")

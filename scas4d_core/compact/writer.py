@@ -92,19 +92,19 @@ class CompactWriter:
             FileError: the frame cannot follow those before.
         """
         self._check(index, state)
-        before = self._last
+        columns, before = Columns.of(state), self._last
         if before is None or len(state) > len(before):
-            self._bear(index, time, state)
+            self._bear(index, time, columns)
         born = self._born
         assert born is not None
         if before is None:  # the state that was just told
             self._told, self._last = self._records[-1], born
-            return self._noted(errors_of(born, Columns.of(state)))
+            return self._noted(errors_of(born, columns))
         if len(before) < len(born):
             before = before.joined(born.after(len(before)))
         self._since_key += 1
         key = self._since_key >= self._key_every
-        coded = encode(born if key else before, Columns.of(state), self._clusters, self.head.bounds)
+        coded = encode(born if key else before, columns, self._clusters, self.head.bounds)
         if key:
             self._since_key = 0
             self._append(record_bytes(Kind.KEY, coded.body, index, time))
@@ -167,19 +167,18 @@ class CompactWriter:
         finally:
             self._file.close()
 
-    def _bear(self, index: int, time: float, state: Gaussians) -> None:
+    def _bear(self, index: int, time: float, state: Columns) -> None:
         """Writes the Gaussians that are not known yet."""
         if self._last is None:
-            born, clusters = state, Clusters.of(state)
+            born, clusters = state, Clusters.of(state.gaussians())
         else:
-            born = state.rows(np.arange(len(self._last), len(state)))
-            born = born.replace(gloss=None, environment=None)  # those born later are dull
+            born = state.after(len(self._last))
             clusters = Clusters(self._clusters.nearest(self._last, born))
-        body, decoded = encode_born(Columns.of(born), clusters, self.head.bounds)
+        body, decoded = encode_born(born, clusters, self.head.bounds)
         self._append(record_bytes(Kind.BORN, len(born).to_bytes(4, "little") + body, index, time))
         self._born = decoded if self._born is None else self._born.joined(decoded)
         self._clusters = self._clusters.joined(clusters.labels)
-        self._opacities = state.own_opacities.copy()
+        self._opacities = state.opacities.copy()
 
     def _noted(self, errors: Mapping[str, float]) -> Mapping[str, float]:
         for name, value in errors.items():

@@ -29,7 +29,7 @@ def whole_file(path: Path | str) -> Iterator[Path]:
     ['a.txt']
     """
     target = Path(path)
-    beside = target.with_name(f".part{os.getpid()}-{target.name}")
+    beside = _beside(target)
     try:
         with writing(target):
             yield beside
@@ -51,9 +51,13 @@ def check_writable(path: Path | str) -> None:
     """
     target = Path(path)
     with writing(target):
-        beside = target.with_name(f".part{os.getpid()}-{target.name}")
+        beside = _beside(target)
         beside.touch()
         beside.unlink()
+
+
+def _beside(target: Path) -> Path:
+    return target.with_name(f".part{os.getpid()}-{target.name}")
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from scas4d_core.compact import CompactWriter, Head
 from scas4d_core.first_frame.calibration.record import in_use
 from scas4d_core.storage.history import History
 from server.processes.messages import SceneSpec
+from server.processes.part_labels import fitted
 
 
 def compact_head(spec: SceneSpec, history: History) -> Head:
@@ -40,4 +41,4 @@ def write_compact(file: Path, history: History, asked: Sequence[int], head: Head
         for index in frames:
             writer.add(index, history.time(index), history.gaussians(index))
         if labels is not None:
-            writer.add_parts(frames[-1], labels[: len(history.gaussians(frames[-1]))])
+            writer.add_parts(frames[-1], fitted(labels, len(history.gaussians(frames[-1]))))

@@ -9,9 +9,10 @@ import io
 import logging
 import os
 import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import imageio.v3 as imageio
@@ -47,7 +48,7 @@ from server.processes.queries import (
 if TYPE_CHECKING:
     from scas4d_core.query.committed import CommittedScene, View
 
-FLOAT32 = "application/octet-stream"
+BYTES = "application/octet-stream"
 QUALITY = 92
 """Quality of JPEG and WebP, 1…100, if the query names none."""
 CHANNELS = {"colour": ("red", "green", "blue"), "depth": ("depth",), "alpha": ("alpha",), "parts": ("parts",)}
@@ -197,20 +198,20 @@ class Renderer:
                 told = GaussiansModel(frame=self.history.indices[-1], gaussians=lives)
                 return Answer(number, told.model_dump_json().encode(), "application/json")
             case PlyQuery():
-                file = self.spec.folder.export
-                try:
-                    self.reader.write_ply(file, query.frame)
-                    return Answer(number, file.read_bytes(), "application/octet-stream")
-                finally:
-                    file.unlink(missing_ok=True)
+                return self._file(number, lambda file: self.reader.write_ply(file, query.frame))
             case CompactQuery():
-                file = self.spec.folder.export
                 parts = self.labels(None) if query.parts and self.history.newest.moving.any() else None
-                try:
-                    write_compact(file, self.history, query.frames, compact_head(self.spec, self.history), parts)
-                    return Answer(number, file.read_bytes(), "application/octet-stream")
-                finally:
-                    file.unlink(missing_ok=True)
+                head = compact_head(self.spec, self.history)
+                return self._file(number, lambda file: write_compact(file, self.history, query.frames, head, parts))
+
+    def _file(self, number: int, write: Callable[[Path], None]) -> Answer:
+        """Answers with the file that is written to a path, and removes it."""
+        file = self.spec.folder.export
+        try:
+            write(file)
+            return Answer(number, file.read_bytes(), BYTES)
+        finally:
+            file.unlink(missing_ok=True)
 
 
 def float32(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, str]]:
@@ -240,7 +241,7 @@ def encode_view(
         return track_answers.npz(arrays), track_answers.NPZ, {}
     if format == "float32":
         body, headers = float32(arrays)
-        return body, FLOAT32, headers
+        return body, BYTES, headers
     pixels, headers = _pixels(kinds[0], arrays[kinds[0]])
     media_type = f"image/{format}"
     if kinds[0] == "parts":  # imageio writes no palettes

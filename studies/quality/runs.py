@@ -134,6 +134,7 @@ FORMER: Mapping[tuple[str, ...], Mapping[str, Constant]] = {
     ("static",): StaticSettings.constants,
     ("update",): UpdateSettings.constants,
     ("update", "weights"): Weights.constants,
+    ("update", "layer_rates"): LayerRates.constants,
 }
 """Settings that rows measured before name and that are constants today, by group."""
 
@@ -155,22 +156,24 @@ def completed(settings: Mapping[str, Any], today: Mapping[str, Any]) -> dict[str
         for group, given in settings.items()
     }
     varied = dict(told.get("constants", {}))
-    update = told.get("update")
-    if isinstance(update, dict) and "layer_rates" in update:
-        (scaling,) = LayerRates.constants.values()
-        layers = [dict(layer) for layer in update["layer_rates"]]
-        rates = {layer.pop("scaling", scaling.value) for layer in layers}
-        told["update"] = update | {"layer_rates": layers}
-        varied |= {scaling.place: max(rates)} if rates != {scaling.value} else {}
     for path, constants in FORMER.items():
-        inner = told
-        for group in path:
-            inner[group] = inner = dict(inner.get(group, {}))
-        for name, constant in constants.items():
-            value = inner.pop(name, constant.value)
-            if (tuple(value) if isinstance(value, list) else value) != constant.value:
-                varied[constant.place or ".".join([*path, name])] = value
+        for inner in _copied(told, path):
+            for name, constant in constants.items():
+                value = inner.pop(name, constant.value)
+                if (tuple(value) if isinstance(value, list) else value) != constant.value:
+                    varied[constant.place or ".".join([*path, name])] = value
     return told | ({"constants": varied} if varied else {})
+
+
+def _copied(told: dict[str, Any], path: Sequence[str]) -> list[dict[str, Any]]:
+    """The group at a path of a row's settings, copied into ``told`` with those above it; several where it is a list."""
+    inner = told
+    for group in path:
+        if isinstance(given := inner.get(group, {}), list):
+            inner[group] = layers = [dict(layer) for layer in given]
+            return layers
+        inner[group] = inner = dict(given)
+    return [inner]
 
 
 def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
