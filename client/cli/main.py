@@ -157,7 +157,7 @@ def export(
 
     Example: scas4d reconstruct samples/robot --out out/robot; scas4d export out/robot --format usd
     """
-    from client.cli.export import export as run
+    from client.exports.export import export as run
 
     run(source, format, out, frames, ids, url=url, token=token)
 

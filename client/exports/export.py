@@ -1,0 +1,64 @@
+"""`scas4d export`: states of a compact file, or of a scene of the service, in the formats of other tools."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from client.cli.progress import Bars, console
+from client.exports.sources import frame_range, opened
+from scas4d_core.errors import InputError
+
+
+def export(
+    source: str,
+    format: str,
+    out: Path | None,
+    frames: str | None = None,
+    ids: list[int] | None = None,
+    *,
+    url: str,
+    token: str | None,
+) -> None:
+    """Exports frames; one state is in memory at a time.
+
+    Args:
+        source: as `opened` takes it.
+        format: a name of docs/exports.md. out: a folder or `.zip` for numbered files, else a file; None: beside the
+            file, or in this folder for a scene, named after it and the format.
+        frames: `A:B`, the frames from A to B, both counted in; either may be left out. None: all. ids: of tracks.
+        url, token: of the service.
+
+    Raises:
+        InputError: a format, a range or an output that cannot be.
+    """
+    from scas4d_core.exports.formats import check_suffix, format_of
+    from scas4d_core.exports.sequence import export_sequence
+
+    wanted = format_of(format)
+    low, high = frame_range(frames)
+    if ids and format != "tracks":
+        raise InputError(f"id is given for format {format!r}", "leave --id out; it chooses the Gaussians of tracks")
+    if out is not None and not wanted.numbered:
+        check_suffix(out, wanted)
+    with_parts = wanted.needs_parts or format == "usd"
+    with opened(source, low, high, with_parts, url, token) as given, Bars() as bars:
+        target = out or given.beside / f"{given.name}-{format}{'' if wanted.numbered else wanted.suffixes[0]}"
+        if given.damage is not None:
+            console.print(f"only a part can be read: {given.damage}", soft_wrap=True)
+        count = sum(low <= index <= high for index in given.frames)
+        if not count:
+            held = f"frames {given.frames[0]} to {given.frames[-1]}" if given.frames else "no frame"
+            raise InputError(f"frames {frames or 'of all'} are not in {source}", f"it has {held}")
+        paths = export_sequence(
+            given.states(low, high),
+            format,
+            target,
+            world=given.head.world,
+            rig=given.head.rig,
+            parts=given.parts() if with_parts else None,
+            ids=ids,
+            frames_per_second=given.head.frames_per_second,
+            progress=lambda index, done: bars("exporting", done, count),
+        )
+    what = f"{len(paths)} files in {target}" if len(paths) > 1 else f"{count} frames in {target}"
+    console.print(f"{what} ({format}; docs/exports.md says what each format holds)", soft_wrap=True)
