@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
@@ -16,6 +17,7 @@ from scas4d_core.compact.columns import Columns
 from scas4d_core.compact.frame_code import decode
 from scas4d_core.compact.head import Head
 from scas4d_core.compact.index import read_index
+from scas4d_core.compact.notes import read_note
 from scas4d_core.compact.planes import PlaneError, unpack
 from scas4d_core.compact.records import (
     HEAD_SIZE,
@@ -26,6 +28,7 @@ from scas4d_core.compact.records import (
     Record,
     checksum_bytes,
     read_body,
+    record_bytes,
     scan,
 )
 from scas4d_core.gaussians import Gaussians
@@ -35,6 +38,24 @@ __all__ = ["CompactReader", "DamagedFileError", "FileError"]
 STATES = (Kind.KEY, Kind.DELTA)
 MOST_PER_BYTE = 4
 """Gaussians for each byte that tells of them; a count that lies must not fill the memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class LastTold:
+    """The end of a file that is gone on with.
+
+    Attributes:
+        head: of the file. records: up to the last state. told: the record of that. state: that, as it is read.
+        born, clusters: of all Gaussians so far, as they were told. since_key: states since the last key.
+    """
+
+    head: Head
+    records: tuple[Record, ...]
+    told: Record
+    state: Columns
+    born: Columns
+    clusters: Clusters
+    since_key: int
 
 
 class CompactReader:
@@ -69,6 +90,7 @@ class CompactReader:
         self._frames: list[int] = []
         self._births: list[Record] = []
         self._parts: list[Record] = []
+        self._notes: dict[int, Record] = {}
         self._born: tuple[int, Columns, Clusters] | None = None
         self._last: tuple[int, Columns] | None = None
         try:
@@ -161,6 +183,33 @@ class CompactReader:
         assert state is not None
         return state.gaussians()
 
+    def copied(self, first: int, last: int, file: BinaryIO) -> list[int]:
+        """Copies the records of some frames to another file, which has no index then: their states keep their bits.
+
+        The copy begins with this file's first frame and the key before ``first``, by which the others are told.
+
+        Args:
+            first, last: frames, both counted in.
+
+        Returns:
+            The frames of the copy.
+
+        Raises:
+            FileError: no frame lies between. DamagedFileError: a record is damaged.
+        """
+        wanted = [place for place, index in enumerate(self._frames) if first <= index <= last]
+        if not wanted:
+            raise FileError(f"{self.path.name}: no frame from {first} to {last} is in the file{self._why()}")
+        begin = next(place for place in range(wanted[0], -1, -1) if self._states[place].kind is not Kind.DELTA)
+        states = {self._states[place] for place in (0, *range(begin, wanted[-1] + 1))}
+        for record in self._records:
+            end = self._frames[wanted[-1]]
+            if record in states or record.kind is Kind.HEAD or (record.kind is Kind.BORN and record.frame <= end):
+                file.write(
+                    record_bytes(record.kind, read_body(self._file, record, self.path.name), record.frame, record.time)
+                )
+        return sorted({record.frame for record in states})
+
     def parts(self, index: int | None = None) -> NDArray[np.int64] | None:
         """[N] part of each Gaussian, −1 for none, as it was last seen up to a frame; None where none was."""
         found = [record for record in self._parts if index is None or record.frame <= index]
@@ -174,6 +223,37 @@ class CompactReader:
             return unpack(body, count, 4)[0].astype(np.int64) - 1
         except PlaneError as error:
             raise self._damaged(found[-1], error) from None
+
+    @property
+    def whole(self) -> bool:
+        """True for a file that was closed: it ends with its index."""
+        return self._whole
+
+    def last_told(self) -> LastTold:
+        """All that a writer needs to go on after the last state; there has to be one."""
+        place = len(self._states) - 1
+        self.state(self._frames[place])
+        told, columns = self._states[place], self._last
+        assert columns is not None
+        born, clusters = self._born_by(told.frame)
+        key = next(i for i in range(place, -1, -1) if i == 0 or self._states[i].kind is Kind.KEY)
+        behind = (told.end, *(one.end for one in self._parts if one.frame == told.frame))
+        records = tuple(one for one in self._records if one.end <= max(behind))
+        return LastTold(self.head, records, told, columns[1], born, clusters, place - key)
+
+    def note(self, index: int) -> dict[str, Any]:
+        """The note on a frame, JSON values; empty where there is none.
+
+        Raises:
+            DamagedFileError: it is damaged.
+        """
+        record = self._notes.get(index)
+        if record is None:
+            return {}
+        try:
+            return read_note(read_body(self._file, record, self.path.name))
+        except PlaneError as error:
+            raise self._damaged(record, error) from None
 
     def _note(self, record: Record) -> None:
         self._records.append(record)
@@ -191,6 +271,8 @@ class CompactReader:
             self._frames.append(record.frame)
         elif record.kind is Kind.PARTS:
             self._parts.append(record)
+        elif record.kind is Kind.NOTE:
+            self._notes[record.frame] = record
 
     def _decoded(self, place: int, before: Columns | None) -> Columns:
         record = self._states[place]

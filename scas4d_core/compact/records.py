@@ -36,6 +36,8 @@ class Kind(IntEnum):
     """A part of each Gaussian."""
     INDEX = 6
     """Where all records are; the last."""
+    NOTE = 7
+    """JSON about the frame whose state follows."""
 
 
 class FileError(ValueError):

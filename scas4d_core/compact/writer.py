@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,9 @@ from scas4d_core.compact.columns import Columns
 from scas4d_core.compact.frame_code import encode, errors_of
 from scas4d_core.compact.head import Head
 from scas4d_core.compact.index import footer, index_body
+from scas4d_core.compact.notes import note_bytes
 from scas4d_core.compact.planes import pack
+from scas4d_core.compact.reader import CompactReader
 from scas4d_core.compact.records import FileError, Kind, Record, checksum_bytes, parse_head, record_bytes
 from scas4d_core.gaussians import Gaussians
 
@@ -65,10 +67,36 @@ class CompactWriter:
         self._clusters = Clusters(np.zeros(0, np.int64))
         self._last: Columns | None = None
         self._since_key = 0
-        self._opacities = np.zeros(0, np.float32)
+        self._opacities: NDArray[np.float32] | None = None
+        """Exact ones of all that are born; None where they are not known yet."""
         self._told = Record(Kind.HEAD, -1, 0.0, 0, 0, 0)
         """The record of the last state."""
         self._append(record_bytes(Kind.HEAD, text))
+
+    @classmethod
+    def resume(cls, path: Path | str, key_every: int = KEY_EVERY) -> CompactWriter:
+        """Goes on with a file that was not closed, after its last whole state; what stands behind that is cut off.
+
+        ``errors`` are those of the frames that follow.
+
+        Raises:
+            FileNotFoundError: it is not there. FileError: it has its index already, or no state, or is damaged.
+        """
+        with CompactReader(path) as reader:
+            if reader.whole:
+                raise FileError(f"{reader.path.name}: it is whole, with its index; begin another file")
+            if reader.damage is not None or not reader.frames:
+                raise FileError(f"{reader.path.name}: it cannot be gone on with ({reader.damage or 'it has no state'})")
+            last = reader.last_told()
+        writer = cls.__new__(cls)
+        writer.path, writer.head, writer.errors, writer._key_every = Path(path), last.head, {}, key_every
+        writer._records, writer._told, writer._since_key = list(last.records), last.told, last.since_key
+        writer._born, writer._clusters, writer._last = last.born, last.clusters, last.state
+        writer._opacities = None
+        writer._file = writer.path.open("r+b")
+        writer._file.truncate(last.records[-1].end)
+        writer._file.seek(0, 2)
+        return writer
 
     def __enter__(self) -> Self:
         return self
@@ -81,18 +109,24 @@ class CompactWriter:
         else:
             self._file.close()
 
-    def add(self, index: int, time: float, state: Gaussians) -> Mapping[str, float]:
+    def add(
+        self, index: int, time: float, state: Gaussians, note: Mapping[str, Any] | None = None
+    ) -> Mapping[str, float]:
         """Writes the state of a frame; returns its largest error by attribute.
 
         Args:
             index: above that of every frame before. time: seconds. state: the Gaussians of the frame before, in their
                 order, and after them those that are born in this one, with their ids.
+            note: JSON values about the frame, written before its state.
 
         Raises:
-            FileError: the frame cannot follow those before.
+            FileError: the frame cannot follow those before. ValueError: the note is no JSON.
         """
         self._check(index, state)
+        if note is not None:
+            self._append(record_bytes(Kind.NOTE, note_bytes(note), index, time))
         columns, before = Columns.of(state), self._last
+        self._opacities = columns.opacities.copy() if self._opacities is None else self._opacities
         if before is None or len(state) > len(before):
             self._bear(index, time, columns)
         born = self._born
@@ -142,7 +176,7 @@ class CompactWriter:
             known = len(born)
             if len(state) < known or not np.array_equal(state.ids[:known], born.ids):
                 raise FileError(f"{name}: frame {index} has other Gaussians than frame {last}; they are never removed")
-            if not np.array_equal(state.own_opacities[:known], self._opacities):
+            if self._opacities is not None and not np.array_equal(state.own_opacities[:known], self._opacities):
                 raise FileError(f"{name}: frame {index} has other opacities than frame {last}; they are fixed at birth")
             if _glossy(state.gloss) != (0 if born.gloss is None else born.gloss.shape[1]):
                 raise FileError(f"{name}: frame {index} has gloss of {_glossy(state.gloss)} Gaussians, others before")
