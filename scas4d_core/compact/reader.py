@@ -241,6 +241,15 @@ class CompactReader:
         records = tuple(one for one in self._records if one.end <= max(behind))
         return LastTold(self.head, records, told, columns[1], born, clusters, place - key)
 
+    def sizes(self) -> list[tuple[int, int, int]]:
+        """Index, bytes of the file since the state before, and checksum of the state, of each frame."""
+        ends = [0, *(one.end for one in self._states)]
+        return [(one.frame, one.end - before, one.checksum) for one, before in zip(self._states, ends, strict=False)]
+
+    def end_before(self, index: int) -> int:
+        """Bytes of the file up to what tells of a frame."""
+        return min(one.offset - HEAD_SIZE for one in self._records if one.frame >= index)
+
     def note(self, index: int) -> dict[str, Any]:
         """The note on a frame, JSON values; empty where there is none.
 

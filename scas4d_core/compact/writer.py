@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
@@ -19,10 +21,12 @@ from scas4d_core.compact.head import Head
 from scas4d_core.compact.index import footer, index_body
 from scas4d_core.compact.notes import note_bytes
 from scas4d_core.compact.planes import pack
-from scas4d_core.compact.reader import CompactReader
+from scas4d_core.compact.reader import STATES, CompactReader
 from scas4d_core.compact.records import FileError, Kind, Record, checksum_bytes, parse_head, record_bytes
 from scas4d_core.gaussians import Gaussians
 
+ERRORS = "errors"
+"""Name of a frame's largest errors in its note."""
 KEY_EVERY = 8
 """Frames from a key to the next: a reader decodes at most so many for one."""
 
@@ -77,7 +81,7 @@ class CompactWriter:
     def resume(cls, path: Path | str, key_every: int = KEY_EVERY) -> CompactWriter:
         """Goes on with a file that was not closed, after its last whole state; what stands behind that is cut off.
 
-        ``errors`` are those of the frames that follow.
+        ``errors`` are those of the frames with a note, and of those that follow.
 
         Raises:
             FileNotFoundError: it is not there. FileError: it has its index already, or no state, or is damaged.
@@ -88,11 +92,14 @@ class CompactWriter:
             if reader.damage is not None or not reader.frames:
                 raise FileError(f"{reader.path.name}: it cannot be gone on with ({reader.damage or 'it has no state'})")
             last = reader.last_told()
+            known = [reader.note(index).get(ERRORS, {}) for index in reader.frames]
         writer = cls.__new__(cls)
         writer.path, writer.head, writer.errors, writer._key_every = Path(path), last.head, {}, key_every
         writer._records, writer._told, writer._since_key = list(last.records), last.told, last.since_key
         writer._born, writer._clusters, writer._last = last.born, last.clusters, last.state
         writer._opacities = None
+        for errors in known:
+            writer._note_errors(errors)
         writer._file = writer.path.open("r+b")
         writer._file.truncate(last.records[-1].end)
         writer._file.seek(0, 2)
@@ -117,35 +124,37 @@ class CompactWriter:
         Args:
             index: above that of every frame before. time: seconds. state: the Gaussians of the frame before, in their
                 order, and after them those that are born in this one, with their ids.
-            note: JSON values about the frame, written before its state.
+            note: JSON values about the frame, written before its state, with its ``errors``.
 
         Raises:
             FileError: the frame cannot follow those before. ValueError: the note is no JSON.
         """
         self._check(index, state)
-        if note is not None:
-            self._append(record_bytes(Kind.NOTE, note_bytes(note), index, time))
+        note_bytes(note or {})
         columns, before = Columns.of(state), self._last
         self._opacities = columns.opacities.copy() if self._opacities is None else self._opacities
-        if before is None or len(state) > len(before):
-            self._bear(index, time, columns)
+        records = [] if before is not None and len(state) == len(before) else [(Kind.BORN, self._bear(columns))]
         born = self._born
         assert born is not None
-        if before is None:  # the state that was just told
-            self._told, self._last = self._records[-1], born
-            return self._noted(errors_of(born, columns))
-        if len(before) < len(born):
-            before = before.joined(born.after(len(before)))
-        self._since_key += 1
-        key = self._since_key >= self._key_every
-        coded = encode(born if key else before, columns, self._clusters, self.head.bounds)
-        if key:
-            self._since_key = 0
-            self._append(record_bytes(Kind.KEY, coded.body, index, time))
-        else:  # a reader must not tell it by another state
-            self._append(record_bytes(Kind.DELTA, checksum_bytes(self._told) + coded.body, index, time))
-        self._told, self._last = self._records[-1], coded.decoded
-        return self._noted(coded.errors)
+        if before is None:
+            decoded = born
+            errors: Mapping[str, float] = errors_of(born, columns)
+        else:
+            if len(before) < len(born):
+                before = before.joined(born.after(len(before)))
+            key = self._since_key + 1 >= self._key_every
+            self._since_key = 0 if key else self._since_key + 1
+            coded = encode(born if key else before, columns, self._clusters, self.head.bounds)
+            told = b"" if key else checksum_bytes(self._told)  # a reader must not tell it by another state
+            records.append((Kind.KEY if key else Kind.DELTA, told + coded.body))
+            decoded, errors = coded.decoded, coded.errors
+        if note is not None:
+            records.insert(0, (Kind.NOTE, note_bytes({**note, ERRORS: dict(errors)})))
+        for kind, body in records:
+            self._append(record_bytes(kind, body, index, time))
+        self._told, self._last = self._records[-1], decoded
+        self._note_errors(errors)
+        return errors
 
     def add_parts(self, index: int, labels: NDArray[np.integer]) -> None:
         """Writes the part of each Gaussian, as it is seen from the last frame on.
@@ -201,23 +210,41 @@ class CompactWriter:
         finally:
             self._file.close()
 
-    def _bear(self, index: int, time: float, state: Columns) -> None:
-        """Writes the Gaussians that are not known yet."""
+    @property
+    def frames(self) -> int:
+        """How many are written."""
+        return sum(record.kind in STATES for record in self._records) + (self._last is not None)
+
+    @property
+    def last_frame(self) -> int:
+        """Index of the last frame; −1 without one."""
+        return self._told.frame
+
+    def sync(self) -> None:
+        """Has the disk confirm all that was written."""
+        os.fsync(self._file.fileno())
+
+    def abandon(self) -> None:
+        """Closes the file without an index: it can be gone on with, after a disk that took nothing, too."""
+        with suppress(OSError):
+            self._file.close()
+
+    def _bear(self, state: Columns) -> bytes:
+        """Takes in the Gaussians that are not known yet; returns the body of their record."""
         if self._last is None:
             born, clusters = state, Clusters.of(state.gaussians())
         else:
             born = state.after(len(self._last))
             clusters = Clusters(self._clusters.nearest(self._last, born))
         body, decoded = encode_born(born, clusters, self.head.bounds)
-        self._append(record_bytes(Kind.BORN, len(born).to_bytes(4, "little") + body, index, time))
         self._born = decoded if self._born is None else self._born.joined(decoded)
         self._clusters = self._clusters.joined(clusters.labels)
         self._opacities = state.opacities.copy()
+        return len(born).to_bytes(4, "little") + body
 
-    def _noted(self, errors: Mapping[str, float]) -> Mapping[str, float]:
+    def _note_errors(self, errors: Mapping[str, float]) -> None:
         for name, value in errors.items():
             self.errors[name] = max(value, self.errors.get(name, 0.0))
-        return errors
 
     def _append(self, data: bytes) -> None:
         offset = self._file.tell()

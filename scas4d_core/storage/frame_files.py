@@ -4,25 +4,25 @@
 beside its place, synced and renamed: a file with its final name is whole, and the listing of the directory is the only
 index. ``fixed.npz`` and the first frame, which everything needs, have a copy: a reader that finds the original damaged
 or gone reads the copy. So has ``born_<index>.npz``, the Gaussians born in a frame, which all later frames need; it is
-written before that frame, and stays when the frame is deleted or taken back.
+written before that frame, and stays when the frame is deleted or taken back. Older frames may be in chunks
+(``chunks``); a file of a frame's own goes before its chunk.
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from scas4d_core.compact import FileError
+from scas4d_core.storage.chunks import Chunks, in_chunk
+from scas4d_core.storage.frame_arrays import Arrays, Stamp
 from scas4d_core.storage.npz import read_npz, sync_folder, verify, write_npz
 
-Arrays = dict[str, NDArray[Any]]
-Stamp = tuple[int, int]
-"""Bytes and time of change of a file, in ns: they tell a file that was written anew."""
 INDEX = "index"
 """Array in the copy of the first frame: its index."""
 
@@ -48,7 +48,9 @@ class FrameFiles:
     """Reads and writes the files of a history in one directory.
 
     Attributes:
-        faults: files that could not be read, by name with the reason; emptied when they are reported.
+        chunks: the compact files that hold older frames.
+        faults: files that could not be read, by name with the reason; emptied when they are reported. A frame in a
+            chunk is named as if it had a file of its own.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -56,6 +58,7 @@ class FrameFiles:
         self.fixed = directory / FIXED_FILE
         self.fixed_copy = directory / FIXED_COPY
         self.first_copy = directory / FIRST_COPY
+        self.chunks = Chunks(directory)
         self.faults: dict[str, str] = {}
         self._copied: tuple[Stamp, int] | None = None
 
@@ -71,13 +74,18 @@ class FrameFiles:
     def listed(self) -> dict[int, Stamp]:
         """Stamps of the frames in the directory, rising; the first one is listed also where only its copy exists."""
         found: dict[int, Stamp] = {}
+        others: list[str] = []
         with os.scandir(self.directory) as entries:
             for entry in entries:
-                if (index := frame_of(entry.name)) is not None:
-                    try:
-                        found[index] = _stamp(entry.stat())
-                    except FileNotFoundError:  # deleted meanwhile
-                        continue
+                if (index := frame_of(entry.name)) is None:
+                    others.append(entry.name)
+                    continue
+                try:
+                    found[index] = _stamp(entry.stat())
+                except FileNotFoundError:  # deleted, or compacted, meanwhile
+                    continue
+        self.chunks.look(others)
+        found = self.chunks.stamps() | found
         first = self._first()
         if found and first is not None and first[1] < min(found):
             found[first[1]] = first[0]
@@ -86,6 +94,7 @@ class FrameFiles:
     def stamped(self, indices: Iterable[int]) -> dict[int, Stamp]:
         """Stamps of the given frames that exist, without listing the directory."""
         found: dict[int, Stamp] = {}
+        absent: list[int] = []
         for index in sorted(indices):
             try:
                 found[index] = _stamp(self.path(index).stat())
@@ -93,7 +102,12 @@ class FrameFiles:
                 first = self._first()
                 if first is not None and first[1] == index:
                     found[index] = first[0]
-        return found
+                else:
+                    absent.append(index)
+        if any(index not in self.chunks for index in absent):
+            self.chunks.look()
+        found |= {index: stamp for index in absent if (stamp := self.chunks.stamp(index)) is not None}
+        return dict(sorted(found.items()))
 
     def _first(self) -> tuple[Stamp, int] | None:
         """Stamp and frame of the copy of the first frame, if there is one that can be read."""
@@ -117,16 +131,21 @@ class FrameFiles:
         write_npz(self.fixed_copy, arrays)
         write_npz(self.first_copy, {**first, INDEX: np.int64(index)})
 
-    def time(self, index: int) -> float:
+    def time(self, index: int, stamp: Stamp | None = None) -> float:
         """Time of a frame, seconds.
+
+        Args:
+            stamp: of the frame, where it is known: the times of a chunk's frames need no reading.
 
         Raises:
             FileNotFoundError: it is not there. UnreadableFrameError: it is damaged.
         """
+        if stamp is not None and in_chunk(stamp) and (known := self.chunks.time(index)) is not None:
+            return known
         return float(self.read(index, ("time",))["time"])
 
     def read(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
-        """Named arrays of a frame; of the first frame from its copy, where only that can be read.
+        """Named arrays of a frame; of the first frame from its copy, where only that can be read, or from its chunk.
 
         Args:
             optional: arrays that are read as well where there are any.
@@ -139,12 +158,26 @@ class FrameFiles:
         except (FileNotFoundError, UnreadableFrameError) as error:
             first = self._first()
             if first is None or first[1] != index:
-                if isinstance(error, UnreadableFrameError):
-                    self.faults[self.path(index).name] = str(error)
+                if isinstance(error, FileNotFoundError):
+                    return self._from_chunk(index, names, optional)
+                self.faults[self.path(index).name] = str(error)
                 raise
             found = _read(self.first_copy, names, optional)
             self.faults[self.path(index).name] = _reason(self.path(index), error)
             return found
+
+    def _from_chunk(self, index: int, names: Sequence[str], optional: Sequence[str]) -> Arrays:
+        try:
+            return self.chunks.read(index, names, optional)
+        except FileError as error:
+            self.faults[self.path(index).name] = str(error)
+            raise UnreadableFrameError(str(error)) from error
+
+    def fault(self, index: int) -> str | None:
+        """Reads all that there is of a frame; returns its fault, None where it is whole."""
+        if not self.path(index).exists() and index in self.chunks:
+            return self.chunks.fault(index)
+        return fault_of(self.path(index))
 
     def read_fixed(self, names: Sequence[str]) -> Arrays:
         """Named arrays of those that all frames share.
@@ -213,8 +246,26 @@ class FrameFiles:
         return mended
 
     def remove(self, index: int) -> None:
-        """Deletes a frame, if it is there."""
+        """Deletes a frame, if it is there; out of a chunk, with those after it."""
         self.path(index).unlink(missing_ok=True)
+        self.chunks.cut(index)
+
+    def chunk_of(self, index: int, stamp: Stamp) -> int | None:
+        """First frame of the chunk that a frame with this stamp is in; None for one with a file of its own."""
+        chunk = self.chunks.of(index) if in_chunk(stamp) else None
+        return None if chunk is None else chunk.first
+
+    def remove_oldest(self, deleted: Collection[int]) -> None:
+        """Deletes frames, those of a chunk all or none."""
+        firsts: set[int] = set()
+        for index in deleted:
+            self.path(index).unlink(missing_ok=True)
+            if (chunk := self.chunks.of(index)) is not None and chunk.times.keys() <= set(deleted):
+                firsts.add(chunk.first)
+        for first in firsts:
+            self.chunks.remove(first)
+        if firsts:
+            self.chunks.look()
 
     def sync(self) -> None:
         """Syncs the directory: deleted files stay deleted after a power cut."""

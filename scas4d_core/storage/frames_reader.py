@@ -6,7 +6,6 @@ import json
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from io import BytesIO
 from pathlib import Path
 from typing import Any, Self
 
@@ -15,22 +14,9 @@ from numpy.typing import NDArray
 
 from scas4d_core.gaussians import FIXED
 from scas4d_core.storage.births import NO_EVENTS, Int
-from scas4d_core.storage.frame_files import (
-    Arrays,
-    DamagedFrameError,
-    FrameFiles,
-    HistoryError,
-    Stamp,
-    UnreadableFrameError,
-)
-from scas4d_core.storage.npz import member
+from scas4d_core.storage.frame_arrays import EFFECTS, EVENTS, Arrays, Stamp, unpacked
+from scas4d_core.storage.frame_files import DamagedFrameError, FrameFiles, HistoryError, UnreadableFrameError
 
-EVENTS = "events"
-"""Array of a frame's file: the log of births, retirements and revivals up to it; only where there are any."""
-EFFECTS = "effects"
-"""Array of a frame's file: what effects left of it for a cold start, the bytes of an npz; only where there is any."""
-EffectArrays = Mapping[str, Mapping[str, NDArray[Any]]]
-"""Arrays of effects, by effect and name."""
 FRAMES_KEPT = 4
 """Frames of a history on disk that stay in memory: the newest, and the last ones read."""
 
@@ -106,7 +92,7 @@ class FramesReader:
         added = []
         for index in changed:
             try:
-                self._times[index] = self._files.time(index)
+                self._times[index] = self._files.time(index, listed[index])
             except FileNotFoundError:  # deleted since it was listed
                 continue
             except ValueError as error:
@@ -120,6 +106,13 @@ class FramesReader:
         if added and not self._fixed:
             self._fixed = self._files.read_fixed(FIXED)
         return added, gone
+
+    def restamp(self, index: int) -> None:
+        """Notes that the state of a frame went to a chunk, from which it is read from now on."""
+        if self._files is not None and index in self._times and (stamp := self._files.chunks.stamp(index)) is not None:
+            self._stamps[index] = stamp
+            for kept in (self._frames, self._texts, self._packed):
+                kept.pop(index, None)
 
     def take_faults(self) -> dict[str, str]:
         """Files found damaged or gone since the last call, by name with the reason."""
@@ -224,7 +217,7 @@ class FramesReader:
             return log
         return NO_EVENTS
 
-    def _log_at(self, index: int) -> Int:
+    def log_at(self, index: int) -> Int:
         """The log as it was after a frame."""
         log = self._events()
         return log[log[:, 0] <= index] if len(log) else log
@@ -301,43 +294,3 @@ class FramesReader:
                 del self._frames[old]
                 self._texts.pop(old, None)
                 self._packed.pop(old, None)
-
-
-def packed(effects: EffectArrays) -> NDArray[np.uint8] | None:
-    """Arrays of effects as one array of bytes; None of none.
-
-    >>> unpacked(packed({"shadows": {"c.0": np.arange(3)}}))
-    {'shadows': {'c.0': array([0, 1, 2])}}
-    """
-    arrays: dict[str, Any] = {f"{name}.{key}": array for name, own in effects.items() for key, array in own.items()}
-    if not arrays:
-        return None
-    file = BytesIO()
-    np.savez(file, **arrays)
-    return np.frombuffer(file.getvalue(), np.uint8)
-
-
-def unpacked(given: NDArray[np.uint8] | None) -> dict[str, Arrays]:
-    """The arrays of effects, by effect and name, that were ``packed``."""
-    found: dict[str, Arrays] = {}
-    if given is not None:
-        with np.load(BytesIO(given.tobytes()), allow_pickle=False) as file:
-            for name in file.files:
-                effect, _, key = name.partition(".")
-                found.setdefault(effect, {})[key] = file[member(name)]
-    return found
-
-
-def as_written(
-    frame: Mapping[str, NDArray[Any]], time: float, report: bytes, log: Int, left: NDArray[np.uint8] | None
-) -> dict[str, Any]:
-    """The arrays of a frame's file.
-
-    Args:
-        log: up to it. left: what effects left of it, packed.
-    """
-    if len(log):
-        frame = {**frame, EVENTS: log}
-    if left is not None:
-        frame = {**frame, EFFECTS: left}
-    return {**frame, "time": np.float64(time), "report": np.frombuffer(report, np.uint8)}

@@ -21,11 +21,13 @@ from numpy.typing import NDArray
 
 from scas4d_core.gaussians import FIXED, PER_FRAME, UNBORN, WHOLES, Gaussians
 from scas4d_core.storage.births import FOUNDERLESS, Event, Int, births_in, events_of, retired_after
+from scas4d_core.storage.frame_arrays import Arrays, EffectArrays, as_written, packed
 from scas4d_core.storage.frame_aside import ScratchFile
-from scas4d_core.storage.frame_files import Arrays, DamagedFrameError, FrameFiles, HistoryError, UnreadableFrameError
-from scas4d_core.storage.frames_reader import FRAMES_KEPT, EffectArrays, as_written, packed
+from scas4d_core.storage.frame_files import DamagedFrameError, FrameFiles, HistoryError, UnreadableFrameError
+from scas4d_core.storage.frames_reader import FRAMES_KEPT
 from scas4d_core.storage.history_reader import ROOT, ROOTS, HistoryReader
 from scas4d_core.storage.npz import clear_parts
+from scas4d_core.storage.retention import surplus
 
 __all__ = [
     "FIXED", "FRAMES_KEPT", "NEWEST_KEPT", "PER_FRAME", "DamagedFrameError", "History", "HistoryError",
@@ -95,7 +97,7 @@ class History(HistoryReader):
         """A copy of some committed frames, in memory or in another directory; ids, births and lives are the same."""
         copy = History(directory)
         for index in sorted(set(indices)):
-            arrays, log = self.gaussians(index).arrays(), self._log_at(index)
+            arrays, log = self.gaussians(index).arrays(), self.log_at(index)
             frame = {name: np.array(arrays[name]) for name in (*PER_FRAME, *WHOLES) if name in arrays}
             births = {birth[0]: self._born(birth) for birth in births_in(log)}
             text, left = json.dumps(self.report(index)), self._left(index)
@@ -233,7 +235,7 @@ class History(HistoryReader):
         """Deletes the oldest states until the rules hold. Without a rule all stay.
 
         The first frame stays, because every update needs it, and so do the newest ``NEWEST_KEPT``, from which an
-        interrupted scene is resumed, whatever the rule.
+        interrupted scene is resumed, whatever the rule. The frames of a chunk go together, once ``last`` spares none.
 
         Args:
             last: states to keep besides the first.
@@ -248,18 +250,13 @@ class History(HistoryReader):
         for name, rule in (("last", last), ("size_bytes", size_bytes)):
             if rule is not None and rule < 1:
                 raise HistoryError(f"{name} is {rule}; keep at least 1, or give None to keep all")
-        candidates = self.indices[1:-NEWEST_KEPT]
-        surplus = 0 if last is None else max(0, len(self) - 1 - last)
-        excess = 0 if size_bytes is None else sum(size for size, _ in self._stamps.values()) - size_bytes
-        deleted: list[int] = []
-        for index in candidates:
-            if len(deleted) >= surplus and excess <= 0:
-                break
-            excess -= self._stamps[index][0]
-            if self._files is not None:
-                self._files.remove(index)
+        files = self._files
+        chunk_of = None if files is None else lambda index: files.chunk_of(index, self._stamps[index])
+        deleted = surplus(self.indices, lambda index: self._stamps[index][0], NEWEST_KEPT, last, size_bytes, chunk_of)
+        if files is not None:
+            files.remove_oldest(deleted)
+        for index in deleted:
             self._forget(index)
-            deleted.append(index)
         return deleted
 
     def put_aside(self, folder: Path) -> None:
@@ -321,7 +318,7 @@ class History(HistoryReader):
         if self._files is None or frame is None or text is None or index not in self._times:
             return False
         self._stamps[index] = self._files.write(
-            index, as_written(frame, self._times[index], text, self._log_at(index), self._left(index))
+            index, as_written(frame, self._times[index], text, self.log_at(index), self._left(index))
         )
         return True
 
@@ -339,7 +336,7 @@ class History(HistoryReader):
             HistoryError: the frame is not before the newest, or has another number of Gaussians.
         """
         assert self._files is not None
-        log = self._log_at(index)
+        log = self.log_at(index)
         if index >= self._newest() or len(arrays["means"]) != len(self._fixed_after(births_in(log))["ids"]):
             raise HistoryError(f"frame {index} cannot take the place of one that was committed")
         frame = {name: np.asarray(arrays[name]) for name in (*PER_FRAME, *WHOLES) if name in arrays}

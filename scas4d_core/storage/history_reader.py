@@ -55,7 +55,7 @@ class HistoryReader(FramesReader):
             self._keep(index, frame)
         else:
             self._frames.move_to_end(index)
-        log = self._log_at(index)
+        log = self.log_at(index)
         if not len(log):
             return Gaussians(**frame, **self._fixed)
         fixed = self._fixed_after(births_in(log))
@@ -77,7 +77,7 @@ class HistoryReader(FramesReader):
         Raises:
             HistoryError: the first frame cannot be read, or what is kept of a birth.
         """
-        log = self._events() if index is None else self._log_at(index)
+        log = self._events() if index is None else self.log_at(index)
         if not len(log):
             return self.first
         roots, births = self.gaussians(self.indices[0]), births_in(log)
@@ -93,7 +93,7 @@ class HistoryReader(FramesReader):
 
         Where that came back is not kept apart: it is shown as in the next frame that can be read.
         """
-        log = self._log_at(index)
+        log = self.log_at(index)
         for birth in births_in(log):
             born = self._born(birth)
             if self.rows_of(birth[1:2])[0] >= len(state):
@@ -156,7 +156,7 @@ class HistoryReader(FramesReader):
             HistoryError: the frame was not committed.
         """
         self._require(index)
-        log, ids = self._log_at(index), self.ids
+        log, ids = self.log_at(index), self.ids
         there = ~retired_after(log, ids)
         there[len(self._fixed_after(births_in(log))["ids"]) :] = False
         return there

@@ -17,7 +17,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.remake import remake
 from scas4d_core.settings import Settings
-from scas4d_core.storage.frames_reader import packed, unpacked
+from scas4d_core.storage.frame_arrays import packed, unpacked
 from scas4d_core.storage.history import History
 from scas4d_core.storage.npz import read_npz, write_npz
 

@@ -1,0 +1,269 @@
+"""Chunks: compact files in the folder of a history that hold older frames, one after the other. Numpy, zstandard.
+
+``states_<index>.s4d`` begins with the frame of that index. A frame is in a chunk when its state's record is whole; the
+note before it is the frame's report. Where a frame has a file of its own, too, that holds. What is exact of a chunk's
+frames stays elsewhere: ids and opacities with the first frame and the births, who is retired in the log of later ones.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import weakref
+from bisect import bisect_right, insort
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scas4d_core.compact import CompactReader, FileError
+from scas4d_core.storage.births import Int
+from scas4d_core.storage.frame_arrays import EVENTS, Arrays, Stamp
+
+REPORT = "report"
+"""Name of the report in a frame's note."""
+READERS = 2
+"""Chunks that stay open in a process, each with a state: tracks read through one, views jump."""
+_CHUNK_FILE = re.compile(r"states_(\d{6,})\.s4d")
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """A compact file of a history.
+
+    Attributes:
+        path: of it. size, changed: bytes, and time of change in ns, when it was looked at.
+        times: seconds of its frames by index. stamps: of its frames: bytes of the file that they take, and −1 less
+            the checksum of the state, which no file of a frame of its own has.
+        damage: why frames after those are not listed; None where nothing is wrong.
+    """
+
+    path: Path
+    size: int
+    changed: int
+    times: dict[int, float] = field(default_factory=dict)
+    stamps: dict[int, Stamp] = field(default_factory=dict)
+    damage: str | None = None
+
+    @property
+    def first(self) -> int:
+        """Its first frame."""
+        return min(self.times)
+
+
+class Chunks:
+    """Reads the chunks in a folder.
+
+    Args:
+        directory: of the history.
+
+    Attributes:
+        known: chunks by the index of their first frame, as of the last ``look``.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self.known: dict[int, Chunk] = {}
+        self._firsts: list[int] = []
+        self._readers: OrderedDict[Path, tuple[Chunk, CompactReader]] = OrderedDict()
+        weakref.finalize(self, _close_all, self._readers)
+
+    def look(self, names: Iterable[str] | None = None) -> None:
+        """Picks up chunks that are new, grew or are gone; others stay unopened.
+
+        Args:
+            names: of the files in the folder, where they are known.
+        """
+        listed = os.listdir(self.directory) if names is None else names
+        firsts = sorted(first for name in listed if (first := chunk_of(name)) is not None)
+        found = {first: chunk for first in firsts if (chunk := self._looked_at(first)) is not None}
+        for first in self.known.keys() - found.keys():
+            self._close(self.known[first].path)
+        self.known, self._firsts = found, list(found)
+
+    def look_at(self, first: int) -> None:
+        """Picks up the chunk that begins with a frame, which is new or grew."""
+        if (chunk := self._looked_at(first)) is not None:
+            self.known[first] = chunk
+            if first not in self._firsts:
+                insort(self._firsts, first)
+
+    def _looked_at(self, first: int) -> Chunk | None:
+        path = self.directory / chunk_file(first)
+        try:
+            status = path.stat()
+        except FileNotFoundError:  # deleted meanwhile
+            return None
+        known = self.known.get(first)
+        if known is not None and (known.size, known.changed) == (status.st_size, status.st_mtime_ns):
+            return known
+        return _listed(path, status)
+
+    def __contains__(self, index: object) -> bool:
+        return isinstance(index, int) and self.of(index) is not None
+
+    def __iter__(self) -> Iterator[int]:
+        return (index for first in self._firsts for index in self.known[first].times)
+
+    def of(self, index: int) -> Chunk | None:
+        """The chunk that holds a frame, as of the last look; None where there is none."""
+        place = bisect_right(self._firsts, index) - 1
+        chunk = self.known[self._firsts[place]] if place >= 0 else None
+        return chunk if chunk is not None and index in chunk.times else None
+
+    def stamp(self, index: int) -> Stamp | None:
+        """The stamp of a frame; None where no chunk has it."""
+        return None if (chunk := self.of(index)) is None else chunk.stamps[index]
+
+    def time(self, index: int) -> float | None:
+        """Seconds of a frame; None where no chunk has it."""
+        return None if (chunk := self.of(index)) is None else chunk.times[index]
+
+    def stamps(self) -> dict[int, Stamp]:
+        """The stamps of all frames, rising."""
+        return {index: stamp for first in self._firsts for index, stamp in self.known[first].stamps.items()}
+
+    @property
+    def damages(self) -> list[str]:
+        """A sentence for each chunk that is damaged so that frames of it are not listed."""
+        return [chunk.damage for chunk in self.known.values() if chunk.damage is not None]
+
+    def read(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
+        """Arrays of a frame, as its own file would have them; ``report`` is its note.
+
+        Raises:
+            FileNotFoundError: no chunk has it. FileError: it cannot be read.
+        """
+        if (chunk := self.of(index)) is None:
+            self.look()
+            if (chunk := self.of(index)) is None:
+                raise FileNotFoundError(f"frame {index} is in no chunk")
+        found: Arrays = {}
+        asked = {*names, *optional}
+        if "time" in asked:
+            found["time"] = np.asarray(chunk.times[index], np.float64)
+        if asked <= {"time"}:
+            return found
+        reader = self._reader(chunk)
+        if "report" in asked:
+            text = json.dumps(reader.note(index).get(REPORT, {}))
+            found["report"] = np.frombuffer(text.encode(), np.uint8)
+        if EVENTS in asked and len(log := _log(reader, index)):
+            found[EVENTS] = log
+        if asked - {"time", "report", EVENTS}:
+            arrays = reader.state(index).arrays()
+            found |= {name: arrays[name] for name in asked & arrays.keys()}
+        if missing := set(names) - found.keys():
+            raise FileError(f"{chunk.path.name}: frame {index} has no {', '.join(sorted(missing))}")
+        return found
+
+    def reader(self, index: int) -> CompactReader:
+        """An open reader of the chunk that holds a frame; it is this object's own.
+
+        Raises:
+            FileNotFoundError: no chunk has it. FileError: it cannot be opened.
+        """
+        if (chunk := self.of(index)) is None:
+            raise FileNotFoundError(f"frame {index} is in no chunk")
+        return self._reader(chunk)
+
+    def _reader(self, chunk: Chunk) -> CompactReader:
+        known = self._readers.get(chunk.path)
+        if known is None or known[0] is not chunk:
+            self._close(chunk.path)
+            known = self._readers[chunk.path] = chunk, CompactReader(chunk.path)
+        self._readers.move_to_end(chunk.path)
+        while len(self._readers) > READERS:
+            self._readers.popitem(last=False)[1][1].close()
+        return known[1]
+
+    def _close(self, path: Path) -> None:
+        if (known := self._readers.pop(path, None)) is not None:
+            known[1].close()
+
+    def fault(self, index: int) -> str | None:
+        """Reads all that a frame in a chunk needs, from the disk; returns its fault, None where it is whole."""
+        if (chunk := self.of(index)) is None:
+            return f"frame {index} is gone"
+        self._close(chunk.path)
+        try:
+            self.read(index, ("means", "report"))
+        except (FileNotFoundError, FileError) as error:
+            return str(error)
+        return None
+
+    def remove(self, first: int) -> None:
+        """Deletes the chunk that begins with a frame."""
+        (self.directory / chunk_file(first)).unlink(missing_ok=True)
+
+    def cut(self, index: int) -> None:
+        """Takes a frame, and those after it, out of the chunk that holds it, which has no index then."""
+        if (chunk := self.of(index)) is None:
+            return
+        self._close(chunk.path)
+        if index == chunk.first:
+            chunk.path.unlink(missing_ok=True)
+        else:
+            with CompactReader(chunk.path) as reader:
+                end = reader.end_before(index)
+            with chunk.path.open("r+b") as file:
+                file.truncate(end)
+                os.fsync(file.fileno())
+        self.look()
+
+
+def _close_all(readers: OrderedDict[Path, tuple[Chunk, CompactReader]]) -> None:
+    for _, reader in readers.values():
+        reader.close()
+
+
+def note_of(report: Mapping[str, Any], log: Int, index: int, first: bool) -> dict[str, Any]:
+    """The note on a frame: its report, and the events of its log.
+
+    Args:
+        log: [E, 4] up to it. first: of the chunk: then all of the log, so that no other chunk is needed for it.
+    """
+    own = log if first else log[log[:, 0] == index]
+    return {REPORT: dict(report), **({EVENTS: own.tolist()} if len(own) else {})}
+
+
+def _log(reader: CompactReader, index: int) -> Int:
+    """The log up to a frame."""
+    rows = [row for frame in reader.frames if frame <= index for row in reader.note(frame).get(EVENTS, ())]
+    return np.array(rows, np.int64).reshape(-1, 4)
+
+
+def chunk_file(first: int) -> str:
+    """Name of the chunk that begins with a frame.
+
+    >>> chunk_of(chunk_file(121))
+    121
+    """
+    return f"states_{first:06d}.s4d"
+
+
+def chunk_of(name: str) -> int | None:
+    """Index of the first frame in a chunk of this name; None for other files."""
+    match = _CHUNK_FILE.fullmatch(name)
+    return int(match[1]) if match else None
+
+
+def in_chunk(stamp: Stamp) -> bool:
+    """True for the stamp of a frame that is in a chunk."""
+    return stamp[1] < 0
+
+
+def _listed(path: Path, status: os.stat_result) -> Chunk:
+    """Looks at a chunk; one that cannot be opened has no frames."""
+    size, changed = status.st_size, status.st_mtime_ns
+    try:
+        with CompactReader(path) as reader:
+            times = dict(zip(reader.frames, reader.times.tolist(), strict=True))
+            stamps = {index: (taken, -1 - checksum) for index, taken, checksum in reader.sizes()}
+            return Chunk(path, size, changed, times, stamps, reader.damage)
+    except (FileError, FileNotFoundError) as error:
+        return Chunk(path, size, changed, damage=str(error))

@@ -1,0 +1,170 @@
+"""Compaction: older states go from files of their own to chunks, frame by frame. Numpy, zstandard.
+
+The first frame and the newest stay exact: updates, replays and a restart need their bits. A frame is appended to a
+chunk and synced, with its report as the note, and then its own file goes: whatever ends the process meanwhile, each
+frame is read, and what a chunk holds is the same bytes. A past view changes once at most.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from scas4d_core.compact import CompactWriter, FileError, Head
+from scas4d_core.storage.chunks import chunk_file, note_of
+from scas4d_core.storage.frame_files import HistoryError
+from scas4d_core.storage.history import NEWEST_KEPT, History
+from scas4d_core.storage.npz import sync_folder
+
+CHUNK_FRAMES = 120
+"""Frames of a chunk: its first state takes as much as five to ten of the others, and retention deletes it whole."""
+
+log = logging.getLogger("scas4d.storage")
+
+
+class Compaction:
+    """Moves the oldest exact states of a history to chunks. For the process that appends to it.
+
+    Args:
+        history: in a directory. head: returns what holds for all states, bounds included; asked when a chunk begins.
+        exact: the newest states that stay as they are, ``NEWEST_KEPT`` at least.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> from scas4d_core.cameras import WorldFrame
+    >>> from scas4d_core.gaussians import Gaussians
+    >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
+    >>> with TemporaryDirectory() as folder:
+    ...     history = History(folder)
+    ...     for index in range(6):
+    ...         history.append(index, index / 30, state)
+    ...     compaction = Compaction(history, lambda: Head(WorldFrame(np.zeros(3))), exact=2)
+    ...     moved = [compaction.step() for _ in range(4)]
+    ...     compaction.close()
+    ...     moved, sorted(path.name for path in history.directory.glob("[fs]*_00000[1-5].*"))
+    ([1, 2, 3, None], ['frame_000004.npz', 'frame_000005.npz', 'states_000001.s4d'])
+    """
+
+    def __init__(self, history: History, head: Callable[[], Head], exact: int) -> None:
+        assert history.files is not None
+        self.exact = max(exact, NEWEST_KEPT)
+        self._history, self._files, self._head = history, history.files, head
+        self._writer: CompactWriter | None = None
+        self._first = -1
+        """First frame of the chunk that is written."""
+        self._passed = max(history.files.chunks, default=-1)
+        """The last frame that is in a chunk, or that cannot be."""
+        if self._passed >= 0:
+            self._complete(self._passed)
+
+    @property
+    def due(self) -> int:
+        """How many states are to be moved."""
+        return len(self._waiting())
+
+    def step(self) -> int | None:
+        """Moves one state; returns its frame, or None where none is due.
+
+        Raises:
+            OSError: the disk is full, or fails; nothing is lost, and the next step tries again.
+        """
+        for index in self._waiting():
+            try:
+                self._move(index)
+            except OSError:
+                self._drop()
+                raise
+            except (HistoryError, FileError) as error:  # damaged, or it cannot be told: it stays as it is
+                log.warning("frame %d is not compacted: %s", index, error)
+                self._drop()
+                self._passed = index
+                continue
+            return index
+        return None
+
+    def close(self) -> None:
+        """Leaves the chunk that is being written as it is; another ``Compaction`` goes on with it."""
+        self._drop()
+
+    def _complete(self, index: int) -> None:
+        """Deletes the file of the last frame in a chunk, which a stop left beside it."""
+        path = self._files.path(index)
+        if path.exists() and index != self._history.indices[0] and self._files.chunks.fault(index) is None:
+            path.unlink()
+            self._history.restamp(index)
+
+    def _waiting(self) -> list[int]:
+        indices = self._history.indices
+        end = len(indices) - self.exact
+        if end < 2 or indices[end - 1] <= self._passed:
+            return []
+        begin = next(place for place in range(end, 0, -1) if place == 1 or indices[place - 1] <= self._passed)
+        return indices[begin:end]
+
+    def _move(self, index: int) -> None:
+        history, files = self._history, self._files
+        state, time = history.gaussians(index), history.time(index)
+        report, log = history.report(index), history.log_at(index)
+        writer = self._writer or self._resumed()
+        if writer is None or not self._fits(writer, index):
+            self._finish(writer)
+            writer = self._begun(index)
+        self._writer = writer
+        try:
+            writer.add(index, time, state, note=note_of(report, log, index, index == self._first))
+        except FileError:
+            if index == self._first or not writer.frames:
+                raise
+            self._finish(writer)  # other Gaussians than before: a chunk of its own may hold it
+            writer = self._writer = self._begun(index)
+            writer.add(index, time, state, note=note_of(report, log, index, index == self._first))
+        writer.sync()
+        files.chunks.look_at(self._first)
+        if index not in files.chunks:
+            raise FileError(f"{writer.path.name}: frame {index} is not in it after it was written")
+        files.path(index).unlink(missing_ok=True)
+        history.restamp(index)
+        self._passed = index
+
+    def _fits(self, writer: CompactWriter, index: int) -> bool:
+        return writer.frames < CHUNK_FRAMES and writer.last_frame < index
+
+    def _resumed(self) -> CompactWriter | None:
+        """The newest chunk, to go on with, where it has not ended and was begun with the same bounds."""
+        known = self._files.chunks.known
+        if not known:
+            return None
+        self._first = max(known)
+        try:
+            writer = CompactWriter.resume(known[self._first].path)
+        except (FileError, FileNotFoundError):
+            return None
+        if writer.head.text() != self._head().text():
+            self._finish(writer)
+            return None
+        return writer
+
+    def _begun(self, index: int) -> CompactWriter:
+        self._first = index
+        path: Path = self._files.directory / chunk_file(index)
+        path.unlink(missing_ok=True)  # one without a whole state: a stop came between its beginning and its end
+        writer = CompactWriter(path, self._head())
+        sync_folder(path.parent)
+        return writer
+
+    def _finish(self, writer: CompactWriter | None) -> None:
+        """Ends a chunk with its index."""
+        if writer is not None:
+            writer.close()
+            with writer.path.open("rb") as file:
+                os.fsync(file.fileno())
+            self._files.chunks.look()
+        self._writer = None
+
+    def _drop(self) -> None:
+        """Lets go of the chunk that is being written; a half-written record is cut off when it is gone on with."""
+        if self._writer is not None:
+            self._writer.abandon()
+        self._writer = None
