@@ -126,6 +126,7 @@ def edit_scene(
     archived: bool | None = None,
     keep_frames: Retention | None = None,
     keep_states: Retention | None = None,
+    exact_states: int | None = None,
 ) -> Call[SceneStatus]:
     """Renames a scene, archives it or takes that back, or changes what it keeps; what is None stays.
 
@@ -133,6 +134,7 @@ def edit_scene(
         id: of the scene. name: for people.
         archived: True: it takes no further frames, and sleeps unless it is looked at.
         keep_frames, keep_states: rules for pictures and committed states, as in `IngestSettings`; they hold at once.
+        exact_states: so many newest states stay exact, older ones go to compact files.
 
     >>> from client.wire import Retention
     >>> new = client.create_scene(rig)
@@ -140,7 +142,9 @@ def edit_scene(
     'rehearsal'
     >>> client.delete_scene(new.id)
     """
-    edit = SceneEdit(name=name, archived=archived, keep_frames=keep_frames, keep_states=keep_states)
+    edit = SceneEdit(
+        name=name, archived=archived, keep_frames=keep_frames, keep_states=keep_states, exact_states=exact_states
+    )
     return Call("PATCH", path(id), reads(SceneStatus), arguments=body(edit))
 
 

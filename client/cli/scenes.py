@@ -109,12 +109,17 @@ def keep(
         str | None,
         typer.Option(metavar="COUNT|all", help="Keep so many committed states, the last; others are deleted for good."),
     ] = None,
+    exact: Annotated[
+        int | None,
+        typer.Option(min=24, metavar="COUNT", help="Keep so many states exact; older ones go to compact files."),
+    ] = None,
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:
     """Changes how many pictures and committed states a scene keeps; it holds at once."""
+    kept_frames, kept_states = _rule("--frames", frames), _rule("--states", states)
     with Client(url, token=token) as client:
-        _told(client.edit_scene(scene, keep_frames=_rule("--frames", frames), keep_states=_rule("--states", states)))
+        _told(client.edit_scene(scene, keep_frames=kept_frames, keep_states=kept_states, exact_states=exact))
 
 
 @app.command()

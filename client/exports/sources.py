@@ -64,11 +64,13 @@ class CompactStates:
     @classmethod
     def of(cls, name: str, beside: Path, files: Sequence[Path]) -> CompactStates:
         """Looks at each file."""
-        heads, frames, damages = [], [], []
+        heads: list[Head] = []
+        frames: list[int] = []
+        damages: list[str] = []
         for file in files:
             with CompactReader(file) as reader:
                 heads.append(reader.head)
-                frames += reader.frames
+                frames += [index for index in reader.frames if not frames or index > frames[-1]]
                 damages += [] if reader.damage is None else [reader.damage]
         return cls(name, beside, files, heads[0], frames, damages[0] if damages else None)
 
@@ -78,11 +80,13 @@ class CompactStates:
             return reader.parts()
 
     def states(self, low: int, high: int) -> Iterator[tuple[int, float, Gaussians]]:
-        """Index, time in seconds and state of the frames from ``low`` to ``high``."""
+        """Index, time in seconds and state of the frames from ``low`` to ``high``, each once."""
+        last = low - 1
         for file in self.files:
             with CompactReader(file) as reader:
                 for index, time in zip(reader.frames, reader.times.tolist(), strict=True):
-                    if low <= index <= high:
+                    if last < index <= high:
+                        last = index
                         yield index, time, reader.state(index)
 
 

@@ -45,6 +45,7 @@ from client.wire.scenes import (
     SceneList,
     SceneState,
     SceneStatus,
+    StateBounds,
 )
 from client.wire.service import Health, ProblemDetails, Share, ShareRequest, Ticket
 from client.wire.tracks import GaussianModel, GaussiansModel, TracksModel, TracksRequest, tracks_model
@@ -120,6 +121,7 @@ __all__ = [
     "SceneStatus",
     "Share",
     "ShareRequest",
+    "StateBounds",
     "Ticket",
     "TimeModel",
     "TracksModel",

@@ -27,6 +27,17 @@ class Retention(Model):
         return self
 
 
+class StateBounds(Model):
+    """The largest error that a state may have once it is in a compact file (docs/format.md)."""
+
+    position: float = Field(default=0.04, ge=1e-6, le=1, description="Of a centre, in the Gaussian's own size.")
+    axes: float = Field(default=0.06, ge=1e-6, le=1, description="Of its axes, in the same.")
+    rotation: float = Field(default=0.05, ge=0.002, le=1, description="Of its material rotation, radians.")
+    colour: float = Field(default=0.012, ge=1e-6, le=1, description="Of a channel, where colours are 0 to 1.")
+    gloss: float = Field(default=0.01, ge=1e-6, le=1, description="Of a component of its gloss.")
+    opacity: float = Field(default=0.0005, ge=1e-6, le=1, description="In files that are taken away; here it is exact.")
+
+
 class IngestSettings(Model):
     """Rules of a scene for frames that are sent, and for what it keeps of them."""
 
@@ -53,8 +64,18 @@ class IngestSettings(Model):
         default=Retention(last=32), description="Pictures as they came; those not yet committed are always kept."
     )
     keep_states: Retention = Field(
-        default=Retention(), description="Committed states; the first and the two newest are always kept."
+        default=Retention(),
+        description="Committed states; the first and the two newest are always kept. Those of a compact file, at most "
+        "120, go together.",
     )
+    exact_states: int | None = Field(
+        default=48,
+        ge=24,
+        le=1_000_000,
+        description="So many newest states stay exact; older ones go to compact files, within `state_bounds`, a "
+        "twentieth of the size. null: all stay exact.",
+    )
+    state_bounds: StateBounds = StateBounds()
 
 
 class SceneCreate(Model):
@@ -88,11 +109,17 @@ class SceneEdit(Model):
     keep_states: Retention | None = Field(
         default=None, description="As in `ingest`; holds at once: states beyond it are deleted for good."
     )
+    exact_states: int | None = Field(
+        default=None,
+        ge=24,
+        le=1_000_000,
+        description="As in `ingest`; older states go to compact files when the worker is idle, and stay there.",
+    )
 
     @model_validator(mode="after")
     def _changes_something(self) -> SceneEdit:
         if all(value is None for _, value in self):
-            raise InputError("nothing is to be changed", "give name, archived, keep_frames or keep_states")
+            raise InputError("nothing is to be changed", "give name, archived, keep_frames, keep_states, exact_states")
         return self
 
 

@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from pathlib import Path
 from typing import BinaryIO
 
 MAGIC = b"s4dR"
@@ -110,6 +111,18 @@ def scan(file: BinaryIO, offset: int, name: str) -> Iterator[Record]:
             return
         yield record
         offset = record.end
+
+
+def checked_records(path: Path) -> Iterator[int]:
+    """Reads all whole records of a file, and yields the bytes of each.
+
+    Raises:
+        FileNotFoundError: it is not there. DamagedFileError: a record is damaged.
+    """
+    with path.open("rb") as file:
+        for record in scan(file, 0, path.name):
+            read_body(file, record, path.name)
+            yield record.size
 
 
 def parse_head(data: bytes, offset: int, name: str) -> Record:

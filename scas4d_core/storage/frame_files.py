@@ -250,6 +250,14 @@ class FrameFiles:
         self.path(index).unlink(missing_ok=True)
         self.chunks.cut(index)
 
+    def compacted(self, index: int) -> bool:
+        """True for a frame that is in a chunk, and has no file of its own."""
+        if self.path(index).exists():
+            return False
+        if index not in self.chunks:
+            self.chunks.look()
+        return index in self.chunks
+
     def chunk_of(self, index: int, stamp: Stamp) -> int | None:
         """First frame of the chunk that a frame with this stamp is in; None for one with a file of its own."""
         chunk = self.chunks.of(index) if in_chunk(stamp) else None

@@ -107,6 +107,15 @@ class FramesReader:
             self._fixed = self._files.read_fixed(FIXED)
         return added, gone
 
+    @property
+    def unlisted(self) -> list[str]:
+        """A sentence for each compact file that is damaged so that frames of it are not among ``indices``."""
+        return [] if self._files is None else self._files.chunks.damages
+
+    def compacted(self, index: int) -> bool:
+        """True for a committed frame that is in a chunk by now."""
+        return index in self._times and self._files is not None and self._files.compacted(index)
+
     def restamp(self, index: int) -> None:
         """Notes that the state of a frame went to a chunk, from which it is read from now on."""
         if self._files is not None and index in self._times and (stamp := self._files.chunks.stamp(index)) is not None:

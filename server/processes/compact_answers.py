@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
-from scas4d_core.compact import CompactWriter, Head
+from scas4d_core.compact import CompactWriter, FileError, Head
 from scas4d_core.first_frame.calibration.record import in_use
 from scas4d_core.storage.history import History
 from server.processes.messages import SceneSpec
@@ -26,19 +27,49 @@ def compact_head(spec: SceneSpec, history: History) -> Head:
     )
 
 
-def write_compact(file: Path, history: History, asked: Sequence[int], head: Head, labels: NDArray[Any] | None) -> None:
+def write_compact(file: Path, history: History, asked: Sequence[int], head: Head, labels: NDArray[Any] | None) -> int:
     """Writes committed frames, each read when it is its turn; those that retention has deleted since are left out.
+
+    What the scene keeps in a compact file already is copied with its bits; a file that begins so may have frames before
+    those asked for, by which they are told, and it ends with that compact file.
 
     Args:
         file: replaced where it is there. asked: frames, rising. labels: [N] part of each Gaussian, or None.
+
+    Returns:
+        The last frame in the file.
 
     Raises:
         HistoryError: none of the frames is there any more, or one cannot be read.
     """
     file.unlink(missing_ok=True)
-    frames = [index for index in asked if index in history] or asked[:1]
-    with CompactWriter(file, head) as writer:
-        for index in frames:
-            writer.add(index, history.time(index), history.gaussians(index))
-        if labels is not None:
-            writer.add_parts(frames[-1], fitted(labels, len(history.gaussians(frames[-1]))))
+    frames = [index for index in asked if index in history] or list(asked[:1])
+    last = _copied(file, history, frames)
+    if last is None:
+        frames = list(takewhile(lambda index: index == frames[0] or not history.compacted(index), frames))
+        with CompactWriter(file, head) as writer:
+            for index in frames:
+                writer.add(index, history.time(index), history.gaussians(index))
+            last = frames[-1]
+            _add_parts(writer, history, last, labels)
+    else:
+        with CompactWriter.resume(file) as writer:
+            _add_parts(writer, history, last, labels)
+    return last
+
+
+def _copied(file: Path, history: History, frames: Sequence[int]) -> int | None:
+    """Copies frames out of the compact file that holds the first of them; returns the last, None where none does."""
+    if history.files is None or not history.compacted(frames[0]):
+        return None
+    try:
+        with file.open("wb") as copy:
+            return history.files.chunks.reader(frames[0]).copied(frames[0], frames[-1], copy)[-1]
+    except (FileError, FileNotFoundError):  # reading the states says what is wrong, and reports it
+        file.unlink(missing_ok=True)
+        return None
+
+
+def _add_parts(writer: CompactWriter, history: History, last: int, labels: NDArray[Any] | None) -> None:
+    if labels is not None:
+        writer.add_parts(last, fitted(labels, len(history.gaussians(last))))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from client.wire import Budget, Retention
+from client.wire import Budget, IngestSettings
 from scas4d_core.cameras import Rig
 from scas4d_core.settings import Settings
 from server.storage.layout import SceneFolder
@@ -20,7 +20,7 @@ class SceneSpec:
     rig: Rig
     settings: Settings
     minimum_cameras: int = 1
-    keep_states: Retention = field(default_factory=Retention)
+    kept: IngestSettings = field(default_factory=IngestSettings)
     frames_per_second: float | None = None
 
 
@@ -29,9 +29,9 @@ class SceneSpec:
 
 @dataclass(frozen=True)
 class KeepStates:
-    """Another rule for states from now on."""
+    """Other rules for states from now on."""
 
-    rule: Retention
+    rules: IngestSettings
 
 
 @dataclass(frozen=True)

@@ -202,14 +202,17 @@ class Renderer:
             case CompactQuery():
                 parts = self.labels(None) if query.parts and self.history.newest.moving.any() else None
                 head = compact_head(self.spec, self.history)
-                return self._file(number, lambda file: write_compact(file, self.history, query.frames, head, parts))
+                return self._file(
+                    number,
+                    lambda file: {"X-Last-Frame": str(write_compact(file, self.history, query.frames, head, parts))},
+                )
 
-    def _file(self, number: int, write: Callable[[Path], None]) -> Answer:
-        """Answers with the file that is written to a path, and removes it."""
+    def _file(self, number: int, write: Callable[[Path], dict[str, str] | None]) -> Answer:
+        """Answers with the file that is written to a path, and the headers that this returns; removes it."""
         file = self.spec.folder.export
         try:
-            write(file)
-            return Answer(number, file.read_bytes(), BYTES)
+            headers = write(file) or {}
+            return Answer(number, file.read_bytes(), BYTES, headers)
         finally:
             file.unlink(missing_ok=True)
 

@@ -24,6 +24,7 @@ from scas4d_core.captures.images import ImageError, decode_image, decode_mask
 from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.storage.npz import read_npz
+from server.processes.compacting import Compacting
 from server.processes.kernels import wait_for_first, wait_for_updates
 from server.processes.messages import (
     Broken,
@@ -110,6 +111,7 @@ class Worker:
         self._write_seconds: float | None = None
         self._publish_seconds = 0.0
         self._later: deque[Any] = deque()
+        self._compacting = Compacting(spec)
 
     def open(self) -> bool:
         """Resumes from the committed states and reports them; returns False if that cannot be done."""
@@ -156,7 +158,8 @@ class Worker:
             stall = min(2 * stall, LONGEST_STALL_S)
 
     def next(self) -> Any:
-        """Returns the next message; those that came while a frame waited for room go first."""
+        """Returns the next message; those that came while a frame waited for room go first. Compacts meanwhile."""
+        self._compacting.meanwhile(self.states, lambda: bool(self._later) or self.connection.poll(0))
         return self._later.popleft() if self._later else self.connection.recv()
 
     def _await_room(self, seconds: float) -> None:
@@ -198,8 +201,9 @@ class Worker:
             return FrameFailed(message.index, f"{type(error).__name__}: {message_of(error)}", dropped, fatal=first)
 
     def keep(self, message: KeepStates) -> None:
-        """Keeps states by another rule, and reports which that deletes."""
-        self.spec = replace(self.spec, keep_states=message.rule)
+        """Keeps states by other rules, and reports which that deletes."""
+        self.spec = replace(self.spec, kept=message.rules)
+        self._compacting.keep(message.rules)
         self.connection.send(StatesRetained(tuple(self.retain())))
 
     def mend(self, message: Mend) -> None:
@@ -258,9 +262,7 @@ class Worker:
     def retain(self) -> list[int]:
         """Deletes old states by the scene's rule and returns their indices; failures are tried again next time."""
         assert self.states is not None
-        rule = self.spec.keep_states
-        if rule.last is None and rule.bytes is None:
-            return []
+        rule = self.spec.kept.keep_states
         last, size = (None if value is None else max(1, value) for value in (rule.last, rule.bytes))
         return self.states.retain(last=last, size_bytes=size)
 

@@ -64,10 +64,10 @@ def mend(history: History, reconstruction: Reconstruction | None, message: Mend)
 def _mend(
     history: History, files: FrameFiles, reconstruction: Reconstruction | None, name: str, message: Mend
 ) -> tuple[MendOutcome, str]:
-    fault = fault_of(files.directory / name)
+    index, known = frame_of(name), history.indices
+    fault = fault_of(files.directory / name) if index is None else files.fault(index)
     if fault is None:
         return MendOutcome.WHOLE, ""
-    index, known = frame_of(name), history.indices
     birth = born_of(name)
     if birth is not None and birth not in history.born_at:  # of a frame that was taken back
         return MendOutcome.GONE, ""
@@ -122,7 +122,7 @@ def remake(spec: SceneSpec, history: History, message: Remake, decode: Decode) -
     assert history.files is not None
     name = history.files.path(index).name
     base = history.files.path(message.base).name
-    if (fault := fault_of(history.files.directory / base)) is not None:
+    if (fault := history.files.fault(message.base)) is not None:
         for mended in mend(history, None, Mend((base,), {}, {})):
             yield mended
             match mended.outcome:

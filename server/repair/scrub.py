@@ -15,7 +15,9 @@ from functools import partial
 from pathlib import Path
 
 from client.wire import FrameState
+from scas4d_core.compact import checked_records
 from scas4d_core.errors import message_of
+from scas4d_core.storage.chunks import Chunk
 from scas4d_core.storage.frame_files import (
     FIRST_COPY,
     FIXED_COPY,
@@ -145,10 +147,31 @@ class Scrub:
         newest = checkpoint_file(ledger.committed[-1])
         if listed and not self._at_work() and not await asyncio.to_thread((folder / newest).exists):
             self._noticed({newest: f"{newest} is gone"})
+        await asyncio.to_thread(files.chunks.look)
         for index in reversed(committed):
-            await self._state(files.path(index), partial(ledger.committed.__contains__, index))
+            if index in files.chunks and not files.path(index).exists():
+                continue
+            await self._state(files.path(index), partial(self._expected, files, index))
             if index not in committed[-FRAMES_KEPT:]:
                 await asyncio.to_thread(_forget, files.path(index))
+        for chunk in list(files.chunks.known.values()):
+            if await self._read(checked_records(chunk.path)) not in (None, GONE):
+                await self._scrub_frames_of(files, chunk)
+            await asyncio.to_thread(_forget, chunk.path)
+
+    async def _scrub_frames_of(self, files: FrameFiles, chunk: Chunk) -> None:
+        """Notices the frames of a damaged chunk that cannot be read."""
+        for index in chunk.times:
+            fault = await asyncio.to_thread(files.chunks.fault, index)
+            if fault is not None and index in self._ledger.committed and not files.path(index).exists():
+                self._noticed({files.path(index).name: fault})
+
+    def _expected(self, files: FrameFiles, index: int) -> bool:
+        """True for a committed frame that has not gone to a chunk since it was listed."""
+        if index in self._ledger.committed:
+            files.chunks.look()
+            return index not in files.chunks
+        return False
 
     async def _state(self, path: Path, expected: Callable[[], bool]) -> None:
         """Scrubs one file; `expected`: returns whether a missing file is damage."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import AsyncIterator
 from typing import Annotated, Any
 
@@ -186,10 +186,11 @@ async def ply(scene: TheScene, n: FrameIndex, request: Request) -> Response:
             "content": {"application/octet-stream": {}},
             "description": "A compact 4D file (docs/format.md).",
             "headers": {
+                "X-Last-Frame": {"schema": {"type": "integer"}, "description": "The last frame of the answer."},
                 "X-Next-Frame": {
                     "schema": {"type": "integer"},
                     "description": "The committed frame to go on with as `first`; absent where there is none.",
-                }
+                },
             },
         }
     },
@@ -201,7 +202,11 @@ async def compact(
     limit: Annotated[int, Query(ge=1, le=MOST_STATES, description="Frames at most.")] = MOST_STATES,
     parts: Annotated[bool, Query(description="With the parts of all Gaussians, as they are seen now.")] = False,
 ) -> Response:
-    """Exports committed frames as a compact 4D file, which `scas4d export` turns into other formats."""
+    """Exports committed frames as a compact 4D file, which `scas4d export` turns into other formats.
+
+    Frames that the scene keeps in a compact file already come with the same bits: the answer ends where that file does,
+    and may begin with earlier frames, by which those asked for are told.
+    """
     scene.committed_frame(None, "first")
     begin = bisect_left(scene.committed, first)
     frames = tuple(scene.committed[begin : begin + limit])
@@ -213,9 +218,10 @@ async def compact(
             value=first,
             remedy=f"ask within {scene.committed[0]} to {scene.committed[-1]}",
         )
-    following = scene.committed[begin + limit : begin + limit + 1]
     answer = await ask(request, scene, CompactQuery(frames, parts))
-    headers = {"X-Next-Frame": str(following[0])} if len(following) else {}
+    after = bisect_right(scene.committed, int(answer.headers["X-Last-Frame"]))
+    following = scene.committed[after : after + 1]
+    headers = {**answer.headers, **({"X-Next-Frame": str(following[0])} if len(following) else {})}
     name = f"{scene.id[:8]}-{frames[0]:06d}.s4d"
     return unchanging(request, answer.body, media_type=answer.media_type, name=name, headers=headers)
 

@@ -80,7 +80,7 @@ class Scene:
         )
         kept = content.ledger.edited.rules(asked)
         least, rate = self.rules.minimum_cameras, definition.request.frames_per_second
-        self.spec = SceneSpec(folder, rig, definition.settings, least, kept.keep_states, rate)
+        self.spec = SceneSpec(folder, rig, definition.settings, least, kept, rate)
         self.points_sha256 = found.points_sha256
         self.warnings = found.warnings
         self._definition = definition
@@ -302,7 +302,7 @@ class Scene:
 
         await uncancelled(change())
         kept = self.ledger.edited.rules(self.request.ingest)
-        await self.updates.keep(kept.keep_frames, kept.keep_states)
+        await self.updates.keep(kept)
 
     def _refuse_unfinished(self) -> None:
         waiting = self.ledger.unfinished + len(self.ledger.open)

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from client.wire import FrameState, ProgressModel, Retention
+from client.wire import FrameState, IngestSettings, ProgressModel, Retention
 from server.health import metrics
 from server.processes.kernels import STAGE
 from server.processes.messages import (
@@ -87,7 +87,7 @@ class Updates:
         self.first = first
         self._index: int | None = None
         self._holding = 0
-        self._rule: Retention | None = None
+        self._rule: IngestSettings | None = None
         """For states, that the worker has not said it keeps."""
         self._told = False
         self.mending = Mending(
@@ -298,13 +298,14 @@ class Updates:
         await self._log.delete_pictures(names)
         await self._log.write(event)
 
-    async def keep(self, frames: Retention, states: Retention) -> None:
+    async def keep(self, rules: IngestSettings) -> None:
         """Keeps so much from now on, and deletes what is beyond it."""
-        if states != self.worker.spec.keep_states:
-            self.worker.spec = replace(self.worker.spec, keep_states=states)
-            self._rule, self._told = states, False
+        before = self.worker.spec.kept
+        if (rules.keep_states, rules.exact_states) != (before.keep_states, before.exact_states):
+            self.worker.spec = replace(self.worker.spec, kept=rules)
+            self._rule, self._told = rules, False
             self.begin()
-        self._keep_frames = frames
+        self._keep_frames = rules.keep_frames
         await self.retain()
 
     # Mending.

@@ -79,12 +79,17 @@ class Definition:
             return cls(
                 data["id"],
                 datetime.fromisoformat(data["created"]).astimezone(UTC),
-                SceneCreate.model_validate(data["request"]),
+                SceneCreate.model_validate(_exact_before(data["request"])),
                 _within_limits(data["settings"]),
                 begun_of(data),
             )
         except (KeyError, TypeError, ValueError) as error:  # pydantic's error is a ValueError
             raise DefinitionError(f"the definition cannot be read: {message_of(error)}") from None
+
+
+def _exact_before(request: Mapping[str, Any]) -> dict[str, Any]:
+    """The request of a scene; one from before states went to compact files keeps all of them exact."""
+    return {**request, "ingest": {"exact_states": None, **request.get("ingest", {})}}
 
 
 def begun_of(data: Mapping[str, Any]) -> ReconstructionBegun | None:

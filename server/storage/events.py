@@ -123,6 +123,7 @@ class SceneEdited(_Event):
     archived: bool | None = None
     keep_frames: Retention | None = None
     keep_states: Retention | None = None
+    exact_states: int | None = None
 
     def after(self, before: SceneEdited) -> SceneEdited:
         """Both changes in one, this one later."""
@@ -131,7 +132,7 @@ class SceneEdited(_Event):
 
     def rules(self, ingest: IngestSettings) -> IngestSettings:
         """The rules of a scene with those of retention that were changed."""
-        changed = {"keep_frames": self.keep_frames, "keep_states": self.keep_states}
+        changed: dict[str, Any] = {name: getattr(self, name) for name in ("keep_frames", "keep_states", "exact_states")}
         return ingest.model_copy(update={name: rule for name, rule in changed.items() if rule is not None})
 
 

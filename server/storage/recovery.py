@@ -288,6 +288,7 @@ def _states(folder: Path, damage: list[str]) -> _States:
             damage.append(f"the committed states cannot be read: {error}")
         return _States()
     damage.extend(f"frame {index}: its state is damaged: {reason}" for index, reason in history.damaged.items())
+    damage.extend(history.unlisted)
     newest: dict[str, Any] = {}
     if history.indices:
         with contextlib.suppress(HistoryError):  # the worker loads the state, or says why it cannot

@@ -1,0 +1,65 @@
+"""Compacts the older states of a scene in its worker, while no message waits."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+
+from client.wire import IngestSettings
+from scas4d_core.compact import Bounds, Head
+from scas4d_core.storage.compaction import Compaction
+from scas4d_core.storage.history import History
+from server.processes.compact_answers import compact_head
+from server.processes.messages import SceneSpec
+from server.storage.disk import no_room
+
+BEHIND = 8
+"""States more than are to stay exact: from there on one is compacted before the next frame, though that waits."""
+
+log = logging.getLogger("scas4d.worker")
+
+
+class Compacting:
+    """Keeps the newest states of a scene exact and the others compact.
+
+    Args:
+        spec: of the scene; ``kept.exact_states`` None: all stay exact.
+    """
+
+    def __init__(self, spec: SceneSpec) -> None:
+        self._spec = spec
+        self._rules = spec.kept
+        self._compaction: Compaction | None = None
+
+    def keep(self, rules: IngestSettings) -> None:
+        """Goes by other rules from now on."""
+        self._rules = rules
+        if self._compaction is not None:
+            self._compaction.close()
+        self._compaction = None
+
+    def meanwhile(self, history: History | None, waits: Callable[[], bool]) -> None:
+        """Compacts states that are due until a message waits; a disk that takes nothing is tried at the next message.
+
+        Args:
+            history: of the scene; None: it is not open.
+            waits: returns whether a message waits.
+        """
+        exact = self._rules.exact_states
+        if history is None or exact is None or len(history) <= exact + 1:
+            return
+        try:
+            if self._compaction is None:
+                self._compaction = Compaction(history, lambda: self._head(history), exact)
+            while (due := self._compaction.due) and (due > BEHIND or not waits()):
+                if self._compaction.step() is None or waits():
+                    return
+        except OSError as error:
+            if not no_room(error):
+                raise
+            log.warning("scene %s: no state is compacted: %s", self._spec.folder.name, error)
+
+    def _head(self, history: History) -> Head:
+        bounds = Bounds(**self._rules.state_bounds.model_dump())
+        return replace(compact_head(self._spec, history), bounds=bounds)
