@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from studies.compact.commands import compact
+from studies.compact.commands import compact, opening
 from studies.effort.commands import effort
 from studies.exports.commands import exports
 from studies.frontier.commands import frontier
@@ -27,7 +27,7 @@ from studies.variants.commands import variants
 STUDIES = {
     "Quality": (quality, refit, effects, switches, targets, table, processors),
     "Rigs": (rigs, calibration, drift),
-    "What comes out": (compact, exports),
+    "What comes out": (compact, opening, exports),
     "Accuracy against time": (frontier, effort, paper, variants),
     "Speed of the code": (kernels, device, moving, startup),
     "Hard cases": (stability, timing),

@@ -1,4 +1,4 @@
-"""`scripts/bench compact`."""
+"""`scripts/bench compact` and `scripts/bench opening`."""
 
 from __future__ import annotations
 
@@ -34,3 +34,12 @@ def compact(
     text = told(found)
     print(text)
     write_page(page, text)
+
+
+def opening(
+    frames: Annotated[int, typer.Option(min=200, help="Of the history: a day at one a second, when left out.")] = 86_400,
+) -> None:
+    """Measures how long a history of many frames takes to open where older states are in compact files."""
+    from studies.compact.opening import opening as measured
+
+    print(measured(frames))
