@@ -51,7 +51,7 @@ class CompactStates:
 
     Attributes:
         name, beside: of outputs. files: in the order of their frames. head: of the first. frames: of all.
-        damage: of the first file that has any.
+        times: seconds, of all. damage: of the first file that has any.
     """
 
     name: str
@@ -59,18 +59,41 @@ class CompactStates:
     files: Sequence[Path]
     head: Head
     frames: Sequence[int]
+    times: Sequence[float]
     damage: str | None
 
     @classmethod
     def of(cls, name: str, beside: Path, files: Sequence[Path]) -> CompactStates:
         """Looks at each file."""
-        heads, frames, damages = [], [], []
+        heads, frames, times, damages = [], [], [], []
         for file in files:
             with CompactReader(file) as reader:
                 heads.append(reader.head)
                 frames += reader.frames
+                times += reader.times.tolist()
                 damages += [] if reader.damage is None else [reader.damage]
-        return cls(name, beside, files, heads[0], frames, damages[0] if damages else None)
+        return cls(name, beside, files, heads[0], frames, times, damages[0] if damages else None)
+
+    def within(self, low: int, high: int) -> dict[int, float]:
+        """Index and time in seconds of the frames from ``low`` to ``high``, in order.
+
+        Raises:
+            InputError: there is none.
+        """
+        found = {index: time for index, time in zip(self.frames, self.times, strict=True) if low <= index <= high}
+        if not found:
+            held = f"frames {self.frames[0]} to {self.frames[-1]}" if self.frames else "no frame"
+            asked = f"{low}:{'' if high == LAST else high}"
+            raise InputError(f"frames {asked} are not in {self.name}", f"it has {held}")
+        return found
+
+    @property
+    def rate(self) -> float:
+        """Frames a second: the nominal rate, else the mean one, else 30."""
+        if self.head.frames_per_second is not None:
+            return self.head.frames_per_second
+        length = self.times[-1] - self.times[0] if self.times else 0.0
+        return (len(self.times) - 1) / length if length > 0 else 30.0
 
     def parts(self) -> NDArray[np.int64] | None:
         """[N] part of each Gaussian, by the last file."""
