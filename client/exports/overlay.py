@@ -89,7 +89,7 @@ class Trails:
         uv = np.stack([camera.project(places)[0] for places in self._places]) * SHARPER
         sheet = Image.new("RGBA", (width * SHARPER, height * SHARPER))
         draw = ImageDraw.Draw(sheet)
-        thick = max(2, round(WIDTH * height * SHARPER))
+        thick = max(4, round(WIDTH * height * SHARPER))
         inside = (np.abs(uv) < 4 * SHARPER * max(width, height)).all(axis=2)  # NaN is not; nor what is far outside
         for step in range(1, len(uv)):
             alpha = round(255 * step / (len(uv) - 1))
