@@ -24,7 +24,7 @@ def painted(state: Gaussians, labels: NDArray[Any]) -> NDArray[np.float32]:
 
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1, colours=1.0)
     >>> painted(state, np.array([0])).round(2)
-    array([[0.33, 0.62, 0.95],
+    array([[0.33, 0.65, 0.95],
            [1.  , 1.  , 1.  ]], dtype=float32)
     """
     grey = np.clip(state.colours, 0, 1) @ LUMINANCE

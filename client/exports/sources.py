@@ -38,11 +38,21 @@ def opened(source: str, low: int, high: int, parts: bool, url: str, token: str |
     path = Path(source)
     if path.exists():
         yield of_file(path / STATES if path.is_dir() else path)
-    elif path.suffix or len(path.parts) > 1:
+    elif not is_scene_id(source):
         raise InputError(f"source {source!r} is not there", "give a compact file, its folder, or a scene's id")
     else:
         with of_scene(source, low, high, parts, url, token) as given:
             yield given
+
+
+def is_scene_id(source: str) -> bool:
+    """Tells whether a source is the id of a scene: it is no file, and its name could not be one.
+
+    >>> is_scene_id("0f6a21"), is_scene_id("client"), is_scene_id("out/robot"), is_scene_id("robot.s4d")
+    (True, False, False, False)
+    """
+    path = Path(source)
+    return not (path.exists() or path.suffix or len(path.parts) > 1)
 
 
 @dataclass(frozen=True)
