@@ -96,6 +96,26 @@ def video(
     make_video(source, out, wanted, frames=frames, beside=capture, url=url, token=token)
 
 
+def rerun(
+    source: Source,
+    out: Annotated[Path | None, typer.Option(help="File, .rrd. [beside SOURCE, named after it]")] = None,
+    frames: Frames = None,
+    tracks: Annotated[int, typer.Option(min=0, max=10_000, help="Ways of so many points that move.")] = 50,
+    trail: Annotated[float, typer.Option(min=0, help="Length of these ways, seconds of the scene.")] = 0.5,
+    parts: Annotated[bool, typer.Option("--parts", help="Colour by part.")] = False,
+    url: commands.Url = DEFAULT_URL,
+    token: commands.Token = None,
+) -> None:
+    """Writes frames as a recording for the Rerun viewer (extra `rerun`): points, tracks, the rig, parts.
+
+    Example: scas4d reconstruct samples/robot --out out/robot; scas4d rerun out/robot; rerun out/robot/states.rrd
+    """
+    from client.exports.recording import make_recording
+
+    make_recording(source, out, frames=frames, tracks=tracks, trail=trail, parts=parts, url=url, token=token)
+
+
 def register(app: typer.Typer) -> None:
     """Adds these commands."""
     app.command()(video)
+    app.command()(rerun)
