@@ -11,7 +11,6 @@ from PIL import Image, ImageDraw
 
 from client.wire import part_colour
 from scas4d_core.cameras import Camera, WorldFrame, farthest_first
-from scas4d_core.errors import InputError
 from scas4d_core.gaussians import Gaussians
 
 Picture = NDArray[np.uint8]
@@ -27,13 +26,10 @@ MOST_MOVED = 0.5
 
 
 def rows_that_move(states: Sequence[Gaussians], count: int) -> NDArray[np.intp]:
-    """[count] rows, or fewer: of the Gaussians that move most, some whose ways are far apart.
+    """[count] rows, or fewer: of the Gaussians that move most, some whose ways are far apart; none where none moves.
 
     Args:
-        states: of some frames, the first the earliest; motion is measured from it.
-
-    Raises:
-        InputError: nothing moves.
+        states: of some frames, the first the earliest; motion is measured from it. Only what moves in all is taken.
 
     >>> a = Gaussians.of_points([[0, 0, 2], [1, 0, 2], [2, 0, 2]], radius=0.1)
     >>> b = a.replace(means=a.means + np.float32([[0, 0, 0], [0, 1, 0], [0, 2, 0]]))
@@ -48,8 +44,8 @@ def rows_that_move(states: Sequence[Gaussians], count: int) -> NDArray[np.intp]:
         moved = np.maximum(moved, np.linalg.norm(state.means[: len(first)] - first.means, axis=1))
     solid = there & (first.opacities >= OPAQUE)
     rows = np.flatnonzero(solid if solid.any() else there)
-    if not rows.size:
-        raise InputError("tracks: no Gaussian moves in these frames", "leave --tracks out, or choose other --frames")
+    if not rows.size or not count:
+        return np.zeros(0, np.intp)
     rows = rows[np.argsort(-moved[rows], kind="stable")]
     rows = rows[: max(count, round(MOST_MOVED * rows.size))]
     ways = np.concatenate([state.means[rows] for state in states], axis=1)

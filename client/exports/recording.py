@@ -64,7 +64,7 @@ def make_recording(
         labels = given.parts()
         if parts and labels is None:
             raise InputError(f"parts: {given.name} holds none", "leave --parts out; there are none without motion")
-        rows = _rows(given, list(times), tracks)
+        rows = rows_that_move(given.some(list(times)), tracks)
         with _stream(target) as stream:
             _log_what_stays(stream, given, labels)
             ways: deque[tuple[float, NDArray[np.float64]]] = deque()
@@ -99,15 +99,6 @@ def _stream(target: Path) -> Iterator[Any]:
             yield stream
         finally:
             stream.disconnect()
-
-
-def _rows(given: CompactStates, indices: list[int], count: int) -> NDArray[np.intp]:
-    """Rows of the tracks; none where nothing moves."""
-    some = dict.fromkeys((indices[0], indices[len(indices) // 2], indices[-1]))
-    states = [state for index in some for _, _, state in given.states(index, index)]
-    if not count or not states[0].moving.any():
-        return np.zeros(0, np.intp)
-    return rows_that_move(states, count)
 
 
 def _log_what_stays(stream: Any, given: CompactStates, labels: NDArray[np.int64] | None) -> None:

@@ -107,10 +107,9 @@ class Shot:
         return labels
 
     def _trails(self) -> Trails:
-        indices = list(self.times)
-        some = dict.fromkeys((indices[0], indices[len(indices) // 2], indices[-1]))
-        states = [state for index in some for _, _, state in self.given.states(index, index)]
-        rows = rows_that_move(states, self.options.tracks)
+        rows = rows_that_move(self.given.some(list(self.times)), self.options.tracks)
+        if not rows.size:
+            raise InputError("tracks: nothing moves in these frames", "leave --tracks out, or choose other --frames")
         return Trails(rows, self.given.head.world, round(self.options.trail * self.fps) + 1)
 
 

@@ -97,6 +97,11 @@ class CompactStates:
             raise InputError(f"frames {asked} are not in {self.name}", f"it has {held}")
         return found
 
+    def some(self, indices: Sequence[int]) -> list[Gaussians]:
+        """The states of the first, the middle and the last of some frames, each once."""
+        chosen = dict.fromkeys((indices[0], indices[len(indices) // 2], indices[-1]))
+        return [state for index in chosen for _, _, state in self.states(index, index)]
+
     @property
     def rate(self) -> float:
         """Frames a second: the nominal rate, else the mean one, else 30."""

@@ -9,6 +9,7 @@ from client.cli.progress import Bars, console
 from client.exports.shot import VideoOptions, shot
 from client.exports.sources import frame_range, opened
 from client.exports.video_file import check_suffix, video_file
+from client.importers.extras import pyav
 from scas4d_core.captures import Capture
 from scas4d_core.errors import InputError
 
@@ -44,6 +45,7 @@ def make_video(
     low, high = frame_range(frames)
     if out is not None:
         check_suffix(out)
+    pyav()  # before anything is fetched or compiled
     with opened(source, low, high, options.parts, url, token) as given, Bars() as bars:
         if given.damage is not None:
             console.print(f"only a part can be read: {given.damage}", soft_wrap=True)

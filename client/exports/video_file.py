@@ -16,7 +16,7 @@ from scas4d_core.errors import InputError
 Picture = NDArray[np.uint8]
 
 SUFFIXES = (".mp4", ".webp")
-QUALITY = {".mp4": {"crf": "18", "preset": "medium"}, ".webp": {"quality": "85", "lossless": "0"}}
+QUALITY = {".mp4": {"crf": "18", "preset": "medium"}, ".webp": {"quality": "90", "lossless": "0"}}
 """Options of the encoders; at these the eye sees no loss."""
 FINEST_RATE = 65535
 """Largest denominator of a rate: the containers have no room for more."""
@@ -66,8 +66,7 @@ def video_file(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
     """
     from scas4d_core.exports.whole_files import whole_file
 
-    suffix = check_suffix(path)
-    pyav()
+    suffix, av = check_suffix(path), pyav()
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as beside:
         encoder = _Encoder(beside, suffix, fps)
@@ -76,6 +75,8 @@ def video_file(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
             if not encoder.count:
                 raise InputError(f"out {str(path)!r} would hold no picture", "give frames that there are")
             encoder.finish()
+        except av.FFmpegError as error:
+            raise InputError(f"out {str(path)!r} cannot be encoded ({error})", "give a smaller size") from error
         finally:
             encoder.close()
 

@@ -1,4 +1,4 @@
-"""A compact file of the moving blob (`tests/helpers/moving_blob.py`), and a capture of its rig."""
+"""A compact file of the moving blob (`tests/helpers/export_cases/blob.py`), and a capture of its rig."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from moving_blob import BACKGROUND, BLOB, FRAMES, RATE, WORLD, make_rig, state, true_colour
+from export_cases.blob import BACKGROUND, BLOB, FRAMES, RATE, WORLD, make_rig, state, true_colour
 
 from scas4d_core.cameras import Rig
 from scas4d_core.captures import Capture

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
-from moving_blob import make_rig
+from export_cases.blob import make_rig
 from scipy.spatial.transform import Rotation
 
 from client.exports.camera_path import by_keys, orbit
@@ -44,6 +46,13 @@ def test_a_path_goes_through_its_keys_without_a_jerk(tmp_path):
     assert path(9.0).centre == pytest.approx(places[-1])
     rig_up = RigView.of(make_rig()).up
     assert all(path(t).rotation[1] @ rig_up < -0.5 for t in times)  # upright
+
+
+def test_the_key_poses_of_the_page_are_a_path(tmp_path):
+    page = (Path(__file__).parents[3] / "docs/videos.md").read_text()
+    (document,) = re.findall(r"```json\n(.*?)```", page, re.DOTALL)
+    path = keyed(tmp_path, document, frames={6: 0.1, 7: 2.0})
+    assert path(2.0).centre == pytest.approx([1.2, -1.6, 1.8])
 
 
 def test_poses_turn_the_short_way_and_stay_rotations(tmp_path):

@@ -6,7 +6,7 @@ import weakref
 
 import numpy as np
 import pytest
-from moving_blob import BLOB, RATE, centre, state
+from export_cases.blob import BLOB, RATE, centre, state
 from scipy.spatial.transform import Rotation
 
 from client.exports.moments import interpolated, moments

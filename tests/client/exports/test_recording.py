@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from moving_blob import BLOB, FRAMES, RATE, WORLD, centre, make_rig
+from export_cases.blob import BLOB, FRAMES, RATE, WORLD, centre, make_rig
 from typer.testing import CliRunner
 
 from client.cli.extras import remedy

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from moving_blob import BLOB, FRAMES, RATE, STEP, WORLD, centre, state
+from export_cases.blob import BLOB, FRAMES, RATE, STEP, WORLD, centre, state
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -100,6 +101,17 @@ def test_faults_have_remedies(source, tmp_path):
     ):
         with pytest.raises(InputError, match=said):
             ask()
+
+
+def test_the_page_does_what_it_says(source):
+    page = (ROOT / "docs/python.md").read_text()
+    (lines,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert lines.count('"out/robot"') == 1
+    names: dict = {}
+    exec(compile(lines.replace('"out/robot"', repr(str(source))), "python.md", "exec"), names)
+    assert names["tracks"].positions.shape == (FRAMES, BLOB, 3)
+    assert names["poses"].motions.shape == (1, FRAMES, 4, 4)
+    assert names["poses"].residuals.shape == (1, FRAMES)
 
 
 def test_the_example_leaves_a_picture(source, tmp_path):

@@ -8,16 +8,19 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from moving_blob import BACKGROUND, BLOB, FRAMES, RATE, WORLD, centre, make_rig, true_colour
+from export_cases.blob import BACKGROUND, BLOB, FRAMES, RATE, WORLD, centre, make_rig, state, true_colour
 from PIL import Image
+from running import make_rig as a_rig
+from running import pictures
 from typer.testing import CliRunner
 
 from client.cli.main import app
 from client.exports.shot import VideoOptions
 from client.exports.video import make_video, picture_size
 from client.exports.video_file import video_file
+from client.sdk import Client
 from client.wire import part_colour
-from scas4d_core.compact import CompactReader
+from scas4d_core.compact import CompactReader, CompactWriter, Head
 from scas4d_core.errors import InputError
 
 av = pytest.importorskip("av")
@@ -178,6 +181,38 @@ def test_a_background_that_is_asked_for(source, tmp_path):
         options = VideoOptions(path="camera", size=(400, 60), background=colour)
         shown = read(made(source, tmp_path / "a.mp4", options, frames="0"))[0]
         assert np.abs(shown[0, 30, 4] / 255 - wanted).max() < 0.03
+
+
+def test_a_scene_of_the_service(service, tmp_path):
+    with Client(service.url, patience=20) as client:
+        scene = client.create_scene(a_rig()).id
+        try:
+            for index in range(2):
+                client.put_frame(scene, index, pictures(index))
+                client.wait(scene, index, every=0.05)
+            options = VideoOptions(path="camera", size=(48, 32), fps=60)
+            made = make_video(scene, tmp_path / "a.mp4", options, url=service.url, token=None)
+        finally:
+            client.delete_scene(scene)
+    assert read(made)[0].shape == (3, 32, 48, 3)
+
+
+def test_tracks_of_what_stands_are_refused(tmp_path):
+    with CompactWriter(tmp_path / "states.s4d", Head(WORLD, rig=make_rig())) as writer:
+        still = state(0)
+        writer.add(0, 0.0, still.replace(foreground=0 * still.foreground))
+    with pytest.raises(InputError, match="tracks: nothing moves in these frames; leave --tracks out"):
+        made(tmp_path, tmp_path / "a.mp4", VideoOptions(path="camera", tracks=3))
+    with pytest.raises(InputError, match="parts: states holds none; leave --parts out"):
+        made(tmp_path, tmp_path / "a.mp4", VideoOptions(path="camera", parts=True))
+    assert [path.name for path in tmp_path.iterdir()] == ["states.s4d"]
+
+
+def test_a_moment_from_all_around(source, tmp_path):
+    options = VideoOptions(seconds=0.4, turn=900.0)
+    shown = read(made(source, tmp_path / "a.mp4", options, frames="2"))[0]
+    assert len(shown) == 4
+    assert len({picture.tobytes() for picture in shown}) == 4
 
 
 @pytest.mark.parametrize(
