@@ -14,7 +14,7 @@ import numpy as np
 
 from client.cli import pictures
 from client.cli.progress import Bars, console
-from client.exports.video_file import video_file
+from client.exports.video.video_file import video_file
 from scas4d_core.captures import Capture
 from scas4d_core.compact import CompactWriter, Head
 from scas4d_core.frame_outcome import AlarmKind

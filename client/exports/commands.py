@@ -73,8 +73,8 @@ def video(
 
     Example: scas4d reconstruct samples/robot --out out/robot; scas4d video out/robot --speed 0.25 --between
     """
-    from client.exports.shot import VideoOptions
-    from client.exports.video import background_colour, make_video, picture_size
+    from client.exports.video.shot import VideoOptions
+    from client.exports.video.video import background_colour, make_video, picture_size
 
     wanted = VideoOptions(
         path=path,

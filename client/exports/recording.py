@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.cli.progress import Bars, console
-from client.exports.overlay import rows_that_move
-from client.exports.rig_view import RigView
 from client.exports.sources import CompactStates, frame_range, opened
+from client.exports.video.overlay import rows_that_move
+from client.exports.video.rig_view import RigView
 from client.wire import part_colour
 from scas4d_core.cameras import Rig
 from scas4d_core.errors import InputError

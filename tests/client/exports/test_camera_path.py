@@ -11,8 +11,8 @@ import pytest
 from export_cases.blob import make_rig
 from scipy.spatial.transform import Rotation
 
-from client.exports.camera_path import by_keys, orbit
-from client.exports.rig_view import RigView
+from client.exports.video.camera_path import by_keys, orbit
+from client.exports.video.rig_view import RigView
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.errors import InputError
 

@@ -9,7 +9,7 @@ import pytest
 from export_cases.blob import BLOB, RATE, centre, state
 from scipy.spatial.transform import Rotation
 
-from client.exports.moments import interpolated, moments
+from client.exports.video.moments import interpolated, moments
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels.appearance.direction import ROWS
 

@@ -15,9 +15,9 @@ from running import pictures
 from typer.testing import CliRunner
 
 from client.cli.main import app
-from client.exports.shot import VideoOptions
-from client.exports.video import make_video, picture_size
-from client.exports.video_file import video_file
+from client.exports.video.shot import VideoOptions
+from client.exports.video.video import make_video, picture_size
+from client.exports.video.video_file import video_file
 from client.sdk import Client
 from client.wire import part_colour
 from scas4d_core.compact import CompactReader, CompactWriter, Head

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from client.exports.key_poses import KeyPose, KeyPoses, pose_error, read_key_poses
-from client.exports.rig_view import RigView, looking
+from client.exports.video.key_poses import KeyPose, KeyPoses, pose_error, read_key_poses
+from client.exports.video.rig_view import RigView, looking
 from scas4d_core.cameras import Camera, CameraError, Rig
 from scas4d_core.errors import InputError
 
