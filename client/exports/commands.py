@@ -100,7 +100,7 @@ def rerun(
     source: Source,
     out: Annotated[Path | None, typer.Option(help="File, .rrd. [beside SOURCE, named after it]")] = None,
     frames: Frames = None,
-    tracks: Annotated[int, typer.Option(min=0, max=10_000, help="Ways of so many points that move.")] = 50,
+    tracks: Annotated[int, typer.Option(min=0, max=10_000, help="Ways of so many points that move.")] = 30,
     trail: Annotated[float, typer.Option(min=0, help="Length of these ways, seconds of the scene.")] = 0.5,
     parts: Annotated[bool, typer.Option("--parts", help="Colour by part.")] = False,
     url: commands.Url = DEFAULT_URL,

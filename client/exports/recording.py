@@ -23,6 +23,8 @@ from scas4d_core.gaussians import Gaussians
 SUFFIX = ".rrd"
 FAINT = 0.1
 """Opacity below which a Gaussian is left out: points are drawn solid, and haze would hide what it lies before."""
+THIN = -0.7
+"""Radius of a track; the viewer takes what is negative for points of the screen."""
 PLANE = 0.15
 """Distance at which the viewer draws a camera's picture, as a share of the rig's distance."""
 
@@ -32,7 +34,7 @@ def make_recording(
     out: Path | None,
     *,
     frames: str | None = None,
-    tracks: int = 50,
+    tracks: int = 30,
     trail: float = 0.5,
     parts: bool = False,
     url: str,
@@ -180,4 +182,4 @@ def _log_tracks(stream: Any, ways: NDArray[np.float64]) -> None:
     strips = {k: way[np.isfinite(way).all(axis=1)] for k, way in enumerate(np.moveaxis(ways, 1, 0))}
     strips = {k: way.astype(np.float32) for k, way in strips.items() if len(way) > 1}
     colours = [part_colour(k) for k in strips]
-    stream.log("world/tracks", rerun.LineStrips3D(list(strips.values()), colors=colours))
+    stream.log("world/tracks", rerun.LineStrips3D(list(strips.values()), colors=colours, radii=THIN))
