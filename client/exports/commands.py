@@ -25,29 +25,28 @@ Frames = Annotated[str | None, typer.Option(metavar="A:B", help="Only these fram
 def video(
     source: Source,
     options: CaptureOptions,
-    out: Annotated[
-        Path | None, typer.Option(help="File, .mp4 or .webp. [beside SOURCE, named after it and the path]")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="File, .mp4 or .webp; without it an MP4 beside SOURCE.")] = None,
     path: Annotated[
         str, typer.Option(help="orbit, camera, or a JSON file of key poses; docs/videos.md.", metavar="PATH")
     ] = "orbit",
     camera: Annotated[
         str | None,
-        typer.Option(help="Camera to look through, or where the orbit begins. [the first]", metavar="CAMERA"),
+        typer.Option(help="Camera to look through, or where the orbit begins; the first without it.", metavar="CAMERA"),
     ] = None,
     frames: Frames = None,
     fps: Annotated[
-        float | None, typer.Option(min=0.1, max=240, help="Pictures a second. [those of the frames]")
+        float | None, typer.Option(min=0.1, max=240, help="Pictures a second; those of the frames without it.")
     ] = None,
     speed: Annotated[
         float,
         typer.Option(min=0.001, max=1000, help="Seconds of the scene in a second of the video; 0.25: slow motion."),
     ] = 1.0,
     seconds: Annotated[
-        float | None, typer.Option(min=0.01, max=86400, help="Length; the last frame stays. [until the frames end]")
+        float | None,
+        typer.Option(min=0.01, max=86400, help="Length; the last frame stays. Without it until the frames end."),
     ] = None,
     size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Size of the render, as 1280x720. [the camera's]")
+        str | None, typer.Option(metavar="WxH", help="Size of the render, as 1280x720; the camera's without it.")
     ] = None,
     turn: Annotated[
         float, typer.Option(min=-3600, max=3600, help="Degrees a second of the orbit; negative: to the left.")
@@ -64,7 +63,7 @@ def video(
         Path | None, typer.Option(metavar="CAPTURE", help="Put the camera's true picture of this capture beside.")
     ] = None,
     background: Annotated[
-        str | None, typer.Option(help="Colour behind everything, as white or #202020. [the scene's]")
+        str | None, typer.Option(help="Colour behind everything, as white or #202020; the scene's without it.")
     ] = None,
     url: commands.Url = DEFAULT_URL,
     token: commands.Token = None,
@@ -98,7 +97,7 @@ def video(
 
 def rerun(
     source: Source,
-    out: Annotated[Path | None, typer.Option(help="File, .rrd. [beside SOURCE, named after it]")] = None,
+    out: Annotated[Path | None, typer.Option(help="File, .rrd; without it beside SOURCE, named after it.")] = None,
     frames: Frames = None,
     tracks: Annotated[int, typer.Option(min=0, max=10_000, help="Ways of so many points that move.")] = 30,
     trail: Annotated[float, typer.Option(min=0, help="Length of these ways, seconds of the scene.")] = 0.5,
