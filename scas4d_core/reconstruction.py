@@ -27,7 +27,7 @@ from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_report import FrameReport, Progress, report_of_first, report_of_update
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import Preparation, room_for_births
-from scas4d_core.query.committed import CommittedScene, View
+from scas4d_core.query.committed import CommittedScene
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.rig_checks import check_rig
 from scas4d_core.robust.alarms import first_watched, sharpness
@@ -45,7 +45,7 @@ from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFacto
 from scas4d_core.update.result import REPORT, Stopwatch
 from scas4d_core.update.schedule import TimeBudget
 
-__all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "ResumePoint", "StepError", "View"]
+__all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "ResumePoint", "StepError"]
 
 
 class Reconstruction(CommittedScene):

@@ -13,6 +13,8 @@ CUDA = ("torch", "gsplat")
 """Modules of the extra `cuda`."""
 EXPORTS = ("gsply", "pxr")
 """Modules of the extra `exports`."""
+RERUN = ("rerun",)
+"""Modules of the extra `rerun`."""
 
 
 def need_server() -> None:
@@ -29,7 +31,7 @@ def need_server() -> None:
 def remedy(missing: ModuleNotFoundError) -> str | None:
     """Says what to install, in a sentence; None where the module belongs to no extra."""
     package = (missing.name or "").partition(".")[0]
-    extras = {"server": SERVER, "cuda": CUDA, "exports": EXPORTS}
+    extras = {"server": SERVER, "cuda": CUDA, "exports": EXPORTS, "rerun": RERUN}
     extra = next((name for name, packages in extras.items() if package in packages), None)
     if extra is None:
         return None

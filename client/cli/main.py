@@ -17,12 +17,14 @@ from client.cli.capture_options import opened, takes_capture
 from client.cli.changes import parse_changes
 from client.cli.progress import console
 from client.errors import ServiceError, ServiceUnreachable
+from client.exports import commands as looks
 from client.importers.open_source import CaptureOptions
 from client.sdk import DEFAULT_URL
 from scas4d_core.captures import CaptureError, ImageError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Online 4D reconstruction of multi-camera rigs.")
 commands.register(app)
+looks.register(app)
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture.")]
 Preset = Annotated[str, typer.Option(help="Preset of settings, as scas4d, adaptive or cloth.")]

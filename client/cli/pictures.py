@@ -1,16 +1,13 @@
-"""Pictures and videos that commands leave: renders beside the truth, written through imageio."""
+"""Pictures that commands leave: renders beside the truth, written through imageio."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import imageio.v3 as imageio
 import numpy as np
 from numpy.typing import NDArray
 
-from client.importers.extras import pyav
 from client.wire import part_colour
 
 DIFFERENCE_GAIN = 4
@@ -58,32 +55,3 @@ def save(path: Path, picture: Picture) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     imageio.imwrite(path, picture)
     return path
-
-
-@contextmanager
-def video(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
-    """Writes pictures of one size as a video, H.264 in an MP4, which every browser plays; folders are made.
-
-    Args:
-        path: ends in `.mp4`. fps: pictures a second.
-
-    Yields:
-        A function that adds a picture, [H, W, 3]; an odd row or column at the end is left out, as the encoding needs.
-
-    Raises:
-        MissingExtra: PyAV is not installed.
-
-    >>> with video(out / "grey.mp4", 25) as add:
-    ...     for level in range(3):
-    ...         add(np.full((16, 32, 3), level, np.uint8))
-    """
-    pyav()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with imageio.imopen(path, "w", plugin="pyav") as file:
-        file.init_video_stream("libx264", fps=fps)
-
-        def add(picture: Picture) -> None:
-            height, width = (size // 2 * 2 for size in picture.shape[:2])
-            file.write_frame(np.ascontiguousarray(picture[:height, :width]))
-
-        yield add

@@ -14,6 +14,7 @@ import numpy as np
 
 from client.cli import pictures
 from client.cli.progress import Bars, console
+from client.exports.video.video_file import video_file
 from scas4d_core.captures import Capture
 from scas4d_core.compact import CompactWriter, Head
 from scas4d_core.frame_outcome import AlarmKind
@@ -161,7 +162,7 @@ def reconstruct(
                 pictures.save(out / f"camera_{camera.name}" / f"{index:06d}.png", compared)
                 if videos and camera.name not in add:
                     file = out / f"camera_{camera.name}.mp4"
-                    add[camera.name] = opened.enter_context(pictures.video(file, given.fps))
+                    add[camera.name] = opened.enter_context(video_file(file, given.fps))
                 if videos:
                     add[camera.name](compared)
             console.print(f"frame {index}: {np.mean(scores):.2f} dB{told(done.report)}")

@@ -45,10 +45,7 @@ def export(
         target = out or given.beside / f"{given.name}-{format}{'' if wanted.numbered else wanted.suffixes[0]}"
         if given.damage is not None:
             console.print(f"only a part can be read: {given.damage}", soft_wrap=True)
-        count = sum(low <= index <= high for index in given.frames)
-        if not count:
-            held = f"frames {given.frames[0]} to {given.frames[-1]}" if given.frames else "no frame"
-            raise InputError(f"frames {frames or 'of all'} are not in {source}", f"it has {held}")
+        count = len(given.within(low, high))
         paths = export_sequence(
             given.states(low, high),
             format,

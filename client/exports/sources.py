@@ -38,11 +38,21 @@ def opened(source: str, low: int, high: int, parts: bool, url: str, token: str |
     path = Path(source)
     if path.exists():
         yield of_file(path / STATES if path.is_dir() else path)
-    elif path.suffix or len(path.parts) > 1:
+    elif not is_scene_id(source):
         raise InputError(f"source {source!r} is not there", "give a compact file, its folder, or a scene's id")
     else:
         with of_scene(source, low, high, parts, url, token) as given:
             yield given
+
+
+def is_scene_id(source: str) -> bool:
+    """Tells whether a source is the id of a scene: it is no file, and its name could not be one.
+
+    >>> is_scene_id("0f6a21"), is_scene_id("client"), is_scene_id("out/robot"), is_scene_id("robot.s4d")
+    (True, False, False, False)
+    """
+    path = Path(source)
+    return not (path.exists() or path.suffix or len(path.parts) > 1)
 
 
 @dataclass(frozen=True)
@@ -51,7 +61,7 @@ class CompactStates:
 
     Attributes:
         name, beside: of outputs. files: in the order of their frames. head: of the first. frames: of all.
-        damage: of the first file that has any.
+        times: seconds, of all. damage: of the first file that has any.
     """
 
     name: str
@@ -59,20 +69,48 @@ class CompactStates:
     files: Sequence[Path]
     head: Head
     frames: Sequence[int]
+    times: Sequence[float]
     damage: str | None
 
     @classmethod
-    def of(cls, name: str, beside: Path, files: Sequence[Path]) -> CompactStates:
-        """Looks at each file."""
+    def of(cls, name: str, beside: Path, files: Sequence[Path], first: int = 0) -> CompactStates:
+        """Looks at each file; frames before ``first`` are left out: they only tell the others."""
         heads: list[Head] = []
-        frames: list[int] = []
+        times: dict[int, float] = {}
         damages: list[str] = []
         for file in files:
             with CompactReader(file) as reader:
                 heads.append(reader.head)
-                frames += [index for index in reader.frames if not frames or index > frames[-1]]
+                found = zip(reader.frames, reader.times.tolist(), strict=True)
+                times |= {index: time for index, time in found if index >= first and index not in times}
                 damages += [] if reader.damage is None else [reader.damage]
-        return cls(name, beside, files, heads[0], frames, damages[0] if damages else None)
+        return cls(name, beside, files, heads[0], list(times), list(times.values()), damages[0] if damages else None)
+
+    def within(self, low: int, high: int) -> dict[int, float]:
+        """Index and time in seconds of the frames from ``low`` to ``high``, in order.
+
+        Raises:
+            InputError: there is none.
+        """
+        found = {index: time for index, time in zip(self.frames, self.times, strict=True) if low <= index <= high}
+        if not found:
+            held = f"frames {self.frames[0]} to {self.frames[-1]}" if self.frames else "no frame"
+            asked = f"{low}:{'' if high == LAST else high}"
+            raise InputError(f"frames {asked} are not in {self.name}", f"it has {held}")
+        return found
+
+    def some(self, indices: Sequence[int]) -> list[Gaussians]:
+        """The states of the first, the middle and the last of some frames, each once."""
+        chosen = dict.fromkeys((indices[0], indices[len(indices) // 2], indices[-1]))
+        return [state for index in chosen for _, _, state in self.states(index, index)]
+
+    @property
+    def rate(self) -> float:
+        """Frames a second: the nominal rate, else the mean one, else 30."""
+        if self.head.frames_per_second is not None:
+            return self.head.frames_per_second
+        length = self.times[-1] - self.times[0] if self.times else 0.0
+        return (len(self.times) - 1) / length if length > 0 else 30.0
 
     def parts(self) -> NDArray[np.int64] | None:
         """[N] part of each Gaussian, by the last file."""
@@ -117,7 +155,7 @@ def of_scene(id: str, low: int, high: int, parts: bool, url: str, token: str | N
             data, following = client.states(id, following, min(MOST, high - following + 1), parts)
             files.append(Path(folder) / f"{len(files)}.s4d")
             files[-1].write_bytes(data)
-        yield CompactStates.of(id[:8], Path(), files)
+        yield CompactStates.of(id[:8], Path(), files, low)
 
 
 def frame_range(text: str | None) -> tuple[int, int]:

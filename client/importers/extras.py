@@ -34,4 +34,4 @@ def opencv() -> Any:
 
 def pyav() -> Any:
     """Imports PyAV, for video."""
-    return load("av", needed="reading video")
+    return load("av", needed="video")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,43 +11,13 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera, WorldFrame
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.kernels.blend import GROUP
 from scas4d_core.query import parts as parts_of_history
 from scas4d_core.query import ply
 from scas4d_core.query import tracks as tracks_of_history
-from scas4d_core.query.tracks import ALPHA_OF_A_SURFACE, Tracks
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
+from scas4d_core.query.tracks import Tracks
+from scas4d_core.query.view import View, ViewRenderer
 from scas4d_core.rasterize.limits import DEFAULT, Limits
-from scas4d_core.rasterize.shading import colours_seen
 from scas4d_core.storage.history import History
-
-Array = NDArray[np.float32]
-
-MOST_LABEL = 254
-"""Parts are painted into 8 bits; 0 means no part."""
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A rendered picture.
-
-    Attributes:
-        colour: [H, W, 3] float32, nominally 0…1, over the background. alpha: [H, W] float32.
-        depth: [H, W] float32, alpha-weighted mean z along the camera's axis in the user's units; NaN where less than
-            half of the pixel is covered.
-        parts: [H, W] uint8, or None where no labels were given: 0 for no part, else 1 + the label that covers the pixel
-            most.
-
-    >>> black = np.zeros((2, 2), np.float32)
-    >>> view = View(np.zeros((2, 2, 3), np.float32), alpha=black, depth=np.full_like(black, np.nan))
-    >>> view.colour.shape, view.parts is None  # no labels were given
-    ((2, 2, 3), True)
-    """
-
-    colour: Array
-    alpha: Array
-    depth: Array
-    parts: NDArray[np.uint8] | None = None
 
 
 class CommittedScene:
@@ -69,7 +38,7 @@ class CommittedScene:
         self.history = history
         self.world = world
         self._limits = limits
-        self._rasterizer = CpuRasterizer(limits)
+        self._view = ViewRenderer(world, limits)
 
     def render(
         self,
@@ -91,44 +60,10 @@ class CommittedScene:
             HistoryError: the frame was not committed. ValueError: labels of another shape or range.
         """
         gaussians = self._state(index)
-        inside = self.world.camera_to_inside(camera)
-        colours = colours_seen(gaussians, CameraArrays.of(inside))
-        features = np.concatenate([colours, np.zeros((len(gaussians.means), 1), np.float32)], axis=1)
-        picture = self._rasterizer.forward(
-            gaussians.means, gaussians.factors, gaussians.opacities, features, CameraArrays.of(inside),
-            np.array([*(self.history.background if background is None else background), 0.0], np.float32),
-            depth_channel=3,
-        )  # fmt: skip
-        colour = np.moveaxis(picture.features[:3], 0, -1).copy()
-        alpha = 1 - picture.rest
-        with np.errstate(invalid="ignore", divide="ignore"):
-            depth = picture.features[3] / alpha / np.float32(self.world.metres_per_unit)
-        depth[alpha < ALPHA_OF_A_SURFACE] = np.nan
-        parts = None if labels is None else self._parts_picture(gaussians, np.asarray(labels), inside)
-        return View(colour, alpha, depth, parts)
-
-    def _parts_picture(self, gaussians: Gaussians, labels: NDArray[Any], inside: Camera) -> NDArray[np.uint8]:
-        """[H, W] uint8: the label whose Gaussians weigh most in the pixel, plus 1. A pass renders ``GROUP`` labels."""
-        if labels.shape == (self.history.count,):
-            labels = labels[: len(gaussians)]
-        if labels.shape != (len(gaussians),) or not ((labels >= -1) & (labels <= MOST_LABEL)).all():
-            raise ValueError(
-                f"labels {labels.shape} must be [{len(gaussians)}], one a Gaussian, each in -1...{MOST_LABEL}"
-            )
-        found = np.zeros((inside.height, inside.width), np.uint8)
-        most = np.full(found.shape, -1.0, np.float32)
-        black = np.zeros(GROUP, np.float32)
-        for first in range(-1, int(labels.max(initial=-1)) + 1, GROUP):
-            weights = (labels[:, None] == np.arange(first, first + GROUP)).astype(np.float32)
-            picture = self._rasterizer.forward(
-                gaussians.means, gaussians.factors, gaussians.opacities, weights, CameraArrays.of(inside), black
-            )
-            best = picture.features.max(axis=0)
-            wins = best > most
-            found[wins] = (first + 1 + picture.features.argmax(axis=0))[wins]
-            most[wins] = best[wins]
-        found[picture.rest > 1 - ALPHA_OF_A_SURFACE] = 0
-        return found
+        if labels is not None and np.shape(labels) == (self.history.count,):
+            labels = np.asarray(labels)[: len(gaussians)]
+        behind = self.history.background if background is None else background
+        return self._view.render(gaussians, camera, behind, labels=labels)
 
     def _state(self, index: int | None) -> Gaussians:
         return self.history.gaussians(self.history.indices[-1] if index is None else index)

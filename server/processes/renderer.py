@@ -46,7 +46,8 @@ from server.processes.queries import (
 )
 
 if TYPE_CHECKING:
-    from scas4d_core.query.committed import CommittedScene, View
+    from scas4d_core.query.committed import CommittedScene
+    from scas4d_core.query.view import View
 
 BYTES = "application/octet-stream"
 QUALITY = 92

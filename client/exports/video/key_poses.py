@@ -1,0 +1,92 @@
+"""Key poses of a camera path, read from a JSON file (docs/videos.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Self
+
+from pydantic import Field, FiniteFloat, ValidationError, model_validator
+
+from client.wire.base import Model, Row3, Row4
+from scas4d_core.cameras import CameraError
+from scas4d_core.errors import InputError
+
+
+class KeyPose(Model):
+    """One pose of the camera and its moment; user's world and units, OpenCV axes.
+
+    Attributes:
+        time: seconds since the beginning of the video. frame: or the frame of the scene that is shown then.
+        position, look_at: of the camera, and a point in the middle of its picture.
+        world_to_camera: 4×4, in place of both. field_of_view: degrees over the picture's height.
+    """
+
+    time: Annotated[FiniteFloat, Field(ge=0)] | None = None
+    frame: Annotated[int, Field(ge=0)] | None = None
+    position: Row3 | None = None
+    look_at: Row3 | None = None
+    world_to_camera: Annotated[list[Row4], Field(min_length=4, max_length=4)] | None = None
+    field_of_view: Annotated[FiniteFloat, Field(ge=1, le=170)] | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.time is None) == (self.frame is None):
+            raise ValueError("give time (seconds of the video) or frame (of the scene), one of them")
+        placed = self.position is not None or self.look_at is not None
+        if placed == (self.world_to_camera is not None):
+            raise ValueError("give position and look_at, or world_to_camera, one of them")
+        if placed and (self.position is None or self.look_at is None):
+            raise ValueError("position and look_at go together; give both")
+        if placed and self.position == self.look_at:
+            raise ValueError("position and look_at are the same point; give a point before the camera")
+        return self
+
+
+class KeyPoses(Model):
+    """A camera path by its key poses.
+
+    Attributes:
+        keys: in order of time. up: direction that is upwards in the picture of poses by look_at; the rig's where None.
+    """
+
+    keys: Annotated[list[KeyPose], Field(min_length=1, max_length=10_000)]
+    up: Row3 | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.up is not None and not any(self.up):
+            raise ValueError("up is zero; give a direction")
+        return self
+
+
+def read_key_poses(path: Path) -> KeyPoses:
+    """Reads key poses.
+
+    Raises:
+        InputError: no such file, or a fault in it; the message names the field.
+
+    >>> out.mkdir()
+    >>> file = out / "keys.json"
+    >>> _ = file.write_text('{"keys": [{"time": 0, "position": [0, 0, -3], "look_at": [0, 0, 0]}]}')
+    >>> read_key_poses(file).keys[0].position
+    [0.0, 0.0, -3.0]
+    """
+    if not path.is_file():
+        raise InputError(f"path {str(path)!r} is no file", "give orbit, camera, or a JSON file of key poses")
+    try:
+        return KeyPoses.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
+        value = first["input"]
+        given = f" {value!r}" if isinstance(value, str | int | float) and field else ""
+        fault = first["msg"].removeprefix("Value error, ")
+        raise InputError(
+            f"{path.name}: {field + given + ': ' if field else ''}{fault[0].lower()}{fault[1:]}",
+            "docs/videos.md has the format",
+        ) from None
+
+
+def pose_error(path: Path, place: int, error: CameraError) -> InputError:
+    """The error of a pose that is no camera."""
+    return InputError(f"{path.name}: keys[{place}].world_to_camera: {error.fault}", error.remedy)

@@ -1,0 +1,106 @@
+"""States at the times of a video: the nearest that was reconstructed, or one between two."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.gaussians import Gaussians, quaternions_to_matrices
+
+
+class Moment(NamedTuple):
+    """A state at a time; ``frame`` is the index of the nearest frame."""
+
+    frame: int
+    state: Gaussians
+
+
+def moments(
+    states: Iterable[tuple[int, float, Gaussians]], wanted: Iterable[float], *, between: bool = False
+) -> Iterator[Moment]:
+    """States at times, in seconds and rising; two states are in memory at once.
+
+    Args:
+        states: index, seconds and state of frames, in order. wanted: before the first and after the last frame it is
+            that frame's state.
+        between: whether states are interpolated; else the nearest is taken, of two that are as near the earlier.
+
+    >>> at = [(k, float(k), Gaussians.of_points([[k, 0, 2]], radius=0.1)) for k in range(3)]
+    >>> [moment.frame for moment in moments(at, [0, 0.4, 0.6, 1.5, 9])]
+    [0, 0, 1, 1, 2]
+    >>> [float(moment.state.means[0, 0]) for moment in moments(at, [0.25, 1.5], between=True)]
+    [0.25, 1.5]
+    """
+    coming = iter(states)
+    before = next(coming)
+    after = next(coming, None)
+    for seconds in wanted:
+        while after is not None and after[1] <= seconds:
+            before, after = after, next(coming, None)
+        share = 0.0 if after is None else max(seconds - before[1], 0.0) / (after[1] - before[1])
+        nearest = before if after is None or share <= 0.5 + 1e-6 else after
+        if between and after is not None and share > 0:
+            yield Moment(nearest[0], interpolated(before[2], after[2], share))
+        else:
+            yield Moment(nearest[0], nearest[2])
+
+
+def interpolated(a: Gaussians, b: Gaussians, share: float) -> Gaussians:
+    """A state between two of a scene, at ``share`` 0…1 of the way from ``a`` to ``b``.
+
+    Centres and colours go straight; axes turn with the material rotations, so that what turns keeps its size. What is
+    there in one state alone stays where it is there, and fades.
+
+    >>> a = Gaussians.of_points([[0, 0, 2]], radius=0.1)
+    >>> b = a.joined(Gaussians.of_points([[0, 1, 2]], radius=0.1))
+    >>> interpolated(a, b, 0.5).opacities
+    array([0.9 , 0.45], dtype=float32)
+    """
+    count = len(a)
+    old = b.rows(np.arange(count))
+    here, there = a.present, old.present
+    part = np.where(here & there, np.float32(share), there.astype(np.float32))
+    turn = _between_turns(a.rotations, old.rotations, part)
+    axes_a = np.swapaxes(quaternions_to_matrices(a.rotations), 1, 2) @ a.factors
+    axes_b = np.swapaxes(quaternions_to_matrices(old.rotations), 1, 2) @ old.factors
+    fade = np.where(here, 1.0, share) * np.where(there, 1.0, 1 - share)
+    mixed = {
+        "means": _mixed(a.means, old.means, part),
+        "factors": quaternions_to_matrices(turn) @ _mixed(axes_a, axes_b, part),
+        "rotations": turn,
+        "colours": _mixed(a.colours, old.colours, part),
+        "foreground": _mixed(a.foreground, old.foreground, part),
+        "opacities": (old.own_opacities * fade).astype(np.float32),
+    }
+    born = b.rows(np.arange(count, len(b)))
+    late = {name: getattr(born, name) for name in mixed} | {"opacities": born.opacities * np.float32(share)}
+    arrays = {name: np.ascontiguousarray(np.concatenate([mixed[name], late[name]]), np.float32) for name in mixed}
+    gone = np.concatenate([~(here | there), born.retired])
+    gloss = b.gloss if a.gloss is None or b.gloss is None else _gloss(a.gloss, b.gloss, share)
+    environment = b.environment
+    if a.environment is not None and b.environment is not None:
+        environment = _mixed(a.environment, b.environment, np.full(len(a.environment), share, np.float32))
+    return Gaussians(**arrays, ids=b.ids, retired=gone, gloss=gloss, environment=environment)
+
+
+def _mixed(a: NDArray[Any], b: NDArray[Any], part: NDArray[Any]) -> NDArray[np.float32]:
+    """Rows between those of two arrays, ``part`` [N] of the way."""
+    ways = part.reshape(-1, *[1] * (a.ndim - 1))
+    return np.asarray(a + ways * (b - a), np.float32)
+
+
+def _between_turns(a: NDArray[Any], b: NDArray[Any], part: NDArray[Any]) -> NDArray[np.float32]:
+    """[N, 4] unit quaternions between two, the short way."""
+    near = np.where((a * b).sum(axis=1, keepdims=True) < 0, -b, b)
+    mixed = _mixed(a, near, part)
+    size = np.linalg.norm(mixed, axis=1, keepdims=True)
+    return np.asarray(np.where(size > 1e-6, mixed / np.maximum(size, 1e-6), a), np.float32)
+
+
+def _gloss(a: NDArray[Any], b: NDArray[Any], share: float) -> NDArray[np.float32]:
+    count = min(len(a), len(b))
+    mixed = _mixed(a[:count], b[:count], np.full(count, share, np.float32))
+    return np.concatenate([mixed, b[count:]])

@@ -1,0 +1,215 @@
+"""A video as it was asked for: checked, and rendered picture by picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from client.cli.pictures import Picture, eight_bit
+from client.exports.sources import CompactStates
+from client.exports.video.camera_path import CameraPath, by_keys, orbit, still
+from client.exports.video.moments import moments
+from client.exports.video.overlay import Trails, rows_that_move
+from client.exports.video.part_paint import painted
+from scas4d_core.cameras import Camera, Rig, rig_inside
+from scas4d_core.captures import Capture
+from scas4d_core.captures.images import resize_area
+from scas4d_core.errors import InputError
+
+MOST_PICTURES = 1_000_000
+"""Of a video; more is a mistake in its rate or its speed."""
+
+
+@dataclass(frozen=True)
+class VideoOptions:
+    """Options of a video.
+
+    Attributes:
+        path: `orbit`, `camera`, or a JSON file of key poses (docs/videos.md).
+        camera: of the rig or of the capture beside: it is looked through, or the orbit begins there; None: the first.
+        turn: degrees a second of the orbit, to the camera's right.
+        fps: of the video; None: that of the frames. speed: seconds of the scene in one of the video.
+        seconds: of the video; None: until the frames end.
+        size: (width, height) of the render; None: that of the camera.
+        between: whether states are interpolated. tracks: how many; trail: their length in seconds of the video.
+        parts: whether Gaussians have the colours of their parts.
+        background: RGB in 0…1; None: the scene's.
+    """
+
+    path: str = "orbit"
+    camera: str | None = None
+    turn: float = 30.0
+    fps: float | None = None
+    speed: float = 1.0
+    seconds: float | None = None
+    size: tuple[int, int] | None = None
+    between: bool = False
+    tracks: int = 0
+    trail: float = 1.0
+    parts: bool = False
+    background: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A video that can be made.
+
+    Attributes:
+        given: the states. times: seconds of its frames that are shown, by index. options: as asked for.
+        fps: of the video. count: of pictures. size: (width, height) of the render. path: of the camera.
+        truth: the true picture of a frame, of that size; None where none is asked for.
+    """
+
+    given: CompactStates
+    times: Mapping[int, float]
+    options: VideoOptions
+    fps: float
+    count: int
+    size: tuple[int, int]
+    path: CameraPath
+    truth: Callable[[int], Picture] | None
+
+    @property
+    def whole_size(self) -> tuple[int, int]:
+        """Width and height of the video."""
+        return self.size[0] * (1 if self.truth is None else 2), self.size[1]
+
+    def pictures(self) -> Iterator[Picture]:
+        """The pictures, [H, W, 3], one after the other; two states are in memory at once."""
+        from scas4d_core.query.view import ViewRenderer
+        from scas4d_core.rasterize.limits import DEFAULT, scene_limits
+
+        head, options = self.given.head, self.options
+        limits = DEFAULT if head.rig is None else scene_limits("auto", rig_inside(head.world, head.rig.cameras).radius)
+        renderer = ViewRenderer(head.world, limits)
+        background = head.background if options.background is None else options.background
+        labels = self._labels() if options.parts else None
+        trails = self._trails() if options.tracks else None
+        indices, first = list(self.times), next(iter(self.times.values()))
+        wanted = (first + number / self.fps * options.speed for number in range(self.count))
+        states = self.given.states(indices[0], indices[-1])
+        for number, moment in enumerate(moments(states, wanted, between=options.between)):
+            camera = self.path(number / self.fps)
+            colours = None if labels is None else painted(moment.state, labels)
+            picture = eight_bit(renderer.render(moment.state, camera, background, colours=colours).colour)
+            if trails is not None:
+                trails.add(moment.state)
+                picture = trails.drawn(picture, camera)
+            yield picture if self.truth is None else np.concatenate([picture, self.truth(moment.frame)], axis=1)
+
+    def _labels(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+        labels = self.given.parts()
+        if labels is None:
+            raise InputError(f"parts: {self.given.name} holds none", "leave --parts out; there are none without motion")
+        return labels
+
+    def _trails(self) -> Trails:
+        rows = rows_that_move(self.given.some(list(self.times)), self.options.tracks)
+        if not rows.size:
+            raise InputError("tracks: nothing moves in these frames", "leave --tracks out, or choose other --frames")
+        return Trails(rows, self.given.head.world, round(self.options.trail * self.fps) + 1)
+
+
+def shot(
+    given: CompactStates, low: int, high: int, options: VideoOptions, beside: Capture | None, *, even: bool
+) -> Shot:
+    """Checks what is asked for.
+
+    Args:
+        given: the states. low, high: first and last frame. beside: the capture whose pictures stand beside.
+        even: whether both sides of the picture have to be even; an odd size of a camera is cut, one that was asked
+            for is refused.
+
+    Raises:
+        InputError: frames, a camera or pictures that are not there, or options that contradict each other.
+    """
+    _check(options, beside)
+    times = given.within(low, high)
+    first, last = min(times.values()), max(times.values())
+    fps = options.fps or given.rate
+    # The last frame is shown for as long as a picture.
+    length = (last - first) / options.speed + 1 / fps if options.seconds is None else options.seconds
+    if length * fps > MOST_PICTURES:
+        raise InputError(
+            f"fps {fps:g} and speed {options.speed:g} make {length * fps:.0f} pictures",
+            f"give --frames, --fps or --speed that make at most {MOST_PICTURES}",
+        )
+    camera = _camera(given, options.camera, beside)
+    size = _size(options.size, camera, even)
+    shown = {index: (time - first) / options.speed for index, time in times.items()}
+    path = _path(given.head.rig or Rig((camera,)), camera, size, options, shown)
+    truth = None if beside is None else _truth(beside, camera, size, max(times))
+    return Shot(given, times, options, fps, max(1, int(length * fps + 1e-6)), size, path, truth)
+
+
+def _check(options: VideoOptions, beside: Capture | None) -> None:
+    if beside is not None and options.path != "camera":
+        raise InputError(f"beside is given for path {options.path!r}", "give --path camera: cameras have true pictures")
+    if beside is not None and options.between:
+        raise InputError("beside and between contradict each other: between frames there is no truth", "leave one out")
+
+
+def _camera(given: CompactStates, name: str | None, beside: Capture | None) -> Camera:
+    """The camera of a name, as the scene has refined it, or one that only the capture has; without a name the first."""
+    cameras = {}
+    if beside is not None:
+        cameras = {
+            camera.name: camera for rig in (beside.full_rig, beside.full_test_rig) if rig for camera in rig.cameras
+        }
+    if given.head.rig is not None:
+        cameras = {camera.name: camera for camera in given.head.rig.cameras} | {
+            other: camera for other, camera in cameras.items() if other not in given.head.rig.names
+        }
+    if not cameras:
+        raise InputError(f"{given.name} tells no cameras", "write it with its rig: scas4d reconstruct does")
+    if name is None:
+        return next(iter(cameras.values()))
+    if name not in cameras:
+        raise InputError(f"camera {name!r} is not there", f"give one of {', '.join(cameras)}")
+    return cameras[name]
+
+
+def _size(asked: tuple[int, int] | None, camera: Camera, even: bool) -> tuple[int, int]:
+    width, height = asked or (camera.width, camera.height)
+    if not even or not (width % 2 or height % 2):
+        return width, height
+    fits = max(width // 2 * 2, 2), max(height // 2 * 2, 2)
+    if asked is not None:
+        raise InputError(f"size {width}x{height} is odd, and an MP4 cannot be", f"give {fits[0]}x{fits[1]}, or a .webp")
+    return fits
+
+
+def _path(
+    rig: Rig, camera: Camera, size: tuple[int, int], options: VideoOptions, shown: Mapping[int, float]
+) -> CameraPath:
+    if options.path == "orbit":
+        return orbit(rig, camera, size, options.turn)
+    if options.path == "camera":
+        return still(camera, size)
+    return by_keys(Path(options.path), rig, size, shown, camera)
+
+
+def _truth(beside: Capture, camera: Camera, size: tuple[int, int], last: int) -> Callable[[int], Picture]:
+    """Gives the true picture of a frame, in the place where ``fitted`` puts the camera's own."""
+    training = camera.name in beside.full_rig.names
+    if not training and (beside.full_test_rig is None or camera.name not in beside.full_test_rig.names):
+        raise InputError(f"beside: capture {beside.name} has no camera {camera.name!r}", "give another --camera")
+    if last >= beside.frame_count:
+        raise InputError(
+            f"beside: capture {beside.name} has {beside.frame_count} frames, and frame {last} is shown",
+            f"give --frames up to {beside.frame_count - 1}, or the capture that was reconstructed",
+        )
+    scale = min(size[0] / camera.width, size[1] / camera.height)
+    width, height = round(scale * camera.width), round(scale * camera.height)
+    left, top = (size[0] - width) // 2, (size[1] - height) // 2
+
+    def true(index: int) -> Picture:
+        frame = beside.frame(index) if training else beside.test_frame(index)
+        picture = np.zeros((size[1], size[0], 3), np.uint8)
+        picture[top : top + height, left : left + width] = resize_area(frame.images[camera.name], (width, height))
+        return picture
+
+    return true

@@ -1,0 +1,100 @@
+"""`scas4d video`: states rendered along a path of the camera, as an MP4 or an animated WebP."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from client.cli.progress import Bars, console
+from client.exports.sources import frame_range, opened
+from client.exports.video.shot import VideoOptions, shot
+from client.exports.video.video_file import check_suffix, video_file
+from client.importers.extras import pyav
+from scas4d_core.captures import Capture
+from scas4d_core.errors import InputError
+
+SMALLEST, LARGEST = 16, 7680
+"""Pixels of a side of the render; encoders and memory end there."""
+
+
+def make_video(
+    source: str,
+    out: Path | None,
+    options: VideoOptions,
+    *,
+    frames: str | None = None,
+    beside: Capture | None = None,
+    url: str,
+    token: str | None,
+) -> Path:
+    """Renders a video; two states and one picture are in memory at a time.
+
+    Args:
+        source: as `opened` takes it. out: ends in `.mp4` or `.webp`; None: an MP4 beside the source, named after it.
+        frames: `A:B`, the frames from A to B, both counted in; None: all.
+        beside: the capture; the true picture of the same camera stands to the right of each render.
+        url, token: of the service.
+
+    Returns:
+        The file.
+
+    Raises:
+        InputError: an option that cannot be, or frames, a camera or parts that are not there.
+        MissingExtra: PyAV is not installed.
+    """
+    low, high = frame_range(frames)
+    if out is not None:
+        check_suffix(out)
+    pyav()  # before anything is fetched or compiled
+    with opened(source, low, high, options.parts, url, token) as given, Bars() as bars:
+        if given.damage is not None:
+            console.print(f"only a part can be read: {given.damage}", soft_wrap=True)
+        target = out or given.beside / f"{given.name}-{Path(options.path).stem}.mp4"
+        planned = shot(given, low, high, options, beside, even=check_suffix(target) == ".mp4")
+        _compile_kernels(bars)
+        with video_file(target, planned.fps) as add:
+            for number, picture in enumerate(planned.pictures()):
+                add(picture)
+                bars("rendering", number + 1, planned.count)
+    width, height = planned.whole_size
+    seconds, size = planned.count / planned.fps, target.stat().st_size / 1e6
+    told = f"{planned.count} pictures of {width}x{height}, {seconds:.1f} s, {size:.1f} MB"
+    console.print(f"{target}: {told}", highlight=False, soft_wrap=True)
+    return target
+
+
+def picture_size(text: str) -> tuple[int, int]:
+    """Width and height of a size.
+
+    >>> picture_size("1280x720")
+    (1280, 720)
+    """
+    found = re.fullmatch(r"(\d{1,5})[xX×](\d{1,5})", text.strip())
+    size = (int(found[1]), int(found[2])) if found else (0, 0)
+    if not all(SMALLEST <= side <= LARGEST for side in size):
+        raise InputError(
+            f"size {text!r} is no size of a picture", f"give WIDTHxHEIGHT, as 1280x720, {SMALLEST} to {LARGEST} each"
+        )
+    return size
+
+
+def background_colour(text: str) -> tuple[float, float, float]:
+    """RGB in 0…1 of a colour.
+
+    >>> background_colour("#ff8000"), background_colour("white")
+    ((1.0, 0.5019607843137255, 0.0), (1.0, 1.0, 1.0))
+    """
+    from PIL import ImageColor
+
+    try:
+        red, green, blue = ImageColor.getrgb(text)[:3]
+    except ValueError:
+        raise InputError(f"background {text!r} is no colour", "give a name or #rrggbb, as white or #202020") from None
+    return red / 255, green / 255, blue / 255
+
+
+def _compile_kernels(bars: Bars) -> None:
+    from scas4d_core.compilation.manifest import Group
+    from scas4d_core.warm_up import warm_up_elsewhere
+
+    warm_up_elsewhere((Group.FIRST_FRAME,), told=lambda done, total: bars("compiling the kernels", done, total))

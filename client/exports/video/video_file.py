@@ -1,0 +1,129 @@
+"""Writes videos through PyAV, picture by picture: H.264 in an MP4, or an animated WebP."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.importers.extras import pyav
+from scas4d_core.errors import InputError
+
+Picture = NDArray[np.uint8]
+
+SUFFIXES = (".mp4", ".webp")
+QUALITY = {".mp4": {"crf": "18", "preset": "medium"}, ".webp": {"quality": "90", "lossless": "0"}}
+"""Options of the encoders; at these the eye sees no loss."""
+FINEST_RATE = 65535
+"""Largest denominator of a rate: the containers have no room for more."""
+
+
+def check_suffix(path: Path) -> str:
+    """The suffix of a video, in small letters.
+
+    Raises:
+        InputError: it is none that is written.
+
+    >>> check_suffix(Path("a.MP4"))
+    '.mp4'
+    >>> check_suffix(Path("a.gif"))
+    Traceback (most recent call last):
+    scas4d_core.errors.InputError: out 'a.gif' ends in '.gif'; give a name that ends in .mp4 or .webp
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InputError(
+            f"out {str(path)!r} ends in {path.suffix!r}", f"give a name that ends in {' or '.join(SUFFIXES)}"
+        )
+    return suffix
+
+
+@contextmanager
+def video_file(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
+    """Writes pictures of one size as a video; folders are made, and the file has its name when it is whole.
+
+    An MP4 is 4:2:0 with 8 bits, which everything plays, in the colours of BT.709 with limited range, and says so. A
+    WebP repeats for ever. A picture is encoded when it is added; none is kept.
+
+    Args:
+        path: ends in `.mp4` or `.webp`. fps: pictures a second.
+
+    Yields:
+        A function that adds a picture, [H, W, 3], sRGB values 0…255; of an MP4 an odd row or column at the end is left
+        out, as the encoding needs.
+
+    Raises:
+        InputError: another suffix, no picture was added, or the file cannot be written.
+        MissingExtra: PyAV is not installed.
+
+    >>> with video_file(out / "grey.mp4", 25) as add:
+    ...     for level in range(3):
+    ...         add(np.full((16, 32, 3), level, np.uint8))
+    """
+    from scas4d_core.exports.whole_files import whole_file
+
+    suffix, av = check_suffix(path), pyav()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as beside:
+        encoder = _Encoder(beside, suffix, fps)
+        try:
+            yield encoder.add
+            if not encoder.count:
+                raise InputError(f"out {str(path)!r} would hold no picture", "give frames that there are")
+            encoder.finish()
+        except av.FFmpegError as error:
+            raise InputError(f"out {str(path)!r} cannot be encoded ({error})", "give a smaller size") from error
+        finally:
+            encoder.close()
+
+
+class _Encoder:
+    """One file that is being written.
+
+    Attributes:
+        count: pictures so far.
+    """
+
+    def __init__(self, path: Path, suffix: str, fps: float) -> None:
+        self._av = pyav()
+        self._mp4 = suffix == ".mp4"
+        self._rate = Fraction(fps).limit_denominator(FINEST_RATE)
+        self.count = 0
+        options = {"movflags": "faststart"} if self._mp4 else {"loop": "0"}
+        self._container = self._av.open(str(path), "w", format=suffix[1:], options=options)
+        self._stream = self._container.add_stream("libx264" if self._mp4 else "libwebp_anim", rate=self._rate)
+        self._stream.options = QUALITY[suffix]
+        if self._mp4:
+            context = self._stream.codec_context
+            context.color_range, context.colorspace = 1, 1  # limited; BT.709
+            context.color_primaries, context.color_trc = 1, 1
+
+    def add(self, picture: Picture) -> None:
+        height, width = picture.shape[:2]
+        if self._mp4:
+            height, width = height // 2 * 2, width // 2 * 2
+        if not self.count:
+            self._stream.width, self._stream.height = width, height
+            self._stream.pix_fmt = "yuv420p" if self._mp4 else "bgra"
+        frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(picture[:height, :width]), "rgb24")
+        if self._mp4:
+            frame = frame.reformat(
+                format="yuv420p",
+                src_colorspace="ITU709", dst_colorspace="ITU709", src_color_range="JPEG", dst_color_range="MPEG",
+            )  # fmt: skip
+        else:
+            frame = frame.reformat(format="bgra")
+        frame.pts, frame.time_base = self.count, 1 / self._rate
+        self._container.mux(self._stream.encode(frame))
+        self.count += 1
+
+    def finish(self) -> None:
+        """Writes what the encoder still holds."""
+        self._container.mux(self._stream.encode(None))
+
+    def close(self) -> None:
+        self._container.close()

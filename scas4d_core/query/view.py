@@ -1,0 +1,122 @@
+"""Pictures of one state from any camera: colour, depth, alpha, and the part that covers each pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Camera, WorldFrame
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.kernels.blend import GROUP
+from scas4d_core.query.tracks import ALPHA_OF_A_SURFACE
+from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
+from scas4d_core.rasterize.limits import DEFAULT, Limits
+from scas4d_core.rasterize.shading import colours_seen
+
+Array = NDArray[np.float32]
+
+MOST_LABEL = 254
+"""Parts are painted into 8 bits; 0 means no part."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A rendered picture.
+
+    Attributes:
+        colour: [H, W, 3] float32, nominally 0…1, over the background. alpha: [H, W] float32.
+        depth: [H, W] float32, alpha-weighted mean z along the camera's axis in the user's units; NaN where less than
+            half of the pixel is covered.
+        parts: [H, W] uint8, or None where no labels were given: 0 for no part, else 1 + the label that covers the pixel
+            most.
+
+    >>> black = np.zeros((2, 2), np.float32)
+    >>> view = View(np.zeros((2, 2, 3), np.float32), alpha=black, depth=np.full_like(black, np.nan))
+    >>> view.colour.shape, view.parts is None  # no labels were given
+    ((2, 2, 3), True)
+    """
+
+    colour: Array
+    alpha: Array
+    depth: Array
+    parts: NDArray[np.uint8] | None = None
+
+
+class ViewRenderer:
+    """Renders states, each given with its camera; buffers are kept from one picture to the next.
+
+    Args:
+        world: the user's world to that of the states. limits: of the rasterizer.
+
+    >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
+    >>> camera = Camera("front", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], np.eye(4), 16, 16)
+    >>> renderer = ViewRenderer(WorldFrame(np.zeros(3)))
+    >>> renderer.render(state, camera, background=(0, 0, 1)).colour[8, 8].round(1)
+    array([0.9, 0. , 0.1], dtype=float32)
+    >>> green = np.array([[0, 1, 0]], np.float32)
+    >>> renderer.render(state, camera, colours=green).colour[8, 8].round(1)
+    array([0. , 0.9, 0. ], dtype=float32)
+    """
+
+    def __init__(self, world: WorldFrame, limits: Limits = DEFAULT) -> None:
+        self.world = world
+        self._rasterizer = CpuRasterizer(limits)
+
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        *,
+        colours: Array | None = None,
+        labels: NDArray[Any] | None = None,
+    ) -> View:
+        """Renders a view of a state.
+
+        Args:
+            gaussians: N Gaussians in the inside world. camera: user's world. background: RGB in 0…1 behind everything.
+            colours: [N, 3] float32 RGB in place of the state's own; None: its own, as this camera sees them.
+            labels: [N] part of each Gaussian, −1 for none; given where ``View.parts`` is wanted.
+
+        Raises:
+            ValueError: labels of another shape or range.
+        """
+        inside = self.world.camera_to_inside(camera)
+        arrays = CameraArrays.of(inside)
+        shown = colours_seen(gaussians, arrays) if colours is None else colours
+        features = np.concatenate([shown, np.zeros((len(gaussians), 1), np.float32)], axis=1)
+        picture = self._rasterizer.forward(
+            gaussians.means, gaussians.factors, gaussians.opacities, features, arrays,
+            np.array([*background, 0.0], np.float32), depth_channel=3,
+        )  # fmt: skip
+        colour = np.moveaxis(picture.features[:3], 0, -1).copy()
+        alpha = 1 - picture.rest
+        with np.errstate(invalid="ignore", divide="ignore"):
+            depth = picture.features[3] / alpha / np.float32(self.world.metres_per_unit)
+        depth[alpha < ALPHA_OF_A_SURFACE] = np.nan
+        parts = None if labels is None else self._parts_picture(gaussians, np.asarray(labels), arrays)
+        return View(colour, alpha, depth, parts)
+
+    def _parts_picture(self, gaussians: Gaussians, labels: NDArray[Any], camera: CameraArrays) -> NDArray[np.uint8]:
+        """[H, W] uint8: the label whose Gaussians weigh most in the pixel, plus 1. A pass renders ``GROUP`` labels."""
+        if labels.shape != (len(gaussians),) or not ((labels >= -1) & (labels <= MOST_LABEL)).all():
+            raise ValueError(
+                f"labels {labels.shape} must be [{len(gaussians)}], one a Gaussian, each in -1...{MOST_LABEL}"
+            )
+        found = np.zeros((camera.height, camera.width), np.uint8)
+        most = np.full(found.shape, -1.0, np.float32)
+        black = np.zeros(GROUP, np.float32)
+        for first in range(-1, int(labels.max(initial=-1)) + 1, GROUP):
+            weights = (labels[:, None] == np.arange(first, first + GROUP)).astype(np.float32)
+            picture = self._rasterizer.forward(
+                gaussians.means, gaussians.factors, gaussians.opacities, weights, camera, black
+            )
+            best = picture.features.max(axis=0)
+            wins = best > most
+            found[wins] = (first + 1 + picture.features.argmax(axis=0))[wins]
+            most[wins] = best[wins]
+        found[picture.rest > 1 - ALPHA_OF_A_SURFACE] = 0
+        return found
