@@ -37,7 +37,7 @@ def compact(
 
 
 def opening(
-    frames: Annotated[int, typer.Option(min=200, help="Of the history: a day at one a second, when left out.")] = 86_400,
+    frames: Annotated[int, typer.Option(min=200, help="Of the history; a day at one a second.")] = 86_400,
 ) -> None:
     """Measures how long a history of many frames takes to open where older states are in compact files."""
     from studies.compact.opening import opening as measured

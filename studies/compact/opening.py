@@ -39,8 +39,8 @@ def opening(frames: int) -> str:
             reads.append(time.process_time() - began)
         files = len(list(folder.glob("states_*.s4d")))
     return (
-        f"{frames:,} frames, {frames - EXACT - 1:,} of them in {files} compact files: opened in {median(seconds):.2f} s "
-        f"of the processor (median of {TURNS}); one of {GAUSSIANS} Gaussians read at random in "
+        f"{frames:,} frames, {frames - EXACT - 1:,} of them in {files} compact files: opened in "
+        f"{median(seconds):.2f} s of the processor (median of {TURNS}); one of {GAUSSIANS} Gaussians read at random in "
         f"{1e3 * median(reads):.1f} ms"
     )
 
