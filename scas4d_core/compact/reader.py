@@ -186,29 +186,33 @@ class CompactReader:
     def copied(self, first: int, last: int, file: BinaryIO) -> list[int]:
         """Copies the records of some frames to another file, which has no index then: their states keep their bits.
 
-        The copy begins with this file's first frame and the key before ``first``, by which the others are told.
-
         Args:
             first, last: frames, both counted in.
 
         Returns:
-            The frames of the copy.
+            The frames of the copy, up to the first that is damaged. It begins with this file's first frame and the key
+            before ``first``, by which the others are told.
 
         Raises:
-            FileError: no frame lies between. DamagedFileError: a record is damaged.
+            FileError: no frame lies between. DamagedFileError: the first of them, or what tells it, is damaged.
         """
         wanted = [place for place, index in enumerate(self._frames) if first <= index <= last]
         if not wanted:
             raise FileError(f"{self.path.name}: no frame from {first} to {last} is in the file{self._why()}")
         begin = next(place for place in range(wanted[0], -1, -1) if self._states[place].kind is not Kind.DELTA)
         states = {self._states[place] for place in (0, *range(begin, wanted[-1] + 1))}
+        end, copied = self._frames[wanted[-1]], list[int]()
         for record in self._records:
-            end = self._frames[wanted[-1]]
             if record in states or record.kind is Kind.HEAD or (record.kind is Kind.BORN and record.frame <= end):
-                file.write(
-                    record_bytes(record.kind, read_body(self._file, record, self.path.name), record.frame, record.time)
-                )
-        return sorted({record.frame for record in states})
+                try:
+                    body = read_body(self._file, record, self.path.name)
+                except DamagedFileError:
+                    if not copied or copied[-1] < first:
+                        raise
+                    break
+                file.write(record_bytes(record.kind, body, record.frame, record.time))
+                copied += [record.frame] if record in states else []
+        return copied
 
     def parts(self, index: int | None = None) -> NDArray[np.int64] | None:
         """[N] part of each Gaussian, −1 for none, as it was last seen up to a frame; None where none was."""

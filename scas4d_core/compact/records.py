@@ -106,11 +106,22 @@ def scan(file: BinaryIO, offset: int, name: str) -> Iterator[Record]:
     size = file.tell()
     while offset + HEAD_SIZE <= size:
         file.seek(offset)
-        record = parse_head(file.read(HEAD_SIZE), offset, name)
+        data = file.read(HEAD_SIZE)
+        if not any(data) and _is_zero(file):  # a power cut came before the bytes, and after the length of the file
+            return
+        record = parse_head(data, offset, name)
         if record.end > size:
             return
         yield record
         offset = record.end
+
+
+def _is_zero(file: BinaryIO) -> bool:
+    """True where only zeros follow."""
+    while piece := file.read(1 << 20):
+        if any(piece):
+            return False
+    return True
 
 
 def checked_records(path: Path) -> Iterator[int]:

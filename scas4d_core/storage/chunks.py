@@ -14,6 +14,7 @@ import weakref
 from bisect import bisect_right, insort
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from scas4d_core.compact import CompactReader, FileError
+from scas4d_core.errors import message_of
 from scas4d_core.storage.births import Int
 from scas4d_core.storage.frame_arrays import EVENTS, Arrays, Stamp
 
@@ -51,8 +53,8 @@ class Chunk:
 
     @property
     def first(self) -> int:
-        """Its first frame."""
-        return min(self.times)
+        """Its first frame, as its name tells."""
+        return chunk_of(self.path.name) or 0
 
 
 class Chunks:
@@ -138,10 +140,19 @@ class Chunks:
         Raises:
             FileNotFoundError: no chunk has it. FileError: it cannot be read.
         """
-        if (chunk := self.of(index)) is None:
+        try:
+            return self._read(index, names, optional)
+        except FileNotFoundError:  # new since the last look, or deleted
             self.look()
-            if (chunk := self.of(index)) is None:
-                raise FileNotFoundError(f"frame {index} is in no chunk")
+            return self._read(index, names, optional)
+
+    def _read(self, index: int, names: Sequence[str], optional: Sequence[str]) -> Arrays:
+        if (chunk := self.of(index)) is None:
+            raise FileNotFoundError(f"frame {index} is in no chunk")
+        with _disk_errors(chunk.path):
+            return self._read_from(chunk, index, names, optional)
+
+    def _read_from(self, chunk: Chunk, index: int, names: Sequence[str], optional: Sequence[str]) -> Arrays:
         found: Arrays = {}
         asked = {*names, *optional}
         if "time" in asked:
@@ -193,7 +204,7 @@ class Chunks:
         try:
             self.read(index, ("means", "report"))
         except (FileNotFoundError, FileError) as error:
-            return str(error)
+            return message_of(error)
         return None
 
     def remove(self, first: int) -> None:
@@ -221,13 +232,14 @@ def _close_all(readers: OrderedDict[Path, tuple[Chunk, CompactReader]]) -> None:
         reader.close()
 
 
-def note_of(report: Mapping[str, Any], log: Int, index: int, first: bool) -> dict[str, Any]:
+def note_of(report: Mapping[str, Any], log: Int, before: int) -> dict[str, Any]:
     """The note on a frame: its report, and the events of its log.
 
     Args:
-        log: [E, 4] up to it. first: of the chunk: then all of the log, so that no other chunk is needed for it.
+        log: [E, 4] up to it. before: the frame before it in its chunk; −1 for the first, which has all of the log, so
+            that no other chunk is needed for it.
     """
-    own = log if first else log[log[:, 0] == index]
+    own = log[log[:, 0] > before]
     return {REPORT: dict(report), **({EVENTS: own.tolist()} if len(own) else {})}
 
 
@@ -265,5 +277,16 @@ def _listed(path: Path, status: os.stat_result) -> Chunk:
             times = dict(zip(reader.frames, reader.times.tolist(), strict=True))
             stamps = {index: (taken, -1 - checksum) for index, taken, checksum in reader.sizes()}
             return Chunk(path, size, changed, times, stamps, reader.damage)
-    except (FileError, FileNotFoundError) as error:
-        return Chunk(path, size, changed, damage=str(error))
+    except (FileError, OSError) as error:
+        return Chunk(path, size, changed, damage=f"{path.name}: {message_of(error)}")
+
+
+@contextmanager
+def _disk_errors(path: Path) -> Iterator[None]:
+    """Takes what the disk cannot read for damage."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise FileError(f"{path.name}: {message_of(error)}") from error

@@ -9,17 +9,20 @@ from __future__ import annotations
 
 import logging
 import os
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
 from scas4d_core.compact import CompactWriter, FileError, Head
 from scas4d_core.storage.chunks import chunk_file, note_of
-from scas4d_core.storage.frame_files import HistoryError
 from scas4d_core.storage.history import NEWEST_KEPT, History
 from scas4d_core.storage.npz import sync_folder
 
 CHUNK_FRAMES = 120
 """Frames of a chunk: its first state takes as much as five to ten of the others, and retention deletes it whole."""
+
+UNTOLD = (ValueError, ArithmeticError, MemoryError)
+"""Errors of states that cannot be read or told: those of histories and of compact files are ValueErrors."""
 
 log = logging.getLogger("scas4d.storage")
 
@@ -56,13 +59,16 @@ class Compaction:
         """First frame of the chunk that is written."""
         self._passed = max(history.files.chunks, default=-1)
         """The last frame that is in a chunk, or that cannot be."""
-        if self._passed >= 0:
-            self._complete(self._passed)
+        self._queue: deque[int] = deque()
+        """Frames to move, the oldest first."""
+        self._complete()
 
     @property
     def due(self) -> int:
-        """How many states are to be moved."""
-        return len(self._waiting())
+        """How many states are to be moved, as far as is known: at least one where any is."""
+        if not self._queue:
+            self._queue.extend(self._history.older(self.exact, self._passed))
+        return len(self._queue)
 
     def step(self) -> int | None:
         """Moves one state; returns its frame, or None where none is due.
@@ -70,41 +76,42 @@ class Compaction:
         Raises:
             OSError: the disk is full, or fails; nothing is lost, and the next step tries again.
         """
-        for index in self._waiting():
+        while self.due:
+            index = self._queue[0]
             try:
-                self._move(index)
+                if index in self._history:  # retention may have deleted it
+                    self._move(index)
             except OSError:
                 self._drop()
                 raise
-            except (HistoryError, FileError) as error:  # damaged, or it cannot be told: it stays as it is
+            except UNTOLD as error:  # damaged, or it cannot be told: it stays as it is
                 log.warning("frame %d is not compacted: %s", index, error)
                 self._drop()
-                self._passed = index
-                continue
-            return index
+            else:
+                self._passed = self._queue.popleft()
+                return index
+            self._passed = self._queue.popleft()
         return None
 
     def close(self) -> None:
         """Leaves the chunk that is being written as it is; another ``Compaction`` goes on with it."""
         self._drop()
 
-    def _complete(self, index: int) -> None:
-        """Deletes the file of the last frame in a chunk, which a stop left beside it."""
-        path = self._files.path(index)
-        if path.exists() and index != self._history.indices[0] and self._files.chunks.fault(index) is None:
-            path.unlink()
-            self._history.restamp(index)
-
-    def _waiting(self) -> list[int]:
-        indices = self._history.indices
-        end = len(indices) - self.exact
-        if end < 2 or indices[end - 1] <= self._passed:
-            return []
-        begin = next(place for place in range(end, 0, -1) if place == 1 or indices[place - 1] <= self._passed)
-        return indices[begin:end]
+    def _complete(self) -> None:
+        """Deletes files of frames that are in a chunk, whole and on disk: a stop left them beside it."""
+        first = next(iter(self._history.indices), -1)
+        own = [index for index in self._files.chunks if index != first and self._files.path(index).exists()]
+        for path in {chunk.path for index in own if (chunk := self._files.chunks.of(index)) is not None}:
+            _confirm(path)
+        for index in own:
+            if self._files.chunks.fault(index) is None:
+                self._files.path(index).unlink()
+                self._history.restamp(index)
 
     def _move(self, index: int) -> None:
         history, files = self._history, self._files
+        if self._writer is not None and self._first not in files.chunks.known:  # retention has deleted it
+            self._drop()
         state, time = history.gaussians(index), history.time(index)
         report, log = history.report(index), history.log_at(index)
         writer = self._writer or self._resumed()
@@ -112,24 +119,26 @@ class Compaction:
             self._finish(writer)
             writer = self._begun(index)
         self._writer = writer
-        try:
-            writer.add(index, time, state, note=note_of(report, log, index, index == self._first))
-        except FileError:
-            if index == self._first or not writer.frames:
-                raise
-            self._finish(writer)  # other Gaussians than before: a chunk of its own may hold it
-            writer = self._writer = self._begun(index)
-            writer.add(index, time, state, note=note_of(report, log, index, index == self._first))
+        if writer.last_frame < index:  # else the disk did not confirm it the last time
+            try:
+                writer.add(index, time, state, note=note_of(report, log, writer.last_frame))
+            except FileError:
+                if not writer.frames:
+                    self._drop()
+                    writer.path.unlink(missing_ok=True)
+                    raise
+                self._finish(writer)  # other Gaussians than before: a chunk of its own may hold it
+                writer = self._writer = self._begun(index)
+                writer.add(index, time, state, note=note_of(report, log, -1))
         writer.sync()
         files.chunks.look_at(self._first)
         if index not in files.chunks:
             raise FileError(f"{writer.path.name}: frame {index} is not in it after it was written")
         files.path(index).unlink(missing_ok=True)
         history.restamp(index)
-        self._passed = index
 
     def _fits(self, writer: CompactWriter, index: int) -> bool:
-        return writer.frames < CHUNK_FRAMES and writer.last_frame < index
+        return writer.last_frame == index or (writer.frames < CHUNK_FRAMES and writer.last_frame < index)
 
     def _resumed(self) -> CompactWriter | None:
         """The newest chunk, to go on with, where it has not ended and was begun with the same bounds."""
@@ -139,7 +148,7 @@ class Compaction:
         self._first = max(known)
         try:
             writer = CompactWriter.resume(known[self._first].path)
-        except (FileError, FileNotFoundError):
+        except UNTOLD:
             return None
         if writer.head.text() != self._head().text():
             self._finish(writer)
@@ -158,8 +167,7 @@ class Compaction:
         """Ends a chunk with its index."""
         if writer is not None:
             writer.close()
-            with writer.path.open("rb") as file:
-                os.fsync(file.fileno())
+            _confirm(writer.path)
             self._files.chunks.look()
         self._writer = None
 
@@ -168,3 +176,10 @@ class Compaction:
         if self._writer is not None:
             self._writer.abandon()
         self._writer = None
+
+
+def _confirm(path: Path) -> None:
+    """Has the disk confirm a file, and that it is in its folder."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+    sync_folder(path.parent)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,17 +74,15 @@ class FrameFiles:
     def listed(self) -> dict[int, Stamp]:
         """Stamps of the frames in the directory, rising; the first one is listed also where only its copy exists."""
         found: dict[int, Stamp] = {}
-        others: list[str] = []
         with os.scandir(self.directory) as entries:
             for entry in entries:
                 if (index := frame_of(entry.name)) is None:
-                    others.append(entry.name)
                     continue
                 try:
                     found[index] = _stamp(entry.stat())
                 except FileNotFoundError:  # deleted, or compacted, meanwhile
                     continue
-        self.chunks.look(others)
+        self.chunks.look()  # after the files: a frame goes to a chunk before its own file goes
         found = self.chunks.stamps() | found
         first = self._first()
         if found and first is not None and first[1] < min(found):
@@ -104,7 +102,7 @@ class FrameFiles:
                     found[index] = first[0]
                 else:
                     absent.append(index)
-        if any(index not in self.chunks for index in absent):
+        if absent:
             self.chunks.look()
         found |= {index: stamp for index in absent if (stamp := self.chunks.stamp(index)) is not None}
         return dict(sorted(found.items()))
@@ -161,6 +159,8 @@ class FrameFiles:
                 if isinstance(error, FileNotFoundError):
                     return self._from_chunk(index, names, optional)
                 self.faults[self.path(index).name] = str(error)
+                if index in self.chunks:  # it was made again, or not deleted: the other is better than none
+                    return self.chunks.read(index, names, optional)
                 raise
             found = _read(self.first_copy, names, optional)
             self.faults[self.path(index).name] = _reason(self.path(index), error)
@@ -258,17 +258,21 @@ class FrameFiles:
             self.chunks.look()
         return index in self.chunks
 
-    def chunk_of(self, index: int, stamp: Stamp) -> int | None:
-        """First frame of the chunk that a frame with this stamp is in; None for one with a file of its own."""
-        chunk = self.chunks.of(index) if in_chunk(stamp) else None
-        return None if chunk is None else chunk.first
+    def chunk_of(self, index: int) -> list[int]:
+        """The frames of the chunk that a frame is in, the frame alone where it is in none."""
+        chunk = self.chunks.of(index)
+        return [index] if chunk is None else list(chunk.times)
 
-    def remove_oldest(self, deleted: Collection[int]) -> None:
-        """Deletes frames, those of a chunk all or none."""
+    def remove_oldest(self, deleted: Collection[int], left: Container[int]) -> None:
+        """Deletes frames, and chunks that hold none of those that are left.
+
+        Args:
+            left: the frames of the history without the deleted.
+        """
         firsts: set[int] = set()
         for index in deleted:
             self.path(index).unlink(missing_ok=True)
-            if (chunk := self.chunks.of(index)) is not None and chunk.times.keys() <= set(deleted):
+            if (chunk := self.chunks.of(index)) is not None and not any(other in left for other in chunk.times):
                 firsts.add(chunk.first)
         for first in firsts:
             self.chunks.remove(first)

@@ -6,6 +6,7 @@ import json
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any, Self
 
@@ -106,6 +107,12 @@ class FramesReader:
         if added and not self._fixed:
             self._fixed = self._files.read_fixed(FIXED)
         return added, gone
+
+    def older(self, newest: int, after: int) -> list[int]:
+        """The frames after one that are older than so many newest, rising, without the first of all."""
+        first = next(iter(self._times), -1)
+        frames = takewhile(lambda index: index > max(after, first), islice(reversed(self._times), newest, None))
+        return list(frames)[::-1]
 
     @property
     def unlisted(self) -> list[str]:

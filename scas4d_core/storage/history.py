@@ -250,13 +250,12 @@ class History(HistoryReader):
         for name, rule in (("last", last), ("size_bytes", size_bytes)):
             if rule is not None and rule < 1:
                 raise HistoryError(f"{name} is {rule}; keep at least 1, or give None to keep all")
-        files = self._files
-        chunk_of = None if files is None else lambda index: files.chunk_of(index, self._stamps[index])
-        deleted = surplus(self.indices, lambda index: self._stamps[index][0], NEWEST_KEPT, last, size_bytes, chunk_of)
-        if files is not None:
-            files.remove_oldest(deleted)
+        with_it = None if self._files is None else self._files.chunk_of
+        deleted = surplus(self.indices, lambda index: self._stamps[index][0], NEWEST_KEPT, last, size_bytes, with_it)
         for index in deleted:
             self._forget(index)
+        if self._files is not None and deleted:
+            self._files.remove_oldest(deleted, self._times)
         return deleted
 
     def put_aside(self, folder: Path) -> None:

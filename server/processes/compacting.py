@@ -1,4 +1,4 @@
-"""Compacts the older states of a scene in its worker, while no message waits."""
+"""Compacts the older states of a scene in its worker: one after each commit, more while no message waits."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ class Compacting:
         self._spec = spec
         self._rules = spec.kept
         self._compaction: Compaction | None = None
+        self._failed = False
 
     def keep(self, rules: IngestSettings) -> None:
         """Goes by other rules from now on."""
@@ -47,7 +48,7 @@ class Compacting:
             waits: returns whether a message waits.
         """
         exact = self._rules.exact_states
-        if history is None or exact is None or len(history) <= exact + 1:
+        if self._failed or history is None or exact is None or len(history) <= exact + 1:
             return
         try:
             if self._compaction is None:
@@ -55,10 +56,12 @@ class Compacting:
             while (due := self._compaction.due) and (due > BEHIND or not waits()):
                 if self._compaction.step() is None or waits():
                     return
-        except OSError as error:
-            if not no_room(error):
-                raise
-            log.warning("scene %s: no state is compacted: %s", self._spec.folder.name, error)
+        except Exception as error:  # whatever it is, the scene goes on with exact states
+            if no_room(error):
+                log.warning("scene %s: no state is compacted: %s", self._spec.folder.name, error)
+                return
+            log.exception("scene %s: no state is compacted until its worker starts again", self._spec.folder.name)
+            self._failed = True
 
     def _head(self, history: History) -> Head:
         bounds = Bounds(**self._rules.state_bounds.model_dump())

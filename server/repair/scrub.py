@@ -176,7 +176,7 @@ class Scrub:
     async def _state(self, path: Path, expected: Callable[[], bool]) -> None:
         """Scrubs one file; `expected`: returns whether a missing file is damage."""
         fault = await self._read(verified(path))
-        if fault == GONE and expected():
+        if fault == GONE and await asyncio.to_thread(expected):
             self._noticed({path.name: f"{path.name} is gone"})
         elif fault is not None and fault != GONE:
             self._noticed({path.name: fault})

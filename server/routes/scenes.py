@@ -103,7 +103,7 @@ async def edit(id: SceneId, scenes: AllScenes, request: SceneEdit) -> SceneStatu
     It is on disk when this answers. States that a shorter `keep_states` deletes go within seconds, for good; the scene
     wakes for that.
     """
-    async with scenes.using(id, place=request.keep_states is not None) as scene:
+    async with scenes.using(id, place=request.keep_states is not None or request.exact_states is not None) as scene:
         await scene.edit(request)
         return scene.status()
 

@@ -54,7 +54,6 @@ def _fill(folder: Path, frames: int) -> None:
     for first in range(1, exact, CHUNK_FRAMES):
         with CompactWriter(folder / chunk_file(first), Head(WorldFrame(np.zeros(3)))) as writer:
             for index in range(first, min(exact, first + CHUNK_FRAMES)):
-                note = note_of({}, history.log_at(0), index, index == first)
-                writer.add(index, index / 30, state, note=note)
+                writer.add(index, index / 30, state, note=note_of({}, history.log_at(0), writer.last_frame))
     for index in range(exact, frames):
         history.append(index, index / 30, state, report={})

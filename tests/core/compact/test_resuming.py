@@ -128,3 +128,34 @@ def test_a_note_that_is_no_json_writes_nothing(tmp_path: Path) -> None:
         writer.add(0, *TRUE[0], note={"loss": 0.5})
     with CompactReader(tmp_path / "a.s4d") as reader:
         assert reader.note(0)["loss"] == 0.5
+
+
+def test_a_tail_of_zeros_is_cut_off(whole: Path, tmp_path: Path) -> None:
+    """What a power cut leaves: the length of the file was written, its last bytes were not."""
+    with CompactReader(whole) as reader:
+        end = reader._states[-3].end
+    path = tmp_path / "zeros.s4d"
+    path.write_bytes(whole.read_bytes()[:end] + bytes(5000))
+    with CompactReader(path) as reader:
+        assert reader.damage is None
+        assert reader.frames == list(FRAMES[:-2])
+    with CompactWriter.resume(path) as writer:
+        for index in FRAMES[-2:]:
+            writer.add(index, *TRUE[index], note={"frame": index})
+    assert path.read_bytes() == whole.read_bytes()
+
+
+def test_a_copy_ends_before_what_is_damaged(whole: Path, tmp_path: Path) -> None:
+    with CompactReader(whole) as reader:
+        place = next(one for one in reader._states if one.frame == 9)
+    data = bytearray(whole.read_bytes())
+    data[place.offset + 9] ^= 2
+    damaged, path = tmp_path / "damaged.s4d", tmp_path / "copy.s4d"
+    damaged.write_bytes(data)
+    with CompactReader(damaged) as reader, path.open("wb") as file:
+        assert reader.copied(7, 20, file)[-1] == 8
+        file.close()
+        with CompactReader(path) as copy:
+            near(copy, 8)
+        with path.open("wb") as file, pytest.raises(DamagedFileError):
+            reader.copied(9, 20, file)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,10 @@ import numpy as np
 import pytest
 
 from scas4d_core.cameras import WorldFrame
-from scas4d_core.compact import Bounds, CompactWriter, Head
+from scas4d_core.compact import Bounds, CompactReader, CompactWriter, Head
 from scas4d_core.compact.columns import Columns
 from scas4d_core.compact.frame_code import errors_of
-from scas4d_core.gaussians import UNBORN, Gaussians
+from scas4d_core.gaussians import PER_FRAME, UNBORN, Gaussians
 from scas4d_core.storage import compaction as compaction_module
 from scas4d_core.storage.chunks import chunk_of
 from scas4d_core.storage.compaction import Compaction
@@ -85,6 +86,11 @@ def same(history: History, true: History, exact: set[int]) -> None:
 def names(history: History) -> list[str]:
     assert history.directory is not None
     return sorted(path.name for path in history.directory.iterdir())
+
+
+def made_again(history: History, true: History, index: int) -> None:
+    arrays = {name: true.gaussians(index).arrays()[name] for name in PER_FRAME}
+    history.replace(index, true.time(index), arrays, {"remade": True})
 
 
 def test_older_states_are_read_from_chunks_by_all(tmp_path: Path, true: History) -> None:
@@ -165,6 +171,8 @@ def test_a_full_disk_loses_nothing_and_is_tried_again(tmp_path: Path, true: Hist
         pass
     moving.close()
     same(history, true, {0, *true.indices[-EXACT:]})
+    held = [index for chunk in history.files.chunks.known.values() for index in chunk.times]
+    assert held == [index for index in true.indices[1:-EXACT]]  # each once
 
 
 def test_a_damaged_chunk_hides_only_what_needs_it(tmp_path: Path, true: History) -> None:
@@ -192,9 +200,7 @@ def test_a_damaged_chunk_hides_only_what_needs_it(tmp_path: Path, true: History)
     assert reader.files.fault(4) is None
     # Made again, a frame has a file of its own, and that is read.
     assert history.files.fault(7)
-    arrays = {name: array for name, array in true.gaussians(7).arrays().items() if name in ("means", "factors")}
-    arrays |= {name: true.gaussians(7).arrays()[name] for name in ("rotations", "colours", "foreground")}
-    history.replace(7, true.time(7), arrays, {"remade": True})
+    made_again(history, true, 7)
     assert np.array_equal(History.load(tmp_path / "states").gaussians(7).means, true.gaussians(7).means)
     assert History.load(tmp_path / "states").report(7) == {"remade": True}
 
@@ -214,17 +220,93 @@ def test_a_chunk_that_is_gone_takes_its_frames_and_no_others(tmp_path: Path, tru
 def test_retention_deletes_chunks_whole(tmp_path: Path) -> None:
     history = filled(tmp_path / "states")
     compacted(history)
+    reader = History.load(tmp_path / "states")
+    assert reader.gaussians(5) is not None
     assert history.retain(last=27) == []
     gone = history.retain(last=14)
     assert gone == [1, 3, 4, 5, 6, 7, 8, 9, 10, 11]
     assert history.indices == History.load(tmp_path / "states").indices
     assert 1 not in history
-    sizes = sum(path.stat().st_size for path in (tmp_path / "states").iterdir() if chunk_of(path.name) is not None)
-    more = history.retain(size_bytes=1)
-    assert more == history.indices[:0] + [index for index in range(12, COUNT - 2)]
-    assert history.indices == [0, COUNT - 2, COUNT - 1]
-    assert sizes
+    assert reader.refresh(gone) == ([], gone)  # a reader that is told so notices
+    with pytest.raises(UnreadableFrameError):
+        reader.gaussians(5)
+    assert history.retain(size_bytes=1) == list(range(12, COUNT - 2))
+    assert history.indices == [0, COUNT - 2, COUNT - 1] == History.load(tmp_path / "states").indices
     assert not [name for name in names(history) if chunk_of(name) is not None]
+
+
+def test_a_frame_made_again_goes_with_the_chunk_that_had_it(tmp_path: Path, true: History) -> None:
+    for again in (1, 6, 11):
+        folder = tmp_path / f"{again}"
+        history = filled(folder)
+        compacted(history)
+        made_again(history, true, again)
+        assert history.retain(last=27) == []
+        assert history.retain(last=14) == [1, 3, 4, 5, 6, 7, 8, 9, 10, 11]
+        assert History.load(folder).indices == history.indices == [0, *range(12, COUNT)]
+
+
+def test_files_that_a_power_cut_brings_back_go_again(tmp_path: Path, true: History) -> None:
+    history = filled(tmp_path / "states")
+    files = {index: history.files.path(index).read_bytes() for index in (5, 6, 20)}
+    compacted(history)
+    known = history.gaussians(6).means
+    for index, data in files.items():
+        history.files.path(index).write_bytes(data)
+    again = History.open(tmp_path / "states")
+    assert compacted(again) == []
+    assert np.array_equal(again.gaussians(6).means, known)
+    same(again, true, {0, *true.indices[-EXACT:]})
+
+
+def test_no_file_goes_before_the_disk_has_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of each frame: its record is written, the chunk is synced, and only then its own file goes; after a stop, too."""
+    history = filled(tmp_path / "states")
+    told: list[str] = []
+    fsync, unlink = os.fsync, Path.unlink
+
+    def synced(descriptor: int) -> None:
+        told.append(f"sync {Path(os.readlink(f'/proc/self/fd/{descriptor}')).name}")
+        fsync(descriptor)
+
+    def gone(self: Path, missing_ok: bool = False) -> None:
+        if self.name.startswith("frame_"):
+            told.append(f"unlink {self.name}")
+        unlink(self, missing_ok=missing_ok)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(Path, "unlink", gone)
+    compacted(history)
+    for place, what in enumerate(told):
+        if what.startswith("unlink"):
+            assert told[place - 1].startswith("sync states_"), told[: place + 1]
+    files = {index: history.files.path(index) for index in (5,)}
+    files[5].write_bytes(b"left by a stop before the sync")
+    told.clear()
+    compacted(History.open(tmp_path / "states"))
+    assert told[:3] == ["sync states_000001.s4d", "sync states", "unlink frame_000005.npz"]
+
+
+def test_a_disk_that_cannot_read_is_damage_and_no_crash(
+    tmp_path: Path, true: History, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    history = filled(tmp_path / "states")
+    compacted(history)
+
+    def broken(self: CompactReader, *args: Any) -> Any:
+        raise OSError(errno.EIO, "Input/output error")
+
+    reader = History.load(tmp_path / "states")
+    with monkeypatch.context() as patched:
+        patched.setattr(CompactReader, "state", broken)
+        with pytest.raises(DamagedFrameError, match="Input/output"):
+            reader.gaussians(5)
+    with monkeypatch.context() as patched:
+        patched.setattr(CompactReader, "__init__", broken)
+        found = History.open(tmp_path / "states")
+        assert found.indices == [0, *true.indices[-EXACT:]]
+        assert len(found.unlisted) == 3
+        assert compacted(found) == []
 
 
 def test_the_sizes_of_frames_in_a_chunk_are_those_of_its_file(tmp_path: Path) -> None:
@@ -246,8 +328,15 @@ def test_what_was_committed_is_taken_back_out_of_a_chunk(tmp_path: Path, true: H
     state = last.gaussians(16)
     last.append(17, 1.7, state, report={"again": True})
     assert compacted(last, exact=2) == []
-    same_until = [index for index in last.indices if index not in (0, 17)]
-    assert [last.report(index)["frame"] for index in same_until] == same_until
+    limits = Bounds().record()
+    for index in last.indices[1:-1]:
+        assert last.report(index)["frame"] == index
+        errors = errors_of(Columns.of(last.gaussians(index)), Columns.of(true.gaussians(index)))
+        assert all(value <= 1.001 * limits[name] for name, value in errors.items())
+        assert np.array_equal(last.gaussians(index).retired, true.gaussians(index).retired)
+    for index in range(18, 22):
+        last.append(index, index / 10, last.gaussians(index - 1), report={"frame": index})
+    assert compacted(last, exact=2) == [17, 18, 19]
 
 
 def test_other_bounds_begin_another_chunk(tmp_path: Path) -> None:
