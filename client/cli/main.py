@@ -141,7 +141,7 @@ def export(
         ),
     ],
     format: Annotated[
-        str, typer.Option(help="ply, splat, spz, spz4, glb, glb-parts, usd, tracks or poses; docs/exports.md.")
+        str, typer.Option(help="ply, splat, spz, spz4, glb, glb-parts, usd, tracks, poses or s4d; docs/exports.md.")
     ],
     out: Annotated[
         Path | None, typer.Option(help="Folder or .zip for a file a frame, else a file. [named after SOURCE]")
