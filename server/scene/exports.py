@@ -191,8 +191,8 @@ class Exports:
         if (free := free_bytes(parent)) < needed:
             raise Problem(
                 507,
-                f"the disk has {free / 1e6:.0f} MB free, of which {exporter.RESERVE_BYTES / 1e6:.0f} MB are left to frames; "
-                f"the export takes about {(needed - exporter.RESERVE_BYTES) / 1e6:.1f} MB",
+                f"the disk has {free / 1e6:.0f} MB free, and {exporter.RESERVE_BYTES / 1e6:.0f} MB of it are left to "
+                f"frames; the export takes about {(needed - exporter.RESERVE_BYTES) / 1e6:.1f} MB",
                 field="last",
                 value=frames,
                 remedy="export fewer frames, a smaller format (spz, s4d), or remove exports that are done",

@@ -75,7 +75,7 @@ def test_a_file_is_made_and_saved_by_keyboard(page, service, scene, tmp_path):
 
 def test_faults_are_told_in_words_and_the_phone_shows_it_all(chromium, service, scene, monkeypatch):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="pip install axe-playwright-python")
-    sdk, id = scene
+    _, id = scene
     context = chromium.new_context(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
     page = context.new_page()
     page.set_default_timeout(20_000)
@@ -92,7 +92,7 @@ def test_faults_are_told_in_words_and_the_phone_shows_it_all(chromium, service, 
     page.fill("#take-first", "")
     page.fill("#take-last", "")
     page.click("#take-make")
-    until(page, "document.getElementById('take-words').innerText.includes('the disk has')")
+    until(page, "document.getElementById('take-words').innerText.includes('The disk has')")
     pictured(page, "take-away-phone")
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     box = page.locator("#take-list .save").bounding_box()
