@@ -8,9 +8,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import imageio.v3 as imageio
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 from client.cli import pictures
@@ -28,6 +28,8 @@ from scas4d_core.storage.history import History
 Float = NDArray[np.float64]
 Y_UP = np.array([1.0, -1.0, -1.0])
 SPLAT = "KHR_gaussian_splatting"
+TITLE, GAP = 24, 12
+"""Pixels of a contact sheet."""
 
 
 @dataclass(frozen=True)
@@ -57,15 +59,21 @@ class Found:
 
 @dataclass(frozen=True)
 class ExportFigures:
-    """Of one format: bytes of the file, dB of its rendering against the state's (mean over cameras), and the reader."""
+    """Figures of one format.
+
+    Attributes:
+        size: bytes of the file. psnr: dB of its rendering against the state's, mean over cameras. reader: its name.
+        picture: state | export | difference in the first camera.
+    """
 
     format: str
     size: int
     psnr: float
     reader: str
+    picture: NDArray[np.uint8]
 
 
-def measure(folder: Path, states: Path, leave: Path | None = None) -> list[ExportFigures]:
+def measure(folder: Path, states: Path) -> list[ExportFigures]:
     """Exports the last committed state of a capture and renders what readers get of it in all test cameras."""
     capture = open_source(folder)
     history = History.load(states)
@@ -83,11 +91,9 @@ def measure(folder: Path, states: Path, leave: Path | None = None) -> list[Expor
             found = read(file).gaussians(Y_UP if y_up else np.ones(3), world, metres)
             views = _rendered(found, world, history, cameras)
             psnr = float(np.mean([metrics.psnr(b, a) for a, b in zip(exact, views, strict=True)]))
-            figures.append(ExportFigures(name, file.stat().st_size, psnr, reader))
-            if leave is not None:
-                leave.mkdir(parents=True, exist_ok=True)
-                left, right = (pictures.eight_bit(each[0]) for each in (exact, views))
-                imageio.imwrite(leave / f"{name}.png", pictures.comparison(left, right))
+            left, right = (pictures.eight_bit(each[0]) for each in (exact, views))
+            compared = pictures.comparison(left, right)
+            figures.append(ExportFigures(name, file.stat().st_size, psnr, reader, compared))
     return figures
 
 
@@ -95,6 +101,19 @@ def told(figures: list[ExportFigures]) -> str:
     """The figures as Markdown."""
     rows = [f"| `{one.format}` | {one.size / 1e6:.2f} MB | {one.psnr:.1f} | {one.reader} |" for one in figures]
     return "\n".join(["| format | a frame | dB against the state | read by |", "|---|---|---|---|", *rows])
+
+
+def sheet(figures: list[ExportFigures], columns: int = 2) -> Image.Image:
+    """A contact sheet: state | export | difference of each format under its name, in the first test camera."""
+    high, wide = figures[0].picture.shape[:2]
+    rows = -(-len(figures) // columns)
+    made = Image.new("RGB", (columns * (wide + GAP), rows * (high + TITLE)), "white")
+    pen, font = ImageDraw.Draw(made), ImageFont.load_default(TITLE - 8)
+    for number, one in enumerate(figures):
+        x, y = number % columns * (wide + GAP), number // columns * (high + TITLE)
+        pen.text((x + 4, y + 2), f"{one.format}: state | read by {one.reader} | difference, 4 times", "black", font)
+        made.paste(Image.fromarray(one.picture), (x, y + TITLE))
+    return made
 
 
 def _rendered(state: Gaussians, world: WorldFrame, of: History, cameras: Any) -> list[NDArray[np.float32]]:
