@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,6 @@ from scipy.spatial.transform import Rotation
 from client.importers.open_source import open_source
 from scas4d_core.captures.ground_truth import Part
 from scas4d_core.exports.sequence import export_sequence
-from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.parts import parts
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
@@ -48,7 +46,8 @@ class PartFigures:
     """A part of the truth.
 
     Attributes:
-        static: whether it stands in the truth. node: its name in the asset, or "none". share: of the part's points that the node holds.
+        static: whether it stands in the truth. node: its name in the asset, or "none".
+        share: of the part's points that the node holds.
         degrees, percent: [T − 1] errors after frame 0: of the rotation, and at its points, in percent of the extent.
     """
 
@@ -62,7 +61,7 @@ class PartFigures:
 
     @property
     def covered(self) -> bool:
-        """Whether the asset has this part."""
+        """True where the asset has this part."""
         return self.share >= COVERED
 
 
@@ -91,7 +90,8 @@ def measure_asset(folder: Path, states: Path) -> list[AssetFigures]:
     """Exports the asset of a whole capture, with the parts chosen by rule and with as many as the truth has.
 
     Args:
-        folder: of a capture; without ground truth of moving rigid parts nothing is measured. states: its committed states.
+        folder: of a capture; without ground truth of moving rigid parts nothing is measured.
+        states: its committed states.
     """
     capture = open_source(folder)
     truth = capture.ground_truth
@@ -171,9 +171,7 @@ def compare(
     places = np.concatenate([node.places for node in nodes])
     of_node = np.repeat(np.arange(len(nodes)), [len(node.places) for node in nodes])
     nearest = of_node[cKDTree(places).query(points)[1]]
-    held = np.array(
-        [[np.count_nonzero(nearest[part_id == part.id] == k) for k in range(len(nodes))] for part in wanted]
-    )
+    held = np.array([np.bincount(nearest[part_id == part.id], minlength=len(nodes)) for part in wanted])
     rows, columns = linear_sum_assignment(-held)
     matched: Mapping[int, int] = dict(zip(rows.tolist(), columns.tolist(), strict=True))
     figures = []
@@ -227,8 +225,8 @@ def told_asset(figures: list[AssetFigures]) -> str:
         (degrees, percent), moving = one.medians(), one.medians(moving=True)
         met = "reached" if degrees <= BAR_DEGREES and percent <= BAR_PERCENT else "missed"
         rows.append(
-            f"| {one.nodes}, {one.count} | **{covered} of {len(one.parts)} parts** | | | **{degrees:.2f}°**, moving ones "
-            f"{moving[0]:.2f}° | **{percent:.3f} %**, moving ones {moving[1]:.3f} % (bar: {BAR_DEGREES:g}°, "
+            f"| {one.nodes}, {one.count} | **{covered} of {len(one.parts)} parts** | | | **{degrees:.2f}°**, moving "
+            f"ones {moving[0]:.2f}° | **{percent:.3f} %**, moving ones {moving[1]:.3f} % (bar: {BAR_DEGREES:g}°, "
             f"{BAR_PERCENT:g} %: {met}) |"
         )
     return "\n".join(rows)

@@ -56,9 +56,9 @@ def test_points_of_another_part_do_not_turn_a_part_along():
 
 def test_the_majority_of_what_moves_as_one_is_all_of_it():
     rng = np.random.default_rng(4)
-    before = rng.normal(size=(20, 3)) + [1e3, 0, 0]
+    before = rng.normal(size=(20, 3)) + np.array([1e3, 0, 0])
     turn = Rotation.from_rotvec([0.2, -0.4, 0.1])
-    found, shift, left = majority_motion(before, turn.apply(before) + [1, 2, 3])
+    found, shift, left = majority_motion(before, turn.apply(before) + np.array([1, 2, 3]))
     np.testing.assert_allclose(found, turn.as_matrix(), atol=1e-7)
     np.testing.assert_allclose(shift, [1, 2, 3], atol=1e-4)
     assert left < 1e-5
