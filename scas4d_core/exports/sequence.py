@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
@@ -127,6 +128,19 @@ def export_sequence(
         writer.discard()
         raise
     return paths or [target]
+
+
+def other_frames(out: Path, format: Format, frames: Collection[int]) -> list[Path]:
+    """Numbered files of this format in a folder that are of other frames, as an earlier, longer export leaves them.
+
+    >>> other_frames(Path("no_such_folder"), format_of("ply"), [0])
+    []
+    """
+    if not format.numbered or not out.is_dir():
+        return []
+    pattern = re.compile(rf"frame_(\d+){re.escape(format.suffixes[0])}")
+    found = ((path, pattern.fullmatch(path.name)) for path in sorted(out.iterdir()))
+    return [path for path, match in found if match and int(match[1]) not in frames]
 
 
 def _chained(
