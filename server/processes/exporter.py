@@ -20,7 +20,6 @@ from scas4d_core.storage.history import DamagedFrameError, History, HistoryError
 from server.processes.compact_answers import compact_head
 from server.processes.messages import Damaged, ExportEnded, ExportProgressed, ExportSpec
 from server.processes.placement import end_with_parent, use_one_thread
-from server.processes.renderer import Renderer
 from server.storage.disk import free_bytes, no_room
 
 NICE = 15
@@ -94,6 +93,8 @@ def _export(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
     folder = spec.file.parent
     try:
         if wanted.needs_parts or spec.format in WITH_PARTS:
+            from server.processes.renderer import Renderer  # it loads what encodes pictures
+
             renderer = Renderer(spec.scene)
             history = renderer.history
             if history.newest.moving.any():
