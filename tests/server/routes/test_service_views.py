@@ -10,8 +10,8 @@ from PIL import Image
 from running import HEIGHT, WIDTH, make_rig, pictures, problem
 from typer.testing import CliRunner
 
-from client.cli import export
 from client.cli.main import app
+from client.exports import sources
 from client.sdk import Client, ServiceError
 from client.wire import CameraModel
 from scas4d_core.compact import CompactReader
@@ -190,7 +190,7 @@ def test_a_scene_is_exported_by_the_command(service, finished, tmp_path, monkeyp
     assert told.exit_code == 0, told.output
     assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["frame_000001.ply", "frame_000002.ply"]
     assert len(read_ply(tmp_path / "a" / "frame_000001.ply")) == 2
-    monkeypatch.setattr(export, "MOST", 2)  # two files
+    monkeypatch.setattr(sources, "MOST", 2)  # two files
     whole = run("--format", "usd", "--out", str(tmp_path / "a.usda"))
     assert whole.exit_code == 0, whole.output
     assert "3 frames in" in whole.output
