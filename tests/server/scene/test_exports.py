@@ -178,6 +178,23 @@ def test_a_process_that_dies_leaves_words_and_no_file(ran, service, monkeypatch)
         sdk.delete_export(id, one.id)
 
 
+def test_a_damaged_state_is_named_and_mended(ran, service):
+    sdk, id = ran
+    file = service.app.state.settings.data / "scenes" / id / "states" / "frame_000002.npz"
+    whole = file.read_bytes()
+    file.write_bytes(whole[:200] + bytes(64) + whole[264:])
+    found = over(sdk, id, sdk.begin_export(id, "ply").id)
+    assert found.state == "failed"
+    assert "frame_000002" in found.error
+    assert "again later" in found.error
+    assert "/" not in found.error
+    until = time.monotonic() + 20
+    while file.read_bytes() != whole:  # it was told to the worker, which has it in memory
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    sdk.delete_export(id, found.id)
+
+
 def test_limits_are_told(ran, service, monkeypatch, http):
     sdk, id = ran
     monkeypatch.setattr(rules, "MOST_A_SCENE", 1)
