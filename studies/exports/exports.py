@@ -21,12 +21,14 @@ from scas4d_core.exports.formats import FORMATS
 from scas4d_core.exports.sequence import export_sequence
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.committed import CommittedScene
+from scas4d_core.query.parts import parts
 from scas4d_core.query.ply import SH_DEGREE_0
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 
 Float = NDArray[np.float64]
 Y_UP = np.array([1.0, -1.0, -1.0])
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 SPLAT = "KHR_gaussian_splatting"
 TITLE, GAP = 24, 12
 """Pixels of a contact sheet."""
@@ -74,7 +76,10 @@ class ExportFigures:
 
 
 def measure(folder: Path, states: Path) -> list[ExportFigures]:
-    """Exports the last committed state of a capture and renders what readers get of it in all test cameras."""
+    """Exports the last committed state of a capture and renders what readers get of it in all test cameras.
+
+    Of the moving parts that is the first state, as the animation of the whole capture has it in the end.
+    """
     capture = open_source(folder)
     history = History.load(states)
     index, state = history.indices[-1], history.newest
@@ -86,7 +91,10 @@ def measure(folder: Path, states: Path) -> list[ExportFigures]:
         for name, (reader, read, y_up) in READERS.items():
             single = FORMATS[name].numbered
             out = Path(temporary) / (name if single else f"{name}{FORMATS[name].suffixes[0]}")
-            (file,) = export_sequence([(index, 0.0, state)], name, out, world=world)
+            labels = parts(history) if FORMATS[name].needs_parts else None
+            chosen = history.indices if labels is not None else [index]  # an asset has all of the motion
+            coming = ((each, history.time(each), history.gaussians(each)) for each in chosen)
+            (file,) = export_sequence(coming, name, out, world=world, parts=labels)
             metres = FORMATS[name].unit.startswith("metre")
             found = read(file).gaussians(Y_UP if y_up else np.ones(3), world, metres)
             views = _rendered(found, world, history, cameras)
@@ -100,7 +108,7 @@ def measure(folder: Path, states: Path) -> list[ExportFigures]:
 def told(figures: list[ExportFigures]) -> str:
     """The figures as Markdown."""
     rows = [f"| `{one.format}` | {one.size / 1e6:.2f} MB | {one.psnr:.1f} | {one.reader} |" for one in figures]
-    return "\n".join(["| format | a frame | dB against the state | read by |", "|---|---|---|---|", *rows])
+    return "\n".join(["| format | file | dB against the state | read by |", "|---|---|---|---|", *rows])
 
 
 def sheet(figures: list[ExportFigures], columns: int = 2) -> Image.Image:
@@ -169,26 +177,39 @@ def _by_gsply(file: Path) -> Found:
 
 
 def _by_pygltflib(file: Path) -> Found:
+    """All nodes where the animation, if there is one, has them at its end."""
     from pygltflib import GLTF2
 
     document = GLTF2().load(str(file))
     blob = document.binary_blob()
-    attributes = vars(document.meshes[0].primitives[0].attributes)
 
-    def values(name: str, width: int) -> Float:
-        accessor = document.accessors[attributes[name]]
+    def values(place: int) -> Float:
+        accessor = document.accessors[place]
         view = document.bufferViews[accessor.bufferView]
+        width = WIDTHS[accessor.type]
         begin = (view.byteOffset or 0) + (accessor.byteOffset or 0)
         found = np.frombuffer(blob, "<f4", accessor.count * width, begin).astype(np.float64)
         return found.reshape(-1, width) if width > 1 else found
 
-    return Found(
-        values("POSITION", 3),
-        values(f"{SPLAT}:ROTATION", 4),
-        values(f"{SPLAT}:SCALE", 3),
-        0.5 + SH_DEGREE_0 * values(f"{SPLAT}:SH_DEGREE_0_COEF_0", 3),
-        values(f"{SPLAT}:OPACITY", 1),
-    )
+    ends: dict[tuple[int, str], Float] = {}
+    for animation in document.animations:
+        for channel in animation.channels:
+            ends[channel.target.node, channel.target.path] = values(animation.samplers[channel.sampler].output)[-1]
+    found = []
+    for number, node in enumerate(document.nodes):
+        has = vars(document.meshes[node.mesh].primitives[0].attributes)
+        turn = Rotation.from_quat(ends.get((number, "rotation"), np.array([0.0, 0, 0, 1])))
+        shift = ends.get((number, "translation"), np.zeros(3))
+        found.append(
+            (
+                turn.apply(values(has["POSITION"])) + shift,
+                (turn * Rotation.from_quat(values(has[f"{SPLAT}:ROTATION"]))).as_quat(),
+                values(has[f"{SPLAT}:SCALE"]),
+                0.5 + SH_DEGREE_0 * values(has[f"{SPLAT}:SH_DEGREE_0_COEF_0"]),
+                values(has[f"{SPLAT}:OPACITY"]),
+            )
+        )
+    return Found(*(np.ascontiguousarray(np.concatenate(arrays)) for arrays in zip(*found, strict=True)))
 
 
 def _by_pxr(file: Path) -> Found:
@@ -215,6 +236,7 @@ READERS: Mapping[str, tuple[str, Callable[[Path], Found], bool]] = {
     "spz": ("gsply", _by_gsply, True),
     "spz4": ("gsply", _by_gsply, True),
     "glb": ("pygltflib", _by_pygltflib, True),
+    "glb-parts": ("pygltflib", _by_pygltflib, True),
     "usd": ("pxr", _by_pxr, True),
 }
 """By format: the reader's name, the reader, and whether the file's y axis is up."""

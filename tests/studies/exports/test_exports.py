@@ -26,7 +26,8 @@ def test_each_format_shows_the_state(tmp_path: Path) -> None:
     reconstruct(open_source(SAMPLE), tmp_path, frames=2, preset="scas4d", changes=CHANGES)
     found = measure(SAMPLE, tmp_path / "states")
     assert [one.format for one in found] == list(READERS)
-    assert all(one.psnr > (60 if one.format in ("ply", "glb", "usd") else 38) for one in found), found
+    least = {"ply": 60, "glb": 60, "usd": 60, "glb-parts": 20}
+    assert all(one.psnr > least.get(one.format, 38) for one in found), [(one.format, one.psnr) for one in found]
     assert sheet(found, columns=2).width > 2 * found[0].picture.shape[1]
     by_rule, as_many = measure_asset(SAMPLE, tmp_path / "states")
     assert as_many.nodes == len(as_many.parts) == len(by_rule.parts) == 6
