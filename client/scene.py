@@ -16,7 +16,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from client.exports.sources import CompactStates, frame_range, is_scene_id, opened
+from client.exports.sources import Source, frame_range, is_scene_id, opened
 from client.sdk import DEFAULT_URL, Client
 from scas4d_core.cameras import Rig, WorldFrame
 from scas4d_core.errors import InputError
@@ -136,7 +136,7 @@ class Scene:
     ([0, 1, 2], [(0, (2, 3)), (1, (2, 3))], (3, 2, 3))
     """
 
-    def __init__(self, given: CompactStates, low: int, high: int, closing: ExitStack) -> None:
+    def __init__(self, given: Source, low: int, high: int, closing: ExitStack) -> None:
         self._given, self._closing = given, closing
         self._times = given.within(low, high)
         self._asked: tuple[str, str, str | None] | None = None

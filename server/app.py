@@ -28,6 +28,7 @@ from server.routes import (
     access,
     budget,
     estimate,
+    exports,
     frames,
     gaussians,
     health,
@@ -47,6 +48,7 @@ from server.routes import (
     tradeoff,
     viewer,
 )
+from server.scene.exports import Exports
 from server.scene.scenes import Scenes
 from server.settings import ServerSettings
 from server.stream.hub import Hub
@@ -71,7 +73,10 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         app.state.readiness = Readiness(settings, where)
         app.state.scenes = Scenes(settings, where, app.state.hub)
         await app.state.scenes.open()
+        app.state.exports = Exports(app.state.scenes, where)
+        await app.state.exports.open()
         yield
+        await app.state.exports.stop()
         await app.state.readiness.stop()
         await app.state.scenes.stop()
 
@@ -119,6 +124,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
             stream,
             budget,
             tradeoff,
+            exports,
         ),
         *(estimate, tickets, shares, health, metrics, viewer, reference),
     )

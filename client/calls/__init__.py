@@ -2,11 +2,12 @@
 
 In the examples `client` is a `client.sdk.Client`, `scene` the id of a scene with frames 0 to 2 committed, `rig` its
 rig of two cameras, `open_scene` the id of a scene that takes further frames, `pictures` a PNG file by camera, and `np`
-is numpy.
+is numpy; `time` is the module.
 """
 
 from client.calls.budgets import budget, end_replay, replay, set_budget, tradeoff
 from client.calls.call import Call
+from client.calls.exports import begin_export, delete_export, export, export_file, exports
 from client.calls.frames import close_frame, declare_missing, frame, frames, picture, ply, put_camera, put_frame, states
 from client.calls.gaussians import gaussians
 from client.calls.parts import parts
@@ -31,14 +32,19 @@ from client.calls.views import render, render_arrays, render_file
 __all__ = [
     "Call",
     "begin_again",
+    "begin_export",
     "budget",
     "close_frame",
     "create_scene",
     "declare_missing",
+    "delete_export",
     "delete_scene",
     "edit_scene",
     "end_replay",
     "estimate",
+    "export",
+    "export_file",
+    "exports",
     "frame",
     "frames",
     "gaussians",

@@ -15,7 +15,7 @@ from client.wire import (
     PartReceipt,
     frame_chunks,
 )
-from client.wire.listings import FrameList
+from client.wire.frames import FrameList
 
 
 def put_frame(

@@ -25,6 +25,7 @@ from scas4d_core.settings import Settings
 
 if TYPE_CHECKING:
     from scas4d_core.first_frame.static_result import StaticResult
+    from scas4d_core.metrics.evaluation import Committed
     from scas4d_core.reconstruction import Reconstruction
 
 Report = Callable[[str], None]
@@ -270,7 +271,6 @@ def summary(lines: Sequence[Row]) -> Row:
     from scas4d_core.metrics.evaluation import mean_scores
 
     names = ("psnr", "psnr_foreground", "psnr_changed", "ssim", "flip", "lpips")
-    stages = dict.fromkeys(name for line in updates for name in line["stages"])
     return {
         "updates": len(updates),
         **mean_scores({name: line.get(name) for name in names} for line in updates),
@@ -278,7 +278,14 @@ def summary(lines: Sequence[Row]) -> Row:
         "psnr_last": updates[-1]["psnr"],
         "alarms": sum(len(line.get("alarms", ())) for line in updates),
         "psnr_by_frame": [round(line["psnr"], 3) for line in lines],
-        # The first update compiles or loads kernels; medians do not see it.
+        **(_seconds(updates) if "seconds" in updates[0] else {}),  # states of a file took none
+    }
+
+
+def _seconds(updates: Sequence[Row]) -> Row:
+    """Medians: the first update compiles or loads kernels, and they do not see it."""
+    stages = dict.fromkeys(name for line in updates for name in line["stages"])
+    return {
         "seconds_update": float(np.median([line["seconds"] for line in updates])),
         "cpu_seconds_update": float(np.median([line["cpu_seconds"] for line in updates])),
         "seconds_stages": {
@@ -287,7 +294,7 @@ def summary(lines: Sequence[Row]) -> Row:
     }
 
 
-def save_comparisons(reconstruction: Reconstruction, capture: Capture, index: int, folder: Path) -> None:
+def save_comparisons(reconstruction: Committed, capture: Capture, index: int, folder: Path) -> None:
     """Saves truth | render | difference of every test camera as PNG files."""
     rig, truth = capture.test_rig, capture.test_frame(index)
     assert rig is not None
@@ -297,9 +304,7 @@ def save_comparisons(reconstruction: Reconstruction, capture: Capture, index: in
         pictures.save(folder / f"frame{index:04d}_camera{camera.name}.png", compared)
 
 
-def save_parts(
-    reconstruction: Reconstruction, capture: Capture, index: int, labels: NDArray[Any], folder: Path
-) -> None:
+def save_parts(reconstruction: Committed, capture: Capture, index: int, labels: NDArray[Any], folder: Path) -> None:
     """Saves true | rendered part labels of every labelled test camera, in colours, as PNG files."""
     from scas4d_core.metrics.evaluation import render_parts
 

@@ -123,11 +123,23 @@ def evaluate(
     again: Annotated[
         bool, typer.Option("--again", help="Measure anew, even where the folder holds the scores.")
     ] = False,
+    states: Annotated[
+        Path | None,
+        typer.Option(help="Score these states, and reconstruct nothing: a .s4d file, USD, numbered .glb files."),
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option("--source-fps", help="Frames a second of numbered files in --states. [30]")
+    ] = None,
 ) -> None:
     """Prints a capture's scores on its test cameras and ground truth; reconstructs it unless `out` has them already.
 
     Without test cameras (--test holds some out) the scores are those of the training cameras, and the table says so.
     """
+    if states is not None:
+        from client.exports.score import evaluate_states
+
+        evaluate_states(states, capture, out, options=options, frames=frames, rate=rate)
+        return
     from client.cli.evaluate import evaluate as run
 
     given = parse_changes(changes)
@@ -139,11 +151,13 @@ def export(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="SOURCE", help="A compact file (.s4d), the folder of `scas4d reconstruct`, or a scene's id."
+            metavar="SOURCE",
+            help="A compact file (.s4d), the folder of `scas4d reconstruct`, a scene's id, or an export with ids: USD, "
+            "numbered .glb files in a folder or a .zip.",
         ),
     ],
     format: Annotated[
-        str, typer.Option(help="ply, splat, spz, spz4, glb, glb-parts, usd, tracks or poses; docs/exports.md.")
+        str, typer.Option(help="ply, splat, spz, spz4, glb, glb-parts, usd, tracks, poses or s4d; docs/exports.md.")
     ],
     out: Annotated[
         Path | None, typer.Option(help="Folder or .zip for a file a frame, else a file. [named after SOURCE]")
@@ -151,6 +165,9 @@ def export(
     frames: Annotated[str | None, typer.Option(metavar="A:B", help="Only these frames, both ends counted in.")] = None,
     ids: Annotated[
         list[int] | None, typer.Option("--id", help="Only this Gaussian, for tracks. May be repeated.")
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option("--source-fps", help="Frames a second of numbered files, which have no times. [30]")
     ] = None,
     url: commands.Url = DEFAULT_URL,
     token: commands.Token = None,
@@ -161,7 +178,7 @@ def export(
     """
     from client.exports.export import export as run
 
-    run(source, format, out, frames, ids, url=url, token=token)
+    run(source, format, out, frames, ids, rate, url=url, token=token)
 
 
 def _version(wanted: bool) -> None:

@@ -1,4 +1,4 @@
-"""`scas4d export`: states of a compact file, or of a scene of the service, in the formats of other tools."""
+"""`scas4d export`: states of a compact file, an export, or a scene of the service, in the formats of other tools."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from client.cli.progress import Bars, console
 from client.exports.sources import frame_range, opened
 from scas4d_core.errors import InputError
 
+WITH_PARTS = ("usd", "s4d")
+"""Formats that have parts where there are any."""
+
 
 def export(
     source: str,
@@ -15,6 +18,7 @@ def export(
     out: Path | None,
     frames: str | None = None,
     ids: list[int] | None = None,
+    rate: float | None = None,
     *,
     url: str,
     token: str | None,
@@ -26,13 +30,14 @@ def export(
         format: a name of docs/exports.md. out: a folder or `.zip` for numbered files, else a file; None: beside the
             file, or in this folder for a scene, named after it and the format.
         frames: `A:B`, the frames from A to B, both counted in; either may be left out. None: all. ids: of tracks.
+        rate: frames a second of a source of numbered files.
         url, token: of the service.
 
     Raises:
-        InputError: a format, a range or an output that cannot be.
+        InputError: a source, a format, a range or an output that cannot be.
     """
     from scas4d_core.exports.formats import check_suffix, format_of
-    from scas4d_core.exports.sequence import export_sequence
+    from scas4d_core.exports.sequence import export_sequence, other_frames
 
     wanted = format_of(format)
     low, high = frame_range(frames)
@@ -40,21 +45,35 @@ def export(
         raise InputError(f"id is given for format {format!r}", "leave --id out; it chooses the Gaussians of tracks")
     if out is not None and not wanted.numbered:
         check_suffix(out, wanted)
-    with_parts = wanted.needs_parts or format == "usd"
-    with opened(source, low, high, with_parts, url, token) as given, Bars() as bars:
-        target = out or given.beside / f"{given.name}-{format}{'' if wanted.numbered else wanted.suffixes[0]}"
+    with_parts = wanted.needs_parts or format in WITH_PARTS
+    with opened(source, low, high, with_parts, url, token, rate) as found, Bars() as bars:
+        given = found.of
+        target = out or found.beside / f"{found.name}-{format}{'' if wanted.numbered else wanted.suffixes[0]}"
+        for remark in given.remarks:
+            console.print(remark, soft_wrap=True)
         if given.damage is not None:
             console.print(f"only a part can be read: {given.damage}", soft_wrap=True)
-        count = len(given.within(low, high))
+        chosen = list(found.within(low, high))
+        count = len(chosen)
+        if others := other_frames(target, wanted, chosen):
+            raise InputError(
+                f"out {str(target)!r} holds {len(others)} files of frames that are not in this export, as "
+                f"{others[0].name}; readers would take them for one with it",
+                "remove them, or give another folder: --out",
+            )
+        parts = given.parts() if with_parts else None
+        if wanted.needs_parts and parts is None:
+            raise InputError(f"{source} has no parts, and {format} is made of them", "take a source with parts")
         paths = export_sequence(
             given.states(low, high),
             format,
             target,
             world=given.head.world,
             rig=given.head.rig,
-            parts=given.parts() if with_parts else None,
+            parts=parts,
             ids=ids,
             frames_per_second=given.head.frames_per_second,
+            background=given.head.background,
             progress=lambda index, done: bars("exporting", done, count),
         )
     what = f"{len(paths)} files in {target}" if len(paths) > 1 else f"{count} frames in {target}"

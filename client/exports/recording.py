@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.cli.progress import Bars, console
-from client.exports.sources import CompactStates, frame_range, opened
+from client.exports.sources import Source, frame_range, opened
 from client.exports.video.overlay import rows_that_move
 from client.exports.video.rig_view import RigView
 from client.wire import part_colour
@@ -59,8 +59,8 @@ def make_recording(
     if out is not None and out.suffix.lower() != SUFFIX:
         raise InputError(f"out {str(out)!r} ends in {out.suffix!r}", f"give a name that ends in {SUFFIX}")
     with opened(source, low, high, parts, url, token) as given, Bars() as bars:
-        if given.damage is not None:
-            console.print(f"only a part can be read: {given.damage}", soft_wrap=True)
+        if given.of.damage is not None:
+            console.print(f"only a part can be read: {given.of.damage}", soft_wrap=True)
         times = given.within(low, high)
         target = out or given.beside / f"{given.name}{SUFFIX}"
         labels = given.parts()
@@ -103,7 +103,7 @@ def _stream(target: Path) -> Iterator[Any]:
             stream.disconnect()
 
 
-def _log_what_stays(stream: Any, given: CompactStates, labels: NDArray[np.int64] | None) -> None:
+def _log_what_stays(stream: Any, given: Source, labels: NDArray[np.int64] | None) -> None:
     """Logs axes, names and colours of parts, and the rig. A part's class is its label and 1; 0 is none."""
     import rerun
 
@@ -138,7 +138,7 @@ def _axes(rig: Rig | None) -> Any:
 
 
 def _log_points(
-    stream: Any, given: CompactStates, state: Gaussians, labels: NDArray[np.int64] | None, *, by_part: bool
+    stream: Any, given: Source, state: Gaussians, labels: NDArray[np.int64] | None, *, by_part: bool
 ) -> None:
     import rerun
 
@@ -161,7 +161,7 @@ def _log_points(
 
 def _longer(
     ways: deque[tuple[float, NDArray[np.float64]]],
-    given: CompactStates,
+    given: Source,
     state: Gaussians,
     rows: NDArray[np.intp],
     seconds: float,

@@ -2,6 +2,7 @@
 
 from client.wire.base import MAX_CAMERAS, MAX_PIXELS_A_SIDE, CameraName, Model, Pixel, Row3, Row4
 from client.wire.budgets import Budget, EffectiveBudget, SceneBudget
+from client.wire.exports import ExportFormat, ExportList, ExportModel, ExportRequest, ExportState
 from client.wire.frames import (
     FINISHED,
     AlarmModel,
@@ -78,6 +79,11 @@ __all__ = [
     "EffectModel",
     "EffectStatus",
     "EffectiveBudget",
+    "ExportFormat",
+    "ExportList",
+    "ExportModel",
+    "ExportRequest",
+    "ExportState",
     "FileKind",
     "FirstCloudModel",
     "FrameFile",

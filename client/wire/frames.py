@@ -259,3 +259,10 @@ class FrameReportModel(Model):
     put_off: list[str] = Field(
         default_factory=list, description="Births for which the budget left no time; the next frame has some for them."
     )
+
+
+class FrameList(Model):
+    """Frames in the order of their indices, without their losses and curves."""
+
+    frames: list[FrameReportModel]
+    next: int | None = Field(description="Where to go on: `first` of the next request; null where that was all.")

@@ -212,7 +212,7 @@ class CompactWriter:
 
     @property
     def frames(self) -> int:
-        """How many are written."""
+        """Number of frames that are written."""
         return sum(record.kind in STATES for record in self._records) + (self._last is not None)
 
     @property

@@ -153,6 +153,19 @@ _FORMATS = (
         lost="all but the rigid motion of the parts",
         needs_parts=True,
     ),
+    Format(
+        name="s4d",
+        suffixes=(".s4d",),
+        numbered=False,
+        axes="x right, y down, z forward, from the `origin` that the head tells",
+        unit="metre; the head tells `metres_per_unit`",
+        colour="sRGB; gloss as it is",
+        scale="by the factor, within bounds that the head tells ([format.md](format.md))",
+        opacity="linear",
+        shape="the factor F, Σ = F Fᵀ, and the material rotation",
+        ids="kept",
+        lost="no more than the bounds allow",
+    ),
 )
 FORMATS: Mapping[str, Format] = MappingProxyType({each.name: each for each in _FORMATS})
 """All formats by name."""

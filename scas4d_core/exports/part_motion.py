@@ -20,6 +20,10 @@ from scas4d_core.query.parts import coverage
 
 Float = NDArray[np.float64]
 
+ROUNDS = 20
+"""Of weights and fits; after about ten nothing changes."""
+PRECISION = 1e-6
+"""Of positions, as a share of the part's size: float32, some metres from the origin."""
 PULL = 1e-9
 """Share of the points' spread that pulls towards the rotation ``near``; it decides only what the points leave open."""
 
@@ -96,7 +100,7 @@ class PartMotion:
             if rows.size:
                 before, weights = self._start[rows] - self.origins[part], self._weights[rows]
                 material = self._material_turn(gaussians, rows, weights)
-                found.append(PartPose(part, *rigid_motion(before, means[rows], weights, material)))
+                found.append(PartPose(part, *majority_motion(before, means[rows], weights, material)))
         return found
 
     def _material_turn(self, gaussians: Gaussians, rows: NDArray[np.intp], weights: Float) -> Float:
@@ -110,6 +114,44 @@ class PartMotion:
     def _centre(self, points: Float, rows: NDArray[np.intp]) -> Float:
         weights = self._weights[rows]
         return np.average(points[rows], axis=0, weights=weights if weights.sum() > 0 else None)
+
+
+def majority_motion(
+    before: NDArray[Any], after: NDArray[Any], weights: NDArray[Any] | None = None, near: NDArray[Any] | None = None
+) -> tuple[Float, Float, float]:
+    """Finds the rigid motion of most points, as ``rigid_motion`` does of all; takes and returns the same.
+
+    Points that move otherwise count the less, the farther they are from it (Cauchy weights about the median distance,
+    Holland and Welsch 1977): a part that was found from motion has Gaussians of its neighbours, and of the inside,
+    which no picture holds. The distance that is left is that of all points.
+
+    >>> before = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [2, 2, 2]])
+    >>> shift = majority_motion(before, before + np.where(np.arange(6)[:, None] < 5, [0, 0, 1], [5, 0, 0]))[1]
+    >>> shift.round(3) + 0
+    array([0., 0., 1.])
+    """
+    old, new = np.asarray(before, np.float64), np.asarray(after, np.float64)
+    mass = np.ones(len(old)) if weights is None else np.asarray(weights, np.float64)
+    turn, shift, _ = rigid_motion(old, new, mass, near)
+    size = float(np.ptp(old, axis=0).max(initial=0))
+    for _ in range(ROUNDS):
+        apart = np.linalg.norm(old @ turn.T + shift - new, axis=1)
+        scale = max(_median(apart, mass), PRECISION * size)
+        if scale <= 0 or (len(old) and apart.max() <= PRECISION * size):
+            break  # all of it moves as one
+        turn, shift, _ = rigid_motion(old, new, mass / (1 + np.square(apart / scale)), near)
+    share = mass / mass.sum() if mass.sum() > 0 else np.full(len(old), 1 / max(len(old), 1))
+    apart = np.square(old @ turn.T + shift - new).sum(axis=1)
+    return turn, shift, float(np.sqrt(share @ apart))
+
+
+def _median(values: Float, weights: Float) -> float:
+    """The value below which half of the weight is."""
+    order = np.argsort(values)
+    sums = np.cumsum(weights[order])
+    if not sums.size or not sums[-1] > 0:
+        return float(np.median(values)) if values.size else 0.0
+    return float(values[order][np.searchsorted(sums, sums[-1] / 2)])
 
 
 def rigid_motion(

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
@@ -14,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scas4d_core.cameras import Rig, WorldFrame
 from scas4d_core.errors import InputError
+from scas4d_core.exports.compact_states import Colour, CompactSequence
 from scas4d_core.exports.formats import Format, check_suffix, format_of
 from scas4d_core.exports.gltf import write_glb
 from scas4d_core.exports.gltf_parts import PartAsset
@@ -61,6 +63,7 @@ def export_sequence(
     parts: NDArray[Any] | None = None,
     ids: ArrayLike | None = None,
     frames_per_second: float | None = None,
+    background: Colour = (0.0, 0.0, 0.0),
     progress: Progress | None = None,
 ) -> list[Path]:
     """Writes frames in a format; holds one state at a time.
@@ -74,10 +77,11 @@ def export_sequence(
             ``CompactReader``: ``((i, t, reader.state(i)) for i, t in zip(reader.frames, reader.times))``.
         format: a name in ``FORMATS``.
         out: for numbered files a folder, which is made, or a ``.zip``; else a file with the format's suffix.
-        world: user's world to inside. rig: in the user's world; only USD has cameras.
-        parts: [N] part of each Gaussian by row, negative for none; for ``glb-parts``, ``poses`` and USD.
+        world: user's world to inside. rig: in the user's world; for USD and ``s4d``.
+        parts: [N] part of each Gaussian by row, negative for none; for ``glb-parts``, ``poses``, USD and ``s4d``.
         ids: the Gaussians of ``tracks``; None: all that move.
         frames_per_second: of USD's time codes; None: by the first two frames.
+        background: RGB in 0…1 behind everything; only ``s4d`` has it.
         progress: told each frame.
 
     Returns:
@@ -108,7 +112,7 @@ def export_sequence(
     waiting = list(islice(coming, 1))
     if not waiting:
         raise InputError("states has no frame", "give a range that holds at least one committed frame")
-    writer = _writer(wanted, target, world, rig, parts, ids, frames_per_second)
+    writer = _writer(wanted, target, world, rig, parts, ids, frames_per_second, background)
     done = 0
     paths: list[Path] = []
     try:
@@ -124,6 +128,19 @@ def export_sequence(
         writer.discard()
         raise
     return paths or [target]
+
+
+def other_frames(out: Path, format: Format, frames: Collection[int]) -> list[Path]:
+    """Numbered files of this format in a folder that are of other frames, as an earlier, longer export leaves them.
+
+    >>> other_frames(Path("no_such_folder"), format_of("ply"), [0])
+    []
+    """
+    if not format.numbered or not out.is_dir():
+        return []
+    pattern = re.compile(rf"frame_(\d+){re.escape(format.suffixes[0])}")
+    found = ((path, pattern.fullmatch(path.name)) for path in sorted(out.iterdir()))
+    return [path for path, match in found if match and int(match[1]) not in frames]
 
 
 def _chained(
@@ -142,11 +159,14 @@ def _writer(
     parts: NDArray[Any] | None,
     ids: ArrayLike | None,
     frames_per_second: float | None,
+    background: Colour,
 ) -> SequenceWriter:
     if wanted.numbered:
         return (_Zip if target.suffix.lower() == ".zip" else _Folder)(target, wanted, world)
     if wanted.name == "usd":
         return UsdSequence(target, world, rig, parts, frames_per_second)
+    if wanted.name == "s4d":
+        return CompactSequence(target, world, rig, parts, frames_per_second, background)
     if wanted.name == "tracks":
         return TrackTable(target, world, ids)
     assert parts is not None  # the others need them

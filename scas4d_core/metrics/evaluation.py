@@ -27,7 +27,11 @@ from scas4d_core.captures import Capture
 from scas4d_core.query.tracks import depth_tolerance
 
 if TYPE_CHECKING:
+    from scas4d_core.query.committed import CommittedScene
     from scas4d_core.reconstruction import Reconstruction
+
+    Committed = Reconstruction | CommittedScene
+    """That has the frames which are measured."""
 
 MOVING_SHARE = 0.01
 """Of the extent: a true point that moves less than this counts as standing."""
@@ -42,7 +46,7 @@ Scores = dict[str, float | None]
 
 
 def measure_pictures(
-    reconstruction: Reconstruction, capture: Capture, index: int, *, with_lpips: bool = False
+    reconstruction: Committed, capture: Capture, index: int, *, with_lpips: bool = False
 ) -> tuple[Scores, dict[str, Scores]]:
     """Scores of one committed frame on the test cameras: their mean, and by camera.
 
@@ -71,7 +75,7 @@ def measure_pictures(
     return mean_scores(by_camera.values()), by_camera
 
 
-def measure_tracks(reconstruction: Reconstruction, capture: Capture, indices: Sequence[int]) -> Scores:
+def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:
     """3D error, 2D error without and with oracle, and visibility accuracy over committed frames; the first is 0."""
     truth, rig = capture.ground_truth, capture.test_rig
     assert truth is not None
@@ -117,7 +121,7 @@ def measure_tracks(reconstruction: Reconstruction, capture: Capture, indices: Se
     }
 
 
-def measure_parts(reconstruction: Reconstruction, capture: Capture, indices: Sequence[int]) -> Scores:
+def measure_parts(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:
     """Adjusted Rand index of rendered part labels, pooled over the test cameras that have labels and the frames."""
     truth, rig = capture.ground_truth, capture.test_rig
     assert truth is not None
@@ -136,7 +140,7 @@ def measure_parts(reconstruction: Reconstruction, capture: Capture, indices: Seq
     return {"parts_ari": index_of_all, "parts_count": float(count)}
 
 
-def measure_flicker(reconstruction: Reconstruction, capture: Capture, indices: Sequence[int]) -> Scores:
+def measure_flicker(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:
     """Mean temporal standard deviation, in 255ths, of the still pixels of the test cameras; how many there are."""
     rig = capture.test_rig
     assert rig is not None
@@ -159,7 +163,7 @@ def measure_flicker(reconstruction: Reconstruction, capture: Capture, indices: S
     return {"still_pixels": float(len(found)), "flicker": float(found.mean()) if len(found) >= FEWEST_STILL else None}
 
 
-def render_parts(reconstruction: Reconstruction, camera: Camera, index: int, labels: NDArray[Any]) -> NDArray[np.uint8]:
+def render_parts(reconstruction: Committed, camera: Camera, index: int, labels: NDArray[Any]) -> NDArray[np.uint8]:
     """[H, W] part labels of one view."""
     parts: NDArray[np.uint8] | None = reconstruction.render(camera, index, labels=labels).parts
     assert parts is not None  # labels were given

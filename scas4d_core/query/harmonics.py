@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.rasterize.shading import without_turn
 
 Float = NDArray[np.float64]
 
@@ -33,7 +32,8 @@ def harmonics(gaussians: Gaussians) -> Float:
     """
     assert gaussians.gloss is not None
     assert gaussians.environment is not None
-    from scas4d_core.kernels.appearance.direction import shade
+    from scas4d_core.kernels.appearance.direction import shade  # only what is glossy needs the kernels
+    from scas4d_core.rasterize.shading import without_turn
 
     place = np.arange(DIRECTIONS) + 0.5
     z, turn = 1 - 2 * place / DIRECTIONS, np.pi * (1 + 5**0.5) * place

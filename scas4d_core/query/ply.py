@@ -11,7 +11,7 @@ import os
 from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,8 +108,11 @@ def write_ply(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None
         beside.unlink(missing_ok=True)
 
 
-def read_ply(path: Path | str) -> Splats:
+def read_ply(source: Path | str | BinaryIO, name: str | None = None) -> Splats:
     """Reads a splat file; of the spherical harmonics only degree 0.
+
+    Args:
+        source: its path, or an open file. name: of it, for messages; None: the path.
 
     Raises:
         PlyError: no splat file, or a property is missing.
@@ -119,10 +122,10 @@ def read_ply(path: Path | str) -> Splats:
     scas4d_core.query.ply.PlyError: README.md: no 3D Gaussian Splatting .ply (...)
     """
     try:
-        vertex = PlyData.read(str(path))["vertex"]
+        vertex = PlyData.read(str(source) if isinstance(source, Path) else source)["vertex"]
         table = {name: np.asarray(vertex[name], dtype=np.float64) for name in _FIELDS if name[0] != "n"}
     except (OSError, KeyError, ValueError, PlyParseError) as error:
-        raise PlyError(f"{path}: no 3D Gaussian Splatting .ply ({error})") from error
+        raise PlyError(f"{name or source}: no 3D Gaussian Splatting .ply ({error})") from error
 
     def columns(*names: str) -> Float:
         return np.stack([table[name] for name in names], axis=-1)

@@ -65,7 +65,7 @@ class Compaction:
 
     @property
     def due(self) -> int:
-        """How many states are to be moved, as far as is known: at least one where any is."""
+        """Number of states to be moved, as far as is known: at least one where any is."""
         if not self._queue:
             self._queue.extend(self._history.older(self.exact, self._passed))
         return len(self._queue)

@@ -1,4 +1,4 @@
-"""Which states retention deletes: the oldest, those of a chunk together."""
+"""Chooses the states that retention deletes: the oldest, those of a chunk together."""
 
 from __future__ import annotations
 

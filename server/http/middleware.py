@@ -11,6 +11,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from server import problems
 from server.problems import Problem
 
+HEAD = "scas4d.head"
+"""In the scope of a HEAD that is answered as GET: a long body need not be read."""
+
 access = logging.getLogger("scas4d.access")
 
 LEAST_BYTES = 1000
@@ -130,4 +133,4 @@ class HeadAsGet:
                 message = {"type": "http.response.body", "body": b""}
             await send(message)
 
-        await self.app({**scope, "method": "GET"}, receive, headers_alone)
+        await self.app({**scope, "method": "GET", HEAD: True}, receive, headers_alone)

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import asyncio
+import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import BinaryIO
 from urllib.parse import quote
 
 from blake3 import blake3
 from starlette.requests import Request
-from starlette.responses import Response
+from starlette.responses import Response, StreamingResponse
 
+from server.http.middleware import HEAD
 from server.problems import Problem
 
 RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 TAG_BYTES = 16
+PIECE = 256 * 1024
+"""Bytes of a file that are read at once."""
 KEEP = "private, no-cache"
 """Caches keep an answer, and ask before each use whether it still holds: a damaged state may be made again."""
 
@@ -67,6 +74,52 @@ def unchanging(
     start, end = wanted
     kept["Content-Range"] = f"bytes {start}-{end - 1}/{len(body)}"
     return Response(bytes(body[start:end]), 206, kept, media_type)
+
+
+async def unchanging_file(request: Request, path: Path, *, tag: str, media_type: str, name: str) -> Response:
+    """Answers with a file that stays as it is, as `unchanging` does, and holds a piece of it in memory.
+
+    Args:
+        request: with the conditions. path: of the file. tag: without quotes, of its bytes. media_type: of it.
+        name: of the file, for those who save it.
+
+    Raises:
+        Problem: 416, the range begins behind the end. FileNotFoundError: there is no such file.
+    """
+    opened = await asyncio.to_thread(path.open, "rb")
+    kept = {
+        "ETag": f'"{tag}"',
+        "Cache-Control": KEEP,
+        "Accept-Ranges": "bytes",
+        "Content-Disposition": disposition(name),
+    }
+    try:
+        if is_known(request, kept["ETag"]):
+            opened.close()
+            return Response(status_code=304, headers=kept)
+        size = os.fstat(opened.fileno()).st_size
+        wanted = _range(request, kept["ETag"], size)
+    except BaseException:
+        opened.close()
+        raise
+    start, end = wanted or (0, size)
+    kept["Content-Length"] = str(end - start)
+    if wanted is not None:
+        kept["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
+    status = 200 if wanted is None else 206
+    if HEAD in request.scope:
+        opened.close()
+        return Response(None, status, kept, media_type)
+    return StreamingResponse(_pieces(opened, start, end), status, kept, media_type)
+
+
+def _pieces(opened: BinaryIO, start: int, end: int) -> Iterator[bytes]:
+    """Reads an open file from one byte to another, and closes it; in threads, as Starlette runs it."""
+    with opened:
+        opened.seek(start)
+        while start < end and (piece := opened.read(min(PIECE, end - start))):
+            start += len(piece)
+            yield piece
 
 
 def is_known(request: Request, tag: str) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from pathlib import Path
 from typing import Any
 
 from client.wire import Budget, IngestSettings
@@ -222,5 +223,38 @@ class ReplayPoint:
 @dataclass(frozen=True)
 class ReplayEnded:
     """The replay has ended; `fault` is None if all numbers of iterations were measured."""
+
+    fault: str | None = None
+
+
+# Of the exporter, which has a process for each export.
+
+
+@dataclass(frozen=True)
+class ExportSpec:
+    """Committed frames to be written to `file`, alone in its folder, in a format of `scas4d_core.exports`.
+
+    `first`: the scene's first frame, whose report all need. `ids` of `tracks`, None: all that move.
+    """
+
+    scene: SceneSpec
+    file: Path
+    format: str
+    first: int
+    frames: tuple[int, ...]
+    ids: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True)
+class ExportProgressed:
+    """So many frames of an export are written; its folder has so many bytes."""
+
+    done: int
+    size: int
+
+
+@dataclass(frozen=True)
+class ExportEnded:
+    """The export has ended; `fault` is None if its file is whole."""
 
     fault: str | None = None

@@ -16,6 +16,7 @@ from starlette.requests import HTTPConnection
 
 from server.problems import Problem
 from server.processes.queries import Answer, Query
+from server.scene.exports import Exports
 from server.scene.scene import Scene
 from server.scene.scenes import Scenes
 from server.settings import ServerSettings
@@ -24,6 +25,11 @@ from server.settings import ServerSettings
 def _scenes(request: Request) -> Scenes:
     scenes: Scenes = request.app.state.scenes
     return scenes
+
+
+def _exports(request: Request) -> Exports:
+    exports: Exports = request.app.state.exports
+    return exports
 
 
 def _settings(request: Request) -> ServerSettings:
@@ -45,6 +51,7 @@ async def _record(request: Request, id: SceneId) -> AsyncIterator[Scene]:
 
 
 AllScenes = Annotated[Scenes, Depends(_scenes)]
+AllExports = Annotated[Exports, Depends(_exports)]
 TheSettings = Annotated[ServerSettings, Depends(_settings)]
 TheScene = Annotated[Scene, Depends(_scene)]
 """For what needs its processes: it is woken, and gets a place."""

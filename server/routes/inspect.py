@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query
 
 from client.wire import RigModel
-from client.wire.listings import FrameList
+from client.wire.frames import FrameList
 from server.routes.access import TheRecord, TheScene
 
 router = APIRouter(prefix="/v1/scenes")

@@ -16,7 +16,7 @@ from server.health import devices, estimate
 from server.http import validation
 from server.http.permissions import ALL, PERMISSION
 from server.problems import Problem, of_rig
-from server.routes.access import AllScenes, SceneId, TheRecord, TheScene, TheSettings
+from server.routes.access import AllExports, AllScenes, SceneId, TheRecord, TheScene, TheSettings
 from server.settings import ServerSettings
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
@@ -139,6 +139,7 @@ async def put_to_sleep(id: SceneId, scenes: AllScenes) -> SceneStatus:
 
 
 @router.delete("/{id}", status_code=204)
-async def delete(id: SceneId, scenes: AllScenes) -> None:
-    """Ends the scene and removes all it has on disk."""
+async def delete(id: SceneId, scenes: AllScenes, exports: AllExports) -> None:
+    """Ends the scene and removes all it has on disk, and its exports."""
     await scenes.delete(id)
+    await exports.forget(id)

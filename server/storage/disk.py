@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import shutil
 from pathlib import Path
 
 from scas4d_core.errors import message_of
@@ -32,6 +33,11 @@ def full_disk(error: Exception) -> Problem:
         remedy="free room in the service's data folder, or shorten the scene's retention, and send the same again",
         headers={"Retry-After": "5"},
     )
+
+
+def free_bytes(path: Path) -> int:
+    """Returns the bytes that are free where a folder lies."""
+    return shutil.disk_usage(path).free
 
 
 class FolderLock:

@@ -36,6 +36,11 @@ class DataFolder:
         """Folders of deleted scenes until they are removed."""
         return self.path / "deleted"
 
+    @property
+    def exports(self) -> Path:
+        """One folder a scene, by id, with a folder an export; emptied when the service starts."""
+        return self.path / "exports"
+
     def scene(self, id: str) -> SceneFolder:
         """Folder of a scene."""
         return SceneFolder(self.scenes / id)

@@ -5,6 +5,7 @@ import { listenToKeys } from "./keys.js";
 import { $, curtain, inOrder, node, note, page, sentence } from "./page.js";
 import { Figures } from "./panels/figures.js";
 import { showCameras, showEffects, showFacts, showQueue, showWarnings } from "./panels/facts.js";
+import { TakeAway } from "./panels/takeaway.js";
 import { Timeline } from "./panels/timeline.js";
 import { Tracks } from "./panels/tracks.js";
 import { Tradeoff } from "./panels/tradeoff.js";
@@ -41,6 +42,7 @@ const timeline = new Timeline(() => {
 const tracks = new Tracks(view);
 const figures = new Figures((index) => timeline.choose(index));
 const tradeoff = new Tradeoff($);
+const takeAway = new TakeAway();
 const manage = new Manage(showStatus, letGo);
 const list = new SceneList(openScene);
 
@@ -83,6 +85,7 @@ async function openScene({ id, asleep }) {
   view.setFrame(page.frame);
   beside.look(0);
   tradeoff.open(id);
+  takeAway.open(id);
   await loadReports();
 }
 
@@ -92,6 +95,7 @@ function closeScene() {
   view.close();
   beside.close();
   tradeoff.close();
+  takeAway.close();
   Object.assign(page, { stream: null, status: null, rig: null, scene: null, tracks: [], failed: null, lost: false });
   timeline.stop(); // it would keep the address of the scene that is open
   page.reports.clear();
@@ -170,6 +174,7 @@ function showStatus(status) {
   showWarnings($("warnings"), $("to-check"), status.warnings);
   showEffects($("effects"), $("effects-words"), status.effects);
   manage.show();
+  takeAway.show();
   const actions = token.reads() ? {} : { resume: () => manage.post("resume"), restore: () => manage.edit({ archived: false }, "") };
   if (!status.committed) curtain(beforeFirstFrame(status, actions));
   else if (!view.shown) curtain(status.asleep ? WAKING : OPENING);

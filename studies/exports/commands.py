@@ -15,17 +15,25 @@ def exports(
     states: Annotated[
         Path, typer.Argument(metavar="STATES", help="Its committed states: `states` of `scas4d reconstruct`.")
     ],
-    pictures: Annotated[
-        Path | None, typer.Option(help="Leave state | export | difference of each format here.")
+    sheet: Annotated[
+        Path | None, typer.Option(help="Write a contact sheet here: state | export | difference of each format.")
     ] = None,
     page: Page = None,
 ) -> None:
     """Exports the last state in every format of splats, reads it with another reader, and renders it beside the state.
 
+    With ground truth, the moving parts of the whole capture's `glb-parts` are compared with the truth's poses.
     Needs the extras `exports` and `dev`. Example: scripts/bench exports captures/robot out/robot/states
     """
     from studies.exports.exports import measure, told
+    from studies.exports.exports import sheet as sheet_of
+    from studies.exports.part_truth import measure_asset, told_asset
 
-    text = told(measure(capture, states, pictures))
+    figures = measure(capture, states)
+    text = told(figures)
+    if asset := measure_asset(capture, states):
+        text += f"\n\nArticulated asset against the truth's poses:\n\n{told_asset(asset)}"
     print(text)
+    if sheet is not None:
+        sheet_of(figures).save(sheet)
     write_page(page, text)

@@ -8,9 +8,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import imageio.v3 as imageio
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 from client.cli import pictures
@@ -21,13 +21,17 @@ from scas4d_core.exports.formats import FORMATS
 from scas4d_core.exports.sequence import export_sequence
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.committed import CommittedScene
+from scas4d_core.query.parts import parts
 from scas4d_core.query.ply import SH_DEGREE_0
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 
 Float = NDArray[np.float64]
 Y_UP = np.array([1.0, -1.0, -1.0])
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 SPLAT = "KHR_gaussian_splatting"
+TITLE, GAP = 24, 12
+"""Pixels of a contact sheet."""
 
 
 @dataclass(frozen=True)
@@ -57,16 +61,25 @@ class Found:
 
 @dataclass(frozen=True)
 class ExportFigures:
-    """Of one format: bytes of the file, dB of its rendering against the state's (mean over cameras), and the reader."""
+    """Figures of one format.
+
+    Attributes:
+        size: bytes of the file. psnr: dB of its rendering against the state's, mean over cameras. reader: its name.
+        picture: state | export | difference in the first camera.
+    """
 
     format: str
     size: int
     psnr: float
     reader: str
+    picture: NDArray[np.uint8]
 
 
-def measure(folder: Path, states: Path, leave: Path | None = None) -> list[ExportFigures]:
-    """Exports the last committed state of a capture and renders what readers get of it in all test cameras."""
+def measure(folder: Path, states: Path) -> list[ExportFigures]:
+    """Exports the last committed state of a capture and renders what readers get of it in all test cameras.
+
+    Of the moving parts that is the first state, as the animation of the whole capture has it in the end.
+    """
     capture = open_source(folder)
     history = History.load(states)
     index, state = history.indices[-1], history.newest
@@ -78,23 +91,37 @@ def measure(folder: Path, states: Path, leave: Path | None = None) -> list[Expor
         for name, (reader, read, y_up) in READERS.items():
             single = FORMATS[name].numbered
             out = Path(temporary) / (name if single else f"{name}{FORMATS[name].suffixes[0]}")
-            (file,) = export_sequence([(index, 0.0, state)], name, out, world=world)
+            labels = parts(history) if FORMATS[name].needs_parts else None
+            chosen = history.indices if labels is not None else [index]  # an asset has all of the motion
+            coming = ((each, history.time(each), history.gaussians(each)) for each in chosen)
+            (file,) = export_sequence(coming, name, out, world=world, parts=labels)
             metres = FORMATS[name].unit.startswith("metre")
             found = read(file).gaussians(Y_UP if y_up else np.ones(3), world, metres)
             views = _rendered(found, world, history, cameras)
             psnr = float(np.mean([metrics.psnr(b, a) for a, b in zip(exact, views, strict=True)]))
-            figures.append(ExportFigures(name, file.stat().st_size, psnr, reader))
-            if leave is not None:
-                leave.mkdir(parents=True, exist_ok=True)
-                left, right = (pictures.eight_bit(each[0]) for each in (exact, views))
-                imageio.imwrite(leave / f"{name}.png", pictures.comparison(left, right))
+            left, right = (pictures.eight_bit(each[0]) for each in (exact, views))
+            compared = pictures.comparison(left, right)
+            figures.append(ExportFigures(name, file.stat().st_size, psnr, reader, compared))
     return figures
 
 
 def told(figures: list[ExportFigures]) -> str:
     """The figures as Markdown."""
     rows = [f"| `{one.format}` | {one.size / 1e6:.2f} MB | {one.psnr:.1f} | {one.reader} |" for one in figures]
-    return "\n".join(["| format | a frame | dB against the state | read by |", "|---|---|---|---|", *rows])
+    return "\n".join(["| format | file | dB against the state | read by |", "|---|---|---|---|", *rows])
+
+
+def sheet(figures: list[ExportFigures], columns: int = 2) -> Image.Image:
+    """A contact sheet: state | export | difference of each format under its name, in the first test camera."""
+    high, wide = figures[0].picture.shape[:2]
+    rows = -(-len(figures) // columns)
+    made = Image.new("RGB", (columns * (wide + GAP), rows * (high + TITLE)), "white")
+    pen, font = ImageDraw.Draw(made), ImageFont.load_default(TITLE - 8)
+    for number, one in enumerate(figures):
+        x, y = number % columns * (wide + GAP), number // columns * (high + TITLE)
+        pen.text((x + 4, y + 2), f"{one.format}: state | read by {one.reader} | difference, 4 times", "black", font)
+        made.paste(Image.fromarray(one.picture), (x, y + TITLE))
+    return made
 
 
 def _rendered(state: Gaussians, world: WorldFrame, of: History, cameras: Any) -> list[NDArray[np.float32]]:
@@ -150,26 +177,39 @@ def _by_gsply(file: Path) -> Found:
 
 
 def _by_pygltflib(file: Path) -> Found:
+    """All nodes where the animation, if there is one, has them at its end."""
     from pygltflib import GLTF2
 
     document = GLTF2().load(str(file))
     blob = document.binary_blob()
-    attributes = vars(document.meshes[0].primitives[0].attributes)
 
-    def values(name: str, width: int) -> Float:
-        accessor = document.accessors[attributes[name]]
+    def values(place: int) -> Float:
+        accessor = document.accessors[place]
         view = document.bufferViews[accessor.bufferView]
+        width = WIDTHS[accessor.type]
         begin = (view.byteOffset or 0) + (accessor.byteOffset or 0)
         found = np.frombuffer(blob, "<f4", accessor.count * width, begin).astype(np.float64)
         return found.reshape(-1, width) if width > 1 else found
 
-    return Found(
-        values("POSITION", 3),
-        values(f"{SPLAT}:ROTATION", 4),
-        values(f"{SPLAT}:SCALE", 3),
-        0.5 + SH_DEGREE_0 * values(f"{SPLAT}:SH_DEGREE_0_COEF_0", 3),
-        values(f"{SPLAT}:OPACITY", 1),
-    )
+    ends: dict[tuple[int, str], Float] = {}
+    for animation in document.animations:
+        for channel in animation.channels:
+            ends[channel.target.node, channel.target.path] = values(animation.samplers[channel.sampler].output)[-1]
+    found = []
+    for number, node in enumerate(document.nodes):
+        has = vars(document.meshes[node.mesh].primitives[0].attributes)
+        turn = Rotation.from_quat(ends.get((number, "rotation"), np.array([0.0, 0, 0, 1])))
+        shift = ends.get((number, "translation"), np.zeros(3))
+        found.append(
+            (
+                turn.apply(values(has["POSITION"])) + shift,
+                (turn * Rotation.from_quat(values(has[f"{SPLAT}:ROTATION"]))).as_quat(),
+                values(has[f"{SPLAT}:SCALE"]),
+                0.5 + SH_DEGREE_0 * values(has[f"{SPLAT}:SH_DEGREE_0_COEF_0"]),
+                values(has[f"{SPLAT}:OPACITY"]),
+            )
+        )
+    return Found(*(np.ascontiguousarray(np.concatenate(arrays)) for arrays in zip(*found, strict=True)))
 
 
 def _by_pxr(file: Path) -> Found:
@@ -196,6 +236,7 @@ READERS: Mapping[str, tuple[str, Callable[[Path], Found], bool]] = {
     "spz": ("gsply", _by_gsply, True),
     "spz4": ("gsply", _by_gsply, True),
     "glb": ("pygltflib", _by_pygltflib, True),
+    "glb-parts": ("pygltflib", _by_pygltflib, True),
     "usd": ("pxr", _by_pxr, True),
 }
 """By format: the reader's name, the reader, and whether the file's y axis is up."""

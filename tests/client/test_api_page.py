@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +110,8 @@ def test_tracks_parts_and_the_export_have_content(made):
     with CompactReader(made / "states.s4d") as compact:
         assert compact.frames == [0, 1, 2, 3]
         assert len(set(compact.parts().tolist()) - {-1}) > 1
+    with zipfile.ZipFile(made / "frames.zip") as archive:
+        assert archive.namelist() == ["frame_000002.glb", "frame_000003.glb"]
 
 
 def test_the_token_does_not_stay_behind(made):

@@ -40,6 +40,11 @@ CALLS = [
     calls.frames("s"),
     calls.ply("s", 7),
     calls.states("s"),
+    calls.begin_export("s", "ply"),
+    calls.exports("s"),
+    calls.export("s", "e7"),
+    calls.export_file("s", "e7"),
+    calls.delete_export("s", "e7"),
     calls.picture("s", 7, "c0"),
     calls.render("s", "c0"),
     calls.render_file("s", "c0"),
@@ -61,6 +66,7 @@ PAGES = ("/viewer", "/docs", "/openapi.json", "/redoc")
 
 def template(path):
     path = re.sub(r"^/v1/scenes/s\b", "/v1/scenes/{id}", path)
+    path = re.sub(r"/exports/e7\b", "/exports/{export}", path)
     path = re.sub(r"/reconstructions/3$", "/reconstructions/{n}", path)
     return re.sub(r"/cameras/c0$", "/cameras/{c}", re.sub(r"/frames/7\b", "/frames/{n}", path))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import doctest
 import importlib
+import time
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ def scenes(service):
 def test_an_example_gives_what_it_says(example, service, scenes, capture_folder, tmp_path):
     with Client(service.url, patience=20) as client:
         given = {"client": client, "url": service.url, "rig": make_rig(), "pictures": pictures()}
-        given |= {"folder": capture_folder, "out": tmp_path / "out", "np": np, "asyncio": asyncio}
+        given |= {"folder": capture_folder, "out": tmp_path / "out", "np": np, "asyncio": asyncio, "time": time}
         given |= {"scene": scenes[0], "open_scene": scenes[1]}
         given |= {"Stream": stream.Stream, "calls": calls}
         example.globs.update(given)

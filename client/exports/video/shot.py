@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from client.cli.pictures import Picture, eight_bit
-from client.exports.sources import CompactStates
+from client.exports.sources import Source
 from client.exports.video.camera_path import CameraPath, by_keys, orbit, still
 from client.exports.video.moments import moments
 from client.exports.video.overlay import Trails, rows_that_move
@@ -63,7 +63,7 @@ class Shot:
         truth: the true picture of a frame, of that size; None where none is asked for.
     """
 
-    given: CompactStates
+    given: Source
     times: Mapping[int, float]
     options: VideoOptions
     fps: float
@@ -113,9 +113,7 @@ class Shot:
         return Trails(rows, self.given.head.world, round(self.options.trail * self.fps) + 1)
 
 
-def shot(
-    given: CompactStates, low: int, high: int, options: VideoOptions, beside: Capture | None, *, even: bool
-) -> Shot:
+def shot(given: Source, low: int, high: int, options: VideoOptions, beside: Capture | None, *, even: bool) -> Shot:
     """Checks what is asked for.
 
     Args:
@@ -152,7 +150,7 @@ def _check(options: VideoOptions, beside: Capture | None) -> None:
         raise InputError("beside and between contradict each other: between frames there is no truth", "leave one out")
 
 
-def _camera(given: CompactStates, name: str | None, beside: Capture | None) -> Camera:
+def _camera(given: Source, name: str | None, beside: Capture | None) -> Camera:
     """The camera of a name, as the scene has refined it, or one that only the capture has; without a name the first."""
     cameras = {}
     if beside is not None:

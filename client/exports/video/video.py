@@ -47,8 +47,8 @@ def make_video(
         check_suffix(out)
     pyav()  # before anything is fetched or compiled
     with opened(source, low, high, options.parts, url, token) as given, Bars() as bars:
-        if given.damage is not None:
-            console.print(f"only a part can be read: {given.damage}", soft_wrap=True)
+        if given.of.damage is not None:
+            console.print(f"only a part can be read: {given.of.damage}", soft_wrap=True)
         target = out or given.beside / f"{given.name}-{Path(options.path).stem}.mp4"
         planned = shot(given, low, high, options, beside, even=check_suffix(target) == ".mp4")
         _compile_kernels(bars)

@@ -96,7 +96,7 @@ def test_faults_have_remedies(source, tmp_path):
         (lambda: given.tracks(ids=[7]), "ids: there is no Gaussian 7 in frame 4"),
         (lambda: next(given.states("9:")), "frames 9: are not there; frames 0 to 4 are"),
         (lambda: Scene.open(source, frames="8:"), "frames 8: are not in states; it has frames 0 to 4"),
-        (lambda: Scene.open(tmp_path), "holds no states.s4d"),
+        (lambda: Scene.open(tmp_path), "holds no numbered files .*; give a .s4d file"),
         (lambda: Scene.open(tmp_path / "no.s4d"), "is not there; give a compact file"),
     ):
         with pytest.raises(InputError, match=said):

@@ -79,7 +79,7 @@ def test_the_residual_is_told(tmp_path):
     means[rows] += np.float32([[0, 0, 0.01]]) * np.float32([1, -1, 0, -1, 1])[:, None]
     found = written(tmp_path / "a.glb", [moving.state(0), moving.state(0), bent.replace(means=means)])
     zero, one = (node.extras for node in found.nodes()[:2])
-    assert 0.1 < zero["residual_worst"] < 1.0  # of 1 cm, in the user's cm
+    assert 0.1 < zero["residual_worst"] < 1.5  # of 1 cm, in the user's cm; more where others are followed
     assert zero["worst_frame"] == 14
     np.testing.assert_allclose(zero["residual_rms"], zero["residual_worst"] / np.sqrt(2), rtol=1e-4)
     extent = moving_extent(moving.state(0)) / corner.WORLD.metres_per_unit

@@ -6,7 +6,7 @@ from export_cases import corner, moving
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.errors import InputError
-from scas4d_core.exports.part_motion import PartMotion, part_labels, rigid_motion
+from scas4d_core.exports.part_motion import PartMotion, majority_motion, part_labels, rigid_motion
 
 
 def test_a_known_motion_is_found():
@@ -38,6 +38,32 @@ def test_weights_count():
     np.testing.assert_allclose(shift, [0, 0, 2], atol=1e-9)
     assert left < 1e-5
     assert rigid_motion(before, after)[2] > 1
+
+
+def test_points_of_another_part_do_not_turn_a_part_along():
+    rng = np.random.default_rng(3)
+    before, weights = rng.normal(size=(200, 3)), rng.uniform(0.5, 1, 200)
+    turn = Rotation.from_rotvec([0, 0, 0.6])
+    after = turn.apply(before) + [0.5, 0, 0] + 0.01 * rng.normal(size=(200, 3))
+    after[:60] = before[:60]  # they stand
+    found, shift, left = majority_motion(before, after, weights)
+    assert np.degrees((Rotation.from_matrix(found) * turn.inv()).magnitude()) < 1
+    np.testing.assert_allclose(shift, [0.5, 0, 0], atol=0.02)
+    all_of_it, _, least = rigid_motion(before, after, weights)
+    assert np.degrees((Rotation.from_matrix(all_of_it) * turn.inv()).magnitude()) > 5
+    assert left >= least > 0.1  # what is left is told of all points
+
+
+def test_the_majority_of_what_moves_as_one_is_all_of_it():
+    rng = np.random.default_rng(4)
+    before = rng.normal(size=(20, 3)) + np.array([1e3, 0, 0])
+    turn = Rotation.from_rotvec([0.2, -0.4, 0.1])
+    found, shift, left = majority_motion(before, turn.apply(before) + np.array([1, 2, 3]))
+    np.testing.assert_allclose(found, turn.as_matrix(), atol=1e-7)
+    np.testing.assert_allclose(shift, [1, 2, 3], atol=1e-4)
+    assert left < 1e-5
+    assert majority_motion(before[:1], before[:1] + 1.0)[2] == 0
+    assert majority_motion(before, before + 1.0, np.zeros(20))[2] < 1e-9
 
 
 def test_a_mirror_image_is_no_motion():

@@ -46,7 +46,18 @@ def owner(running):
         yield sdk
 
 
-READS = ("", "/rig", "/frames", "/frames/0", "/frames/0/cameras/c0", "/render", "/budget", "/tradeoff", "/parts")
+READS = (
+    "",
+    "/rig",
+    "/frames",
+    "/frames/0",
+    "/frames/0/cameras/c0",
+    "/render",
+    "/budget",
+    "/tradeoff",
+    "/parts",
+    "/exports",
+)
 CHANGES = (
     ("PATCH", ""),
     ("DELETE", ""),
@@ -62,6 +73,8 @@ CHANGES = (
     ("POST", "/tradeoff"),
     ("DELETE", "/tradeoff"),
     ("PUT", "/reconstructions/1"),
+    ("POST", "/exports"),
+    ("DELETE", "/exports/x"),
 )
 
 

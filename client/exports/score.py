@@ -1,0 +1,132 @@
+"""`scas4d evaluate --states`: states of a file, scored on a capture's test cameras and ground truth.
+
+Nothing is reconstructed: a compact file, or an export that tells which Gaussian is which, is rendered as it is.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.console import Console
+
+from client.cli.evaluate import DEFAULT_OPTIONS, TRAINING, Report, page, peak_megabytes, save_comparisons, summary
+from client.cli.progress import Bars
+from client.cli.scores import Row, Store
+from client.exports.sources import Source, of_path
+from client.importers.open_source import CaptureOptions
+from scas4d_core.captures import Capture
+from scas4d_core.errors import InputError
+from scas4d_core.gaussians import UNBORN, Gaussians
+from scas4d_core.settings import Settings
+
+if TYPE_CHECKING:
+    from scas4d_core.storage.history import History
+
+SHOWN = (0, 1, -1)
+"""Frames whose comparison pictures are saved."""
+
+
+def evaluate_states(
+    source: Path,
+    folder: Path,
+    out: Path,
+    *,
+    options: CaptureOptions = DEFAULT_OPTIONS,
+    frames: int | None = None,
+    rate: float | None = None,
+    report: Report = print,
+) -> Row:
+    """Scores of states, printed as a table; `out` gets the row, a line a frame, pictures and table.md.
+
+    Args:
+        source: a compact file, the folder of one, or an export with ids. folder: of the capture.
+        out: folder. options: how the capture is read. frames: only the first so many. rate: frames a second of
+            numbered files. report: takes the printed lines.
+
+    Raises:
+        InputError: the source cannot be read, or has no frame of the capture. CaptureError: nor can the capture.
+    """
+    if not source.exists():
+        raise InputError(f"there is no {str(source)!r}", "give a .s4d file, or an export with ids (docs/exports.md)")
+    found = of_path(source, rate)
+    truth = options.open(folder, image_scale=Settings().scene.image_scale)
+    unseen = truth.full_test_rig is not None
+    truth = truth if unseen else truth.measured_on_training()
+    for remark in [*found.of.remarks, *([] if found.of.damage is None else [found.of.damage])]:
+        report(remark)
+    if not unseen:
+        report("no test cameras: the scores are those of the training cameras (--test holds some out)")
+    row = _measure(found, truth, Store(out), frames, report)
+    row["preset"] = source.name
+    row["measured_on"] = "test cameras" if unseen else TRAINING
+    row["changes"] = "" if unseen else TRAINING
+    Store(out).put(row)
+    table = page([row])
+    (out / "table.md").write_text(table + "\n")
+    report(table)
+    return row
+
+
+def _measure(found: Source, truth: Capture, store: Store, frames: int | None, report: Report) -> Row:
+    # These bring the kernels; the command does not.
+    from scas4d_core.cameras import rig_inside
+    from scas4d_core.metrics.evaluation import measure_flicker, measure_parts, measure_pictures, measure_tracks
+    from scas4d_core.query.committed import CommittedScene
+    from scas4d_core.rasterize.limits import scene_limits
+    from scas4d_core.storage.history import History
+
+    given, last = found.of, truth.frame_count - 1
+    chosen = [index for index in given.frames if index <= last][:frames]
+    if not chosen:
+        raise InputError(
+            f"{found.name} begins at frame {given.frames[0]}, and the capture ends at frame {last}"
+            if given.frames
+            else f"{found.name} has no frame",
+            "give states of this capture",
+        )
+    world, history = given.head.world, History()
+    limits = scene_limits(Settings().scene.near, rig_inside(world, truth.rig.cameras).radius)
+    scene = CommittedScene(history, world, limits)
+    key = f"{truth.name}-{found.name}"
+    store.start_frames(key)
+    lines: list[Row] = []
+    with Bars(Console(stderr=True)) as bars:
+        for index, time, state in given.states(chosen[0], chosen[-1]):
+            history.append(index, time, _owned(state, history), {"background": list(given.head.background)})
+            history.put_aside(store.folder)
+            scores, by_camera = measure_pictures(scene, truth, index)
+            line: Row = {"index": index, **scores}
+            store.put_frame(key, {**line, "cameras": by_camera})
+            lines.append(line)
+            bars("frames", len(lines), len(chosen))
+            report(f"    frame {index:3d}/{chosen[-1]}  {line['psnr']:6.2f} dB")
+    row: Row = {
+        "key": key,
+        "capture": truth.name,
+        "measured": datetime.now(UTC).isoformat(timespec="seconds"),
+        "gaussians": history.count,
+        "moving": int(history.newest.moving.sum()),
+        "psnr_first": lines[0]["psnr"],
+        **summary(lines),
+    }
+    row.pop("alarms", None)  # files tell none
+    if len(chosen) > 1:
+        if truth.ground_truth is not None:
+            row |= measure_tracks(scene, truth, chosen)
+            row |= measure_parts(scene, truth, chosen)
+        row |= measure_flicker(scene, truth, chosen)
+    row["peak_mb"] = peak_megabytes()
+    for index in sorted({chosen[i] for i in SHOWN if -len(chosen) <= i < len(chosen)}):
+        save_comparisons(scene, truth, index, store.folder / "pictures" / key)
+    return row
+
+
+def _owned(state: Gaussians, history: History) -> Gaussians:
+    """The state with the ids that the history gives: rows are the same, and nothing asks for ids of the file."""
+    if not len(history):
+        return state
+    known = history.ids
+    return state.replace(ids=np.concatenate([known, np.full(len(state) - len(known), UNBORN, np.int64)]))

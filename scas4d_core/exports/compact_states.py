@@ -1,0 +1,90 @@
+"""Writes a sequence as a compact 4D file (``scas4d_core.compact``): it loses neither ids nor what moves."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Rig, WorldFrame
+from scas4d_core.compact import CompactWriter, FileError, Head
+from scas4d_core.errors import InputError
+from scas4d_core.exports.part_motion import part_labels
+from scas4d_core.exports.whole_files import whole_file, writing
+from scas4d_core.gaussians import Gaussians
+
+Colour = tuple[float, float, float]
+
+
+class CompactSequence:
+    """Writes a sequence, frame by frame; the file appears whole, with ``finish``, or not at all.
+
+    Args:
+        path: of the file; replaced where it is there. world: user's world to inside. rig: in the user's world, or None.
+        labels: [N] part of each Gaussian by row, negative for none; None: no parts.
+        frames_per_second: nominal, or None. background: RGB in 0…1 behind everything.
+
+    Raises:
+        InputError: the file cannot be written.
+
+    >>> import numpy as np
+    >>> from tempfile import TemporaryDirectory
+    >>> from scas4d_core.compact import CompactReader
+    >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1)
+    >>> with TemporaryDirectory() as folder:
+    ...     sequence = CompactSequence(f"{folder}/a.s4d", WorldFrame(np.zeros(3)), labels=np.array([0, 1]))
+    ...     sequence.add(7, 0.5, state)
+    ...     sequence.finish()
+    ...     with CompactReader(f"{folder}/a.s4d") as reader:
+    ...         list(reader.frames), reader.parts()
+    ([7], array([0, 1]))
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        world: WorldFrame,
+        rig: Rig | None = None,
+        labels: NDArray[Any] | None = None,
+        frames_per_second: float | None = None,
+        background: Colour = (0.0, 0.0, 0.0),
+    ) -> None:
+        self.path = Path(path)
+        self._labels = labels
+        self._latest = -1
+        self._count = 0
+        self._stack = ExitStack()
+        head = Head(world, background=background, rig=rig, frames_per_second=frames_per_second)
+        try:
+            beside = self._stack.enter_context(whole_file(self.path))
+            self._writer = self._stack.enter_context(CompactWriter(beside, head))
+        except BaseException as error:
+            if not self._stack.__exit__(type(error), error, error.__traceback__):
+                raise
+
+    def add(self, index: int, time: float, gaussians: Gaussians) -> None:
+        """Adds a frame: its index, its time in seconds, and its state in the inside world.
+
+        Raises:
+            InputError: it cannot follow those before, or has values that are not finite.
+        """
+        with writing(self.path):
+            try:
+                self._writer.add(index, time, gaussians)
+            except FileError as error:
+                fault, _, remedy = str(error).partition("; ")
+                raise InputError(fault, remedy) from error
+        self._latest, self._count = index, len(gaussians)
+
+    def finish(self) -> None:
+        """Completes the file and gives it its name."""
+        if self._labels is not None and self._count:
+            with writing(self.path):
+                self._writer.add_parts(self._latest, part_labels(self._labels, self._count))
+        self._stack.close()
+
+    def discard(self) -> None:
+        """Removes what was written."""
+        self._stack.__exit__(Exception, Exception("given up"), None)

@@ -1,0 +1,6 @@
+"""Reads exports back as states, where it is told which Gaussian is which (docs/exports.md, "And back")."""
+
+from scas4d_core.exports.reading.sources import open_export
+from scas4d_core.exports.reading.states import ReadStates
+
+__all__ = ["ReadStates", "open_export"]

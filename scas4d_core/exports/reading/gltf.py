@@ -1,0 +1,117 @@
+"""Reads a frame of ``.glb`` with KHR_gaussian_splatting, as ``exports.gltf`` writes it."""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.errors import InputError
+from scas4d_core.exports.cloud import Cloud
+from scas4d_core.exports.gltf import DEGREES, EXTENSION
+from scas4d_core.query.ply import SH_DEGREE_0, Splats
+
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+FLOAT = 5126
+REMEDY = "give a .glb of scas4d export --format glb"
+
+
+class GltfFrame:
+    """The document and the bytes of one file.
+
+    Args:
+        data: of the file. name: of it, for messages.
+
+    Raises:
+        InputError: it is no .glb, or holds no single set of splats.
+    """
+
+    def __init__(self, data: bytes, name: str) -> None:
+        self._name = name
+        try:
+            self._document, self._bytes = _chunks(data)
+            self._meshes: list[Any] = self._document.get("meshes", [])
+        except (ValueError, KeyError, TypeError, AttributeError, struct.error) as error:
+            raise InputError(f"{name} is no .glb ({error})", REMEDY) from None
+        if self._document.get("animations"):
+            raise InputError(
+                f"{name} holds parts and their motion (glb-parts), not the states of frames",
+                "give files of scas4d export --format glb, usd or s4d",
+            )
+
+    @property
+    def metres_per_unit(self) -> float:
+        """Metres of one of the user's units."""
+        told = self._document.get("asset", {}).get("extras", {}).get("metres_per_unit", 1.0)
+        if not isinstance(told, int | float) or not 0 < told < float("inf"):
+            raise InputError(f"{self._name}: metres_per_unit is {told!r}", REMEDY)
+        return float(told)
+
+    def cloud(self) -> Cloud:
+        """The Gaussians in the user's world and unit, OpenCV axes; of the harmonics all that the file has.
+
+        Raises:
+            InputError: attributes are missing, or there are no ids.
+        """
+        if not self._meshes:
+            none = np.zeros((0, 3))
+            empty = Splats(none, none, np.zeros((0, 4)), np.zeros(0), none)
+            return Cloud(empty, np.zeros((0, 1, 3)), np.zeros(0, np.int64))
+        try:
+            (mesh,) = self._meshes
+            (primitive,) = mesh["primitives"]
+            attributes = primitive["attributes"]
+            if "_ID" not in attributes:
+                raise InputError(
+                    f"{self._name} has no ids (_ID), so nobody knows which Gaussian is which in other frames",
+                    "export it as usd or s4d; ids from 2^24 on are left out of .glb",
+                )
+            means, scales, rotations = (
+                self._values(attributes[key]) for key in ("POSITION", f"{EXTENSION}:SCALE", f"{EXTENSION}:ROTATION")
+            )
+            names = [
+                [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{place}" for place in range(len(rows))]
+                for degree, rows in enumerate(DEGREES)
+            ]
+            held = [name for each in names for name in each if name in attributes]
+            harmonics = np.stack([self._values(attributes[name]) for name in held], axis=1)
+            ids = np.rint(self._values(attributes["_ID"])[:, 0]).astype(np.int64)
+            opacities = self._values(attributes[f"{EXTENSION}:OPACITY"])[:, 0]
+            splats = Splats(
+                means, scales, np.roll(rotations, 1, axis=1), opacities, 0.5 + SH_DEGREE_0 * harmonics[:, 0]
+            )
+            cloud = Cloud(splats, harmonics, ids)
+        except (ValueError, KeyError, IndexError, TypeError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"{self._name} holds no splats that can be read ({error})", REMEDY) from None
+        return cloud.turned().in_units(1 / self.metres_per_unit)
+
+    def _values(self, number: int) -> NDArray[np.float64]:
+        """[N, width] of an accessor."""
+        accessor = self._document["accessors"][number]
+        view = self._document["bufferViews"][accessor["bufferView"]]
+        width, count = WIDTHS[accessor["type"]], accessor["count"]
+        if accessor["componentType"] != FLOAT or "byteStride" in view or "sparse" in accessor:
+            raise ValueError("its numbers are no plain float32")
+        begin = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        return np.frombuffer(self._bytes, "<f4", count * width, begin).reshape(count, width).astype(np.float64)
+
+
+def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The document and the binary chunk (glTF 2.0, section 4.4)."""
+    magic, version, _ = struct.unpack_from("<4sII", data)
+    if magic != b"glTF" or version != 2:
+        raise ValueError("it does not begin as one")
+    length, kind = struct.unpack_from("<I4s", data, 12)
+    if kind != b"JSON":
+        raise ValueError("its first chunk is no JSON")
+    document = json.loads(data[20 : 20 + length])
+    begin = 20 + length
+    if begin + 8 > len(data):
+        return document, b""
+    length, _ = struct.unpack_from("<I4s", data, begin)
+    return document, data[begin + 8 : begin + 8 + length]

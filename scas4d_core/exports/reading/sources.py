@@ -1,0 +1,156 @@
+"""Opens what an export has left: numbered files in a folder or a .zip, one file, USD. Refuses what lost the ids."""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from plyfile import PlyData
+
+from scas4d_core.errors import InputError
+from scas4d_core.exports.cloud import Cloud
+from scas4d_core.exports.reading.gltf import GltfFrame
+from scas4d_core.exports.reading.states import ReadStates, head_of
+from scas4d_core.exports.reading.usd import open_usd
+from scas4d_core.exports.usd import SUFFIXES as USD_SUFFIXES
+from scas4d_core.query.ply import SH_DEGREE_0, read_ply
+
+RATE = 30.0
+"""Frames a second of numbered files where nothing tells: they have no times."""
+NUMBERED = re.compile(r"frame_(\d+)(\.\w+)")
+LOST = {
+    ".splat": "its rows are sorted by size, and have no ids",
+    ".spz": "it has no ids",
+    ".csv": "it has centres or poses alone",
+}
+REMEDY = "give a .s4d file, USD, or numbered .glb files (scas4d export --format s4d, usd, glb)"
+Bytes = Callable[[], bytes]
+
+
+def open_export(path: Path | str, frames_per_second: float = RATE) -> ReadStates:
+    """Opens an export as states; one frame is read at a time.
+
+    Args:
+        path: a folder or a .zip of numbered .glb or .ply files, one such file, or USD.
+        frames_per_second: of numbered files: frame n is at n / frames_per_second.
+
+    Raises:
+        InputError: it is none, or its format does not tell which Gaussian is which.
+
+    >>> open_export("scene.splat")
+    Traceback (most recent call last):
+    scas4d_core.errors.InputError: 'scene.splat' cannot be read as states: its rows are sorted by size, and ...
+    """
+    given = Path(path)
+    suffix = given.suffix.lower()
+    if suffix in LOST:
+        raise InputError(f"{str(given)!r} cannot be read as states: {LOST[suffix]}", REMEDY)
+    if not given.exists():
+        raise InputError(f"there is no {str(given)!r}", REMEDY)
+    if suffix in USD_SUFFIXES:
+        return open_usd(given)
+    if given.is_dir():
+        files = {file.name: file.read_bytes for file in given.iterdir() if file.is_file()}
+        return _numbered(str(given), files, frames_per_second)
+    if suffix == ".zip":
+        return _numbered(str(given), _of_zip(given), frames_per_second)
+    if suffix not in (".glb", ".ply"):
+        raise InputError(f"{str(given)!r} is no export that can be read", REMEDY)
+    return _sequence(str(given), suffix, {_number(given.name): (given.name, given.read_bytes)}, frames_per_second)
+
+
+def _number(name: str) -> int:
+    found = NUMBERED.fullmatch(name)
+    return int(found[1]) if found else 0
+
+
+def _of_zip(path: Path) -> dict[str, Bytes]:
+    try:
+        archive = zipfile.ZipFile(path)
+    except (zipfile.BadZipFile, OSError) as error:
+        raise InputError(f"{str(path)!r} is no .zip ({error})", REMEDY) from None
+    return {name: lambda name=name: archive.read(name) for name in archive.namelist()}  # type: ignore[misc]
+
+
+def _numbered(source: str, files: dict[str, Bytes], rate: float) -> ReadStates:
+    found = {name: match for name in sorted(files) if (match := NUMBERED.fullmatch(name))}
+    suffixes = sorted({match[2].lower() for match in found.values()})
+    if lost := [suffix for suffix in suffixes if suffix in LOST]:
+        raise InputError(f"{source!r} cannot be read as states: {lost[0]}: {LOST[lost[0]]}", REMEDY)
+    if suffixes not in ([".glb"], [".ply"]):
+        held = f"files {', '.join(suffixes)}" if suffixes else "no numbered files (frame_000000.glb)"
+        raise InputError(f"{source!r} holds {held}", REMEDY)
+    by_index = {int(match[1]): (name, files[name]) for name, match in found.items()}
+    return _sequence(source, suffixes[0], dict(sorted(by_index.items())), rate)
+
+
+def _sequence(source: str, suffix: str, files: dict[int, tuple[str, Bytes]], rate: float) -> ReadStates:
+    if not 0 < rate < float("inf"):
+        raise InputError(f"frames_per_second is {rate!r}", "give a positive number")
+    frames, named = list(files), list(files.values())
+    name, read = named[0]
+    remarks = [f"numbered files have no times: {rate:g} frames a second are taken"] if len(frames) > 1 else []
+    cloud: Callable[[int], Cloud]
+    if suffix == ".ply":
+        rows = PlyRows(named)
+        cloud, metres, deep = rows.cloud, 1.0, rows.glossy
+        remarks.append("a .ply tells no unit: metres are taken")
+    else:
+        first = GltfFrame(read(), name)
+        metres, deep = first.metres_per_unit, first.cloud().harmonics.shape[1] > 1
+
+        def cloud(place: int) -> Cloud:
+            name, read = named[place]
+            return GltfFrame(read(), name).cloud()
+
+    if deep:
+        remarks.append("gloss is read as the mean over all directions")
+    return ReadStates(frames, [index / rate for index in frames], cloud, head_of(metres, rate), {}, remarks)
+
+
+class PlyRows:
+    """Reads numbered .ply files, whose rows are Gaussians where all files have the same.
+
+    A Gaussian keeps its opacity for ever, so rows with other opacities are other Gaussians.
+
+    Args:
+        files: name and bytes of each.
+
+    Raises:
+        InputError: the first is no such file.
+    """
+
+    def __init__(self, files: list[tuple[str, Bytes]]) -> None:
+        self._files = files
+        vertex = _vertex(*files[0])
+        self._opacities: NDArray[np.float64] = np.asarray(vertex["opacity"], np.float64)
+        self.glossy = any(name.startswith("f_rest_") for name in vertex.data.dtype.names)
+
+    def cloud(self, place: int) -> Cloud:
+        """The Gaussians of a frame in the user's world; ids are rows.
+
+        Raises:
+            InputError: it has other Gaussians than the first.
+        """
+        name, read = self._files[place]
+        splats = read_ply(io.BytesIO(read()), name)
+        own = np.asarray(_vertex(name, read)["opacity"], np.float64)
+        if not np.array_equal(own, self._opacities):
+            raise InputError(
+                f"{name} has other Gaussians than {self._files[0][0]} (a .ply has no ids, and some came or went), so "
+                "nobody knows which is which",
+                REMEDY,
+            )
+        return Cloud(splats, (splats.colours[:, None] - 0.5) / SH_DEGREE_0, np.arange(len(splats), dtype=np.int64))
+
+
+def _vertex(name: str, read: Bytes) -> PlyData:
+    try:
+        return PlyData.read(io.BytesIO(read()))["vertex"]
+    except Exception as error:
+        raise InputError(f"{name}: no 3D Gaussian Splatting .ply ({error})", REMEDY) from None

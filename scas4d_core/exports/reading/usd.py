@@ -1,0 +1,99 @@
+"""Reads a sequence from USD as ``exports.usd`` writes it: Gaussians with ids, over time, and their parts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.errors import InputError, message_of
+from scas4d_core.exports.cloud import Cloud
+from scas4d_core.exports.reading.states import ReadStates, head_of
+from scas4d_core.exports.whole_files import package
+from scas4d_core.query.ply import SH_DEGREE_0, Splats
+
+GAUSSIANS = "/World/Gaussians"
+PARTS = "/World/Parts"
+REMEDY = "give a file of scas4d export --format usd"
+
+
+def open_usd(path: Path) -> ReadStates:
+    """Opens a file; a frame is read when it is asked for.
+
+    Raises:
+        InputError: usd-core is missing, it is no such file, or has no ids.
+    """
+    usd, geometry, volume = (package(f"pxr.{name}", "usd") for name in ("Usd", "UsdGeom", "UsdVol"))
+    failure = package("pxr.Tf", "usd").ErrorException
+    try:
+        stage = usd.Stage.Open(str(path))
+    except failure as error:
+        raise InputError(f"{path.name} is no USD ({message_of(error)})", REMEDY) from None
+    prim = stage.GetPrimAtPath(GAUSSIANS)
+    if not prim or not prim.IsA("ParticleField3DGaussianSplat"):
+        raise InputError(f"{path.name} has no Gaussians at {GAUSSIANS}", REMEDY)
+    told = geometry.PrimvarsAPI(prim)
+    ids = told.GetPrimvar("scas4d:id").Get()
+    if ids is None:
+        raise InputError(
+            f"{path.name} has no ids (primvars:scas4d:id), so nobody knows which Gaussian is which", REMEDY
+        )
+    reader = _Reader(stage, volume.ParticleField3DGaussianSplat(prim), np.array(ids, np.int64))
+    origin = stage.GetRootLayer().customLayerData.get("scas4d", {})
+    rate = float(stage.GetTimeCodesPerSecond())
+    codes = _codes(stage, prim)
+    first, begin = int(origin.get("first_frame", 0)), float(origin.get("first_time_s", 0.0))
+    frames = [first + round(code) for code in codes]
+    if len(set(frames)) < len(frames):  # several in one time code: the rate is not that of the frames
+        frames = list(range(first, first + len(codes)))
+    parts = told.GetPrimvar("scas4d:part").Get()
+    part_of = {} if parts is None else dict(zip(reader.ids.tolist(), np.array(parts).tolist(), strict=True))
+    unit = float(geometry.GetStageMetersPerUnit(stage))
+    return ReadStates(
+        frames,
+        [begin + code / rate for code in codes],
+        lambda place: reader.cloud(codes[place]),
+        head_of(unit, rate),
+        part_of,
+        ["gloss is read as the mean over all directions"] if reader.degree else [],
+    )
+
+
+def _codes(stage: Any, prim: Any) -> list[float]:
+    """Time codes of the frames: those of any sample, for what does not change has one alone."""
+    found = {float(stage.GetStartTimeCode()), float(stage.GetEndTimeCode())}
+    scope = stage.GetPrimAtPath(PARTS)
+    for each in [prim, *(scope.GetChildren() if scope else ())]:
+        for attribute in each.GetAttributes():
+            found.update(attribute.GetTimeSamples())
+    return sorted(found)
+
+
+class _Reader:
+    """Reads the Gaussians that are there at a time code."""
+
+    def __init__(self, stage: Any, prim: Any, ids: NDArray[np.int64]) -> None:
+        self._stage = stage  # it must outlive its prims
+        self._prim, self.ids = prim, ids
+        self.degree = int(prim.GetRadianceSphericalHarmonicsDegreeAttr().Get() or 0)
+
+    def cloud(self, code: float) -> Cloud:
+        prim, count = self._prim, len(self.ids)
+        means, scales = (
+            np.array(attribute.Get(code), np.float64).reshape(-1, 3)
+            for attribute in (prim.GetPositionsAttr(), prim.GetScalesAttr())
+        )
+        quaternions = np.array(
+            [(q.GetReal(), *q.GetImaginary()) for q in prim.GetOrientationsAttr().Get(code)], np.float64
+        ).reshape(-1, 4)
+        opacities = np.array(prim.GetOpacitiesAttr().Get(code), np.float64)
+        harmonics = np.array(prim.GetRadianceSphericalHarmonicsCoefficientsAttr().Get(code), np.float64)
+        if not len(means) == len(scales) == len(quaternions) == len(opacities) == count:
+            raise InputError(f"its Gaussians have {len(means)} places and {count} ids", REMEDY)
+        harmonics = harmonics.reshape(count, -1, 3)
+        colours = 0.5 + SH_DEGREE_0 * harmonics[:, 0]
+        there = opacities > 0
+        found = Cloud(Splats(means, scales, quaternions, opacities, colours), harmonics, self.ids)
+        return found.turned().rows(there)

@@ -1,0 +1,134 @@
+"""The export process: writes committed frames in the format of another tool, at a low priority."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+from collections.abc import Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.errors import InputError, message_of, without_paths
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.storage.history import DamagedFrameError, History, HistoryError
+from server.processes.compact_answers import compact_head
+from server.processes.messages import Damaged, ExportEnded, ExportProgressed, ExportSpec
+from server.processes.placement import end_with_parent, use_one_thread
+from server.storage.disk import free_bytes, no_room
+
+NICE = 15
+"""Added to its niceness: of a core that it shares with a scene's worker it gets about a tenth."""
+RESERVE_BYTES = 500_000_000
+"""Room on the disk that exports leave to the frames of the scenes: about a thousand of them."""
+WITH_PARTS = ("usd", "s4d")
+"""Formats that have parts where there are any."""
+
+log = logging.getLogger("scas4d.exporter")
+
+
+class ShortOfRoomError(RuntimeError):
+    """The export would take the room that scenes need."""
+
+
+def main(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
+    """Runs one export; the service ends the process when it is not wanted any more."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(NICE)
+    end_with_parent()
+    fault: str | None = None
+    try:
+        _export(spec, connection)
+    except Exception as error:  # whatever the core raises, the service goes on and says so
+        known = isinstance(error, InputError | HistoryError | ShortOfRoomError) or no_room(error)
+        log.warning("scene %s: an export failed: %s", spec.scene.folder.name, error, exc_info=not known)
+        fault = words(error)
+    with contextlib.suppress(EOFError, OSError):  # the service is gone
+        connection.send(ExportEnded(fault))
+        logging.shutdown()
+        connection.recv()  # until it is asked to stop: an end of its own would be taken for a fault
+    os._exit(0)
+
+
+def words(error: Exception) -> str:
+    """Tells a person why an export failed, without paths of this machine.
+
+    >>> words(InputError("parts: no Gaussian belongs to one", "ask for the parts"))
+    'parts: no Gaussian belongs to one; ask for the parts'
+    """
+    if isinstance(error, ShortOfRoomError) or no_room(error):
+        return f"the disk has no room ({message_of(error)}); export fewer frames, or a smaller format"
+    if isinstance(error, DamagedFrameError):
+        return f"{message_of(error)}; export again later: it is mended if it can be"
+    if isinstance(error, HistoryError):
+        return (
+            f"{message_of(error)}: its state was deleted while the export ran, by the scene's retention or because it "
+            "was begun anew; export later frames, or have the scene keep more states (keep_states)"
+        )
+    if isinstance(error, InputError):
+        return without_paths(str(error))
+    return f"{type(error).__name__}: {message_of(error)}"
+
+
+def size_of(folder: Path) -> int:
+    """Returns the bytes of the files below a folder."""
+    total = 0
+    for path in folder.rglob("*"):
+        with contextlib.suppress(FileNotFoundError):
+            total += path.stat().st_size
+    return total
+
+
+def _export(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
+    from scas4d_core.exports import export_sequence, format_of  # in this process only: the others stay light
+
+    history: History | None = None
+    wanted = format_of(spec.format)
+    labels: NDArray[np.int64] | None = None
+    folder = spec.file.parent
+    try:
+        if wanted.needs_parts or spec.format in WITH_PARTS:
+            from server.processes.renderer import Renderer  # it loads what encodes pictures
+
+            renderer = Renderer(spec.scene)
+            history = renderer.history
+            if history.newest.moving.any():
+                labels = renderer.labels(None)
+            elif wanted.needs_parts:
+                raise InputError("nothing moves in this scene, so it has no parts", "export it in another format")
+        else:
+            history = History.load(spec.scene.folder.states, only=(spec.first, *spec.frames))
+            use_one_thread()
+        head = compact_head(spec.scene, history)
+
+        def progress(_: int, done: int) -> None:
+            connection.send(ExportProgressed(done, size_of(folder)))
+            if (free := free_bytes(folder)) < RESERVE_BYTES:
+                raise ShortOfRoomError(f"{free / 1e6:.0f} MB are free, {RESERVE_BYTES / 1e6:.0f} MB are left to frames")
+
+        export_sequence(
+            _states(history, spec.frames),
+            spec.format,
+            spec.file,
+            world=head.world,
+            rig=head.rig,
+            parts=labels,
+            ids=spec.ids,
+            frames_per_second=head.frames_per_second,
+            background=head.background,
+            progress=progress,
+        )
+    finally:
+        if history is not None and (faults := history.take_faults()):
+            connection.send(Damaged(faults))
+
+
+def _states(history: History, frames: tuple[int, ...]) -> Iterator[tuple[int, float, Gaussians]]:
+    """Each frame is read when it is its turn."""
+    for index in frames:
+        yield index, history.time(index), history.gaussians(index)

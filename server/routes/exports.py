@@ -1,0 +1,109 @@
+"""Routes of exports: files of many frames in the formats of other tools, made in the background."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Request, Response
+
+from client.wire import ExportList, ExportModel, ExportRequest, ExportState
+from server.http.unchanging import unchanging_file
+from server.problems import Problem
+from server.routes.access import AllExports, SceneId, TheRecord
+from server.scene.exports import MEDIA_TYPES
+from server.scene.scene import Scene
+
+router = APIRouter(prefix="/v1/scenes", tags=["exports"])
+
+ExportId = Annotated[str, Path(max_length=64, description="Of the export.")]
+KINDS = (*MEDIA_TYPES.values(), "application/octet-stream")
+FILE: dict[int | str, dict[str, Any]] = {
+    200: {
+        "content": {kind: {"schema": {"type": "string", "format": "binary"}} for kind in KINDS},
+        "description": "The file, or a range of its bytes (206).",
+    }
+}
+
+
+@router.post("/{id}/exports", status_code=202)
+async def begin(scene: TheRecord, exports: AllExports, request: ExportRequest, response: Response) -> ExportModel:
+    """Begins an export of committed frames in the background; `Location` has its place.
+
+    One export of the service is made at a time, in a process of its own at a low priority: updates and views go ahead.
+    A scene may have 8 exports; a file stays for a day, and not beyond the service's end.
+    """
+    if request.ids is not None and request.format != "tracks":
+        raise Problem(
+            422,
+            f"ids are given for format {request.format!r}",
+            field="ids",
+            value=request.ids,
+            remedy="leave ids out; they choose the Gaussians of format 'tracks'",
+        )
+    made = exports.begin(scene, request, _frames(scene, request)).model()
+    response.headers["Location"] = f"/v1/scenes/{scene.id}/exports/{made.id}"
+    return made
+
+
+@router.get("/{id}/exports")
+async def listed(id: SceneId, exports: AllExports) -> ExportList:
+    """Lists the exports of a scene, oldest first. A scene that sleeps is not woken."""
+    return ExportList(exports=[export.model() for export in exports.of(id)])
+
+
+@router.get("/{id}/exports/{export}")
+async def get(id: SceneId, export: ExportId, exports: AllExports) -> ExportModel:
+    """Returns the state of an export: how many frames are written, or why it failed."""
+    return exports.get(id, export).model()
+
+
+@router.get("/{id}/exports/{export}/file", response_class=Response, responses=FILE)
+async def file(id: SceneId, export: ExportId, exports: AllExports, request: Request) -> Response:
+    """Returns the file of an export that is done; numbered files in one .zip. `Range` and `If-None-Match` hold."""
+    found = exports.get(id, export)
+    if found.state != ExportState.DONE:
+        raise Problem(
+            409,
+            f"the export is {found.state.value}" + (f": {found.error}" if found.error else ""),
+            field="export",
+            value=export,
+            remedy=f"wait until GET /v1/scenes/{id}/exports/{export} tells that it is done"
+            if found.error is None
+            else "ask for another export",
+        )
+    try:
+        return await unchanging_file(
+            request, found.spec.file, tag=found.id, media_type=found.media_type, name=found.name
+        )
+    except FileNotFoundError:  # removed between the two
+        remedy = "ask for another export"
+        raise Problem(404, "the file of the export is removed", field="export", value=export, remedy=remedy) from None
+
+
+@router.delete("/{id}/exports/{export}", status_code=204)
+async def remove(id: SceneId, export: ExportId, exports: AllExports) -> None:
+    """Cancels an export that waits or runs; removes one that is over, with its file."""
+    await exports.remove(id, export)
+
+
+def _frames(scene: Scene, request: ExportRequest) -> tuple[int, ...]:
+    """Returns the committed frames of the range.
+
+    Raises:
+        Problem: 409, none is committed at all; 422, none in this range.
+    """
+    scene.committed_frame(None, "first")
+    committed = scene.committed
+    first = committed[0] if request.first is None else request.first
+    last = committed[-1] if request.last is None else request.last
+    frames = tuple(committed[bisect_left(committed, first) : bisect_right(committed, last)])
+    if not frames:
+        raise Problem(
+            422,
+            f"no committed frame from {first} to {last}",
+            field="first",
+            value=first,
+            remedy=f"ask within {committed[0]} to {committed[-1]}",
+        )
+    return frames
