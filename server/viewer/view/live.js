@@ -2,13 +2,13 @@
 
 import { Orbit, project, readCamera } from "./geometry.js";
 import { paintDepth } from "./colours.js";
+import { listenToPointer, moveByKey } from "./gestures.js";
 import { drawFrusta, drawTracks } from "./overlay.js";
 import { fetched, scenePath } from "../service.js";
 
 const SETTLE_MS = 220;
 const SLOW_MS = 1000;
 const TARGET_MS = 90;
-const CLICK_PX = 4;
 const EMPTY = [16, 19, 24];
 const FIT_PX = 200;
 const COVERED = 40; // of 255, from which a pixel shows something
@@ -190,68 +190,17 @@ export class LiveView {
   // Pointer and keys.
 
   listen() {
-    const canvas = this.overlay;
-    const fingers = new Map();
-    let travelled = 0;
-    canvas.addEventListener("pointerdown", (event) => {
-      canvas.setPointerCapture(event.pointerId);
-      fingers.set(event.pointerId, [event.clientX, event.clientY]);
-      travelled = fingers.size > 1 ? Infinity : 0;
-    });
-    canvas.addEventListener("pointermove", (event) => {
-      const before = fingers.get(event.pointerId);
-      if (!before || !this.stream) return;
-      const [dx, dy] = [event.clientX - before[0], event.clientY - before[1]];
-      travelled += Math.abs(dx) + Math.abs(dy);
-      if (fingers.size === 2) this.pinch(fingers, event);
-      fingers.set(event.pointerId, [event.clientX, event.clientY]);
-      if (fingers.size === 2 || travelled < CLICK_PX) return;
-      const height = canvas.getBoundingClientRect().height;
-      if (event.buttons & 6 || event.shiftKey) this.orbit.pan(-dx / height, -dy / height);
-      else this.orbit.turn(-2.6 * dx / height, 2.6 * dy / height);
-      this.moved();
-    });
-    const lift = (event) => {
-      const known = fingers.delete(event.pointerId);
-      if (known && event.type === "pointerup" && event.button === 0 && travelled < CLICK_PX) this.click(event);
-    };
-    canvas.addEventListener("pointerup", lift);
-    canvas.addEventListener("pointercancel", lift);
-    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-    canvas.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      if (!this.stream) return;
-      this.orbit.zoom(Math.exp(Math.max(-0.5, Math.min(0.5, event.deltaY / (event.deltaMode ? 10 : 500)))));
-      this.moved();
-    }, { passive: false });
-  }
-
-  pinch(fingers, event) {
-    const [[, other]] = [...fingers].filter(([id]) => id !== event.pointerId);
-    const before = fingers.get(event.pointerId);
-    const spread = (a, b) => Math.hypot(a[0] - b[0], a[1] - b[1]) || 1;
-    const now = [event.clientX, event.clientY];
-    this.orbit.zoom(spread(before, other) / spread(now, other));
-    const height = this.overlay.getBoundingClientRect().height;
-    this.orbit.pan(-(now[0] - before[0]) / 2 / height, -(now[1] - before[1]) / 2 / height);
-    this.moved();
+    listenToPointer(this.overlay, () => (this.stream ? this.orbit : null), { moved: () => this.moved(), click: (event) => this.click(event) });
   }
 
   /** Moves the camera by a key; answers whether it is one of those that do. */
   key(event) {
-    const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
     if (!this.stream) return false;
-    if (arrows[event.key]) {
-      const [x, y] = arrows[event.key];
-      if (event.shiftKey) this.orbit.pan(0.05 * x, 0.05 * y);
-      else this.orbit.turn(0.08 * x, -0.08 * y);
-    } else if (event.key === "+" || event.key === "=") this.orbit.zoom(0.9);
-    else if (event.key === "-") this.orbit.zoom(1 / 0.9);
-    else if (event.key === "Home" || event.key === "0") this.orbit.from(this.rig[0]);
-    else if (event.key.toLowerCase() === "t") {
+    if (event.key.toLowerCase() === "t") {
       this.pickMiddle();
       return true;
-    } else return false;
+    }
+    if (!moveByKey(this.orbit, event, this.rig[0])) return false;
     this.moved();
     return true;
   }
