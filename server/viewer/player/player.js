@@ -17,7 +17,6 @@ const LONE = { intrinsics: [[800, 0, 400], [0, 800, 300], [0, 0, 1]], width: 800
   world_to_camera: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]] }; // for a file without cameras
 
 const pace = new Pace();
-const asked = new Map(); // requests that are being drawn, by tag
 let [splats, clock, orbit, rig] = [null, null, null, null];
 let scene = null; // what the worker told of the files
 let shown = null; // { camera, place } of the picture that is seen
@@ -102,14 +101,12 @@ function request(moves) {
   const [width, height] = pace.size($("picture").parentElement.getBoundingClientRect(), moves);
   const camera = orbit.camera(width, height);
   const { place } = clock;
-  splats.draw({ place, camera, ahead: clock.playing ? (Math.ceil(place) + 1) % (clock.last + 1) : undefined });
-  asked.set(splats.tag, { camera, place, share: moves ? pace.share : null });
+  const ahead = clock.playing ? (Math.ceil(place) + 1) % (clock.last + 1) : undefined;
+  splats.draw({ place, camera, ahead }, { camera, place, share: moves ? pace.share : null });
 }
 
-function drawn({ tag, milliseconds, range, followed: at }) {
+function drawn({ asked: { camera, place, share }, milliseconds, range, followed: at }) {
   const began = performance.now();
-  const { camera, place, share } = asked.get(tag);
-  asked.delete(tag);
   if (share) pace.took(milliseconds, share);
   $("curtain").hidden = true;
   shown = { camera, place };

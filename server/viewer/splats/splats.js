@@ -8,13 +8,9 @@ export class Splats {
    * @param on { frames(message), drawn(message), picked(message), track(message), trails(message), failed(message) }
    */
   constructor(canvas, worker, on) {
-    Object.assign(this, { worker, on, busy: false, next: null, tag: 0, script: 0 });
+    Object.assign(this, { worker, on, busy: null, next: null });
     const offscreen = canvas.transferControlToOffscreen();
-    worker.onmessage = ({ data }) => {
-      const began = performance.now();
-      this.receive(data);
-      this.script = performance.now() - began;
-    };
+    worker.onmessage = ({ data }) => this.receive(data);
     worker.onerror = (event) => on.failed({ during: "begin", words: event.message || "the worker does not run" });
     worker.postMessage({ kind: "canvas", canvas: offscreen }, [offscreen]);
   }
@@ -32,10 +28,11 @@ export class Splats {
 
   receive(message) {
     if (message.kind === "drawn" || (message.kind === "failed" && message.during === "draw")) {
-      this.busy = false;
+      message.asked = this.busy;
+      this.busy = null;
       const next = this.next;
       this.next = null;
-      if (next) this.draw(next);
+      if (next) this.draw(...next);
     }
     this.on[message.kind]?.(message);
   }
@@ -45,14 +42,19 @@ export class Splats {
     this.worker.postMessage({ kind: "file", bytes, name }, [bytes.buffer]);
   }
 
-  /** @param request { place, camera, ahead }: place among the frames, camera as the service takes it, frame to decode next */
-  draw(request) {
+  /**
+   * Draws, or does so after what is being drawn; of several such the last.
+   *
+   * @param request { place, camera, ahead }: place among the frames, camera as the service takes it, frame to decode next
+   * @param asked comes back with what was drawn
+   */
+  draw(request, asked = {}) {
     if (this.busy) {
-      this.next = request;
+      this.next = [request, asked];
       return;
     }
-    this.busy = true;
-    this.worker.postMessage({ kind: "draw", tag: ++this.tag, ...request });
+    this.busy = asked;
+    this.worker.postMessage({ kind: "draw", ...request });
   }
 
   look(changes) {

@@ -63,7 +63,7 @@ const actions = {
     if (look.trails !== before.trails || (look.trails && changes.hiddenParts)) gatherTrails();
   },
 
-  draw({ tag, place, camera: model, ahead }) {
+  draw({ place, camera: model, ahead }) {
     const began = performance.now();
     const { head } = sequence;
     const camera = inside(model, head, near);
@@ -82,7 +82,7 @@ const actions = {
     painter.finish();
     shown = { camera, moment };
     const [metres, now] = [head.world.metres_per_unit, performance.now()];
-    post("drawn", { tag, place, mode, drawn, milliseconds: now - began, decoding: decoded - began,
+    post("drawn", { place, mode, drawn, milliseconds: now - began, decoding: decoded - began,
       range: range?.map((z) => z / metres), followed: followed < 0 ? null : whereIs(followed) });
     if (ahead !== undefined && ahead < sequence.frames.length && !sequence.has(ahead)) setTimeout(() => sequence.frames[ahead] && sequence.state(ahead));
   },
@@ -168,6 +168,6 @@ self.onmessage = ({ data }) => {
   try {
     actions[data.kind](data);
   } catch (error) {
-    post("failed", { during: data.kind, tag: data.tag, name: data.name, words: error.message });
+    post("failed", { during: data.kind, name: data.name, words: error.message });
   }
 };
