@@ -37,7 +37,7 @@ def write_compact(file: Path, history: History, asked: Sequence[int], head: Head
     """
     file.unlink(missing_ok=True)
     frames = [index for index in asked if index in history] or asked[:1]
-    with CompactWriter(file, head) as writer:
+    with CompactWriter(file, head, clustered=len(frames) > 1) as writer:
         for index in frames:
             writer.add(index, history.time(index), history.gaussians(index))
         if labels is not None:

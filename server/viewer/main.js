@@ -11,6 +11,7 @@ import { Tradeoff } from "./panels/tradeoff.js";
 import { SceneList, remember, wanted } from "./scenes.js";
 import { call, scenePath, token } from "./service.js";
 import { beforeFirstFrame, OPENING, stateKey, stateWords, WAKING } from "./states.js";
+import { PartList } from "./player/parts.js";
 import { Stream } from "./stream.js";
 import { Beside } from "./view/beside.js";
 import { LiveView } from "./view/live.js";
@@ -31,7 +32,9 @@ const view = new LiveView($("picture"), $("overlay"), {
     $("view").classList.toggle("stale", stale);
     if (stale) $("legend").hidden = true;
   },
+  parts: (count) => partList?.show(count),
 });
+const partList = new PartList($("parts"), $("parts-words"), (hiddenParts) => view.setExtras({ hiddenParts }));
 const beside = new Beside($("beside"));
 const timeline = new Timeline(() => {
   if (!timeline.playing) remember(); // browsers bound how often an address may change
@@ -312,6 +315,9 @@ $("from").addEventListener("change", (event) => lookFrom(Number(event.target.val
 $("beside-what").addEventListener("change", (event) => showBeside(event.target.value));
 $("beside-camera").addEventListener("change", (event) => beside.look(Number(event.target.value)));
 $("background").addEventListener("change", (event) => view.setBackground(event.target.value ? JSON.parse(event.target.value) : null));
+$("trails").addEventListener("change", (event) => view.setExtras({ trails: Number(event.target.value) }));
+$("parts-box").addEventListener("toggle", () => $("parts-box").open && page.stream && view.askParts());
+document.addEventListener("click", (event) => event.target.closest("#parts-box") || ($("parts-box").open = false));
 $("who").addEventListener("change", (event) => view.setDrawn(event.target.value));
 $("fit").addEventListener("click", fit);
 $("snapshot").addEventListener("click", snapshot);

@@ -40,7 +40,7 @@ def test_what_moves_is_drawn_here_and_what_rests_by_the_service(page, service, f
     shown(page, frame=str(FRAMES - 1), drawn="service")
     turn(page)  # asks for the frame
     until(page, "document.getElementById('drawn') !== null")
-    page.wait_for_timeout(800)
+    page.wait_for_timeout(600)
     before = len(sent)
     turn(page, 1)
     until(page, HERE)
@@ -60,7 +60,7 @@ def test_here_alone_the_service_is_asked_for_no_picture(page, service, finished,
     assert first.max() > 40  # the points, as blobs
     before = len(sent)
     turn(page)
-    page.wait_for_timeout(700)
+    page.wait_for_timeout(500)
     assert np.abs(seen(page) - first).mean() > 0.1
     page.locator("#time").fill("2")
     shown(page, frame="2", drawn="here")
@@ -123,3 +123,30 @@ def test_where_chunks_do_not_come_the_service_draws(page, service, finished):
     turn(page, 1)
     until(page, f"document.getElementById('view').dataset.tag !== '{tag}'")
     assert page.locator("#curtain").is_hidden()
+
+
+def test_trails_and_parts_that_are_hidden_stay_at_rest(page, service, finished):
+    opened(page, service, finished)
+    shown(page, frame=str(FRAMES - 1), drawn="service")
+    page.locator("#time").fill("5")
+    shown(page, frame="5", drawn="service")
+    page.click("#parts-box summary")
+    page.get_by_label("Show part 1", exact=True).wait_for()
+    page.get_by_label("Show part 2 alone").click()
+    shown(page, frame="5", drawn="here")
+    page.wait_for_timeout(500)
+    assert page.locator("#view").get_attribute("data-drawn") == "here"  # at rest, too
+    assert "3 of 4 hidden" in page.locator("#parts-words").inner_text()
+    page.keyboard.press("Escape")
+    page.get_by_label("Show part 2 alone").click()
+    until(page, BY_THE_SERVICE)
+    page.select_option("#trails", "200")
+    until(page, HERE)
+    first = seen(page)
+    page.locator("#time").fill("1")
+    shown(page, frame="1", drawn="here")
+    page.wait_for_timeout(500)
+    assert np.abs(seen(page) - first).mean() > 0.05
+    page.select_option("#trails", "0")
+    until(page, BY_THE_SERVICE)
+    assert page.faults == []

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import io
 
-import bent_states
 import browser_engine
 import numpy as np
 import pytest
 from browser_page import canvas, until
+from export_cases import bent
 from PIL import Image
 
 from client.exports.player import export_player, write_player
@@ -17,7 +17,7 @@ from client.exports.player import export_player, write_player
 @pytest.fixture(scope="module")
 def player(tmp_path_factory):
     folder = tmp_path_factory.mktemp("player")
-    file = bent_states.write(folder / "bent.s4d", browser_engine.make_rig())
+    file = bent.write(folder / "bent.s4d", browser_engine.make_rig())
     export_player(str(file), folder / "out.html", url="http://127.0.0.1:9", token=None)
     return folder / "out.html"
 
@@ -42,7 +42,7 @@ def opened(page, player):
     return seen(page)
 
 
-def seen(page, pause=400):
+def seen(page, pause=300):
     """The picture in the middle of the page, without what lies over it."""
     page.wait_for_timeout(pause)
     box = page.locator("#picture").bounding_box()
@@ -84,10 +84,10 @@ def test_it_turns_and_shows_depth_and_parts(offline, player):
     offline.mouse.down()
     offline.mouse.move(650, 320, steps=4)
     offline.mouse.up()
-    assert differ(first, seen(offline, 900))
+    assert differ(first, seen(offline, 600))
     offline.focus("#overlay")
     offline.keyboard.press("Home")
-    assert not differ(first, seen(offline, 900))
+    assert not differ(first, seen(offline, 600))
     offline.keyboard.press("2")
     depth = seen(offline)
     assert differ(first, depth)
@@ -97,7 +97,7 @@ def test_it_turns_and_shows_depth_and_parts(offline, player):
     assert differ(depth, seen(offline))
     assert offline.locator("#legend").is_hidden()
     offline.click("#parts-box summary")
-    assert offline.locator("#parts li").count() == bent_states.PARTS + 1
+    assert offline.locator("#parts li").count() == bent.PARTS + 1
     whole = seen(offline)
     offline.get_by_label("Show part 2 alone").click()
     alone = seen(offline)
@@ -118,7 +118,7 @@ def test_a_gaussian_is_followed_and_trails_are_drawn(offline, player):
     before = seen(offline)
     offline.select_option("#trails", "200")
     offline.locator("#time").fill("0.88")
-    after = seen(offline, 900)
+    after = seen(offline, 600)
     assert differ(before, after)
     assert (canvas(offline, "overlay")[..., 3] > 0).sum() > 50  # its track
     offline.mouse.click(box["x"] + 4, box["y"] + 4)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import base64
 import io
 
-import bent_states
 import browser_engine
 import numpy as np
 import pytest
+from export_cases import bent
 from PIL import Image
 
 from scas4d_core.cameras import Camera, Rig
@@ -54,7 +54,7 @@ PAINT = """
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
-    return bent_states.write(tmp_path_factory.mktemp("bent") / "bent.s4d", browser_engine.make_rig())
+    return bent.write(tmp_path_factory.mktemp("bent") / "bent.s4d", browser_engine.make_rig())
 
 
 def run(page, service, script, data, order):
@@ -89,7 +89,7 @@ def test_all_frames_are_read_as_python_reads_them(page, service, file):
         for place, state in found["states"]:
             same(state, reader.state(reader.frames[place]))
             counts.add(len(base64.b64decode(state["opacities"])) // 4)
-    assert counts == {bent_states.BORN, bent_states.BORN + bent_states.LATER}
+    assert counts == {bent.BORN, bent.BORN + bent.LATER}
 
 
 def test_a_file_that_was_cut_is_read_up_to_there(page, service, file):
@@ -99,7 +99,7 @@ def test_a_file_that_was_cut_is_read_up_to_there(page, service, file):
     shorter.write_bytes(cut)
     with CompactReader(shorter) as reader:
         last = len(reader.frames) - 1
-        assert 0 < last < bent_states.FRAMES - 1
+        assert 0 < last < bent.FRAMES - 1
         found = run(page, service, READ, cut, [last])
         assert found["frames"] == reader.frames
         same(found["states"][0][1], reader.state(reader.frames[last]))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import base64
 import re
 
-import bent_states
 import browser_engine
 import numpy as np
 import pytest
+from export_cases import bent
 from typer.testing import CliRunner
 
 from client.cli.main import app
@@ -22,7 +22,7 @@ NOWHERE = {"url": "http://127.0.0.1:9", "token": None}
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
-    return bent_states.write(tmp_path_factory.mktemp("scene") / "states.s4d", browser_engine.make_rig())
+    return bent.write(tmp_path_factory.mktemp("scene") / "states.s4d", browser_engine.make_rig())
 
 
 def held(page, folder):

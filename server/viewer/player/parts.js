@@ -5,15 +5,15 @@ import { partColour } from "../splats/rig.js";
 
 export class PartList {
   /** @param changed takes the labels of the parts that are hidden; −1 is what belongs to none */
-  constructor(list, box, words, changed) {
-    Object.assign(this, { list, box, words, changed, hidden: new Set(), labels: [] });
-    box.hidden = true;
+  constructor(list, words, changed) {
+    Object.assign(this, { list, words, changed, hidden: new Set(), labels: [] });
   }
 
-  /** Lists so many parts, and what belongs to none. */
+  /** Lists so many parts, and what belongs to none; of none, nothing. All are shown where there were others before. */
   show(count) {
-    this.box.hidden = count === 0;
-    this.labels = [...Array(count).keys(), -1];
+    const labels = count ? [...Array(count).keys(), -1] : [];
+    if (labels.length !== this.labels.length) this.hidden.clear();
+    this.labels = labels;
     this.list.replaceChildren(...this.labels.map((label) => this.row(label)));
     this.mark();
   }
@@ -56,6 +56,7 @@ export class PartList {
       row.querySelector("button").setAttribute("aria-pressed", String(this.isAlone(label)));
     }
     const { size } = this.hidden;
-    this.words.textContent = size ? `${size} of ${this.labels.length} hidden.` : "All parts are shown.";
+    if (!this.labels.length) this.words.textContent = "No parts are told yet.";
+    else this.words.textContent = size ? `${size} of ${this.labels.length} hidden.` : "All parts are shown.";
   }
 }

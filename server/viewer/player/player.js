@@ -65,6 +65,7 @@ function frames(message) {
   Object.assign($("time"), { min: clock.times[0], max: clock.times[clock.last] });
   for (const id of ["play", "back", "forth", "time"]) $(id).disabled = all.length < 2;
   partList.show(parts);
+  $("parts-box").hidden = parts === 0;
   const named = $("modes").querySelector("[data-mode=parts]");
   named.disabled = parts === 0;
   if (!parts) named.title = "No parts are told in this file";
@@ -240,7 +241,7 @@ function choose(select, by) {
   select.dispatchEvent(new Event("change"));
 }
 
-const partList = new PartList($("parts"), $("parts-box"), $("parts-words"), (hiddenParts) => {
+const partList = new PartList($("parts"), $("parts-words"), (hiddenParts) => {
   splats.look({ hiddenParts });
   draw(true);
 });

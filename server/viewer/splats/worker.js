@@ -50,6 +50,7 @@ const actions = {
       paints.labels = null;
       actions.look({});
     }
+    if (look.trails) gatherTrails(); // places have moved
     const parts = labels ? Math.max(-1, ...new Set(labels)) + 1 : 0;
     post("frames", { name, frames: sequence.frames.map(({ index, time }) => [index, time]), head: sequence.head, count: reader.count,
       parts, damage: reader.damage });

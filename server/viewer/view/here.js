@@ -11,12 +11,13 @@ const SLOW_MS = 250; // a picture: fewer than four a second
 const SLOWER = 1.5; // times as long as the service takes
 const WARM = 3; // pictures before times count: shaders are compiled in the first
 const AGAIN_MS = 20_000; // after a failure
+const SPAN = 30; // frames of a trail
 const KINDS = ["colour", "depth", "alpha"]; // parts come from the service: it says whose weight is largest in a pixel
 
 export class Here {
-  /** @param picture the canvas that this one lies over  @param on { drawn(asked, message), arrived() } */
+  /** @param picture the canvas that this one lies over  @param on { drawn(asked, message), arrived(), parts(count) } */
   constructor(picture, on) {
-    Object.assign(this, { picture, on, how: "auto", pace: new Pace(), splats: null, scene: null, serial: 0, opened: 0 });
+    Object.assign(this, { picture, on, how: "auto", extras: { trails: 0, hiddenParts: [] }, withParts: false, pace: new Pace(), splats: null, scene: null, serial: 0, opened: 0 });
     this.possible = Splats.possible();
     this.times = { here: 0, service: 0 }; // milliseconds a picture, smoothed
     this.forget();
@@ -30,6 +31,7 @@ export class Here {
     this.drawn = 0;
     this.slow = false;
     this.said = "";
+    this.labelled = 0; // parts that were told
   }
 
   open(scene) {
@@ -44,6 +46,9 @@ export class Here {
     this.splats?.clear();
     this.forget();
     this.hide();
+    this.withParts = false;
+    this.show({ hiddenParts: [] });
+    this.on.parts(0);
   }
 
   /** Chooses who draws: "auto" by measured speed, "here" or "service". */
@@ -51,6 +56,24 @@ export class Here {
     this.how = how;
     this.slow = false;
     this.failedAt = -Infinity;
+  }
+
+  /** Shows trails, or hides parts, which the service's pictures do not: while it does, pictures at rest are from here. */
+  show(extras) {
+    Object.assign(this.extras, extras);
+    this.splats?.look({ ...this.extras, span: SPAN });
+  }
+
+  /** Whether pictures at rest are drawn here, too. */
+  get alone() {
+    return this.how === "here" || this.extras.trails > 0 || this.extras.hiddenParts.length > 0;
+  }
+
+  /** Has the parts of all Gaussians told, for the list of them; they come with the next frame. */
+  askParts() {
+    if (this.withParts) return;
+    this.withParts = true;
+    this.frames = new Map();
   }
 
   /** Whether pictures of a mode are drawn here, once their frame is. */
@@ -84,7 +107,7 @@ export class Here {
     const abort = (this.abort = new AbortController());
     abort.wanted = `${first} ${limit}`;
     try {
-      const answer = await fetched("GET", `${scenePath(scene)}/states.s4d?first=${first}&limit=${limit}`, undefined, abort.signal);
+      const answer = await fetched("GET", `${scenePath(scene)}/states.s4d?first=${first}&limit=${limit}${this.withParts && (limit > 1 || !this.labelled) ? "&parts=true" : ""}`, undefined, abort.signal);
       const bytes = new Uint8Array(await answer.arrayBuffer());
       if (this.abort !== abort) return;
       this.begin().add(bytes, this.opened);
@@ -104,15 +127,19 @@ export class Here {
     this.picture.after(this.canvas);
     const worker = new Worker(new URL("../splats/worker.js", import.meta.url), { type: "module" });
     const hear = (action) => (message) => (message.name ?? message.asked?.opened ?? this.opened) === this.opened && action(message);
-    return (this.splats = new Splats(this.canvas, worker, {
-      frames: hear(({ frames }) => {
+    this.splats = new Splats(this.canvas, worker, {
+      frames: hear(({ frames, parts }) => {
         this.frames = new Map(frames.map(([index], place) => [index, place]));
         this.said = "";
+        if (parts !== this.labelled) this.on.parts((this.labelled = parts));
         this.on.arrived();
       }),
       drawn: hear((message) => this.shown(message)),
       failed: hear((message) => this.failed(message)),
-    }));
+      trails: () => this.on.arrived(true),
+    });
+    this.show({});
+    return this.splats;
   }
 
   failed({ words }) {
@@ -161,7 +188,7 @@ export class Here {
     this.times[who] = this.times[who] ? 0.8 * this.times[who] + 0.2 * milliseconds : milliseconds;
   }
 
-  show() {
+  reveal() {
     this.canvas.hidden = false;
   }
 

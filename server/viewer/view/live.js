@@ -23,7 +23,7 @@ const MODES = {
 };
 
 export class LiveView {
-  /** @param on { pick(u, v, camera, frame), shown(info), turned(), slow(mode), stale(whether) } */
+  /** @param on { pick(u, v, camera, frame), shown(info), turned(), slow(mode), stale(whether), parts(count) } */
   constructor(canvas, overlay, on) {
     this.canvas = canvas;
     this.overlay = overlay;
@@ -35,7 +35,7 @@ export class LiveView {
     this.showFrusta = false;
     this.tracks = [];
     this.largest = 8e6;
-    this.here = new Here(canvas, { drawn: (...drawn) => this.drawnHere(...drawn), arrived: () => this.arrived() });
+    this.here = new Here(canvas, { drawn: (...drawn) => this.drawnHere(...drawn), arrived: (all) => this.arrived(all), parts: (count) => on.parts(count) });
     this.touchedAt = this.movedAt = -Infinity;
     this.listen();
     new ResizeObserver(() => this.moved()).observe(canvas.parentElement);
@@ -117,6 +117,18 @@ export class LiveView {
     this.touch();
   }
 
+  /** Trails of Gaussians, or parts that are hidden: drawn here alone. */
+  setExtras(extras) {
+    this.here.show(extras);
+    this.touch();
+  }
+
+  /** The parts are to be listed. */
+  askParts() {
+    this.here.askParts();
+    this.touch();
+  }
+
   /** A frame was committed. */
   committed(index) {
     if (this.stream && this.frame === null && this.isTouched() && this.here.draws(this.mode)) this.here.fetch(index, true);
@@ -135,7 +147,7 @@ export class LiveView {
   }
 
   isTouched() {
-    return this.here.how === "here" || performance.now() - this.touchedAt < TOUCHED_MS;
+    return this.here.alone || performance.now() - this.touchedAt < TOUCHED_MS;
   }
 
   // Asking.
@@ -164,7 +176,7 @@ export class LiveView {
 
   /** At rest: the service's exact picture, or a sharp one from here. */
   rest() {
-    if (this.here.how !== "here" || !this.drawHere(false)) this.request(1);
+    if (!this.here.alone || !this.drawHere(false)) this.request(1);
   }
 
   /** Draws the view in the page; answers whether it is or will be, else the service is to be asked. */
@@ -173,8 +185,8 @@ export class LiveView {
     const index = this.frame ?? readable().at(-1)?.index;
     if (!here.draws(this.mode) || index === undefined || !this.isTouched()) return false;
     here.fetch(index, this.frame === null && !here.has(index));
-    if (!here.has(index)) return here.how === "here" && !here.said;
-    if (here.how === "here") this.stream.unsubscribe("view");
+    if (!here.has(index)) return here.alone && !here.said;
+    if (here.alone) this.stream.unsubscribe("view");
     this.overtaken = this.tag; // pictures that are on their way show another view
     clearTimeout(this.slow);
     const camera = this.orbit.camera(...here.size(this.canvas.parentElement.getBoundingClientRect(), moving));
@@ -184,7 +196,7 @@ export class LiveView {
 
   drawnHere(asked, { range }) {
     if (!this.stream || asked.serial <= this.exact || asked.mode !== this.mode) return;
-    this.here.show();
+    this.here.reveal();
     this.shown = { camera: asked.camera, frame: asked.index, mode: asked.mode, tag: this.shown?.tag ?? 0 };
     this.on.stale(false);
     this.draw();
@@ -193,8 +205,8 @@ export class LiveView {
   }
 
   /** Frames have come that can be drawn here. */
-  arrived() {
-    if (this.stream && (this.here.how === "here" || performance.now() - this.movedAt < SETTLE_MS)) this.moved();
+  arrived(all = false) {
+    if (this.stream && (all || this.here.alone || performance.now() - this.movedAt < SETTLE_MS)) this.moved();
   }
 
   request(share = 1) {
