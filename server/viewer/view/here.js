@@ -69,11 +69,12 @@ export class Here {
     return this.how === "here" || this.extras.trails > 0 || this.extras.hiddenParts.length > 0;
   }
 
-  /** Has the parts of all Gaussians told, for the list of them; they come with the next frame. */
-  askParts() {
-    if (this.withParts) return;
+  /** Asks for the parts of all Gaussians, once, with the frames about one. */
+  askParts(index) {
+    const begin = this.beginOf(index);
+    if (this.withParts || begin === undefined) return;
     this.withParts = true;
-    this.frames = new Map();
+    this.get(begin, CHUNK, true);
   }
 
   /** Whether pictures of a mode are drawn here, once their frame is. */
@@ -91,23 +92,33 @@ export class Here {
     if (alone) return this.get(index, 1);
     const frames = readable();
     const at = frames.findIndex((report) => report.index === index);
-    if (at < 0) return;
-    const begin = at - (at % CHUNK);
-    if (!this.has(index)) this.get(frames[begin].index, CHUNK);
-    else if (at - begin >= CHUNK - AHEAD && frames[begin + CHUNK] && !this.has(frames[begin + CHUNK].index)) this.get(frames[begin + CHUNK].index, CHUNK);
+    if (!this.has(index)) this.get(this.beginOf(index), CHUNK);
+    else if (at % CHUNK >= CHUNK - AHEAD) {
+      const next = frames[at - (at % CHUNK) + CHUNK]?.index;
+      if (next !== undefined && !this.has(next)) this.get(next, CHUNK);
+    }
+  }
+
+  /** The first frame of the chunk of a frame; undefined where the frame cannot be read. */
+  beginOf(index) {
+    const frames = readable();
+    const at = frames.findIndex((report) => report.index === index);
+    return frames[at - (at % CHUNK)]?.index;
   }
 
   /** One request at a time; of the wishes meanwhile, the newest is next. */
-  async get(first, limit) {
+  async get(first, limit, parts = false) {
+    if (first === undefined) return;
+    const wanted = JSON.stringify([first, limit, parts]);
     if (this.abort) {
-      if (!this.abort.wanted.startsWith(`${first} `)) this.wish = [first, limit];
+      if (this.abort.wanted !== wanted && !this.wish?.[2]) this.wish = [first, limit, parts];
       return;
     }
     const { scene } = this;
     const abort = (this.abort = new AbortController());
-    abort.wanted = `${first} ${limit}`;
+    abort.wanted = wanted;
     try {
-      const answer = await fetched("GET", `${scenePath(scene)}/states.s4d?first=${first}&limit=${limit}${this.withParts && (limit > 1 || !this.labelled) ? "&parts=true" : ""}`, undefined, abort.signal);
+      const answer = await fetched("GET", `${scenePath(scene)}/states.s4d?first=${first}&limit=${limit}&parts=${parts}`, undefined, abort.signal);
       const bytes = new Uint8Array(await answer.arrayBuffer());
       if (this.abort !== abort) return;
       this.begin().add(bytes, this.opened);

@@ -125,7 +125,7 @@ export class LiveView {
 
   /** The parts are to be listed. */
   askParts() {
-    this.here.askParts();
+    this.here.askParts(this.frame ?? readable().at(-1)?.index);
     this.touch();
   }
 
