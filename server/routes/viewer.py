@@ -14,7 +14,7 @@ router = APIRouter(include_in_schema=False)
 FOLDER = Path(__file__).parents[1] / "viewer"
 FILES = {str(file.relative_to(FOLDER)): file for file in FOLDER.rglob("*") if file.suffix in MEDIA_TYPES}
 """The files that are served: these names and no others."""
-HEADERS = policy()  # what a rig or a scene is called stays text
+HEADERS = policy(worker_src="'self'")  # what a rig or a scene is called stays text
 
 
 @router.get("/")

@@ -16,6 +16,12 @@ const turnStep = (bounds) => 2 * bounds.rotation / Math.sqrt(3);
 const levelOf = (label) => Math.max(0, Math.min(LABELS - 1, Math.ceil(LABELS * label) - 1));
 const label = (level) => (Math.max(0, Math.min(LABELS - 1, level)) + 0.5) / LABELS;
 
+/** Fills an array by a function of another's values: several times as fast as `from`. */
+function each(found, values, of) {
+  for (let i = 0; i < found.length; i++) found[i] = of(values[i]);
+  return found;
+}
+
 /** Gaussians without a reference, of a record's body after its count: { state, clusters, gloss }, so many with gloss, −1 for none told. */
 export function decodeBorn(body, at, count, bounds) {
   const told = new Sections(body, at);
@@ -29,16 +35,17 @@ export function decodeBorn(body, at, count, bounds) {
   const [levels, opaque] = [planes(1)[0], planes(1)[0]];
   const factors = new Float32Array(9 * count);
   const axisStep = 2 * Math.min(0.02, bounds.axes / 4);
-  for (let k = 0; k < 9; k++) {
-    const [plane, length, from] = [axes[k], lengths[k % 3], k * count];
-    for (let i = 0; i < count; i++) factors[from + i] = plane[i] * axisStep * 2 ** (length[i] / 8);
-  }
+  const units = lengths.map((plane) => each(new Float64Array(count), plane, (length) => axisStep * 2 ** (length / 8)));
   const sizes = new Float32Array(count);
-  for (let i = 0; i < count; i++) {
-    let square = 0;
-    for (let k = 0; k < 9; k++) square += (axes[k][i] * axisStep * 2 ** (lengths[k % 3][i] / 8)) ** 2;
-    sizes[i] = Math.sqrt(square / 3);
+  for (let k = 0; k < 9; k++) {
+    const [plane, scale, from] = [axes[k], units[k % 3], k * count];
+    for (let i = 0; i < count; i++) {
+      const value = plane[i] * scale[i];
+      factors[from + i] = value;
+      sizes[i] += value * value;
+    }
   }
+  for (let i = 0; i < count; i++) sizes[i] = Math.sqrt(sizes[i] / 3);
   const means = new Float32Array(3 * count);
   const step = 2 * bounds.position / 4 * MARGIN;
   for (let k = 0; k < 3; k++) for (let i = 0; i < count; i++) means[k * count + i] = centres[k][i] * (step * sizes[i]);
@@ -46,8 +53,8 @@ export function decodeBorn(body, at, count, bounds) {
   turnBy(turns, turnStep(bounds), rotations, null);
   const colours = new Float32Array(3 * count);
   addColours(shades, 2 * bounds.colour / 4, colours, count);
-  const opacities = Float32Array.from(opaque, (value) => Math.max(OPAQUE, Math.min(1 - OPAQUE, value * 2 * bounds.opacity)));
-  const state = { count, ids, means, factors, rotations, colours, opacities, foreground: Float32Array.from(levels, label),
+  const opacities = each(new Float32Array(count), opaque, (value) => Math.max(OPAQUE, Math.min(1 - OPAQUE, value * 2 * bounds.opacity)));
+  const state = { count, ids, means, factors, rotations, colours, opacities, foreground: each(new Float32Array(count), levels, label),
     retired: new Uint8Array(count) };
   const gloss = finish(told, state, true);
   return { state, clusters, gloss };
