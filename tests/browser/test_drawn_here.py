@@ -150,3 +150,24 @@ def test_trails_and_parts_that_are_hidden_stay_at_rest(page, service, finished):
     page.select_option("#trails", "0")
     until(page, BY_THE_SERVICE)
     assert page.faults == []
+
+
+def test_where_the_page_is_slow_and_the_service_is_not_the_service_draws(page, service):
+    page.goto(service.url)
+    chosen = page.evaluate(
+        """async () => {
+          const { Here } = await import('/viewer/view/here.js');
+          const found = {};
+          for (const [name, mine, theirs] of [['slow', 600, 80], ['both', 600, 500], ['fast', 60, 20]]) {
+            const here = new Here(document.createElement('canvas'), { drawn() {}, arrived() {}, parts() {} });
+            here.measure('service', theirs);
+            for (let i = 0; i < 8; i++) here.shown({ asked: { moving: true, pace: 1 }, milliseconds: mine, decoding: 0 });
+            found[name] = [here.draws('colour')];
+            here.choose('here');
+            found[name].push(here.draws('colour'), here.draws('parts'));
+          }
+          return found;
+        }"""
+    )
+    assert chosen == {"slow": [False, True, False], "both": [True, True, False], "fast": [True, True, False]}
+    assert page.faults == []

@@ -22,6 +22,11 @@ export class CompactReader {
     if (!this.states.length) throw new FileError(`the file has no frame${damage ? `: ${damage}` : ""}`);
     this.frames = this.states.map((record) => record.frame);
     this.times = this.states.map((record) => record.time);
+    this.forget();
+  }
+
+  /** Lets go of what is decoded; it is decoded again when it is asked for. */
+  forget() {
     this.born = { told: 0, state: null, clusters: null, gloss: -1 };
     this.last = { place: -1, state: null };
   }

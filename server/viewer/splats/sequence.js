@@ -3,13 +3,14 @@
 const MOST_BYTES = 256e6; // of decoded states
 const PER_GAUSSIAN = 88; // bytes of a state, where nothing is shared
 const MOST_FILES_BYTES = 384e6;
+const READY = 3; // files that keep what they need for their next frame
 
 export class Sequence {
   constructor() {
     this.frames = []; // { index, time, reader, place }, rising
     this.kept = new Map(); // decoded states by index, the one used last at the end
+    this.ready = new Set(); // readers, the one used last at the end
     this.head = null;
-    this.dropped = 0;
   }
 
   /** Takes the frames of a file; those that are known already are told by it from now on. */
@@ -19,7 +20,6 @@ export class Sequence {
     const known = new Set(reader.frames);
     for (const index of known) this.kept.delete(index);
     this.frames = [...this.frames.filter((frame) => !known.has(frame.index)), ...fresh].sort((a, b) => a.index - b.index);
-    this.last = reader;
     this.bound(reader);
   }
 
@@ -31,7 +31,6 @@ export class Sequence {
       if (sum <= MOST_FILES_BYTES || reader === newest) break;
       this.frames = this.frames.filter((frame) => frame.reader !== reader);
       sum -= size;
-      this.dropped++;
     }
   }
 
@@ -44,11 +43,22 @@ export class Sequence {
     const { index, reader, place: inFile } = this.frames[place];
     let state = this.kept.get(index);
     if (state) this.kept.delete(index); // and in again, as the last used
-    else state = reader.state(inFile);
+    else state = this.decoded(reader, inFile);
     this.kept.set(index, state);
     const most = Math.max(3, Math.floor(MOST_BYTES / (PER_GAUSSIAN * state.count)));
     while (this.kept.size > most) this.kept.delete(this.kept.keys().next().value);
     return state;
+  }
+
+  decoded(reader, place) {
+    this.ready.delete(reader);
+    this.ready.add(reader);
+    if (this.ready.size > READY) {
+      const [oldest] = this.ready;
+      this.ready.delete(oldest);
+      oldest.forget();
+    }
+    return reader.state(place);
   }
 
   /** The moment at a place between frames: 1.25 is a quarter of the way from the second to the third. */
