@@ -161,7 +161,8 @@ def test_where_the_page_is_slow_and_the_service_is_not_the_service_draws(page, s
           for (const [name, mine, theirs] of [['slow', 600, 80], ['both', 600, 500], ['fast', 60, 20]]) {
             const here = new Here(document.createElement('canvas'), { drawn() {}, arrived() {}, parts() {} });
             here.measure('service', theirs);
-            for (let i = 0; i < 8; i++) here.shown({ asked: { moving: true, pace: 1 }, milliseconds: mine, decoding: 0 });
+            const message = { asked: { moving: true, pace: 1 }, milliseconds: mine, decoding: 0 };
+            for (let i = 0; i < 8; i++) here.shown(message);
             found[name] = [here.draws('colour')];
             here.choose('here');
             found[name].push(here.draws('colour'), here.draws('parts'));

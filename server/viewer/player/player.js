@@ -1,7 +1,7 @@
 // The player of a file that `scas4d export --player` wrote: it has the compact files in it, and asks nothing of a network.
 
 import { Clock } from "./clock.js";
-import { PartList } from "./parts.js";
+import { PartList } from "../panels/parts.js";
 import { takeFiles } from "./pieces.js";
 import { $ } from "../page.js";
 import { Splats } from "../splats/splats.js";
@@ -11,6 +11,7 @@ import { listenToPointer, moveByKey } from "../view/gestures.js";
 import { drawTracks } from "../view/overlay.js";
 
 const SETTLE_MS = 220; // at rest for so long, the picture is drawn sharp
+const NOTE_MS = 6000;
 const TRAIL_S = 1; // seconds of the past
 const FOLLOWED = "#e69f00";
 const LONE = { intrinsics: [[800, 0, 400], [0, 800, 300], [0, 0, 1]], width: 800, height: 600,
@@ -29,7 +30,7 @@ async function open() {
   if (!Splats.possible()) return fail("This browser cannot draw it", "It has no WebGL2 in workers. Take a newer Firefox, Chrome, Edge or Safari 17.");
   const source = new Blob([$("worker").textContent], { type: "text/javascript" });
   const worker = new Worker(URL.createObjectURL(source));
-  splats = new Splats($("picture"), worker, { ready, frames, drawn, picked, track, failed });
+  splats = new Splats($("picture"), worker, { ready, frames, drawn, picked, track, failed, trails: () => draw(true) });
   let files = 0;
   try {
     await takeFiles((bytes, number) => (files++, splats.add(bytes, number)), (share) => ($("progress").value = share));
@@ -70,7 +71,7 @@ function frames(message) {
   named.disabled = parts === 0;
   if (!parts) named.title = "No parts are told in this file";
   trails();
-  if (message.damage) $("note").textContent = `Only a part can be read: ${message.damage}`;
+  if (message.damage) say(`Only a part can be read: ${message.damage}`);
   draw();
 }
 
@@ -164,7 +165,14 @@ function drawOverlay() {
 
 function failed({ during, words }) {
   if (during === "file" || during === "begin" || !shown) return fail("It cannot be shown", words);
+  say(words);
+}
+
+let fading = 0;
+function say(words) {
+  clearTimeout(fading);
   $("note").textContent = words;
+  fading = setTimeout(() => ($("note").textContent = ""), NOTE_MS);
 }
 
 // Following a Gaussian.
@@ -176,7 +184,7 @@ function click(event) {
 }
 
 function picked({ row, id, part, at }) {
-  $("note").textContent = row < 0 ? "There is nothing at that place: click what is there" : "";
+  say(row < 0 ? "There is nothing at that place: click what is there" : "");
   if (row < 0) return;
   followed = { row, positions: new Map(), at };
   $("followed").hidden = false;
