@@ -157,10 +157,14 @@ def export(
         ),
     ],
     format: Annotated[
-        str, typer.Option(help="ply, splat, spz, spz4, glb, glb-parts, usd, tracks, poses or s4d; docs/exports.md.")
-    ],
+        str | None,
+        typer.Option(help="ply, splat, spz, spz4, glb, glb-parts, usd, tracks, poses or s4d; docs/exports.md."),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder or .zip for a file a frame, else a file. [named after SOURCE]")
+    ] = None,
+    player: Annotated[
+        Path | None, typer.Option(metavar="OUT.html", help="Write one page that plays the frames, without a network.")
     ] = None,
     frames: Annotated[str | None, typer.Option(metavar="A:B", help="Only these frames, both ends counted in.")] = None,
     ids: Annotated[
@@ -172,10 +176,18 @@ def export(
     url: commands.Url = DEFAULT_URL,
     token: commands.Token = None,
 ) -> None:
-    """Writes reconstructed frames in the formats of other tools: splats, glTF, USD, tables.
+    """Writes reconstructed frames in the formats of other tools (splats, glTF, USD, tables), or as a page that plays.
 
-    Example: scas4d reconstruct samples/robot --out out/robot; scas4d export out/robot --format usd
+    Example: scas4d reconstruct samples/robot --out out/robot; scas4d export out/robot --player robot.html
     """
+    if player is not None:
+        if format is not None or out is not None or ids:
+            raise typer.BadParameter("--player stands alone; leave --format, --out and --id out")
+        from client.exports.player import export_player
+
+        return export_player(source, player, frames, url=url, token=token)
+    if format is None:
+        raise typer.BadParameter("give --format, or --player OUT.html")
     from client.exports.export import export as run
 
     run(source, format, out, frames, ids, rate, url=url, token=token)

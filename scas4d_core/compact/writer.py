@@ -36,6 +36,8 @@ class CompactWriter:
 
     Args:
         path: of the file, which must not exist. head: what holds for all frames. key_every: frames from key to key.
+        clustered: False: no clusters are looked for, which take most of the time of a file of one frame; frames that
+            follow would take more room.
 
     Attributes:
         errors: the largest error of each attribute so far, in the units of ``Bounds``.
@@ -57,7 +59,7 @@ class CompactWriter:
     np.float32(1.0)
     """
 
-    def __init__(self, path: Path | str, head: Head, key_every: int = KEY_EVERY) -> None:
+    def __init__(self, path: Path | str, head: Head, key_every: int = KEY_EVERY, *, clustered: bool = True) -> None:
         if key_every < 1:
             raise FileError(f"key_every is {key_every}; give 1 or more")
         text = head.text()  # a head that is no JSON leaves no file
@@ -65,6 +67,7 @@ class CompactWriter:
         self.head = head
         self.errors: dict[str, float] = {}
         self._key_every = key_every
+        self._clustered = clustered
         self._file: BinaryIO = self.path.open("xb")
         self._records: list[Record] = []
         self._born: Columns | None = None
@@ -232,7 +235,8 @@ class CompactWriter:
     def _bear(self, state: Columns) -> bytes:
         """Takes in the Gaussians that are not known yet; returns the body of their record."""
         if self._last is None:
-            born, clusters = state, Clusters.of(state.gaussians())
+            born = state
+            clusters = Clusters.of(state.gaussians()) if self._clustered else Clusters(np.zeros(len(state), np.int64))
         else:
             born = state.after(len(self._last))
             clusters = Clusters(self._clusters.nearest(self._last, born))

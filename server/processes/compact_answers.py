@@ -47,7 +47,7 @@ def write_compact(file: Path, history: History, asked: Sequence[int], head: Head
     last = _copied(file, history, frames)
     if last is None:
         frames = list(takewhile(lambda index: index == frames[0] or not history.compacted(index), frames))
-        with CompactWriter(file, head) as writer:
+        with CompactWriter(file, head, clustered=len(frames) > 1) as writer:
             for index in frames:
                 writer.add(index, history.time(index), history.gaussians(index))
             last = frames[-1]

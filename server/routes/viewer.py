@@ -12,9 +12,13 @@ from server.http.files import MEDIA_TYPES, policy, served
 router = APIRouter(include_in_schema=False)
 
 FOLDER = Path(__file__).parents[1] / "viewer"
-FILES = {str(file.relative_to(FOLDER)): file for file in FOLDER.rglob("*") if file.suffix in MEDIA_TYPES}
+FILES = {
+    str(file.relative_to(FOLDER)): file
+    for file in FOLDER.rglob("*")
+    if file.suffix in MEDIA_TYPES and file.parent.name != "player"  # of the page that `scas4d export --player` writes
+}
 """The files that are served: these names and no others."""
-HEADERS = policy()  # what a rig or a scene is called stays text
+HEADERS = policy(worker_src="'self'")  # what a rig or a scene is called stays text
 
 
 @router.get("/")

@@ -5,6 +5,7 @@ import { listenToKeys } from "./keys.js";
 import { $, curtain, inOrder, node, note, page, sentence } from "./page.js";
 import { Figures } from "./panels/figures.js";
 import { showCameras, showEffects, showFacts, showQueue, showWarnings } from "./panels/facts.js";
+import { PartList } from "./panels/parts.js";
 import { TakeAway } from "./panels/takeaway.js";
 import { Timeline } from "./panels/timeline.js";
 import { Tracks } from "./panels/tracks.js";
@@ -32,13 +33,15 @@ const view = new LiveView($("picture"), $("overlay"), {
     $("view").classList.toggle("stale", stale);
     if (stale) $("legend").hidden = true;
   },
+  parts: (count) => partList?.show(count),
 });
+const partList = new PartList($("parts"), $("parts-words"), (hiddenParts) => view.setExtras({ hiddenParts }));
 const beside = new Beside($("beside"));
 const timeline = new Timeline(() => {
   if (!timeline.playing) remember(); // browsers bound how often an address may change
-  view.setFrame(page.frame);
+  view.setFrame(page.frame, true);
   showMoment();
-}, () => page.scene && remember());
+}, () => page.scene && remember(), { smooth: (...frames) => view.smooth(...frames), set: (...moment) => view.setBetween(...moment) });
 const tracks = new Tracks(view);
 const figures = new Figures((index) => timeline.choose(index));
 const tradeoff = new Tradeoff($);
@@ -206,6 +209,7 @@ function keep(report) {
 
 function finished(report, missed) {
   keep(report);
+  if (report.state === "committed") view.committed(report.index);
   if (missed) loadReports();
   else redraw();
   tradeoff.refresh();
@@ -236,7 +240,7 @@ function bulk(head, bytes) {
 
 function showInfo(info) {
   $("curtain").hidden = true;
-  if (info.tag === view.tag) $("busy").hidden = true;
+  if (info.here || info.tag === view.tag) $("busy").hidden = true;
   if (page.failed === "view") note("");
   const legend = $("legend");
   legend.hidden = info.mode !== "depth";
@@ -245,7 +249,7 @@ function showInfo(info) {
     $("far").textContent = info.far.toPrecision(3);
   }
   const stage = $("view").dataset;
-  Object.assign(stage, { frame: info.frame, mode: info.mode, tag: info.tag, size: `${info.width}x${info.height}` });
+  Object.assign(stage, { frame: info.frame, mode: info.mode, tag: info.tag, size: `${info.width}x${info.height}`, drawn: info.here ? "here" : "service" });
   beside.draw(info.frame);
 }
 
@@ -316,6 +320,10 @@ $("from").addEventListener("change", (event) => lookFrom(Number(event.target.val
 $("beside-what").addEventListener("change", (event) => showBeside(event.target.value));
 $("beside-camera").addEventListener("change", (event) => beside.look(Number(event.target.value)));
 $("background").addEventListener("change", (event) => view.setBackground(event.target.value ? JSON.parse(event.target.value) : null));
+$("trails").addEventListener("change", (event) => view.setExtras({ trails: Number(event.target.value) }));
+$("parts-box").addEventListener("toggle", () => $("parts-box").open && page.stream && view.askParts());
+document.addEventListener("click", (event) => event.target.closest("#parts-box") || ($("parts-box").open = false));
+$("who").addEventListener("change", (event) => view.setDrawn(event.target.value));
 $("fit").addEventListener("click", fit);
 $("snapshot").addEventListener("click", snapshot);
 $("full").addEventListener("click", fullScreen);

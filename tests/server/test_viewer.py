@@ -33,7 +33,7 @@ def test_every_file_that_the_page_names_is_served(http):
     named = set(re.findall(r"/viewer/([\w./-]+)", HTML))
     for name, path in FILES.items():
         if path.suffix == ".js":
-            imported = re.findall(r"from \"(\.[\w./-]+)\"", path.read_text())
+            imported = re.findall(r"(?:from |new URL\()\"(\.[\w./-]+)\"", path.read_text())
             named |= {posixpath.normpath(posixpath.join(posixpath.dirname(name), other)) for other in imported}
     assert {"main.js", "viewer.css", "icon.svg", "stream.js", "view/live.js"} <= named
     assert named | {"index.html"} == set(FILES)  # no file is left over

@@ -10,9 +10,14 @@ export class Timeline {
   /**
    * @param shown called when another frame is chosen
    * @param stopped called when playing ends
+   * @param between { smooth(index, next), set(next, share) }: whether moments between frames can be shown, and shows one
    */
-  constructor(shown, stopped) {
-    Object.assign(this, { shown, stopped, playing: null });
+  constructor(shown, stopped, between) {
+    Object.assign(this, { shown, stopped, between, playing: null, speed: 1 });
+    $("speed").addEventListener("change", () => {
+      this.speed = Number($("speed").value);
+      if (this.playing) this.from(readable().find((report) => report.index === page.frame) ?? readable()[0]);
+    });
     $("time").addEventListener("input", (event) => {
       this.stop();
       this.choose(readable()[Number(event.target.value)]?.index ?? null);
@@ -56,14 +61,18 @@ export class Timeline {
   }
 
   from(report) {
-    const [began, time] = [performance.now(), report.time];
+    clearTimeout(this.playing);
+    const [began, time, { speed }] = [performance.now(), report.time, this];
     const turn = () => {
       const frames = readable();
-      const now = time + (performance.now() - began) / 1000;
+      const now = time + speed * (performance.now() - began) / 1000;
       const at = Math.max(0, frames.findLastIndex((one) => one.time <= now));
-      if (frames[at].index !== page.frame) this.choose(frames[at].index);
-      const next = frames[at + 1];
-      this.playing = next ? setTimeout(turn, Math.max(SHORTEST_MS, 1000 * (next.time - now)))
+      const [shown, next] = [frames[at], frames[at + 1]];
+      if (shown.index !== page.frame) this.choose(shown.index);
+      const smooth = next && this.between.smooth(shown.index, next.index);
+      if (smooth) this.between.set(next.index, Math.min(1, (now - shown.time) / (next.time - shown.time)));
+      const wait = next ? 1000 * (next.time - now) / speed : END_MS;
+      this.playing = next ? setTimeout(turn, smooth ? SHORTEST_MS : Math.max(SHORTEST_MS, wait))
         : setTimeout(() => this.from(readable()[0]), END_MS);
     };
     turn();

@@ -1,14 +1,17 @@
-// The live view: a picture that the service renders for the camera that the user moves.
+// The live view: a picture for the camera that the user moves, rendered by the service, or drawn here while it moves.
 
 import { Orbit, project, readCamera } from "./geometry.js";
 import { paintDepth } from "./colours.js";
+import { listenToPointer, moveByKey } from "./gestures.js";
+import { Here } from "./here.js";
 import { drawFrusta, drawTracks } from "./overlay.js";
+import { readable } from "../page.js";
 import { fetched, scenePath } from "../service.js";
 
 const SETTLE_MS = 220;
+const TOUCHED_MS = 15_000; // for so long after a person moved something, frames are kept at hand to be drawn here
 const SLOW_MS = 1000;
 const TARGET_MS = 90;
-const CLICK_PX = 4;
 const EMPTY = [16, 19, 24];
 const FIT_PX = 200;
 const COVERED = 40; // of 255, from which a pixel shows something
@@ -20,7 +23,7 @@ const MODES = {
 };
 
 export class LiveView {
-  /** @param on { pick(u, v, camera, frame), shown(info), turned(), slow(mode), stale(whether) } */
+  /** @param on { pick(u, v, camera, frame), shown(info), turned(), slow(mode), stale(whether), parts(count) } */
   constructor(canvas, overlay, on) {
     this.canvas = canvas;
     this.overlay = overlay;
@@ -32,6 +35,8 @@ export class LiveView {
     this.showFrusta = false;
     this.tracks = [];
     this.largest = 8e6;
+    this.here = new Here(canvas, { drawn: (...drawn) => this.drawnHere(...drawn), arrived: (all) => this.arrived(all), parts: (count) => on.parts(count) });
+    this.touchedAt = this.movedAt = -Infinity;
     this.listen();
     new ResizeObserver(() => this.moved()).observe(canvas.parentElement);
   }
@@ -47,12 +52,16 @@ export class LiveView {
     this.shown = null;
     this.coarse = 1;
     this.frame = null;
+    this.between = { next: null, share: 0 };
+    this.overtaken = this.exact = 0;
     this.clear();
-    this.request("subscribe");
+    this.here.open(this.scene);
+    if (!this.drawHere()) this.request();
   }
 
   close() {
     this.stream = null;
+    this.here.close();
     clearTimeout(this.settle);
     clearTimeout(this.slow);
     this.clear();
@@ -82,15 +91,63 @@ export class LiveView {
     if (this.mode === "parts") this.moved(true);
   }
 
-  setFrame(frame) {
+  /** @param touched whether a person chose it */
+  setFrame(frame, touched = false) {
     this.frame = frame;
+    this.between = { next: null, share: 0 };
+    if (touched) this.touchedAt = performance.now();
     this.moved(true);
+  }
+
+  /** Whether moments between a frame and the next one can be drawn. */
+  smooth(frame, next) {
+    return this.here.draws(this.mode) && this.here.has(frame) && this.here.has(next);
+  }
+
+  /** A moment on the way from the frame that is chosen to the next one. */
+  setBetween(next, share) {
+    this.between = { next, share };
+    this.touchedAt = performance.now();
+    this.moved();
+  }
+
+  /** Who draws: "auto", "here" or "service". */
+  setDrawn(how) {
+    this.here.choose(how);
+    this.touch();
+  }
+
+  /** Trails of Gaussians, or parts that are hidden: drawn here alone. */
+  setExtras(extras) {
+    this.here.show(extras);
+    this.touch();
+  }
+
+  /** The parts are to be listed. */
+  askParts() {
+    this.here.askParts(this.frame ?? readable().at(-1)?.index);
+    this.touch();
+  }
+
+  /** A frame was committed. */
+  committed(index) {
+    if (this.stream && this.frame === null && this.isTouched() && this.here.draws(this.mode)) this.here.fetch(index, true);
   }
 
   /** Looks through a camera of the rig. */
   lookFrom(index) {
     this.orbit.from(this.rig[index]);
+    this.touch();
+  }
+
+  /** A person moves the view. */
+  touch() {
+    this.touchedAt = performance.now();
     this.moved();
+  }
+
+  isTouched() {
+    return this.here.alone || performance.now() - this.touchedAt < TOUCHED_MS;
   }
 
   // Asking.
@@ -104,16 +161,55 @@ export class LiveView {
     return [Math.round(width), Math.round(height)];
   }
 
-  /** Asks after a change of camera, size or mode: a quick picture now, a sharp one when it rests. */
+  /** Draws or asks after a change of camera, size or mode: a quick picture now, a sharp one when it rests. */
   moved(sharp = false) {
     if (!this.stream) return;
-    this.request("update", sharp ? 1 : this.coarse);
     clearTimeout(this.settle);
-    if (!sharp && this.coarse < 1) this.settle = setTimeout(() => this.request("update", 1), SETTLE_MS);
+    this.movedAt = performance.now();
+    if (this.drawHere(true)) this.settle = setTimeout(() => this.rest(), SETTLE_MS);
+    else {
+      this.request(sharp ? 1 : this.coarse);
+      if (!sharp && this.coarse < 1) this.settle = setTimeout(() => this.request(1), SETTLE_MS);
+    }
     this.on.turned?.();
   }
 
-  request(verb, share = 1) {
+  /** At rest: the service's exact picture, or a sharp one from here. */
+  rest() {
+    if (!this.here.alone || !this.drawHere(false)) this.request(1);
+  }
+
+  /** Draws the view in the page; answers whether it is or will be, else the service is to be asked. */
+  drawHere(moving = false) {
+    const { here } = this;
+    const index = this.frame ?? readable().at(-1)?.index;
+    if (!here.draws(this.mode) || index === undefined || !this.isTouched()) return false;
+    here.fetch(index, this.frame === null && !here.has(index));
+    if (!here.has(index)) return here.alone && !here.said;
+    if (here.alone) this.stream.unsubscribe("view");
+    this.overtaken = this.tag; // pictures that are on their way show another view
+    clearTimeout(this.slow);
+    const camera = this.orbit.camera(...here.size(this.canvas.parentElement.getBoundingClientRect(), moving));
+    here.draw({ index, ...this.between, camera, mode: this.mode, background: this.background, moving });
+    return true;
+  }
+
+  drawnHere(asked, { range }) {
+    if (!this.stream || asked.serial <= this.exact || asked.mode !== this.mode) return;
+    this.here.reveal();
+    this.shown = { camera: asked.camera, frame: asked.index, mode: asked.mode, tag: this.shown?.tag ?? 0 };
+    this.on.stale(false);
+    this.draw();
+    const [near, far] = range ?? [];
+    this.on.shown({ ...this.shown, width: asked.camera.width, height: asked.camera.height, near, far, here: true });
+  }
+
+  /** Frames have come that can be drawn here. */
+  arrived(all = false) {
+    if (this.stream && (all || this.here.alone || performance.now() - this.movedAt < SETTLE_MS)) this.moved();
+  }
+
+  request(share = 1) {
     const [width, height] = this.size(share);
     const camera = this.orbit.camera(width, height);
     const request = { camera, frame: this.frame, parts: this.mode === "parts" ? this.parts : null,
@@ -123,23 +219,25 @@ export class LiveView {
     clearTimeout(this.slow);
     this.slow = setTimeout(() => this.stream && this.on.slow(this.mode), SLOW_MS);
     if (this.asked.size > 64) this.asked.delete(this.asked.keys().next().value);
-    if (verb === "subscribe") this.stream.subscribe("view", "render", request, this.tag);
-    else this.stream.update("view", request, this.tag);
+    if (this.stream.subscriptions.has("view")) this.stream.update("view", request, this.tag);
+    else this.stream.subscribe("view", "render", request, this.tag);
   }
 
   // Showing.
 
   async receive(head, bytes) {
     const asked = this.asked.get(head.tag);
-    if (!asked || asked.mode !== this.mode) return;
+    if (!asked || asked.mode !== this.mode || head.tag <= this.overtaken) return;
     const first = !asked.answered;
     asked.answered = true;
     const number = this.latest = (this.latest || 0) + 1;
     const { stream } = this;
     const painted = await this.decode(asked, head, bytes);
     // Decoding takes turns: a newer picture may have been painted meanwhile, or another scene opened.
-    if (number < (this.painted || 0) || this.stream !== stream || asked.mode !== this.mode) return;
+    if (number < (this.painted || 0) || this.stream !== stream || asked.mode !== this.mode || head.tag <= this.overtaken) return;
     this.painted = number;
+    this.exact = this.here.serial;
+    this.here.hide();
     const { width, height } = asked.camera;
     this.canvas.width = width;
     this.canvas.height = height;
@@ -147,7 +245,10 @@ export class LiveView {
     if (painted.image) context.putImageData(painted.image, 0, 0);
     else context.drawImage(painted.bitmap, 0, 0);
     const milliseconds = first ? performance.now() - asked.at : null;
-    if (first && head.missed === 0) this.adapt(milliseconds, asked.share);
+    if (first && head.missed === 0) {
+      this.adapt(milliseconds, asked.share);
+      this.here.measure("service", milliseconds);
+    }
     if (head.tag === this.tag) clearTimeout(this.slow);
     this.shown = { camera: asked.camera, frame: head.frame, mode: asked.mode, tag: head.tag };
     this.on.stale(false);
@@ -190,69 +291,18 @@ export class LiveView {
   // Pointer and keys.
 
   listen() {
-    const canvas = this.overlay;
-    const fingers = new Map();
-    let travelled = 0;
-    canvas.addEventListener("pointerdown", (event) => {
-      canvas.setPointerCapture(event.pointerId);
-      fingers.set(event.pointerId, [event.clientX, event.clientY]);
-      travelled = fingers.size > 1 ? Infinity : 0;
-    });
-    canvas.addEventListener("pointermove", (event) => {
-      const before = fingers.get(event.pointerId);
-      if (!before || !this.stream) return;
-      const [dx, dy] = [event.clientX - before[0], event.clientY - before[1]];
-      travelled += Math.abs(dx) + Math.abs(dy);
-      if (fingers.size === 2) this.pinch(fingers, event);
-      fingers.set(event.pointerId, [event.clientX, event.clientY]);
-      if (fingers.size === 2 || travelled < CLICK_PX) return;
-      const height = canvas.getBoundingClientRect().height;
-      if (event.buttons & 6 || event.shiftKey) this.orbit.pan(-dx / height, -dy / height);
-      else this.orbit.turn(-2.6 * dx / height, 2.6 * dy / height);
-      this.moved();
-    });
-    const lift = (event) => {
-      const known = fingers.delete(event.pointerId);
-      if (known && event.type === "pointerup" && event.button === 0 && travelled < CLICK_PX) this.click(event);
-    };
-    canvas.addEventListener("pointerup", lift);
-    canvas.addEventListener("pointercancel", lift);
-    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-    canvas.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      if (!this.stream) return;
-      this.orbit.zoom(Math.exp(Math.max(-0.5, Math.min(0.5, event.deltaY / (event.deltaMode ? 10 : 500)))));
-      this.moved();
-    }, { passive: false });
-  }
-
-  pinch(fingers, event) {
-    const [[, other]] = [...fingers].filter(([id]) => id !== event.pointerId);
-    const before = fingers.get(event.pointerId);
-    const spread = (a, b) => Math.hypot(a[0] - b[0], a[1] - b[1]) || 1;
-    const now = [event.clientX, event.clientY];
-    this.orbit.zoom(spread(before, other) / spread(now, other));
-    const height = this.overlay.getBoundingClientRect().height;
-    this.orbit.pan(-(now[0] - before[0]) / 2 / height, -(now[1] - before[1]) / 2 / height);
-    this.moved();
+    listenToPointer(this.overlay, () => (this.stream ? this.orbit : null), { moved: () => this.touch(), click: (event) => this.click(event) });
   }
 
   /** Moves the camera by a key; answers whether it is one of those that do. */
   key(event) {
-    const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
     if (!this.stream) return false;
-    if (arrows[event.key]) {
-      const [x, y] = arrows[event.key];
-      if (event.shiftKey) this.orbit.pan(0.05 * x, 0.05 * y);
-      else this.orbit.turn(0.08 * x, -0.08 * y);
-    } else if (event.key === "+" || event.key === "=") this.orbit.zoom(0.9);
-    else if (event.key === "-") this.orbit.zoom(1 / 0.9);
-    else if (event.key === "Home" || event.key === "0") this.orbit.from(this.rig[0]);
-    else if (event.key.toLowerCase() === "t") {
+    if (event.key.toLowerCase() === "t") {
       this.pickMiddle();
       return true;
-    } else return false;
-    this.moved();
+    }
+    if (!moveByKey(this.orbit, event, this.rig[0])) return false;
+    this.touch();
     return true;
   }
 
@@ -275,7 +325,7 @@ export class LiveView {
     }
     if (seen.right < 0) this.orbit.from(this.rig[0]);
     else this.orbit.fit(seen, camera);
-    this.moved();
+    this.touch();
   }
 
   /** A picture of the view as it is, sharp, as a file. */

@@ -377,3 +377,13 @@ def test_frames_that_cannot_follow_are_refused(tmp_path: Path) -> None:
 def test_a_scene_without_gaussians_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="no Gaussian"), CompactWriter(tmp_path / "a.s4d", HEAD) as writer:
         writer.add(0, 0.0, TRUE[0][1].rows(np.zeros(0, np.intp)))
+
+
+def test_without_clusters_a_file_tells_the_same(tmp_path: Path) -> None:
+    for clustered in (False, True):
+        with CompactWriter(tmp_path / f"{clustered}.s4d", HEAD, clustered=clustered) as writer:
+            for index in (0, 1, 5):
+                writer.add(index, *TRUE[index])
+    with CompactReader(tmp_path / "False.s4d") as plain, CompactReader(tmp_path / "True.s4d") as grouped:
+        assert (plain.state(0).means == grouped.state(0).means).all()
+        assert max(errors_of(Columns.of(plain.state(5)), Columns.of(TRUE[5][1])).values()) < 0.07

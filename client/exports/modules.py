@@ -1,0 +1,81 @@
+"""JavaScript modules as one classic script: what a page can run that was opened as a file.
+
+Browsers load no modules from ``file://``. Each module becomes a function that returns what it exports; the modules keep
+to the forms of import and export that are known here, and others are refused.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+_IMPORT = re.compile(r'^import \{([^}]*)\} from "(\.[^"]+)";\n', re.MULTILINE)
+_EXPORT = re.compile(r"^export (?=(?:async )?(?:function|class|const|var) +([\w$]+))", re.MULTILINE)
+_LIST = re.compile(r"^export \{([^}]*)\};\n?", re.MULTILINE)
+_OTHER = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
+
+
+def script(entry: Path, root: Path) -> str:
+    """Links a module and all that it imports.
+
+    Args:
+        entry: the module that runs. root: of the names that modules have in errors.
+
+    Returns:
+        A script that needs no other file, without ``</script``.
+
+    Raises:
+        ValueError: a module has an import or export of another form, or modules import one another in a circle.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     root = Path(folder)
+    ...     _ = (root / "b.js").write_text("export const one = 1;\\n")
+    ...     _ = (root / "a.js").write_text('import { one } from "./b.js";\\nconsole.log(one);\\n')
+    ...     print(script(root / "a.js", root))
+    (() => {
+    "use strict";
+    const modules = {};
+    modules["b.js"] = (() => {
+    const one = 1;
+    return { one };
+    })();
+    modules["a.js"] = (() => {
+    const { one } = modules["b.js"];
+    console.log(one);
+    return {  };
+    })();
+    })();
+    """
+    linked: dict[Path, str] = {}
+    _link(entry.resolve(), root.resolve(), linked, ())
+    text = "\n".join(['(() => {\n"use strict";\nconst modules = {};', *linked.values(), "})();"])
+    if "</script" in text.lower() or "<!--" in text:
+        raise ValueError(f"{entry.name}: a module has text that ends a script of HTML; write it in two parts")
+    return text
+
+
+def _link(path: Path, root: Path, linked: dict[Path, str], within: tuple[Path, ...]) -> None:
+    if path in linked:
+        return
+    if path in within:
+        raise ValueError(f"modules import one another: {' → '.join(one.name for one in (*within, path))}")
+    text = path.read_text(encoding="utf-8")
+    exported = [match.group(1) for match in _EXPORT.finditer(text)]
+    exported += [name.strip() for match in _LIST.finditer(text) for name in match.group(1).split(",") if name.strip()]
+
+    def imported(match: re.Match[str]) -> str:
+        found = (path.parent / match.group(2)).resolve()
+        _link(found, root, linked, (*within, path))
+        names = ", ".join(name.strip().replace(" as ", ": ") for name in match.group(1).split(",") if name.strip())
+        return f"const {{ {names} }} = modules[{_quoted(found, root)}];\n"
+
+    body = _LIST.sub("", _EXPORT.sub("", _IMPORT.sub(imported, text)))
+    if other := _OTHER.search(body):
+        raise ValueError(f"{path.name}: {other.group()!r} is no import or export that can be linked")
+    returned = f"return {{ {', '.join(exported)} }};"
+    linked[path] = f"modules[{_quoted(path, root)}] = (() => {{\n{body.rstrip()}\n{returned}\n}})();"
+
+
+def _quoted(path: Path, root: Path) -> str:
+    return f'"{path.relative_to(root).as_posix()}"'

@@ -1,0 +1,122 @@
+"""`scas4d export --player`: one HTML file that plays a sequence, without a network and without other files."""
+
+from __future__ import annotations
+
+import base64
+import html
+import os
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from client.cli.progress import console
+from client.exports.modules import script
+from client.exports.sources import STATES, CompactStates, Source, frame_range, opened
+from scas4d_core.compact import CompactReader, CompactWriter
+from scas4d_core.errors import InputError
+
+VIEWER = Path(__file__).parents[2] / "server" / "viewer"
+"""The page's own modules: the player has the same."""
+PIECE = 3 << 18
+"""Bytes in a piece; a multiple of 3, so that each piece of base64 stands for itself."""
+LARGE, LARGEST = 100 << 20, 1 << 30
+"""Bytes of compact files from which a player is slow to open, and beyond which browsers refuse it."""
+
+
+def export_player(source: str, out: Path, frames: str | None = None, *, url: str, token: str | None) -> None:
+    """Writes the player; its compact files are the source's own, or a new one where only some frames are asked for.
+
+    Args:
+        source: a compact file, the folder in which `scas4d reconstruct` left one, or the id of a scene of the service.
+        out: of the HTML. frames: `A:B`, both counted in; None: all. url, token: of the service.
+
+    Raises:
+        InputError: a range or an output that cannot be, or more than browsers open.
+    """
+    if out.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"player={str(out)!r} is no name of a page", "give one that ends in .html")
+    low, high = frame_range(frames)
+    with opened(source, low, high, True, url, token) as given:
+        if given.of.damage is not None:
+            console.print(f"only a part can be read: {given.of.damage}", soft_wrap=True)
+        count = len(given.within(low, high))
+        with _files(given, low, high, count) as files:
+            size = sum(file.stat().st_size for file in files)
+            if size > LARGEST:
+                raise InputError(
+                    f"{size / 1e6:.0f} MB of frames are more than browsers open in one page",
+                    "export fewer with --frames A:B",
+                )
+            folder = given.beside.resolve().name  # `scas4d reconstruct` calls all its files alike
+            write_player(out, folder if f"{given.name}.s4d" == STATES and folder else given.name, files)
+    console.print(f"{count} frames in {out}, {out.stat().st_size / 1e6:.1f} MB; open it in a browser", soft_wrap=True)
+    if size > LARGE:
+        console.print("it is large, and slow to open; --frames A:B makes a smaller one", soft_wrap=True)
+
+
+def write_player(out: Path, title: str, files: Sequence[Path]) -> None:
+    """Writes a page with compact files in it; one piece of them is in memory at a time.
+
+    Args:
+        title: of the page. files: in the order of their frames.
+    """
+    parts = {
+        "title": html.escape(title),
+        "style": (VIEWER / "player" / "player.css").read_text(encoding="utf-8"),
+        "worker": script(VIEWER / "splats" / "worker.js", VIEWER),
+        "script": script(VIEWER / "player" / "player.js", VIEWER),
+    }
+    before, _, after = (VIEWER / "player" / "player.html").read_text(encoding="utf-8").partition("{{files}}")
+    working = out.with_name(f".{out.name}.part")
+    try:
+        with working.open("w", encoding="utf-8") as page:
+            page.write(_filled(before, parts))
+            for file in files:
+                page.write(f'<div class="file" data-bytes="{file.stat().st_size}" hidden>\n')
+                for piece in _pieces(file):
+                    page.write(f'<script type="application/octet-stream">{piece}</script>\n')
+                page.write("</div>\n")
+            page.write(_filled(after, parts))
+        os.replace(working, out)
+    finally:
+        working.unlink(missing_ok=True)
+
+
+def _filled(text: str, parts: dict[str, str]) -> str:
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match.group(1)], text)
+
+
+def _pieces(file: Path) -> Iterator[str]:
+    with file.open("rb") as data:
+        while piece := data.read(PIECE):
+            yield base64.b64encode(piece).decode()
+
+
+@contextmanager
+def _files(given: Source, low: int, high: int, count: int) -> Iterator[Sequence[Path]]:
+    """The source's files, or one that is written anew where these hold other frames, too, or are none."""
+    if isinstance(given.of, CompactStates) and count == _held(given.of.files):
+        yield given.of.files
+        return
+    parts = given.parts()
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "some.s4d"
+        with CompactWriter(file, given.head) as writer:
+            index = known = 0
+            for index, time, state in given.states(low, high):
+                writer.add(index, time, state)
+                known = len(state)
+            if parts is not None and len(parts) >= known:
+                writer.add_parts(index, parts[:known])
+        yield [file]
+
+
+def _held(files: Sequence[Path]) -> int:
+    """Number of the frames in compact files, those by which others are told among them."""
+    found: set[int] = set()
+    for file in files:
+        with CompactReader(file) as reader:
+            found.update(reader.frames)
+    return len(found)

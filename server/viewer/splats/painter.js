@@ -1,0 +1,188 @@
+// Paints a picture with WebGL2: ellipses, back to front, depth in colours, trails over them.
+
+import { ROW, programs } from "./programs.js";
+import { STRIDE } from "./project.js";
+import { DEPTH_RAMP } from "../view/colours.js";
+
+const FEWEST = 4096; // ellipses, or trails, that there is room for at least
+
+export class Painter {
+  /**
+   * @param canvas of the page or of a worker
+   * @throws Error where the browser has no WebGL2
+   */
+  constructor(canvas) {
+    this.gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true, powerPreference: "high-performance" });
+    if (!this.gl) throw new Error("this browser has no WebGL2");
+    canvas.addEventListener?.("webglcontextlost", (event) => event.preventDefault());
+    canvas.addEventListener?.("webglcontextrestored", () => this.begin());
+    this.begin();
+  }
+
+  /** Makes all objects; once more after the browser has taken them away. */
+  begin() {
+    const { gl } = this;
+    this.floats = gl.getExtension("EXT_color_buffer_float") !== null && gl.getExtension("EXT_float_blend") !== null;
+    this.most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    this.programs = programs(gl);
+    this.plain = gl.createVertexArray();
+    this.quads = gl.createVertexArray();
+    this.indices = gl.createBuffer();
+    this.room = this.width = this.height = 0;
+    this.target = null;
+    this.trails = null;
+    this.ramp = this.texture(gl.RGBA8, 256, 1);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 256, 1, gl.RGBA, gl.UNSIGNED_BYTE, Uint8Array.from(DEPTH_RAMP.flatMap((rgb) => [...rgb, 255])));
+    this.one = new Uint8Array(4);
+  }
+
+  texture(format, width, height) {
+    const { gl } = this;
+    const made = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, made);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+    return made;
+  }
+
+  size(width, height) {
+    if (this.width === width && this.height === height) return;
+    const { gl } = this;
+    Object.assign(this, { width, height });
+    Object.assign(gl.canvas, { width, height });
+    if (this.target) {
+      gl.deleteFramebuffer(this.target.frame);
+      gl.deleteTexture(this.target.picture);
+    }
+    this.target = null;
+  }
+
+  reserve(count) {
+    if (count <= this.room) return;
+    const { gl } = this;
+    const rows = Math.ceil(1.25 * Math.max(count, FEWEST) / ROW);
+    if (rows > this.most) throw new Error(`this browser draws at most ${ROW * this.most} Gaussians`);
+    this.room = rows * ROW;
+    gl.deleteTexture(this.table ?? null);
+    this.table = this.texture(gl.RGBA32F, 3 * ROW, rows);
+    const corners = new Uint32Array(6 * this.room);
+    for (let i = 0; i < this.room; i++) corners.set([4 * i, 4 * i + 1, 4 * i + 2, 4 * i + 2, 4 * i + 1, 4 * i + 3], 6 * i);
+    gl.bindVertexArray(this.quads);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.indices);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+  }
+
+  /**
+   * Paints ellipses, farthest first.
+   *
+   * @param background [red, green, blue] in 0…1
+   */
+  colours(ellipses, count, background) {
+    const { gl } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.clearColor(...background, 1);
+    this.ellipses(ellipses, count);
+  }
+
+  /** Paints depth: z stands for red in the ellipses; `range` of the colours, `nothing` where less than half is covered. */
+  depth(ellipses, count, range, nothing) {
+    const { gl } = this;
+    if (!this.target) {
+      const picture = this.texture(gl.RGBA16F, this.width, this.height);
+      const frame = gl.createFramebuffer();
+      gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, picture, 0);
+      this.target = { picture, frame };
+    }
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target.frame);
+    gl.clearColor(0, 0, 0, 0);
+    this.ellipses(ellipses, count);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    const { program, places } = this.programs.depth;
+    gl.useProgram(program);
+    gl.bindVertexArray(this.plain);
+    this.bind([[places.picture, this.target.picture], [places.ramp, this.ramp]]);
+    gl.uniform2f(places.range, ...range);
+    gl.uniform3f(places.nothing, ...nothing);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  ellipses(ellipses, count) {
+    const { gl, width, height } = this;
+    gl.viewport(0, 0, width, height);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    if (!count) return;
+    this.reserve(count);
+    const rows = Math.ceil(count / ROW);
+    const { program, places } = this.programs.gaussians;
+    gl.useProgram(program);
+    gl.bindVertexArray(this.quads);
+    this.bind([[places.table, this.table]]);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 3 * ROW, rows, gl.RGBA, gl.FLOAT, ellipses.subarray(0, STRIDE * ROW * rows));
+    gl.uniform2f(places.scale, 2 / width, -2 / height);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.drawElements(gl.TRIANGLES, 6 * count, gl.UNSIGNED_INT, 0);
+    gl.disable(gl.BLEND);
+  }
+
+  bind(textures) {
+    const { gl } = this;
+    textures.forEach(([place, texture], unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+      gl.uniform1i(place, unit);
+    });
+    gl.activeTexture(gl.TEXTURE0);
+  }
+
+  /** Takes the hues [3 × trails], 0…255, of trails over so many frames; their centres come frame by frame. */
+  beginTrails(hues, frames) {
+    const { gl } = this;
+    if (this.trails) for (const texture of [this.trails.centres, this.trails.hues]) gl.deleteTexture(texture);
+    const count = hues.length / 3;
+    this.trails = count ? { count, frames, centres: this.texture(gl.RGBA32F, count, frames), hues: this.texture(gl.RGBA8, count, 1) } : null;
+    if (!count) return;
+    const texels = new Uint8Array(4 * count);
+    for (let i = 0; i < count; i++) texels.set(hues.subarray(3 * i, 3 * i + 3), 4 * i);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, count, 1, gl.RGBA, gl.UNSIGNED_BYTE, texels);
+  }
+
+  /** Takes the centres of trails in a frame: x, y, z, whether one is there. */
+  addTrails(frame, centres) {
+    const { gl } = this;
+    gl.bindTexture(gl.TEXTURE_2D, this.trails.centres);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, frame, this.trails.count, 1, gl.RGBA, gl.FLOAT, centres);
+  }
+
+  /** Paints the trails of `span` frames up to a place in time, over what is painted. */
+  paintTrails(camera, now, span) {
+    if (!this.trails || now <= 0) return;
+    const { gl } = this;
+    const first = Math.max(0, Math.ceil(now) - span);
+    const segments = Math.ceil(now) - first;
+    const { program, places } = this.programs.trails;
+    gl.useProgram(program);
+    gl.bindVertexArray(this.plain);
+    this.bind([[places.centres, this.trails.centres], [places.hues, this.trails.hues]]);
+    gl.uniformMatrix3fv(places.turn, true, camera.rows.flat());
+    gl.uniform3f(places.shift, ...camera.t);
+    gl.uniform4f(places.lens, camera.fx, camera.fy, camera.cx, camera.cy);
+    gl.uniform3f(places.size, camera.width, camera.height, camera.near);
+    gl.uniform1f(places.now, now);
+    gl.uniform1i(places.trails, this.trails.count);
+    gl.uniform1i(places.first, first);
+    gl.uniform1i(places.span, span);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.drawArrays(gl.LINES, 0, 2 * this.trails.count * segments);
+    gl.disable(gl.BLEND);
+  }
+
+  /** Waits until the picture is there: one pixel is read back. */
+  finish() {
+    const { gl } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, this.one);
+  }
+}

@@ -1,0 +1,82 @@
+// Records of a compact 4D file (docs/format.md): heads with checksums, bodies with checksums, and the file's own head.
+
+const MAGIC = 0x52643473; // "s4dR", little-endian
+const HEAD_SIZE = 36;
+const VERSION = 1;
+export const HEAD = 1;
+export const BORN = 2;
+export const KEY = 3;
+export const DELTA = 4;
+export const PARTS = 5;
+export const INDEX = 6;
+const NOTE = 7; // about a frame; passed over
+
+/** A file that cannot be read, or not from some place on; the message is a sentence for a person. */
+export class FileError extends Error {}
+
+const TABLE = new Int32Array(256).map((_, i) => {
+  for (let k = 0; k < 8; k++) i = i & 1 ? (i >>> 1) ^ 0xedb88320 : i >>> 1;
+  return i;
+});
+
+/** CRC-32 of bytes, unsigned. */
+export function crc32(bytes) {
+  let crc = -1;
+  for (let i = 0; i < bytes.length; i++) crc = TABLE[(crc ^ bytes[i]) & 255] ^ (crc >>> 8);
+  return ~crc >>> 0;
+}
+
+/**
+ * Lists the whole records of a file; a rest that is not whole is not there yet.
+ *
+ * @param bytes Uint8Array
+ * @returns { records, damage }: { kind, frame, time, offset, size, checksum } each, and what is damaged after them, or null
+ */
+export function list(bytes) {
+  const records = [];
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  for (let at = 0; at + HEAD_SIZE <= bytes.length;) {
+    const kind = bytes[at + 4];
+    if (view.getUint32(at, true) !== MAGIC || view.getUint32(at + 32, true) !== crc32(bytes.subarray(at, at + 32))) {
+      return { records, damage: `no record begins at byte ${at}; the file is damaged there` };
+    }
+    if (kind < HEAD || kind > NOTE) return { records, damage: `a record of kind ${kind} is at byte ${at}; a later version of scas4d wrote it` };
+    const record = { kind, frame: Number(view.getBigInt64(at + 8, true)), time: view.getFloat64(at + 16, true),
+      offset: at + HEAD_SIZE, size: view.getUint32(at + 24, true), checksum: view.getUint32(at + 28, true) };
+    at = record.offset + record.size;
+    if (at > bytes.length) break;
+    records.push(record);
+    if (kind === INDEX) break;
+  }
+  return { records, damage: null };
+}
+
+/** The body of a record, once its checksum holds. */
+export function bodyOf(bytes, record) {
+  const body = bytes.subarray(record.offset, record.offset + record.size);
+  if (crc32(body) !== record.checksum) {
+    throw new FileError(`the record of frame ${record.frame} at byte ${record.offset - HEAD_SIZE} is damaged`);
+  }
+  return body;
+}
+
+/** What holds for a whole file: world, bounds, background, cameras; numbers are checked, as much depends on them. */
+export function readHead(bytes, record) {
+  let head = null;
+  if (record?.kind === HEAD) {
+    try {
+      head = JSON.parse(new TextDecoder().decode(bodyOf(bytes, record)));
+    } catch {
+      head = null;
+    }
+  }
+  if (head?.format !== "scas4d") throw new FileError("this is no compact 4D file, or its head is damaged or cut");
+  if (head.version > VERSION) {
+    throw new FileError(`version ${head.version} of the format; this player reads up to ${VERSION}, take a later one`);
+  }
+  const numbers = [...head.world.origin, head.world.metres_per_unit, ...head.background];
+  if (numbers.length !== 7 || !numbers.every(Number.isFinite) || !(head.world.metres_per_unit > 0)) {
+    throw new FileError("the head of the file lacks something or is wrong");
+  }
+  return head;
+}

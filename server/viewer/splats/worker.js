@@ -1,0 +1,174 @@
+// A worker that decodes compact files and paints their Gaussians: the thread of the page has neither to do.
+// It is told by messages { kind, … }, and answers by such; see `Splats`, which is the page's side of it.
+
+import { Painter } from "./painter.js";
+import { Projector } from "./project.js";
+import { CompactReader } from "./reader.js";
+import { inside, nearOf, outside, partColour } from "./rig.js";
+import { Sequence } from "./sequence.js";
+import { Walk, chosen, huesOf } from "./trails.js";
+
+const NOTHING = [16 / 255, 19 / 255, 24 / 255]; // of depth, where nothing is
+const NO_PART = [90, 96, 104];
+const post = (kind, message = {}) => self.postMessage({ kind, ...message });
+
+const projector = new Projector();
+const [trailWalk, trackWalk] = [new Walk(), new Walk()];
+let painter = null;
+let sequence = new Sequence();
+let near = 0;
+let labels = null; // part of each Gaussian
+let shown = null; // what was drawn last: { camera, moment }
+let look = { mode: "colour", background: null, hiddenParts: [], trails: 0, span: 20 };
+let cover = null; // hidden Gaussians, from `hiddenParts`
+let paints = { labels: null, ones: null };
+let followed = -1;
+
+const actions = {
+  canvas({ canvas }) {
+    painter = new Painter(canvas);
+    post("ready", { floats: painter.floats });
+  },
+
+  /** Begins anew, without any frame. */
+  clear() {
+    trailWalk.stop();
+    trackWalk.stop();
+    sequence = new Sequence();
+    labels = shown = cover = null;
+    followed = -1;
+    painter?.beginTrails(new Uint8Array(0), 0);
+  },
+
+  file({ bytes, name }) {
+    const reader = new CompactReader(bytes);
+    sequence.add(reader);
+    near = nearOf(sequence.head);
+    const found = reader.parts();
+    if (found) {
+      labels = found;
+      paints.labels = null;
+      actions.look({});
+    }
+    if (look.trails) gatherTrails(); // places have moved
+    const parts = labels ? Math.max(-1, ...new Set(labels)) + 1 : 0;
+    post("frames", { name, frames: sequence.frames.map(({ index, time }) => [index, time]), head: sequence.head, count: reader.count,
+      parts, damage: reader.damage });
+  },
+
+  look(changes) {
+    const before = look;
+    look = { ...look, ...changes };
+    const hidden = new Set(look.hiddenParts);
+    cover = labels && hidden.size ? Uint8Array.from(labels, (label) => (hidden.has(label) ? 1 : 0)) : null;
+    if (look.trails !== before.trails || (look.trails && changes.hiddenParts)) gatherTrails();
+  },
+
+  draw({ place, camera: model, ahead }) {
+    const began = performance.now();
+    const { head } = sequence;
+    const camera = inside(model, head, near);
+    const moment = sequence.moment(place);
+    const [decoded, { mode }] = [performance.now(), look];
+    const count = (moment.to ?? moment.from).count;
+    projector.project(moment, camera, { colours: coloursOf(mode, count), depth: mode === "depth", hidden: covering(count) });
+    painter.size(camera.width, camera.height);
+    const { ellipses, count: drawn } = projector;
+    let range = null;
+    if (mode === "depth") {
+      range = projector.range();
+      painter.depth(ellipses, drawn, range, NOTHING);
+    } else painter.colours(ellipses, drawn, mode === "colour" ? look.background ?? head.background : [0, 0, 0]);
+    if (look.trails) painter.paintTrails(camera, place, look.span);
+    painter.finish();
+    shown = { camera, moment };
+    const [metres, now] = [head.world.metres_per_unit, performance.now()];
+    post("drawn", { place, mode, drawn, milliseconds: now - began, decoding: decoded - began,
+      range: range?.map((z) => z / metres), followed: followed < 0 ? null : whereIs(followed) });
+    if (ahead !== undefined && ahead < sequence.frames.length && !sequence.has(ahead)) setTimeout(() => sequence.frames[ahead] && sequence.state(ahead));
+  },
+
+  /** Follows what is seen at a place of the last picture. */
+  pick({ u, v }) {
+    if (!shown) return;
+    const found = projector.at(u, v);
+    if (!found) return post("picked", { row: -1 });
+    actions.follow({ row: found.row });
+  },
+
+  follow({ row }) {
+    followed = row;
+    trackWalk.stop();
+    if (row < 0 || !shown) return;
+    const { head } = sequence;
+    post("picked", { row, id: (shown.moment.to ?? shown.moment.from).ids[row], part: labels?.[row] ?? -1, at: whereIs(row) });
+    const track = [];
+    trackWalk.begin(sequence, (state, place) => {
+      const there = row < state.count && !state.retired[row];
+      track.push(there ? [place, outside(centreOf(state, row), head)] : [place, null]);
+    }, () => post("track", { row, track }));
+  },
+};
+
+const centreOf = ({ means, count }, row) => [0, 1, 2].map((k) => means[k * count + row]);
+
+function whereIs(row) {
+  const { from, to, share } = shown.moment;
+  const there = (state) => state && row < state.count && !state.retired[row];
+  if (!there(from)) return there(to) ? outside(centreOf(to, row), sequence.head) : null;
+  const [begin, end] = [centreOf(from, row), there(to) ? centreOf(to, row) : null];
+  return outside(end ? begin.map((value, k) => value + share * (end[k] - value)) : begin, sequence.head);
+}
+
+function covering(count) {
+  if (!cover || cover.length >= count) return cover;
+  const all = new Uint8Array(count); // those born after the parts were seen
+  all.set(cover);
+  return (cover = all);
+}
+
+/** [3 N] colours in place of the Gaussians' own. */
+function coloursOf(mode, count) {
+  if (mode === "parts" && labels) {
+    if (paints.labels?.length !== 3 * count) {
+      const table = new Map();
+      paints.labels = new Float32Array(3 * count);
+      for (let i = 0; i < count; i++) {
+        const label = labels[i] ?? -1;
+        if (!table.has(label)) table.set(label, (label < 0 ? NO_PART : partColour(label)).map((value) => value / 255));
+        paints.labels.set(table.get(label), 3 * i);
+      }
+    }
+    return paints.labels;
+  }
+  if (mode !== "alpha") return null;
+  if (paints.ones?.length !== 3 * count) paints.ones = new Float32Array(3 * count).fill(1);
+  return paints.ones;
+}
+
+/** Gathers the centres of the Gaussians with trails, frame by frame. */
+function gatherTrails() {
+  trailWalk.stop();
+  if (!sequence.frames.length || !painter) return;
+  if (!look.trails) return painter.beginTrails(new Uint8Array(0), 0);
+  const first = sequence.state(0);
+  const rows = chosen(first, Math.min(look.trails, painter.most), covering(first.count));
+  painter.beginTrails(huesOf(first, rows), Math.min(sequence.frames.length, painter.most));
+  const texels = new Float32Array(4 * rows.length);
+  trailWalk.begin(sequence, (state, place) => {
+    if (!rows.length || place >= painter.most) return;
+    rows.forEach((row, i) => {
+      for (let k = 0; k < 3; k++) texels[4 * i + k] = state.means[k * state.count + row];
+      texels[4 * i + 3] = state.retired[row] ? 0 : 1;
+    });
+    painter.addTrails(place, texels);
+  }, () => post("trails", { count: rows.length }));
+}
+
+self.onmessage = ({ data }) => {
+  try {
+    actions[data.kind](data);
+  } catch (error) {
+    post("failed", { during: data.kind, name: data.name, words: error.message });
+  }
+};

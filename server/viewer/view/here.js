@@ -1,0 +1,215 @@
+// Views that the page draws itself, from compact files of the service: to turn, play and scrub costs the service nothing then.
+
+import { fetched, scenePath } from "../service.js";
+import { node, note, readable } from "../page.js";
+import { Pace } from "../splats/pace.js";
+import { Splats } from "../splats/splats.js";
+
+const CHUNK = 24; // frames that are asked for at once, for scrubbing and playing
+const AHEAD = 8; // frames before the end of a chunk, at which the next one is asked for
+const SLOW_MS = 250; // a picture: fewer than four a second
+const SLOWER = 1.5; // times as long as the service takes
+const WARM = 3; // pictures before times count: shaders are compiled in the first
+const AGAIN_MS = 20_000; // after a failure
+const SPAN = 30; // frames of a trail
+const KINDS = ["colour", "depth", "alpha"]; // parts come from the service: it says whose weight is largest in a pixel
+
+export class Here {
+  /** @param picture the canvas that this one lies over  @param on { drawn(asked, message), arrived(), parts(count) } */
+  constructor(picture, on) {
+    Object.assign(this, { picture, on, how: "auto", extras: { trails: 0, hiddenParts: [] }, withParts: false, pace: new Pace(), splats: null, scene: null, serial: 0, opened: 0 });
+    this.possible = Splats.possible();
+    this.times = { here: 0, service: 0 }; // milliseconds a picture, smoothed
+    this.forget();
+  }
+
+  forget() {
+    this.frames = new Map(); // places by index
+    this.asked = new Map(); // what is being drawn, by tag
+    this.wish = null;
+    this.failedAt = -Infinity;
+    this.drawn = 0;
+    this.slow = false;
+    this.said = "";
+    this.labelled = 0; // parts that were told
+  }
+
+  open(scene) {
+    this.scene = scene;
+  }
+
+  close() {
+    this.scene = null;
+    this.opened++; // what is on its way belongs to another scene
+    this.abort?.abort();
+    this.abort = null;
+    this.splats?.clear();
+    this.forget();
+    this.hide();
+    this.withParts = false;
+    this.show({ hiddenParts: [] });
+    this.on.parts(0);
+  }
+
+  /** Chooses who draws: "auto" by measured speed, "here" or "service". */
+  choose(how) {
+    this.how = how;
+    this.slow = false;
+    this.failedAt = -Infinity;
+  }
+
+  /** Shows trails, or hides parts, which the service's pictures do not: while it does, pictures at rest are from here. */
+  show(extras) {
+    Object.assign(this.extras, extras);
+    this.splats?.look({ ...this.extras, span: SPAN });
+  }
+
+  /** Whether pictures at rest are drawn here, too. */
+  get alone() {
+    return this.how === "here" || this.extras.trails > 0 || this.extras.hiddenParts.length > 0;
+  }
+
+  /** Asks for the parts of all Gaussians, once, with the frames about one. */
+  askParts(index) {
+    const begin = this.beginOf(index);
+    if (this.withParts || begin === undefined) return;
+    this.withParts = true;
+    this.get(begin, CHUNK, true);
+  }
+
+  /** Whether pictures of a mode are drawn here, once their frame is. */
+  draws(mode) {
+    return this.possible && this.how !== "service" && KINDS.includes(mode) && !(this.how === "auto" && this.slow)
+      && performance.now() - this.failedAt > AGAIN_MS;
+  }
+
+  has(index) {
+    return this.frames.has(index);
+  }
+
+  /** Asks the service for a frame: alone where it is the newest, else with those about it. */
+  fetch(index, alone) {
+    if (alone) return this.get(index, 1);
+    const frames = readable();
+    const at = frames.findIndex((report) => report.index === index);
+    if (!this.has(index)) this.get(this.beginOf(index), CHUNK);
+    else if (at % CHUNK >= CHUNK - AHEAD) {
+      const next = frames[at - (at % CHUNK) + CHUNK]?.index;
+      if (next !== undefined && !this.has(next)) this.get(next, CHUNK);
+    }
+  }
+
+  /** The first frame of the chunk of a frame; undefined where the frame cannot be read. */
+  beginOf(index) {
+    const frames = readable();
+    const at = frames.findIndex((report) => report.index === index);
+    return frames[at - (at % CHUNK)]?.index;
+  }
+
+  /** One request at a time; of the wishes meanwhile, the newest is next. */
+  async get(first, limit, parts = false) {
+    if (first === undefined) return;
+    const wanted = JSON.stringify([first, limit, parts]);
+    if (this.abort) {
+      if (this.abort.wanted !== wanted && !this.wish?.[2]) this.wish = [first, limit, parts];
+      return;
+    }
+    const { scene } = this;
+    const abort = (this.abort = new AbortController());
+    abort.wanted = wanted;
+    try {
+      const frames = readable().filter((report) => report.index >= first).slice(0, limit).map((report) => report.index);
+      for (let from = first, left = limit; left > 0;) { // an answer ends where a file of the service does
+        const answer = await fetched("GET", `${scenePath(scene)}/states.s4d?first=${from}&limit=${left}&parts=${parts}`, undefined, abort.signal);
+        const bytes = new Uint8Array(await answer.arrayBuffer());
+        if (this.abort !== abort) return;
+        this.begin().add(bytes, this.opened);
+        const following = Number(answer.headers.get("X-Next-Frame") ?? Infinity);
+        left = following > from ? frames.filter((index) => index >= following).length : 0;
+        from = following;
+      }
+    } catch (error) {
+      if (this.abort !== abort) return;
+      this.failed({ words: error.message });
+    }
+    this.abort = null;
+    const next = this.wish;
+    this.wish = null;
+    if (next) this.get(...next);
+  }
+
+  begin() {
+    if (this.splats) return this.splats;
+    this.canvas = node("canvas", { id: "drawn", width: 16, height: 16, "aria-hidden": "true", hidden: true });
+    this.picture.after(this.canvas);
+    const worker = new Worker(new URL("../splats/worker.js", import.meta.url), { type: "module" });
+    const hear = (action) => (message) => (message.name ?? message.asked?.opened ?? this.opened) === this.opened && action(message);
+    this.splats = new Splats(this.canvas, worker, {
+      frames: hear(({ frames, parts }) => {
+        this.frames = new Map(frames.map(([index], place) => [index, place]));
+        this.said = "";
+        if (parts !== this.labelled) this.on.parts((this.labelled = parts));
+        this.on.arrived();
+      }),
+      drawn: hear((message) => this.shown(message)),
+      failed: hear((message) => this.failed(message)),
+      trails: () => this.on.arrived(true),
+    });
+    this.show({});
+    return this.splats;
+  }
+
+  failed({ words }) {
+    this.failedAt = performance.now();
+    this.said = words;
+    if (this.how === "here") note(`The view cannot be drawn here: ${words}`);
+    this.hide();
+    this.on.arrived();
+  }
+
+  size(box, moving) {
+    return this.pace.size(box, moving);
+  }
+
+  /**
+   * Draws a moment; `on.drawn` is told when it is there.
+   *
+   * @param asked { index, next, share, camera, mode, background, moving }: share 0…1 of the way from one frame to the next
+   */
+  draw(asked) {
+    const between = asked.next !== null && this.frames.get(asked.next) === this.frames.get(asked.index) + 1;
+    const place = this.frames.get(asked.index) + (between ? asked.share : 0);
+    const look = JSON.stringify([asked.mode, asked.background]);
+    if (look !== this.look) {
+      this.look = look;
+      this.splats.look({ mode: asked.mode, background: asked.background });
+    }
+    const share = this.pace.share;
+    const told = { ...asked, serial: ++this.serial, opened: this.opened, pace: share };
+    this.splats.draw({ place, camera: asked.camera, ahead: asked.next === null ? undefined : Math.floor(place) + 2 }, told);
+  }
+
+  shown(message) {
+    const { asked } = message;
+    this.drawn++;
+    if (asked.moving && this.drawn > WARM) {
+      this.pace.took(message.milliseconds, asked.pace);
+      this.measure("here", message.milliseconds - message.decoding);
+      this.slow = this.times.here > SLOW_MS && this.times.here > SLOWER * this.times.service && this.times.service > 0;
+    }
+    this.on.drawn(asked, message);
+  }
+
+  /** Takes the milliseconds of a picture, drawn here or by the service. */
+  measure(who, milliseconds) {
+    this.times[who] = this.times[who] ? 0.8 * this.times[who] + 0.2 * milliseconds : milliseconds;
+  }
+
+  reveal() {
+    this.canvas.hidden = false;
+  }
+
+  hide() {
+    if (this.canvas) this.canvas.hidden = true;
+  }
+}

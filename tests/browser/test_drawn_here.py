@@ -1,0 +1,174 @@
+"""Views that the page draws itself: who draws when, what the service is asked for meanwhile, and the fallback."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from browser_page import FRAMES, opened, push, shown, start_scene, until
+from PIL import Image
+
+from client.sdk import Client
+
+HERE = "document.getElementById('view').dataset.drawn === 'here'"
+BY_THE_SERVICE = "document.getElementById('view').dataset.drawn === 'service'"
+
+
+def seen(page):
+    box = page.locator("#view").bounding_box()
+    clip = {"x": box["x"] + 8, "y": box["y"] + 40, "width": box["width"] - 16, "height": box["height"] - 80}
+    return np.array(Image.open(io.BytesIO(page.screenshot(clip=clip))).convert("RGB")).astype(int)
+
+
+def turn(page, times=4):
+    page.focus("#overlay")
+    for _ in range(times):
+        page.keyboard.press("ArrowLeft")
+
+
+@pytest.fixture
+def sent(page):
+    """What the page sends to the stream."""
+    messages = []
+    page.on("websocket", lambda socket: socket.on("framesent", lambda data: messages.append(str(data))))
+    return messages
+
+
+def test_what_moves_is_drawn_here_and_what_rests_by_the_service(page, service, finished, sent):
+    opened(page, service, finished)
+    shown(page, frame=str(FRAMES - 1), drawn="service")
+    turn(page)  # asks for the frame
+    until(page, "document.getElementById('drawn') !== null")
+    page.wait_for_timeout(600)
+    before = len(sent)
+    turn(page, 1)
+    until(page, HERE)
+    assert page.locator("#drawn").is_visible()
+    until(page, BY_THE_SERVICE)
+    assert page.locator("#drawn").is_hidden()
+    assert len([one for one in sent[before:] if '"update"' in one]) == 1  # the exact picture, at rest
+    assert page.faults == []
+
+
+def test_here_alone_the_service_is_asked_for_no_picture(page, service, finished, sent):
+    opened(page, service, finished)
+    shown(page, drawn="service")
+    page.select_option("#who", "here")
+    until(page, HERE)
+    first = seen(page)
+    assert first.max() > 40  # the points, as blobs
+    before = len(sent)
+    turn(page)
+    page.wait_for_timeout(500)
+    assert np.abs(seen(page) - first).mean() > 0.1
+    page.locator("#time").fill("2")
+    shown(page, frame="2", drawn="here")
+    page.keyboard.press("2")
+    shown(page, mode="depth", drawn="here")
+    assert float(page.locator("#near").inner_text()) > 1
+    page.keyboard.press("4")
+    shown(page, mode="alpha", drawn="here")
+    assert not [one for one in sent[before:] if '"render"' in one or '"update"' in one]
+    page.keyboard.press("3")
+    shown(page, mode="parts", drawn="service")  # exact, which only the service can
+    page.keyboard.press("1")
+    shown(page, mode="colour", drawn="here")
+    assert page.faults == []
+
+
+def test_playing_slowly_shows_what_is_between_frames(page, service, finished):
+    opened(page, service, finished, 0)
+    shown(page, frame="0")
+    page.select_option("#who", "here")
+    until(page, HERE)
+    page.select_option("#speed", "0.1")
+    page.click("#play")  # a second a frame
+    shown(page, frame="1")
+    pictures = [seen(page) for _ in range(3) if not page.wait_for_timeout(150)]
+    assert page.locator("#view").get_attribute("data-frame") in ("1", "2")
+    page.click("#play")
+    assert np.abs(pictures[0] - pictures[-1]).mean() > 0.02
+    assert page.faults == []
+
+
+def test_a_new_frame_is_drawn_live(page, service):
+    with Client(service.url, patience=30) as sdk:
+        id = start_scene(sdk, "growing")
+        push(sdk, id, 0)
+        sdk.wait(id, 0)
+        opened(page, service, id)
+        shown(page, frame="0")
+        page.select_option("#who", "here")
+        shown(page, frame="0", drawn="here")
+        first = seen(page)
+        push(sdk, id, 1)
+        shown(page, frame="1", drawn="here")
+        page.wait_for_timeout(300)
+        assert np.abs(seen(page) - first).mean() > 0.05
+        sdk.delete_scene(id)
+    assert [fault for fault in page.faults if "404" not in fault] == []
+
+
+def test_where_chunks_do_not_come_the_service_draws(page, service, finished):
+    page.route("**/states.s4d*", lambda route: route.abort())
+    opened(page, service, finished)
+    shown(page, drawn="service")
+    turn(page, 3)
+    page.wait_for_timeout(600)
+    assert page.locator("#view").get_attribute("data-drawn") == "service"
+    page.select_option("#who", "here")
+    until(page, "document.getElementById('note').innerText.includes('cannot be drawn here')")
+    tag = page.locator("#view").get_attribute("data-tag")
+    turn(page, 1)
+    until(page, f"document.getElementById('view').dataset.tag !== '{tag}'")
+    assert page.locator("#curtain").is_hidden()
+
+
+def test_trails_and_parts_that_are_hidden_stay_at_rest(page, service, finished):
+    opened(page, service, finished)
+    shown(page, frame=str(FRAMES - 1), drawn="service")
+    page.locator("#time").fill("5")
+    shown(page, frame="5", drawn="service")
+    page.click("#parts-box summary")
+    page.get_by_label("Show part 1", exact=True).wait_for()
+    page.get_by_label("Show part 2 alone").click()
+    shown(page, frame="5", drawn="here")
+    page.wait_for_timeout(500)
+    assert page.locator("#view").get_attribute("data-drawn") == "here"  # at rest, too
+    assert "3 of 4 hidden" in page.locator("#parts-words").inner_text()
+    page.keyboard.press("Escape")
+    page.get_by_label("Show part 2 alone").click()
+    until(page, BY_THE_SERVICE)
+    page.select_option("#trails", "200")
+    until(page, HERE)
+    first = seen(page)
+    page.locator("#time").fill("1")
+    shown(page, frame="1", drawn="here")
+    page.wait_for_timeout(500)
+    assert np.abs(seen(page) - first).mean() > 0.05
+    page.select_option("#trails", "0")
+    until(page, BY_THE_SERVICE)
+    assert page.faults == []
+
+
+def test_where_the_page_is_slow_and_the_service_is_not_the_service_draws(page, service):
+    page.goto(service.url)
+    chosen = page.evaluate(
+        """async () => {
+          const { Here } = await import('/viewer/view/here.js');
+          const found = {};
+          for (const [name, mine, theirs] of [['slow', 600, 80], ['both', 600, 500], ['fast', 60, 20]]) {
+            const here = new Here(document.createElement('canvas'), { drawn() {}, arrived() {}, parts() {} });
+            here.measure('service', theirs);
+            const message = { asked: { moving: true, pace: 1 }, milliseconds: mine, decoding: 0 };
+            for (let i = 0; i < 8; i++) here.shown(message);
+            found[name] = [here.draws('colour')];
+            here.choose('here');
+            found[name].push(here.draws('colour'), here.draws('parts'));
+          }
+          return found;
+        }"""
+    )
+    assert chosen == {"slow": [False, True, False], "both": [True, True, False], "fast": [True, True, False]}
+    assert page.faults == []

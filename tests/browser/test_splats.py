@@ -1,0 +1,165 @@
+"""The page's own reader of compact files and its painter, against the Python reader and the CPU rasterizer."""
+
+from __future__ import annotations
+
+import base64
+import io
+
+import browser_engine
+import numpy as np
+import pytest
+from export_cases import bent
+from PIL import Image
+
+from scas4d_core.cameras import Camera, Rig
+from scas4d_core.compact import CompactReader
+from scas4d_core.compact.columns import Columns
+from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
+from scas4d_core.rasterize.limits import scene_limits
+
+ATTRIBUTES = ("means", "factors", "rotations", "colours", "foreground", "opacities", "retired", "ids")
+PRELUDE = """async ([data, order]) => {
+  const { CompactReader } = await import('/viewer/splats/reader.js');
+  const bytes = Uint8Array.from(atob(data), (one) => one.charCodeAt(0));
+"""
+READ = """
+  const text = (array) => {
+    let all = '';
+    for (const one of new Uint8Array(array.slice().buffer)) all += String.fromCharCode(one);
+    return btoa(all);
+  };
+  const reader = new CompactReader(bytes);
+  const state = (place) => Object.fromEntries(NAMES.map((name) => [name, text(reader.state(place)[name])]));
+  const parts = reader.parts() && [...reader.parts()];
+  return { frames: reader.frames, times: reader.times, damage: reader.damage, parts,
+    states: order.map((place) => [place, state(place)]) };
+}""".replace("NAMES", str(list(ATTRIBUTES)))
+PAINT = """
+  const { Painter } = await import('/viewer/splats/painter.js');
+  const { Projector } = await import('/viewer/splats/project.js');
+  const { Sequence } = await import('/viewer/splats/sequence.js');
+  const { inside, nearOf } = await import('/viewer/splats/rig.js');
+  const { place, model, depth } = order;
+  const sequence = new Sequence();
+  sequence.add(new CompactReader(bytes));
+  const canvas = document.createElement('canvas');
+  const [painter, projector] = [new Painter(canvas), new Projector()];
+  const camera = inside(model, sequence.head, nearOf(sequence.head));
+  projector.project(sequence.moment(place), camera, { colours: null, depth: false, hidden: null });
+  painter.size(camera.width, camera.height);
+  painter.colours(projector.ellipses, projector.count, sequence.head.background);
+  return { png: canvas.toDataURL('image/png').split(',')[1], at: projector.at(camera.width / 2, camera.height / 2) };
+}"""
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    return bent.write(tmp_path_factory.mktemp("bent") / "bent.s4d", browser_engine.make_rig())
+
+
+def run(page, service, script, data, order):
+    if page.url == "about:blank":
+        page.goto(service.url)
+    return page.evaluate(PRELUDE + script, [base64.b64encode(data).decode(), order])
+
+
+def same(found, state):
+    """Whether a state in JavaScript has the values of the Python reader, but for the last digits of float32."""
+    columns = Columns.of(state)
+    kinds = {"retired": np.uint8, "ids": np.float64}
+    sizes = columns.sizes()
+    for name in ATTRIBUTES:
+        mine = np.frombuffer(base64.b64decode(found[name]), kinds.get(name, np.float32))
+        true = np.asarray(getattr(columns, name)).astype(np.float64)
+        error = np.abs(mine.reshape(true.shape) - true)
+        if name in ("means", "factors"):
+            error = error / np.maximum(sizes, 1e-3)
+        assert error.max() < 2e-4, (name, error.max())
+
+
+def test_all_frames_are_read_as_python_reads_them(page, service, file):
+    order = [6, 2, 3, 0, 5, 1, 4]
+    found = run(page, service, READ, file.read_bytes(), order)
+    with CompactReader(file) as reader:
+        assert found["frames"] == reader.frames
+        assert found["times"] == reader.times.tolist()
+        assert found["parts"] == reader.parts().tolist()
+        assert found["damage"] is None
+        counts = set()
+        for place, state in found["states"]:
+            same(state, reader.state(reader.frames[place]))
+            counts.add(len(base64.b64decode(state["opacities"])) // 4)
+    assert counts == {bent.BORN, bent.BORN + bent.LATER}
+
+
+def test_a_file_that_was_cut_is_read_up_to_there(page, service, file):
+    data = file.read_bytes()
+    cut = data[: len(data) * 3 // 4]
+    shorter = file.with_name("cut.s4d")
+    shorter.write_bytes(cut)
+    with CompactReader(shorter) as reader:
+        last = len(reader.frames) - 1
+        assert 0 < last < bent.FRAMES - 1
+        found = run(page, service, READ, cut, [last])
+        assert found["frames"] == reader.frames
+        same(found["states"][0][1], reader.state(reader.frames[last]))
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda data: b"PNG" + data[3:], "no compact 4D file"),
+        (lambda data: data.replace(b'"version": 1', b'"version": 9'), "damaged or cut"),
+        (lambda data: data[:400], "damaged or cut"),
+    ],
+)
+def test_what_is_no_such_file_is_refused_with_the_reason(page, service, file, damage, words):
+    with pytest.raises(Exception, match=words):
+        run(page, service, READ, damage(file.read_bytes()), [0])
+
+
+def rendered(file, index, model):
+    """The CPU rasterizer's picture of a frame, and the centre row of each Gaussian."""
+    with CompactReader(file) as reader:
+        state, head = reader.state(index), reader.head
+    camera = head.world.camera_to_inside(
+        Camera("view", model["intrinsics"], np.array(model["world_to_camera"]), model["width"], model["height"])
+    )
+    inside = Rig(tuple(head.world.camera_to_inside(one) for one in head.rig.cameras))
+    features = np.concatenate([state.colours, np.zeros((len(state), 1), np.float32)], axis=1)
+    background = np.array([*head.background, 0], np.float32)
+    picture = CpuRasterizer(scene_limits("auto", inside.radius)).forward(
+        state.means, state.factors, state.opacities, features, CameraArrays.of(camera), background
+    )
+    return np.moveaxis(picture.features[:3], 0, -1).clip(0, 1)
+
+
+@pytest.mark.parametrize("number", [0, 4])
+def test_pictures_agree_with_the_cpu_rasterizer(page, service, file, number):
+    camera = browser_engine.make_rig().cameras[number]
+    intrinsics = (np.array([[8], [8], [1]]) * camera.intrinsics).tolist()
+    pose = camera.world_to_camera.tolist()
+    model = {"intrinsics": intrinsics, "world_to_camera": pose, "width": 256, "height": 192}
+    found = run(page, service, PAINT, file.read_bytes(), {"place": 3, "model": model})
+    mine = np.array(Image.open(io.BytesIO(base64.b64decode(found["png"]))).convert("RGB")) / 255
+    true = rendered(file, 16, model)
+    assert true.std() > 0.1  # it shows something
+    psnr = -10 * np.log10(np.square(mine - true).mean())
+    assert psnr > 44, psnr
+    assert np.abs(mine - true).max() < 0.1
+
+
+def test_a_place_between_frames_is_between_them(page, service, file):
+    camera = browser_engine.make_rig().cameras[1]
+    intrinsics = (np.array([[4], [4], [1]]) * camera.intrinsics).tolist()
+    model = {"intrinsics": intrinsics, "world_to_camera": camera.world_to_camera.tolist(), "width": 128, "height": 96}
+
+    def at(place):
+        found = run(page, service, PAINT, file.read_bytes(), {"place": place, "model": model})
+        return np.array(Image.open(io.BytesIO(base64.b64decode(found["png"]))).convert("RGB")) / 255
+
+    before, between, after = at(1), at(1.5), at(2)
+    off = [np.abs(one - between).mean() for one in (before, after)]
+    assert max(off) < 0.8 * np.abs(before - after).mean()
+    assert min(off) > 0
+    assert np.abs(at(1.0) - before).max() == 0
