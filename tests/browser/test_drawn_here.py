@@ -10,6 +10,7 @@ from browser_page import FRAMES, opened, push, shown, start_scene, until
 from PIL import Image
 
 from client.sdk import Client
+from client.wire import IngestSettings
 
 HERE = "document.getElementById('view').dataset.drawn === 'here'"
 BY_THE_SERVICE = "document.getElementById('view').dataset.drawn === 'service'"
@@ -90,6 +91,22 @@ def test_playing_slowly_shows_what_is_between_frames(page, service, finished):
     page.click("#play")
     assert np.abs(pictures[0] - pictures[-1]).mean() > 0.02
     assert page.faults == []
+
+
+def test_frames_are_drawn_from_the_compact_files_of_the_scene(page, service):
+    """Its answers end where a file of the service does, and begin with frames by which others are told."""
+    with Client(service.url, patience=30) as sdk:
+        id = start_scene(sdk, "long", ingest=IngestSettings(exact_states=24))
+        for index in range(30):
+            push(sdk, id, index)
+        sdk.wait(id, 29)
+        for frame in (3, 28, 1):  # the page asks for 24 frames at once: 0, then 1 to 5, then those that are exact
+            opened(page, service, id, frame)
+            page.reload()
+            page.select_option("#who", "here")
+            shown(page, frame=str(frame), drawn="here")
+        sdk.delete_scene(id)
+    assert [fault for fault in page.faults if "404" not in fault] == []
 
 
 def test_a_new_frame_is_drawn_live(page, service):

@@ -15,9 +15,9 @@ from scas4d_core.captures import InitialPoints
 FRAMES = 7
 
 
-def start_scene(sdk, name="ring", settings=None):
+def start_scene(sdk, name="ring", settings=None, ingest=None):
     """A scene of the ring of cameras around the spiral."""
-    status = sdk.create_scene(make_rig(), name=name, settings=settings, frames_per_second=10)
+    status = sdk.create_scene(make_rig(), name=name, settings=settings, frames_per_second=10, ingest=ingest)
     sdk.put_points(status.id, InitialPoints(positions(), colours().astype("float32"), None))
     return status.id
 
