@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import html
-import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from client.exports.modules import script
 from client.exports.sources import STATES, CompactStates, Source, frame_range, opened
 from scas4d_core.compact import CompactReader, CompactWriter
 from scas4d_core.errors import InputError
+from scas4d_core.exports.whole_files import whole_file
 
 VIEWER = Path(__file__).parents[2] / "server" / "viewer"
 """The page's own modules: the player has the same."""
@@ -69,19 +69,15 @@ def write_player(out: Path, title: str, files: Sequence[Path]) -> None:
         "script": script(VIEWER / "player" / "player.js", VIEWER),
     }
     before, _, after = (VIEWER / "player" / "player.html").read_text(encoding="utf-8").partition("{{files}}")
-    working = out.with_name(f".{out.name}.part")
-    try:
-        with working.open("w", encoding="utf-8") as page:
-            page.write(_filled(before, parts))
-            for file in files:
-                page.write(f'<div class="file" data-bytes="{file.stat().st_size}" hidden>\n')
-                for piece in _pieces(file):
-                    page.write(f'<script type="application/octet-stream">{piece}</script>\n')
-                page.write("</div>\n")
-            page.write(_filled(after, parts))
-        os.replace(working, out)
-    finally:
-        working.unlink(missing_ok=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(out) as working, working.open("w", encoding="utf-8") as page:
+        page.write(_filled(before, parts))
+        for file in files:
+            page.write(f'<div class="file" data-bytes="{file.stat().st_size}" hidden>\n')
+            for piece in _pieces(file):
+                page.write(f'<script type="application/octet-stream">{piece}</script>\n')
+            page.write("</div>\n")
+        page.write(_filled(after, parts))
 
 
 def _filled(text: str, parts: dict[str, str]) -> str:

@@ -207,7 +207,7 @@ def of_path(path: Path, rate: float | None = None) -> Source:
     from scas4d_core.exports.reading import open_export  # it brings readers that a compact file does not need
     from scas4d_core.exports.reading.sources import RATE
 
-    return Source(path.stem, path.parent, open_export(path, rate or RATE))
+    return Source(path.stem, path.parent, open_export(path, RATE if rate is None else rate))
 
 
 @contextmanager

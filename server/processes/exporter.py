@@ -108,7 +108,8 @@ def _export(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
 
         def progress(_: int, done: int) -> None:
             connection.send(ExportProgressed(done, size_of(folder)))
-            if (free := free_bytes(folder)) < RESERVE_BYTES:
+            twice = size_of(folder) if spec.format == "usd" else 0  # at its end it is written once more
+            if (free := free_bytes(folder) - twice) < RESERVE_BYTES:
                 raise ShortOfRoomError(f"{free / 1e6:.0f} MB are free, {RESERVE_BYTES / 1e6:.0f} MB are left to frames")
 
         export_sequence(

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Path
 
 from client.wire import ReconstructionRequest, SceneStatus
 from scas4d_core.presets import changed
-from server.routes.access import AllScenes, TheScene, TheSettings
+from server.routes.access import AllExports, AllScenes, TheScene, TheSettings
 from server.routes.scenes import check_settings, setting_problems
 from server.scene.beginning import Beginning
 
@@ -19,16 +19,25 @@ Number = Annotated[int, Path(ge=1, le=1_000_000_000, description="One more than 
 
 @router.put("/{id}/reconstructions/{n}")
 async def put(
-    scene: TheScene, n: Number, scenes: AllScenes, server: TheSettings, request: ReconstructionRequest | None = None
+    scene: TheScene,
+    n: Number,
+    scenes: AllScenes,
+    server: TheSettings,
+    exports: AllExports,
+    request: ReconstructionRequest | None = None,
 ) -> SceneStatus:
     """Begins the reconstruction of a scene anew, after a first frame that failed or came out poor.
 
-    It takes the place of the one before, whatever that does: its committed states are dropped. All frames from the
-    first one on are updated again, in order, as far as their pictures are held. It is on disk when this answers; the
-    same request again gets the same answer.
+    It takes the place of the one before, whatever that does: its committed states and exports are dropped. All frames
+    from the first one on are updated again, in order, as far as their pictures are held. It is on disk when this
+    answers; the same request again gets the same answer.
     """
     asked = request or ReconstructionRequest()
     with setting_problems():
         settings = changed(scene.spec.settings, asked.settings)
     await check_settings(scene.request, settings, server)
-    return await scenes.begin_again(scene, Beginning(n, asked, settings, scene.rig))
+    begun = scene.ledger.reconstruction < n
+    status = await scenes.begin_again(scene, Beginning(n, asked, settings, scene.rig))
+    if begun:
+        await exports.forget(scene.id)
+    return status

@@ -281,7 +281,7 @@ class Exports:
             await self._cancel(found)
 
     async def forget(self, scene: str) -> None:
-        """Ends and removes all exports of a scene that was deleted."""
+        """Ends and removes all exports of a scene that was deleted, or whose reconstruction was begun anew."""
         for export in list(self._known.get(scene, {}).values()):
             await self._cancel(export)
             self._drop(export)

@@ -69,16 +69,19 @@ def video_file(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
     suffix, av = check_suffix(path), pyav()
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as beside:
-        encoder = _Encoder(beside, suffix, fps)
+        encoder: _Encoder | None = None
         try:
+            encoder = _Encoder(beside, suffix, fps)
             yield encoder.add
             if not encoder.count:
                 raise InputError(f"out {str(path)!r} would hold no picture", "give frames that there are")
             encoder.finish()
         except av.FFmpegError as error:
-            raise InputError(f"out {str(path)!r} cannot be encoded ({error})", "give a smaller size") from error
+            remedy = "give a smaller size, or another --fps"
+            raise InputError(f"out {str(path)!r} cannot be encoded at {fps:g} fps ({error})", remedy) from error
         finally:
-            encoder.close()
+            if encoder is not None:
+                encoder.close()
 
 
 class _Encoder:

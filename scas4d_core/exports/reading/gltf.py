@@ -83,6 +83,10 @@ class GltfFrame:
             splats = Splats(
                 means, scales, np.roll(rotations, 1, axis=1), opacities, 0.5 + SH_DEGREE_0 * harmonics[:, 0]
             )
+            if {len(each) for each in (means, scales, rotations, harmonics, ids, opacities)} != {len(means)}:
+                raise ValueError("its attributes have different counts")
+            if not np.linalg.norm(rotations, axis=1).all():
+                raise ValueError("a rotation is zero")
             cloud = Cloud(splats, harmonics, ids)
         except (ValueError, KeyError, IndexError, TypeError) as error:
             if isinstance(error, InputError):

@@ -6,6 +6,7 @@ import io
 import re
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from plyfile import PlyData
 
 from scas4d_core.errors import InputError
 from scas4d_core.exports.cloud import Cloud
+from scas4d_core.exports.reading.faults import readable
 from scas4d_core.exports.reading.gltf import GltfFrame
 from scas4d_core.exports.reading.states import ReadStates, head_of
 from scas4d_core.exports.reading.usd import open_usd
@@ -30,6 +32,8 @@ LOST = {
 }
 REMEDY = "give a .s4d file, USD, or numbered .glb files (scas4d export --format s4d, usd, glb)"
 Bytes = Callable[[], bytes]
+LARGEST = 1 << 30
+"""Bytes of a frame's file in a .zip: a small archive can hold more than the memory does."""
 
 
 def open_export(path: Path | str, frames_per_second: float = RATE) -> ReadStates:
@@ -52,6 +56,11 @@ def open_export(path: Path | str, frames_per_second: float = RATE) -> ReadStates
         raise InputError(f"{str(given)!r} cannot be read as states: {LOST[suffix]}", REMEDY)
     if not given.exists():
         raise InputError(f"there is no {str(given)!r}", REMEDY)
+    with readable(given.name):
+        return _opened(given, suffix, frames_per_second)
+
+
+def _opened(given: Path, suffix: str, frames_per_second: float) -> ReadStates:
     if suffix in USD_SUFFIXES:
         return open_usd(given)
     if given.is_dir():
@@ -74,7 +83,16 @@ def _of_zip(path: Path) -> dict[str, Bytes]:
         archive = zipfile.ZipFile(path)
     except (zipfile.BadZipFile, OSError) as error:
         raise InputError(f"{str(path)!r} is no .zip ({error})", REMEDY) from None
-    return {name: lambda name=name: archive.read(name) for name in archive.namelist()}  # type: ignore[misc]
+    with archive:
+        sizes = {each.filename: each.file_size for each in archive.infolist()}
+
+    def read(name: str) -> bytes:
+        if sizes[name] > LARGEST:
+            raise InputError(f"{name} in {path.name} has {sizes[name]} bytes", f"frames have at most {LARGEST}")
+        with zipfile.ZipFile(path) as opened:
+            return opened.read(name)
+
+    return {name: partial(read, name) for name in sizes}
 
 
 def _numbered(source: str, files: dict[str, Bytes], rate: float) -> ReadStates:
@@ -86,6 +104,10 @@ def _numbered(source: str, files: dict[str, Bytes], rate: float) -> ReadStates:
         held = f"files {', '.join(suffixes)}" if suffixes else "no numbered files (frame_000000.glb)"
         raise InputError(f"{source!r} holds {held}", REMEDY)
     by_index = {int(match[1]): (name, files[name]) for name, match in found.items()}
+    if len(by_index) < len(found):
+        raise InputError(
+            f"{source!r} holds several files of one frame, as frame_1 and frame_000001", "remove all but one"
+        )
     return _sequence(source, suffixes[0], dict(sorted(by_index.items())), rate)
 
 

@@ -19,6 +19,7 @@ from scas4d_core.cameras import WorldFrame
 from scas4d_core.compact import Head
 from scas4d_core.errors import InputError
 from scas4d_core.exports.cloud import Cloud
+from scas4d_core.exports.reading.faults import readable
 from scas4d_core.gaussians import Gaussians
 
 Float = NDArray[np.float64]
@@ -95,7 +96,8 @@ class ReadStates:
         for place, (index, time) in enumerate(zip(self.frames, self.times, strict=True)):
             if high is not None and index > high:
                 return
-            cloud = self.cloud(place)
+            with readable(f"frame {index}"):
+                cloud = self.cloud(place)
             rows = np.array([row_of[id] for id in cloud.ids.tolist()], np.intp)
             of = cloud.splats
             axes = Rotation.from_quat(np.roll(of.rotations, -1, axis=1)) if len(of) else None
@@ -115,7 +117,8 @@ class ReadStates:
         ids: dict[int, int] = {}
         first, turns, opacities, moving = (np.zeros((0, n)) for n in (3, 4, 1, 1))
         for place in range(len(self.frames)):
-            cloud = self.cloud(place)
+            with readable(f"frame {self.frames[place]}"):
+                cloud = self.cloud(place)
             given = cloud.ids.tolist()
             if len(set(given)) < len(given):
                 raise InputError(f"frame {self.frames[place]}: an id belongs to two Gaussians", "export it anew")

@@ -35,7 +35,7 @@ def open_usd(path: Path) -> ReadStates:
     if not prim or not prim.IsA("ParticleField3DGaussianSplat"):
         raise InputError(f"{path.name} has no Gaussians at {GAUSSIANS}", REMEDY)
     told = geometry.PrimvarsAPI(prim)
-    ids = told.GetPrimvar("scas4d:id").Get()
+    ids = told.GetPrimvar("scas4d:id").Get() if told.HasPrimvar("scas4d:id") else None
     if ids is None:
         raise InputError(
             f"{path.name} has no ids (primvars:scas4d:id), so nobody knows which Gaussian is which", REMEDY
@@ -43,12 +43,14 @@ def open_usd(path: Path) -> ReadStates:
     reader = _Reader(stage, volume.ParticleField3DGaussianSplat(prim), np.array(ids, np.int64))
     origin = stage.GetRootLayer().customLayerData.get("scas4d", {})
     rate = float(stage.GetTimeCodesPerSecond())
+    if not 0 < rate < float("inf"):
+        raise InputError(f"{path.name}: timeCodesPerSecond is {rate!r}", REMEDY)
     codes = _codes(stage, prim)
     first, begin = int(origin.get("first_frame", 0)), float(origin.get("first_time_s", 0.0))
     frames = [first + round(code) for code in codes]
     if len(set(frames)) < len(frames):  # several in one time code: the rate is not that of the frames
         frames = list(range(first, first + len(codes)))
-    parts = told.GetPrimvar("scas4d:part").Get()
+    parts = told.GetPrimvar("scas4d:part").Get() if told.HasPrimvar("scas4d:part") else None
     part_of = {} if parts is None else dict(zip(reader.ids.tolist(), np.array(parts).tolist(), strict=True))
     unit = float(geometry.GetStageMetersPerUnit(stage))
     return ReadStates(

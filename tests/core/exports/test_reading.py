@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import zipfile
 from pathlib import Path
@@ -14,7 +15,7 @@ from export_cases.corner import Found
 from scas4d_core.compact import CompactReader
 from scas4d_core.errors import InputError
 from scas4d_core.exports import FORMATS, export_sequence
-from scas4d_core.exports.reading import ReadStates, open_export
+from scas4d_core.exports.reading import ReadStates, open_export, sources
 from scas4d_core.gaussians import Gaussians, quaternions_to_matrices
 
 LATER = Gaussians.of_points([[0.5, -1.2, 2.2]], 0.05, [0.2, 0.7, 0.1])
@@ -53,7 +54,7 @@ def found(state: Gaussians, read: ReadStates) -> Found:
 
 def assert_states(read: ReadStates, states: list[Gaussians], metres: bool = False) -> None:
     assert list(read.frames) == [FIRST + k for k in range(len(states))]
-    for (index, _, back), truth, frame in zip(read.states(), states, range(9), strict=False):
+    for (index, _, back), truth, frame in zip(read.states(), states, range(len(states)), strict=True):
         assert index == FIRST + frame
         assert sorted(back.ids.tolist()) == sorted(truth.ids.tolist())
         order = [back.ids.tolist().index(id) for id in truth.ids.tolist()]
@@ -179,3 +180,70 @@ def test_what_is_no_export_is_refused(tmp_path):
         archive.writestr("readme.txt", "x")
     with pytest.raises(InputError, match="no numbered files"):
         open_export(tmp_path / "b.zip")
+
+
+def test_usd_without_parts_comes_back(tmp_path):
+    path = tmp_path / "a.usdc"
+    states = sequence(False)
+    coming = ((FIRST + k, k / RATE, state) for k, state in enumerate(states))
+    export_sequence(coming, "usd", path, world=corner.WORLD, frames_per_second=RATE)
+    read = open_export(path)
+    assert read.parts() is None
+    assert_states(read, states)
+
+
+def test_usd_without_ids_is_refused(tmp_path):
+    from pxr import Usd
+
+    path = written(tmp_path / "a.usda", "usd", sequence(False)[:2])
+    stage = Usd.Stage.Open(str(path))
+    stage.GetPrimAtPath("/World/Gaussians").RemoveProperty("primvars:scas4d:id")
+    stage.Save()
+    del stage
+    with pytest.raises(InputError, match="has no ids"):
+        open_export(path)
+
+
+def _changed(data, change):
+    """A .glb with another document."""
+    length = int.from_bytes(data[12:16], "little")
+    document = json.loads(data[20 : 20 + length])
+    change(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = data[:8] + (len(data) - length + len(text)).to_bytes(4, "little")
+    return head + len(text).to_bytes(4, "little") + data[16:20] + text + data[20 + length :]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda d: d["accessors"][0].update(count=10**30),
+        lambda d: d["accessors"][0].update(count=-3),
+        lambda d: d.update(bufferViews="none"),
+        lambda d: d.update(asset=[]),
+        lambda d: d["asset"].update(extras=None),
+        lambda d: d["asset"]["extras"].update(metres_per_unit=10**400),
+        lambda d: d["accessors"][d["meshes"][0]["primitives"][0]["attributes"]["_ID"]].update(count=2),
+        lambda d: d.update(meshes=[{}]),
+    ],
+)
+def test_a_hostile_glb_is_refused_in_words(tmp_path, change):
+    folder = written(tmp_path / "out", "glb", sequence(False)[:2])
+    path = folder / f"frame_{FIRST + 1:06d}.glb"
+    path.write_bytes(_changed(path.read_bytes(), change))
+    with pytest.raises(InputError, match=r"frame_?\s?0*6"):
+        list(open_export(folder).states())
+
+
+def test_zips_that_hide_their_size_and_files_of_one_frame_are_refused(tmp_path, monkeypatch):
+    folder = written(tmp_path / "out", "glb", sequence(False)[:2])
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("frame_000000.glb", bytes(300_000))
+    monkeypatch.setattr(sources, "LARGEST", 200_000)
+    with pytest.raises(InputError, match="at most 200000"):
+        open_export(path)
+    shutil.copy(folder / f"frame_{FIRST:06d}.glb", folder / f"frame_{FIRST}.glb")
+    with pytest.raises(InputError, match="several files of one frame"):
+        open_export(folder)
