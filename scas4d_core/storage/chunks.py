@@ -264,11 +264,6 @@ def chunk_of(name: str) -> int | None:
     return int(match[1]) if match else None
 
 
-def in_chunk(stamp: Stamp) -> bool:
-    """True for the stamp of a frame that is in a chunk."""
-    return stamp[1] < 0
-
-
 def _listed(path: Path, status: os.stat_result) -> Chunk:
     """Looks at a chunk; one that cannot be opened has no frames."""
     size, changed = status.st_size, status.st_mtime_ns

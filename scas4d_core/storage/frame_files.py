@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from scas4d_core.compact import FileError
-from scas4d_core.storage.chunks import Chunks, in_chunk
+from scas4d_core.storage.chunks import Chunks
 from scas4d_core.storage.frame_arrays import Arrays, Stamp
 from scas4d_core.storage.npz import read_npz, sync_folder, verify, write_npz
 
@@ -138,7 +138,7 @@ class FrameFiles:
         Raises:
             FileNotFoundError: it is not there. UnreadableFrameError: it is damaged.
         """
-        if stamp is not None and in_chunk(stamp) and (known := self.chunks.time(index)) is not None:
+        if stamp is not None and stamp[1] < 0 and (known := self.chunks.time(index)) is not None:
             return known
         return float(self.read(index, ("time",))["time"])
 

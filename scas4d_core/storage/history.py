@@ -250,6 +250,8 @@ class History(HistoryReader):
         for name, rule in (("last", last), ("size_bytes", size_bytes)):
             if rule is not None and rule < 1:
                 raise HistoryError(f"{name} is {rule}; keep at least 1, or give None to keep all")
+        if last is None and size_bytes is None:
+            return []
         with_it = None if self._files is None else self._files.chunk_of
         deleted = surplus(self.indices, lambda index: self._stamps[index][0], NEWEST_KEPT, last, size_bytes, with_it)
         for index in deleted:

@@ -40,15 +40,14 @@ class Compacting:
             self._compaction.close()
         self._compaction = None
 
-    def meanwhile(self, history: History | None, waits: Callable[[], bool]) -> None:
+    def meanwhile(self, history: History, waits: Callable[[], bool]) -> None:
         """Compacts states that are due until a message waits; a disk that takes nothing is tried at the next message.
 
         Args:
-            history: of the scene; None: it is not open.
-            waits: returns whether a message waits.
+            history: of the scene. waits: returns whether a message waits.
         """
         exact = self._rules.exact_states
-        if self._failed or history is None or exact is None or len(history) <= exact + 1:
+        if self._failed or exact is None:
             return
         try:
             if self._compaction is None:

@@ -159,7 +159,8 @@ class Worker:
 
     def next(self) -> Any:
         """Returns the next message; those that came while a frame waited for room go first. Compacts meanwhile."""
-        self._compacting.meanwhile(self.states, lambda: bool(self._later) or self.connection.poll(0))
+        if self.states is not None and len(self.states) > (self.spec.kept.exact_states or len(self.states)):
+            self._compacting.meanwhile(self.states, lambda: bool(self._later) or self.connection.poll(0))
         return self._later.popleft() if self._later else self.connection.recv()
 
     def _await_room(self, seconds: float) -> None:

@@ -166,7 +166,9 @@ def _push(service: Service, footage: AnyFootage, sent: Sequence[Sent], echo: Ech
     """Frames pushed into a new scene, one after the other; and what went wrong on the way."""
     faults: list[str] = []
     scene = service.create(
-        footage.rig, footage.settings.model_dump(mode="json"), ingest={"keep_frames": {}, "minimum_cameras": 1}
+        footage.rig,
+        footage.settings.model_dump(mode="json"),
+        ingest={"keep_frames": {}, "minimum_cameras": 1, "exact_states": None},
     )
     points = footage.points
     if points is not None:

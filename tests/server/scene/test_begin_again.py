@@ -337,6 +337,9 @@ ADDRESSES = {
     "/frames/{n}/splat.ply": ["/frames/0/splat.ply"],
     "/states.s4d": ["/states.s4d", "/states.s4d?limit=1&parts=true"],
     "/gaussians": ["/gaussians?ids=0"],
+    "/exports": ["/exports"],
+    "/exports/{export}": [],  # of the reconstruction before they are gone (test_exports.py)
+    "/exports/{export}/file": [],
     "/parts": ["/parts", "/parts?count=2"],
     "/render": [
         "/render",

@@ -157,6 +157,19 @@ def test_exports_wait_for_each_other_and_can_be_cancelled(ran, http, service):
         sdk.delete_export(id, one.id)
 
 
+def test_exports_go_with_the_reconstruction_they_are_of(sdk, service):
+    id = sdk.create_scene(make_rig(), frames_per_second=10).id
+    push(sdk, id, range(2))
+    export = over(sdk, id, sdk.begin_export(id, "ply").id)
+    assert export.state == "done"
+    begun = sdk.begin_again(id, 1, discard=True)
+    assert sdk.exports(id).exports == []
+    export = over(sdk, id, sdk.begin_export(id, "ply").id) if begun.committed else None
+    assert sdk.begin_again(id, 1, discard=True).reconstruction == 1  # the same request again takes nothing away
+    assert len(sdk.exports(id).exports) == (0 if export is None else 1)
+    sdk.delete_scene(id)
+
+
 def test_a_process_that_dies_leaves_words_and_no_file(ran, service, monkeypatch):
     sdk, id = ran
     manager = service.app.state.exports
