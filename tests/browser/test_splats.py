@@ -51,6 +51,22 @@ PAINT = """
   return { png: canvas.toDataURL('image/png').split(',')[1], at: projector.at(camera.width / 2, camera.height / 2) };
 }"""
 
+BOUND = """async () => {
+  const { Sequence } = await import('/viewer/splats/sequence.js');
+  const state = { count: 1 };
+  const file = (first) => ({ frames: [first, first + 1], times: [0, 1], head: {}, bytes: new Uint8Array(100),
+    state: () => state, forget() {} });
+  const firsts = (sequence) => sequence.frames.map((frame) => frame.index).filter((index) => index % 10 === 0);
+  const show = (sequence, index) => sequence.moment(sequence.frames.findIndex((frame) => frame.index === index));
+  const [back, again, offline] = [new Sequence(250), new Sequence(250), new Sequence(Infinity)];
+  for (const first of [40, 30, 20, 10]) back.add(file(first)), show(back, first);
+  again.add(file(0)), again.add(file(30)), show(again, 0), again.add(file(10)); // 0 came first, and is shown
+  for (const first of [0, 10, 20, 30]) offline.add(file(first));
+  const one = new Sequence(50); // less than a file
+  one.add(file(0)), show(one, 0), one.add(file(10));
+  return [back, again, offline, one].map(firsts);
+}"""
+
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
@@ -116,6 +132,11 @@ def test_a_file_that_was_cut_is_read_up_to_there(page, service, file):
 def test_what_is_no_such_file_is_refused_with_the_reason(page, service, file, damage, words):
     with pytest.raises(Exception, match=words):
         run(page, service, READ, damage(file.read_bytes()), [0])
+
+
+def test_files_are_forgotten_by_when_they_were_shown(page, service):
+    page.goto(service.url)
+    assert page.evaluate(BOUND) == [[10, 20], [0, 10], [0, 10, 20, 30], [0, 10]]
 
 
 def rendered(file, index, model):

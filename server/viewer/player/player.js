@@ -30,7 +30,7 @@ async function open() {
   if (!Splats.possible()) return fail("This browser cannot draw it", "It has no WebGL2 in workers. Take a newer Firefox, Chrome, Edge or Safari 17.");
   const source = new Blob([$("worker").textContent], { type: "text/javascript" });
   const worker = new Worker(URL.createObjectURL(source));
-  splats = new Splats($("picture"), worker, { ready, frames, drawn, picked, track, failed, trails: () => draw(true) });
+  splats = new Splats($("picture"), worker, { ready, frames, drawn, picked, track, failed, trails: () => draw(true) }, Infinity);
   let files = 0;
   try {
     await takeFiles((bytes, number) => (files++, splats.add(bytes, number)), (share) => ($("progress").value = share));

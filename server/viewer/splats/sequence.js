@@ -6,10 +6,14 @@ const MOST_FILES_BYTES = 384e6;
 const READY = 3; // files that keep what they need for their next frame
 
 export class Sequence {
-  constructor() {
+  /** @param most bytes of files that are kept; Infinity where none can be fetched again */
+  constructor(most = MOST_FILES_BYTES) {
+    this.most = most;
     this.frames = []; // { index, time, reader, place }, rising
     this.kept = new Map(); // decoded states by index, the one used last at the end
     this.ready = new Set(); // readers, the one used last at the end
+    this.used = new Set(); // readers of files, the one that came or was shown last at the end
+    this.shown = new Set(); // readers of what is shown
     this.head = null;
   }
 
@@ -20,18 +24,28 @@ export class Sequence {
     const known = new Set(reader.frames);
     for (const index of known) this.kept.delete(index);
     this.frames = [...this.frames.filter((frame) => !known.has(frame.index)), ...fresh].sort((a, b) => a.index - b.index);
+    this.used.add(reader);
     this.bound(reader);
   }
 
-  /** Forgets the oldest files beyond a bound of memory, but never the one that just came. */
+  /** Forgets files beyond a bound of memory, those first that were shown longest ago; never the newest, nor what is shown. */
   bound(newest) {
-    const sizes = new Map(this.frames.map((frame) => [frame.reader, frame.reader.bytes.length]));
-    let sum = [...sizes.values()].reduce((a, b) => a + b, 0);
-    for (const [reader, size] of sizes) {
-      if (sum <= MOST_FILES_BYTES || reader === newest) break;
-      this.frames = this.frames.filter((frame) => frame.reader !== reader);
-      sum -= size;
+    const told = new Set(this.frames.map((frame) => frame.reader));
+    for (const reader of this.used) if (!told.has(reader)) this.drop(reader);
+    let sum = 0;
+    for (const reader of this.used) sum += reader.bytes.length;
+    for (const reader of this.used) {
+      if (sum <= this.most) break;
+      if (reader === newest || this.shown.has(reader)) continue;
+      this.drop(reader);
+      sum -= reader.bytes.length;
     }
+  }
+
+  drop(reader) {
+    for (const readers of [this.used, this.ready, this.shown]) readers.delete(reader);
+    for (const { index } of this.frames.filter((frame) => frame.reader === reader)) this.kept.delete(index);
+    this.frames = this.frames.filter((frame) => frame.reader !== reader);
   }
 
   /** Whether the state of a frame, by its place, is decoded. */
@@ -67,6 +81,8 @@ export class Sequence {
     const at = Math.max(0, Math.min(last, place));
     const from = this.state(Math.floor(at));
     const share = at - Math.floor(at);
+    this.shown = new Set([Math.floor(at), Math.ceil(at)].map((one) => this.frames[one].reader));
+    for (const reader of this.shown) this.used.delete(reader), this.used.add(reader);
     if (share < 1e-4) return { from, to: null, share: 0 };
     const to = this.state(Math.floor(at) + 1);
     return to.count < from.count ? { from, to: null, share: 0 } : { from, to, share };

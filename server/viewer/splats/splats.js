@@ -6,13 +6,14 @@ export class Splats {
    * @param canvas given to the worker for good
    * @param worker runs worker.js
    * @param on { frames(message), drawn(message), picked(message), track(message), trails(message), failed(message) }
+   * @param mostBytes of files that are kept; Infinity where none can be fetched again, undefined for a bound
    */
-  constructor(canvas, worker, on) {
+  constructor(canvas, worker, on, mostBytes) {
     Object.assign(this, { worker, on, busy: null, next: null });
     const offscreen = canvas.transferControlToOffscreen();
     worker.onmessage = ({ data }) => this.receive(data);
     worker.onerror = (event) => on.failed({ during: "begin", words: event.message || "the worker does not run" });
-    worker.postMessage({ kind: "canvas", canvas: offscreen }, [offscreen]);
+    worker.postMessage({ kind: "canvas", canvas: offscreen, mostBytes }, [offscreen]);
   }
 
   /** Whether this browser can: WebGL2 in a worker. */

@@ -16,6 +16,7 @@ const projector = new Projector();
 const [trailWalk, trackWalk] = [new Walk(), new Walk()];
 let painter = null;
 let sequence = new Sequence();
+let most; // bytes of files that are kept, where the page says so
 let near = 0;
 let labels = null; // part of each Gaussian
 let shown = null; // what was drawn last: { camera, moment }
@@ -25,7 +26,9 @@ let paints = { labels: null, ones: null };
 let followed = -1;
 
 const actions = {
-  canvas({ canvas }) {
+  canvas({ canvas, mostBytes }) {
+    most = mostBytes;
+    sequence = new Sequence(most);
     painter = new Painter(canvas);
     post("ready", { floats: painter.floats });
   },
@@ -34,7 +37,7 @@ const actions = {
   clear() {
     trailWalk.stop();
     trackWalk.stop();
-    sequence = new Sequence();
+    sequence = new Sequence(most);
     labels = shown = cover = null;
     followed = -1;
     painter?.beginTrails(new Uint8Array(0), 0);
