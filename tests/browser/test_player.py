@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 
 import browser_engine
 import numpy as np
@@ -148,3 +149,32 @@ def test_a_file_that_was_cut_says_so(offline, player, tmp_path):
     offline.goto((tmp_path / "cut.html").as_uri())
     until(offline, "document.getElementById('curtain-words').innerText.includes('damaged or cut')")
     assert offline.title() == "<b>cut & run</b>"
+
+
+def damaged(data, frame):
+    """A compact file in which the body of the record of a frame is wrong."""
+    at = 0
+    while True:
+        kind, index, size = data[at + 4], *struct.unpack_from("<q8xI", data, at + 8)
+        if kind in (3, 4) and index == frame:
+            middle = at + 36 + size // 2
+            return data[:middle] + bytes([data[middle] ^ 255]) + data[middle + 1 :]
+        at += 36 + size
+
+
+def test_a_damaged_frame_costs_its_own_pictures_alone(offline, player, tmp_path):
+    file = tmp_path / "damaged.s4d"
+    file.write_bytes(damaged(player.with_name("bent.s4d").read_bytes(), 18))  # 20 is told by it, 22 is a key frame
+    write_player(tmp_path / "damaged.html", "damaged", [file])
+    first = opened(offline, tmp_path / "damaged.html")
+    offline.select_option("#trails", "200")  # meets it in the background
+    until(offline, "document.getElementById('note').innerText.includes('frame 18')")
+    offline.click("#play")  # decodes ahead
+    until(offline, "Number(document.body.dataset.place) > 2")
+    until(offline, "document.body.dataset.place === '6.000'")
+    offline.click("#play")
+    assert offline.locator("#curtain").is_hidden()
+    offline.locator("#time").fill("0.88")
+    until(offline, "document.body.dataset.place === '6.000'")
+    assert differ(first, seen(offline))
+    assert offline.faults == []

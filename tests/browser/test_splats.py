@@ -39,7 +39,7 @@ PAINT = """
   const { Projector } = await import('/viewer/splats/project.js');
   const { Sequence } = await import('/viewer/splats/sequence.js');
   const { inside, nearOf } = await import('/viewer/splats/rig.js');
-  const { place, model, depth } = order;
+  const { place, model } = order;
   const sequence = new Sequence();
   sequence.add(new CompactReader(bytes));
   const canvas = document.createElement('canvas');
@@ -65,6 +65,42 @@ BOUND = """async () => {
   const one = new Sequence(50); // less than a file
   one.add(file(0)), show(one, 0), one.add(file(10));
   return [back, again, offline, one].map(firsts);
+}"""
+
+TRAILS = """async () => {
+  const { Painter } = await import('/viewer/splats/painter.js');
+  const { Ways } = await import('/viewer/splats/trails.js');
+  const size = 8;
+  const painter = new Painter(Object.assign(document.createElement('canvas'), { width: size, height: size }));
+  painter.size(size, size);
+  const state = (x) => ({ count: 1, means: [x, 0, 1], foreground: [1], retired: [0] }); // goes right by a pixel a frame
+  const frames = (...all) => all.map(([index, reader]) => ({ index, reader }));
+  const ways = new Ways();
+  ways.begin(state(0), 1, null);
+  const camera = { rows: [[1, 0, 0], [0, 1, 0], [0, 0, 1]], t: [0, 0, 0], fx: 1, fy: 1, cx: 0.5, cy: 4.5, width: size, height: size, near: 0.1 };
+  let sent = 0;
+  const { gl } = painter;
+  const send = gl.texSubImage2D.bind(gl);
+  gl.texSubImage2D = (...given) => (given[5] === 1 && given[7] === gl.FLOAT && sent++, send(...given));
+  const painted = (all) => {
+    painter.placeTrails(ways, all);
+    gl.clearColor(0, 0, 0, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.viewport(0, 0, size, size);
+    painter.paintTrails(camera, all.length - 1, 30);
+    const row = new Uint8Array(4 * size);
+    gl.readPixels(0, 3, size, 1, gl.RGBA, gl.UNSIGNED_BYTE, row);
+    const found = [[...Array(size).keys()].filter((x) => row[4 * x] + row[4 * x + 1] + row[4 * x + 2] > 0), sent];
+    sent = 0;
+    return found;
+  };
+  for (const [index, x] of [[0, 0], [1, 1], [2, 2], [8, 5], [9, 6]]) ways.add(index, state(x));
+  const answers = [painted(frames([0, 'a'], [1, 'a'], [2, 'a']))];
+  answers.push(painted(frames([0, 'a'], [1, 'a'], [2, 'a'], [8, 'b'], [9, 'b']))); // a gap between files
+  ways.add(3, state(3));
+  answers.push(painted(frames([0, 'a'], [1, 'a'], [2, 'a'], [3, 'c'], [8, 'b'], [9, 'b']))); // one came in between
+  answers.push(painted(frames([0, 'a'], [1, 'a'], [2, 'a'], [8, 'a'], [9, 'a']))); // of one file: frames were left out
+  return answers;
 }"""
 
 
@@ -134,6 +170,16 @@ def test_what_is_no_such_file_is_refused_with_the_reason(page, service, file, da
         run(page, service, READ, damage(file.read_bytes()), [0])
 
 
+def test_trails_are_kept_as_frames_come_and_broken_at_gaps(page, service):
+    page.goto(service.url)
+    (whole, all_sent), (broken, two_sent), (filled, three_sent), (joined, _) = page.evaluate(TRAILS)
+    assert (all_sent, two_sent, three_sent) == (3, 2, 3)
+    assert {0, 1} <= set(whole) <= {0, 1, 2}
+    assert 5 in broken and not {3, 4} & set(broken)
+    assert {2, 5} <= set(filled) and 4 not in filled
+    assert {3, 4} <= set(joined)
+
+
 def test_files_are_forgotten_by_when_they_were_shown(page, service):
     page.goto(service.url)
     assert page.evaluate(BOUND) == [[10, 20], [0, 10], [0, 10, 20, 30], [0, 10]]
@@ -180,7 +226,10 @@ def test_a_place_between_frames_is_between_them(page, service, file):
         return np.array(Image.open(io.BytesIO(base64.b64decode(found["png"]))).convert("RGB")) / 255
 
     before, between, after = at(1), at(1.5), at(2)
+    assert np.abs(at(1.9999) - after).max() < 0.02  # goes on into the next frame
+    with CompactReader(file) as reader:
+        whole = rendered(file, reader.frames[1], model)  # and begins with the frame itself
+    assert -10 * np.log10(np.square(before - whole).mean()) > 40
     off = [np.abs(one - between).mean() for one in (before, after)]
     assert max(off) < 0.8 * np.abs(before - after).mean()
     assert min(off) > 0
-    assert np.abs(at(1.0) - before).max() == 0

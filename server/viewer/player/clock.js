@@ -30,7 +30,8 @@ export class Clock {
       if (times[middle] <= time) low = middle;
       else high = middle;
     }
-    return low === high ? low : low + Math.min(1, (time - times[low]) / (times[high] - times[low]));
+    const gap = times[high] - times[low];
+    return gap > 0 ? low + Math.min(1, (time - times[low]) / gap) : high; // none where both have the same time
   }
 
   /** Goes to the next frame or the one before, and stops. */

@@ -164,7 +164,7 @@ function drawOverlay() {
 }
 
 function failed({ during, words }) {
-  if (during === "file" || during === "begin" || !shown) return fail("It cannot be shown", words);
+  if (during === "file" || during === "begin" || (during === "draw" && !shown)) return fail("It cannot be shown", words);
   say(words);
 }
 

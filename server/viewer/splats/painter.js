@@ -2,9 +2,11 @@
 
 import { ROW, programs } from "./programs.js";
 import { STRIDE } from "./project.js";
+import { joined } from "./trails.js";
 import { DEPTH_RAMP } from "../view/colours.js";
 
-const FEWEST = 4096; // ellipses, or trails, that there is room for at least
+const FEWEST = 4096; // ellipses that there is room for at least
+const FRAMES_MORE = 32; // of trails, that there is room for at once: frames come one by one, live
 
 export class Painter {
   /**
@@ -136,28 +138,51 @@ export class Painter {
     gl.activeTexture(gl.TEXTURE0);
   }
 
-  /** Takes the hues [3 × trails], 0…255, of trails over so many frames; their centres come frame by frame. */
-  beginTrails(hues, frames) {
+  endTrails() {
     const { gl } = this;
     if (this.trails) for (const texture of [this.trails.centres, this.trails.hues]) gl.deleteTexture(texture);
-    const count = hues.length / 3;
-    this.trails = count ? { count, frames, centres: this.texture(gl.RGBA32F, count, frames), hues: this.texture(gl.RGBA8, count, 1) } : null;
-    if (!count) return;
-    const texels = new Uint8Array(4 * count);
-    for (let i = 0; i < count; i++) texels.set(hues.subarray(3 * i, 3 * i + 3), 4 * i);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, count, 1, gl.RGBA, gl.UNSIGNED_BYTE, texels);
+    this.trails = null;
   }
 
-  /** Takes the centres of trails in a frame: x, y, z, whether one is there. */
-  addTrails(frame, centres) {
+  /**
+   * Takes the centres of trails in the frames of a sequence, those that it does not have; a row of a texture has a frame.
+   *
+   * @param ways { rows, hues, centres }  @param frames of the sequence, { index, reader }
+   */
+  placeTrails(ways, frames) {
     const { gl } = this;
+    const count = ways.rows.length;
+    if (!this.trails || this.trails.room < Math.min(frames.length, this.most)) this.beginTrails(ways.hues, frames.length);
+    const { placed, room } = this.trails;
+    const follows = joined(frames);
     gl.bindTexture(gl.TEXTURE_2D, this.trails.centres);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, frame, this.trails.count, 1, gl.RGBA, gl.FLOAT, centres);
+    for (let place = 0; place < Math.min(frames.length, room); place++) {
+      const { index } = frames[place];
+      const known = ways.centres.get(index);
+      const row = known ? `${index} ${follows[place]}` : "";
+      if ((placed[place] ?? "") === row) continue;
+      placed[place] = row;
+      const texels = known ? known.slice() : new Float32Array(4 * count); // what is not gathered is not there
+      if (follows[place]) for (let i = 3; i < texels.length; i += 4) texels[i] *= 2; // joined with the one before
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, place, count, 1, gl.RGBA, gl.FLOAT, texels);
+    }
+  }
+
+  beginTrails(hues, frames) {
+    const { gl } = this;
+    this.endTrails();
+    const count = hues.length / 3;
+    const room = Math.min(this.most, Math.ceil(1.5 * frames) + FRAMES_MORE);
+    this.trails = { count, room, placed: [], centres: this.texture(gl.RGBA32F, count, room), hues: this.texture(gl.RGBA8, count, 1) };
+    const texels = new Uint8Array(4 * count);
+    for (let i = 0; i < count; i++) texels.set(hues.subarray(3 * i, 3 * i + 3), 4 * i);
+    gl.bindTexture(gl.TEXTURE_2D, this.trails.hues);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, count, 1, gl.RGBA, gl.UNSIGNED_BYTE, texels);
   }
 
   /** Paints the trails of `span` frames up to a place in time, over what is painted. */
   paintTrails(camera, now, span) {
-    if (!this.trails || now <= 0) return;
+    if (!this.trails || now <= 0 || Math.ceil(now) >= this.trails.room) return;
     const { gl } = this;
     const first = Math.max(0, Math.ceil(now) - span);
     const segments = Math.ceil(now) - first;

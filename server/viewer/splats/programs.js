@@ -51,7 +51,8 @@ void main() {
   painted = vec4(found.a < 0.5 ? nothing : texelFetch(ramp, ivec2(int(level * 255.0), 0), 0).rgb, 1.0);
 }`;
 
-// A segment of a trail is two vertices; a texture has the centres, a trail a column, a frame a row, and whether one is there.
+// A segment of a trail is two vertices; a texture has the centres, a trail a column, a frame a row, and whether
+// one is there: 1, or 2 where the frame before is the one in the row before.
 const TRAIL = `#version 300 es
 precision highp float;
 precision highp sampler2D;
@@ -74,7 +75,7 @@ void main() {
   vec4 end = texelFetch(centres, ivec2(trail, frame + 1), 0);
   float ahead = (gl_VertexID & 1) == 0 ? 0.0 : min(1.0, now - float(frame));
   vec3 seen = turn * mix(begin.xyz, end.xyz, ahead) + shift;
-  bool there = begin.w * end.w > 0.5 && seen.z > size.z;
+  bool there = begin.w > 0.5 && end.w > 1.5 && seen.z > size.z;
   float age = (now - float(frame) - ahead) / float(span);
   shade = vec4(texelFetch(hues, ivec2(trail, 0), 0).rgb, 1.0) * (0.7 * (1.0 - age));
   vec2 pixel = lens.xy * seen.xy / max(seen.z, 1e-9) + lens.zw;

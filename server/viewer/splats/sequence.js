@@ -75,6 +75,13 @@ export class Sequence {
     return reader.state(place);
   }
 
+  /** The place of a moment on the way from a frame to the next one; null where the frame is not there. */
+  placeOf(index, next, share) {
+    const place = this.frames.findIndex((frame) => frame.index === index);
+    if (place < 0) return null;
+    return next !== null && this.frames[place + 1]?.index === next ? place + share : place;
+  }
+
   /** The moment at a place between frames: 1.25 is a quarter of the way from the second to the third. */
   moment(place) {
     const last = this.frames.length - 1;

@@ -46,7 +46,8 @@ export class Splats {
   /**
    * Draws, or does so after what is being drawn; of several such the last.
    *
-   * @param request { place, camera, ahead }: place among the frames, camera as the service takes it, frame to decode next
+   * @param request { place, camera, ahead }: place among the frames, camera as the service takes it, place to decode next; or
+   *   { index, next, share, camera }: the index of a frame, of the next one or null, and the share 0…1 of the way between them
    * @param asked comes back with what was drawn
    */
   draw(request, asked = {}) {

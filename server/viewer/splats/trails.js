@@ -29,6 +29,52 @@ export function huesOf(state, rows) {
   return hues;
 }
 
+/** Where the Gaussians with trails are in each frame that was gathered, by its index. */
+export class Ways {
+  constructor() {
+    this.clear();
+  }
+
+  clear() {
+    this.rows = new Uint32Array(0);
+    this.hues = new Uint8Array(0);
+    this.centres = new Map();
+  }
+
+  /** Chooses the Gaussians, by the state of a frame. */
+  begin(state, count, hidden) {
+    this.rows = chosen(state, count, hidden);
+    this.hues = huesOf(state, this.rows);
+  }
+
+  has(index) {
+    return this.centres.has(index);
+  }
+
+  add(index, state) {
+    const texels = new Float32Array(4 * this.rows.length);
+    this.rows.forEach((row, i) => {
+      if (row >= state.count || state.retired[row]) return;
+      for (let k = 0; k < 3; k++) texels[4 * i + k] = state.means[k * state.count + row];
+      texels[4 * i + 3] = 1;
+    });
+    this.centres.set(index, texels);
+  }
+
+  /** Forgets the frames that are not among these. */
+  keep(frames) {
+    const wanted = new Set(frames.map(({ index }) => index));
+    for (const index of this.centres.keys()) if (!wanted.has(index)) this.centres.delete(index);
+  }
+}
+
+/** Whether each frame follows the one before without a gap: in the same file, or no farther than is usual among these. */
+export function joined(frames) {
+  const steps = frames.slice(1).map(({ index }, k) => index - frames[k].index);
+  const usual = [...steps].sort((a, b) => a - b)[Math.floor(steps.length / 2)];
+  return frames.map(({ reader }, place) => place > 0 && (reader === frames[place - 1].reader || steps[place - 1] <= usual));
+}
+
 /** Goes through all frames of a sequence, one a turn, so that pictures come between; a later walk ends an earlier one. */
 export class Walk {
   constructor() {
@@ -39,17 +85,28 @@ export class Walk {
     this.number++;
   }
 
-  /** @param each (state, place) of every frame  @param done called after the last */
-  begin(sequence, each, done = () => {}) {
+  /**
+   * @param each (state, place) of every frame  @param done called after the last
+   * @param failed (error) of the first frame that cannot be read; those that can are gone on with
+   * @param known (place) whether a frame is passed over
+   */
+  begin(sequence, each, done, failed, known = () => false) {
     const number = ++this.number;
     const readers = new Map(); // of its own: one that goes from frame to frame is not thrown back by what is drawn
     let place = 0;
+    let whole = true;
     const step = () => {
       if (number !== this.number) return;
+      while (place < sequence.frames.length && known(place)) place++;
       if (place >= sequence.frames.length) return done();
       const { reader, place: inFile } = sequence.frames[place];
-      if (!readers.has(reader)) readers.clear(), readers.set(reader, new CompactReader(reader.bytes));
-      each(sequence.has(place) ? sequence.state(place) : readers.get(reader).state(inFile), place);
+      try {
+        if (!readers.has(reader)) readers.clear(), readers.set(reader, new CompactReader(reader.bytes));
+        each(sequence.has(place) ? sequence.state(place) : readers.get(reader).state(inFile), place);
+      } catch (error) {
+        if (whole) failed(error);
+        whole = false;
+      }
       place++;
       setTimeout(step);
     };

@@ -6,7 +6,7 @@ import { Projector } from "./project.js";
 import { CompactReader } from "./reader.js";
 import { inside, nearOf, outside, partColour } from "./rig.js";
 import { Sequence } from "./sequence.js";
-import { Walk, chosen, huesOf } from "./trails.js";
+import { Ways, Walk } from "./trails.js";
 
 const NOTHING = [16 / 255, 19 / 255, 24 / 255]; // of depth, where nothing is
 const NO_PART = [90, 96, 104];
@@ -14,6 +14,7 @@ const post = (kind, message = {}) => self.postMessage({ kind, ...message });
 
 const projector = new Projector();
 const [trailWalk, trackWalk] = [new Walk(), new Walk()];
+const ways = new Ways();
 let painter = null;
 let sequence = new Sequence();
 let most; // bytes of files that are kept, where the page says so
@@ -35,12 +36,11 @@ const actions = {
 
   /** Begins anew, without any frame. */
   clear() {
-    trailWalk.stop();
     trackWalk.stop();
+    forgetTrails();
     sequence = new Sequence(most);
     labels = shown = cover = null;
     followed = -1;
-    painter?.beginTrails(new Uint8Array(0), 0);
   },
 
   file({ bytes, name }) {
@@ -53,7 +53,10 @@ const actions = {
       paints.labels = null;
       actions.look({});
     }
-    if (look.trails) gatherTrails(); // places have moved
+    if (look.trails) {
+      if (found && look.hiddenParts.length) forgetTrails(); // others are hidden now
+      guarded("trails", gatherTrails); // places have moved
+    }
     const parts = labels ? Math.max(-1, ...new Set(labels)) + 1 : 0;
     post("frames", { name, frames: sequence.frames.map(({ index, time }) => [index, time]), head: sequence.head, count: reader.count,
       parts, damage: reader.damage });
@@ -64,11 +67,16 @@ const actions = {
     look = { ...look, ...changes };
     const hidden = new Set(look.hiddenParts);
     cover = labels && hidden.size ? Uint8Array.from(labels, (label) => (hidden.has(label) ? 1 : 0)) : null;
-    if (look.trails !== before.trails || (look.trails && changes.hiddenParts)) gatherTrails();
+    if (look.trails === before.trails && !(look.trails && changes.hiddenParts)) return;
+    forgetTrails();
+    guarded("trails", gatherTrails);
   },
 
-  draw({ place, camera: model, ahead }) {
+  draw({ camera: model, ...asked }) {
     const began = performance.now();
+    const place = asked.place ?? sequence.placeOf(asked.index, asked.next, asked.share);
+    if (place === null) return post("failed", { during: "draw", gone: true, words: `frame ${asked.index} is not at hand any more` });
+    const ahead = asked.index === undefined ? asked.ahead : asked.next === null ? undefined : Math.floor(place) + 2;
     const { head } = sequence;
     const camera = inside(model, head, near);
     const moment = sequence.moment(place);
@@ -88,7 +96,7 @@ const actions = {
     const [metres, now] = [head.world.metres_per_unit, performance.now()];
     post("drawn", { place, mode, drawn, milliseconds: now - began, decoding: decoded - began,
       range: range?.map((z) => z / metres), followed: followed < 0 ? null : whereIs(followed) });
-    if (ahead !== undefined && ahead < sequence.frames.length && !sequence.has(ahead)) setTimeout(() => sequence.frames[ahead] && sequence.state(ahead));
+    if (ahead !== undefined && ahead < sequence.frames.length && !sequence.has(ahead)) setTimeout(() => guarded("ahead", () => sequence.frames[ahead] && sequence.state(ahead)));
   },
 
   /** Follows what is seen at a place of the last picture. */
@@ -109,7 +117,7 @@ const actions = {
     trackWalk.begin(sequence, (state, place) => {
       const there = row < state.count && !state.retired[row];
       track.push(there ? [place, outside(centreOf(state, row), head)] : [place, null]);
-    }, () => post("track", { row, track }));
+    }, () => post("track", { row, track }), (error) => failed("track", error));
   },
 };
 
@@ -149,29 +157,41 @@ function coloursOf(mode, count) {
   return paints.ones;
 }
 
-/** Gathers the centres of the Gaussians with trails, frame by frame. */
-function gatherTrails() {
+function forgetTrails() {
   trailWalk.stop();
-  if (!sequence.frames.length || !painter) return;
-  if (!look.trails) return painter.beginTrails(new Uint8Array(0), 0);
-  const first = sequence.state(0);
-  const rows = chosen(first, Math.min(look.trails, painter.most), covering(first.count));
-  painter.beginTrails(huesOf(first, rows), Math.min(sequence.frames.length, painter.most));
-  const texels = new Float32Array(4 * rows.length);
-  trailWalk.begin(sequence, (state, place) => {
-    if (!rows.length || place >= painter.most) return;
-    rows.forEach((row, i) => {
-      for (let k = 0; k < 3; k++) texels[4 * i + k] = state.means[k * state.count + row];
-      texels[4 * i + 3] = state.retired[row] ? 0 : 1;
-    });
-    painter.addTrails(place, texels);
-  }, () => post("trails", { count: rows.length }));
+  ways.clear();
+  painter?.endTrails();
 }
 
-self.onmessage = ({ data }) => {
-  try {
-    actions[data.kind](data);
-  } catch (error) {
-    post("failed", { during: data.kind, name: data.name, words: error.message });
+/** Gathers the centres of the Gaussians with trails, frame by frame; those that are known already are kept. */
+function gatherTrails() {
+  trailWalk.stop();
+  const { frames } = sequence;
+  if (!frames.length || !painter || !look.trails) return;
+  if (!ways.rows.length) {
+    const first = sequence.state(0);
+    ways.begin(first, Math.min(look.trails, painter.most), covering(first.count));
   }
-};
+  if (!ways.rows.length) return;
+  ways.keep(frames);
+  painter.placeTrails(ways, frames);
+  trailWalk.begin(sequence, (state, place) => {
+    ways.add(frames[place].index, state);
+    painter.placeTrails(ways, frames);
+  }, () => post("trails", { count: ways.rows.length }), (error) => failed("trails", error), (place) => ways.has(frames[place].index));
+}
+
+function failed(during, error, name) {
+  post("failed", { during, name, words: error.message });
+}
+
+/** Acts; what goes wrong is told, and ends nothing else. */
+function guarded(during, action, name) {
+  try {
+    action();
+  } catch (error) {
+    failed(during, error, name);
+  }
+}
+
+self.onmessage = ({ data }) => guarded(data.kind, () => actions[data.kind](data), data.name);

@@ -12,6 +12,7 @@ const SLOWER = 1.5; // times as long as the service takes
 const WARM = 3; // pictures before times count: shaders are compiled in the first
 const AGAIN_MS = 20_000; // after a failure
 const SPAN = 30; // frames of a trail
+const BESIDE = ["ahead", "trails", "track"]; // what fails there costs no picture
 const KINDS = ["colour", "depth", "alpha"]; // parts come from the service: it says whose weight is largest in a pixel
 
 export class Here {
@@ -24,7 +25,7 @@ export class Here {
   }
 
   forget() {
-    this.frames = new Map(); // places by index
+    this.frames = new Set(); // indices of those that the worker has
     this.asked = new Map(); // what is being drawn, by tag
     this.wish = null;
     this.failedAt = -Infinity;
@@ -146,7 +147,7 @@ export class Here {
     const hear = (action) => (message) => (message.name ?? message.asked?.opened ?? this.opened) === this.opened && action(message);
     this.splats = new Splats(this.canvas, worker, {
       frames: hear(({ frames, parts }) => {
-        this.frames = new Map(frames.map(([index], place) => [index, place]));
+        this.frames = new Set(frames.map(([index]) => index));
         this.said = "";
         if (parts !== this.labelled) this.on.parts((this.labelled = parts));
         this.on.arrived();
@@ -159,7 +160,9 @@ export class Here {
     return this.splats;
   }
 
-  failed({ words }) {
+  failed({ during, gone, words }) {
+    if (gone || BESIDE.includes(during)) return gone && this.on.arrived(); // asked for again, or seen by nobody
+    if (!this.labelled) this.withParts = false; // may be asked for again
     this.failedAt = performance.now();
     this.said = words;
     if (this.how === "here") note(`The view cannot be drawn here: ${words}`);
@@ -177,8 +180,6 @@ export class Here {
    * @param asked { index, next, share, camera, mode, background, moving }: share 0…1 of the way from one frame to the next
    */
   draw(asked) {
-    const between = asked.next !== null && this.frames.get(asked.next) === this.frames.get(asked.index) + 1;
-    const place = this.frames.get(asked.index) + (between ? asked.share : 0);
     const look = JSON.stringify([asked.mode, asked.background]);
     if (look !== this.look) {
       this.look = look;
@@ -186,7 +187,8 @@ export class Here {
     }
     const share = this.pace.share;
     const told = { ...asked, serial: ++this.serial, opened: this.opened, pace: share };
-    this.splats.draw({ place, camera: asked.camera, ahead: asked.next === null ? undefined : Math.floor(place) + 2 }, told);
+    const { index, next, share: way, camera } = asked;
+    this.splats.draw({ index, next, share: way, camera }, told);
   }
 
   shown(message) {
