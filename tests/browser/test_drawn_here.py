@@ -6,7 +6,7 @@ import io
 
 import numpy as np
 import pytest
-from browser_page import FRAMES, opened, push, shown, start_scene, until
+from browser_page import FRAMES, canvas, opened, push, shown, start_scene, until
 from PIL import Image
 
 from client.sdk import Client
@@ -167,6 +167,52 @@ def test_trails_and_parts_that_are_hidden_stay_at_rest(page, service, finished):
     page.select_option("#trails", "0")
     until(page, BY_THE_SERVICE)
     assert page.faults == []
+
+
+def test_a_followed_point_moves_between_frames(page, service, finished):
+    opened(page, service, finished, 0)
+    shown(page, frame="0", drawn="service")
+    picture = canvas(page)
+    rows, columns = np.nonzero(picture[..., :3].sum(-1) > 150)
+    pick = np.argsort(np.hypot(rows - rows.mean(), columns - columns.mean()))[0]
+    box = page.locator("#overlay").bounding_box()
+    right, down = (columns[pick] + 0.5) / picture.shape[1], (rows[pick] + 0.5) / picture.shape[0]
+    page.mouse.click(box["x"] + right * box["width"], box["y"] + down * box["height"])
+    until(page, "document.getElementById('tracks').innerText.includes('7 frames')")
+    page.select_option("#who", "here")
+    until(page, HERE)
+    page.evaluate("""() => {
+      const arc = CanvasRenderingContext2D.prototype.arc;
+      window.dots = new Set();
+      CanvasRenderingContext2D.prototype.arc = function (x, y, ...rest) {
+        if (this.canvas.id === 'overlay') window.dots.add(`${x.toFixed(3)} ${y.toFixed(3)}`);
+        return arc.call(this, x, y, ...rest);
+      };
+    }""")
+    page.select_option("#speed", "0.1")
+    page.click("#play")
+    shown(page, frame="2")
+    page.click("#play")
+    assert page.evaluate("window.dots.size") > 4  # more than the frames 0 to 2 have
+    assert page.faults == []
+
+
+def test_what_fails_beside_costs_no_picture_and_parts_are_asked_for_again(page, service):
+    page.goto(service.url)
+    found = page.evaluate(
+        """async () => {
+          const { Here } = await import('/viewer/view/here.js');
+          const here = new Here(document.createElement('canvas'), { drawn() {}, arrived() {}, parts() {} });
+          const after = [];
+          for (const during of ['ahead', 'file']) {
+            here.withParts = true;
+            here.failed({ during, words: 'damaged' });
+            after.push([here.draws('colour'), here.withParts]);
+          }
+          return after;
+        }"""
+    )
+    assert found == [[True, True], [False, False]]
 
 
 def test_where_the_page_is_slow_and_the_service_is_not_the_service_draws(page, service):

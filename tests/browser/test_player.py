@@ -12,7 +12,7 @@ from browser_page import canvas, until
 from export_cases import bent
 from PIL import Image
 
-from client.exports.player import export_player, write_player
+from client.exports.player import VIEWER, export_player, write_player
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +140,12 @@ def test_it_fits_the_window_and_names_its_controls(offline, player, width, heigh
     assert offline.locator("#picture").bounding_box()["height"] > 0.6 * height
     found = axe.Axe().run(offline).response["violations"]
     assert [one["id"] for one in found if one["impact"] in ("serious", "critical")] == []
+
+
+def test_two_frames_of_one_time_have_a_place(offline):
+    clock = (VIEWER / "player" / "clock.js").read_text(encoding="utf-8").replace("export class", "class")
+    at = "const clock = new Clock([0, 1, 1]); clock.set(1); return clock.place;"
+    assert offline.evaluate(f"() => {{ {clock}\n{at} }}") == 2
 
 
 def test_a_file_that_was_cut_says_so(offline, player, tmp_path):

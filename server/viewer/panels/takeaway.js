@@ -4,6 +4,7 @@ import { $, node, page, sentence } from "../page.js";
 import { call, fetched, scenePath, token } from "../service.js";
 
 const LOOK_MS = 700;
+const SELDOM_MS = 30_000; // at most so long after an error; doubled by each
 const UNDER_WAY = ["waiting", "running"];
 const NAMES = {
   ply: "3DGS .ply", splat: ".splat", spz: "SPZ", spz4: "SPZ 4", glb: "glTF", "glb-parts": "glTF, moving parts",
@@ -22,7 +23,7 @@ const range = (one) => (one.first === one.last ? `frame ${one.first}` : `frames 
 
 export class TakeAway {
   constructor() {
-    Object.assign(this, { scene: null, timer: 0, known: new Map() });
+    Object.assign(this, { scene: null, timer: 0, wait: LOOK_MS, known: new Map() });
     $("take-form").addEventListener("submit", (event) => {
       event.preventDefault();
       this.begin();
@@ -86,17 +87,19 @@ export class TakeAway {
   async look() {
     clearTimeout(this.timer);
     const { scene } = this;
-    let found;
+    let found = null;
+    let refused = false;
     try {
       found = (await call("GET", `${scenePath(scene)}/exports`)).exports;
-    } catch { // the page says elsewhere that the service does not answer
-      found = null;
+    } catch (error) { // the page says elsewhere that the service does not answer
+      refused = error.status >= 400 && error.status < 500 && error.status !== 429; // the next time, too
     }
     if (this.scene !== scene || scene === null) return;
     if (found) this.took(found);
     const busy = [...this.known.values()].some((one) => UNDER_WAY.includes(one.state));
     clearTimeout(this.timer);
-    if (busy || !found) this.timer = setTimeout(() => this.look(), LOOK_MS);
+    this.wait = found ? LOOK_MS : Math.min(SELDOM_MS, 2 * this.wait);
+    if (!refused && (busy || !found)) this.timer = setTimeout(() => this.look(), this.wait);
   }
 
   took(found) {
@@ -156,8 +159,8 @@ export class TakeAway {
 
   async save(one, button) {
     button.disabled = true;
+    let place = null;
     try {
-      let place = null;
       if (window.showSaveFilePicker) place = await (await showSaveFilePicker({ suggestedName: one.name })).createWritable();
       const answer = await fetched("GET", one.file);
       if (place) await answer.body.pipeTo(place);
@@ -167,6 +170,7 @@ export class TakeAway {
         setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
       }
     } catch (error) {
+      await place?.abort().catch(() => {}); // leaves no half of a file
       if (error.name !== "AbortError") this.say(error.message); // else nobody wants it
     }
     button.disabled = false;

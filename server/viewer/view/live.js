@@ -4,7 +4,7 @@ import { Orbit, project, readCamera } from "./geometry.js";
 import { paintDepth } from "./colours.js";
 import { listenToPointer, moveByKey } from "./gestures.js";
 import { Here } from "./here.js";
-import { drawFrusta, drawTracks } from "./overlay.js";
+import { between, drawFrusta, drawTracks } from "./overlay.js";
 import { readable } from "../page.js";
 import { fetched, scenePath } from "../service.js";
 
@@ -194,10 +194,10 @@ export class LiveView {
     return true;
   }
 
-  drawnHere(asked, { range }) {
+  drawnHere(asked, { range, place }) {
     if (!this.stream || asked.serial <= this.exact || asked.mode !== this.mode) return;
     this.here.reveal();
-    this.shown = { camera: asked.camera, frame: asked.index, mode: asked.mode, tag: this.shown?.tag ?? 0 };
+    this.shown = { camera: asked.camera, frame: asked.index, next: asked.next, share: place % 1, mode: asked.mode, tag: this.shown?.tag ?? 0 };
     this.on.stale(false);
     this.draw();
     const [near, far] = range ?? [];
@@ -285,7 +285,9 @@ export class LiveView {
       return seen && [seen[0] * sx, seen[1] * sy];
     };
     if (this.showFrusta) drawFrusta(context, place, this.rig, this.orbit.rig.radius, dense);
-    drawTracks(context, place, this.tracks, this.shown.frame, dense);
+    const { frame, next, share } = this.shown;
+    if (share > 0) drawTracks(context, place, between(this.tracks, frame, next, share), frame + share * (next - frame), dense);
+    else drawTracks(context, place, this.tracks, frame, dense);
   }
 
   // Pointer and keys.

@@ -43,6 +43,16 @@ export function drawTracks(context, place, tracks, frame, dense) {
   context.globalAlpha = 1;
 }
 
+/** Tracks with where their points are on the way from a frame to the next one, at `frame + share * (next - frame)`. */
+export function between(tracks, frame, next, share) {
+  return tracks.map((track) => {
+    const [begin, end] = [track.positions.get(frame), track.positions.get(next)];
+    if (!begin || !end) return track;
+    const at = begin.map((value, k) => value + share * (end[k] - value));
+    return { ...track, positions: new Map(track.positions).set(frame + share * (next - frame), at) };
+  });
+}
+
 /** Draws the rig's cameras as pyramids with their names. */
 export function drawFrusta(context, place, cameras, radius, dense) {
   const depth = 0.07 * radius;
