@@ -116,3 +116,18 @@ def test_who_may_only_read_saves_what_is_there_and_makes_none(page, service, sce
     assert download.value.suggested_filename.endswith("-tracks.csv")
     assert page.faults == []
     sdk.delete_export(id, begun.id)
+
+
+@pytest.mark.parametrize(("status", "most"), [(404, 1), (500, 2)])
+def test_errors_of_the_list_are_not_asked_about_for_ever(page, service, scene, status, most):
+    asked = []
+
+    def answer(route):
+        asked.append(route.request.url)
+        route.fulfill(status=status, json={"detail": "no such scene", "status": status})
+
+    page.route("**/exports", answer)
+    opened(page, service, scene[1])
+    until(page, "document.getElementById('facts').children.length > 0")
+    page.wait_for_timeout(2200)  # three times as long as between two looks at an export under way
+    assert 1 <= len(asked) <= most, asked
