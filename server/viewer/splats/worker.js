@@ -96,7 +96,8 @@ const actions = {
     const [metres, now] = [head.world.metres_per_unit, performance.now()];
     post("drawn", { place, mode, drawn, milliseconds: now - began, decoding: decoded - began,
       range: range?.map((z) => z / metres), followed: followed < 0 ? null : whereIs(followed) });
-    if (ahead !== undefined && ahead < sequence.frames.length && !sequence.has(ahead)) setTimeout(() => guarded("ahead", () => sequence.frames[ahead] && sequence.state(ahead)));
+    if (ahead === undefined || ahead >= sequence.frames.length || sequence.has(ahead)) return;
+    setTimeout(() => guarded("ahead", () => sequence.frames[ahead] && sequence.state(ahead)));
   },
 
   /** Follows what is seen at a place of the last picture. */
@@ -166,19 +167,18 @@ function forgetTrails() {
 /** Gathers the centres of the Gaussians with trails, frame by frame; those that are known already are kept. */
 function gatherTrails() {
   trailWalk.stop();
-  const { frames } = sequence;
-  if (!frames.length || !painter || !look.trails) return;
+  if (!sequence.frames.length || !painter || !look.trails) return;
   if (!ways.rows.length) {
     const first = sequence.state(0);
     ways.begin(first, Math.min(look.trails, painter.most), covering(first.count));
   }
   if (!ways.rows.length) return;
-  ways.keep(frames);
-  painter.placeTrails(ways, frames);
+  ways.keep(sequence.frames);
+  painter.placeTrails(ways, sequence.frames);
   trailWalk.begin(sequence, (state, place) => {
-    ways.add(frames[place].index, state);
-    painter.placeTrails(ways, frames);
-  }, () => post("trails", { count: ways.rows.length }), (error) => failed("trails", error), (place) => ways.has(frames[place].index));
+    ways.add(sequence.frames[place].index, state);
+    painter.placeTrails(ways, sequence.frames);
+  }, () => post("trails", { count: ways.rows.length }), (error) => failed("trails", error), (place) => ways.has(sequence.frames[place].index));
 }
 
 function failed(during, error, name) {
