@@ -31,7 +31,7 @@ class StateBounds(Model):
     """The largest error that a state may have once it is in a compact file (docs/format.md)."""
 
     position: float = Field(default=0.04, ge=1e-6, le=1, description="Of a centre, in the Gaussian's own size.")
-    axes: float = Field(default=0.06, ge=1e-6, le=1, description="Of its axes, in the same.")
+    axes: float = Field(default=0.055, ge=1e-6, le=1, description="Of its axes, in the same.")
     rotation: float = Field(default=0.05, ge=0.002, le=1, description="Of its material rotation, radians.")
     colour: float = Field(default=0.012, ge=1e-6, le=1, description="Of a channel, where colours are 0 to 1.")
     gloss: float = Field(default=0.01, ge=1e-6, le=1, description="Of a component of its gloss.")

@@ -31,7 +31,7 @@ class Bounds:
     """
 
     position: float = 0.04
-    axes: float = 0.06
+    axes: float = 0.055
     rotation: float = 0.05
     colour: float = 0.012
     gloss: float = 0.01

@@ -8,8 +8,8 @@ import numpy as np
 from running import make_rig, pictures
 from sending import create, filled, finished, put_form, serving_with, status, view, wait_for
 
-from client.wire import RigModel
-from scas4d_core.compact import CompactReader
+from client.wire import RigModel, StateBounds
+from scas4d_core.compact import Bounds, CompactReader
 from scas4d_core.storage.chunks import chunk_of
 from scas4d_core.storage.history import History
 from server.storage.definition import _digest
@@ -136,3 +136,7 @@ def test_bounds_and_numbers_that_cannot_be_are_refused(tmp_path):
             response = http.post("/v1/scenes", json={"rig": rig, "ingest": ingest})
             assert response.status_code == 422
             assert field in response.text
+
+
+def test_the_bounds_of_a_scene_are_those_of_compact_files():
+    assert StateBounds().model_dump() == Bounds().record()
