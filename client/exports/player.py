@@ -15,7 +15,6 @@ from client.exports.modules import script
 from client.exports.sources import STATES, CompactStates, Source, frame_range, opened
 from scas4d_core.compact import CompactReader, CompactWriter
 from scas4d_core.errors import InputError
-from scas4d_core.exports.whole_files import whole_file
 
 VIEWER = Path(__file__).parents[2] / "server" / "viewer"
 """The page's own modules: the player has the same."""
@@ -62,6 +61,8 @@ def write_player(out: Path, title: str, files: Sequence[Path]) -> None:
     Args:
         title: of the page. files: in the order of their frames.
     """
+    from scas4d_core.exports.whole_files import whole_file  # with it comes what exports need
+
     parts = {
         "title": html.escape(title),
         "style": (VIEWER / "player" / "player.css").read_text(encoding="utf-8"),
