@@ -8,9 +8,6 @@ from client.cli.progress import Bars, console
 from client.exports.sources import frame_range, opened
 from scas4d_core.errors import InputError
 
-WITH_PARTS = ("usd", "s4d")
-"""Formats that have parts where there are any."""
-
 
 def export(
     source: str,
@@ -36,7 +33,7 @@ def export(
     Raises:
         InputError: a source, a format, a range or an output that cannot be.
     """
-    from scas4d_core.exports.formats import check_suffix, format_of
+    from scas4d_core.exports.formats import WITH_PARTS, check_suffix, format_of
     from scas4d_core.exports.sequence import export_sequence, other_frames
 
     wanted = format_of(format)

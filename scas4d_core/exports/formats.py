@@ -12,6 +12,8 @@ from scas4d_core.exports.usd import SUFFIXES as USD_SUFFIXES
 
 USER_AXES = "the user's: x right, y down, z forward"
 Y_UP = "x right, y up, z towards the viewer"
+WITH_PARTS = ("usd", "s4d")
+"""Formats that have parts where there are any, and do without."""
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,6 @@ NICE = 15
 """Added to its niceness: of a core that it shares with a scene's worker it gets about a tenth."""
 RESERVE_BYTES = 500_000_000
 """Room on the disk that exports leave to the frames of the scenes: about a thousand of them."""
-WITH_PARTS = ("usd", "s4d")
-"""Formats that have parts where there are any."""
 
 log = logging.getLogger("scas4d.exporter")
 
@@ -86,6 +84,7 @@ def size_of(folder: Path) -> int:
 
 def _export(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
     from scas4d_core.exports import export_sequence, format_of  # in this process only: the others stay light
+    from scas4d_core.exports.formats import WITH_PARTS
 
     history: History | None = None
     wanted = format_of(spec.format)
