@@ -7,12 +7,17 @@ import html
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import NDArray
 
 from client.cli.progress import console
 from client.exports.modules import script
 from client.exports.sources import STATES, CompactStates, Source, frame_range, opened
+from scas4d_core.cameras import Camera, Rig
 from scas4d_core.compact import CompactReader, CompactWriter
 from scas4d_core.errors import InputError
 
@@ -100,7 +105,11 @@ def _files(given: Source, low: int, high: int, count: int) -> Iterator[Sequence[
     parts = given.parts()
     with TemporaryDirectory() as folder:
         file = Path(folder) / "some.s4d"
-        with CompactWriter(file, given.head) as writer:
+        head = given.head
+        if head.rig is None:
+            _, _, first = next(given.states(low, high))
+            head = replace(head, rig=Rig((_facing(head.world.to_user(first.means)),)))
+        with CompactWriter(file, head) as writer:
             index = known = 0
             for index, time, state in given.states(low, high):
                 writer.add(index, time, state)
@@ -108,6 +117,21 @@ def _files(given: Source, low: int, high: int, count: int) -> Iterator[Sequence[
             if parts is not None and len(parts) >= known:
                 writer.add_parts(index, parts[:known])
         yield [file]
+
+
+def _facing(points: NDArray[np.float64]) -> Camera:
+    """A camera that sees points [N, 3] of the user's world from the front, along its z: where a source tells none.
+
+    >>> camera = _facing(np.array([[0.0, 0, 5], [1, 0, 5], [0, 1, 5], [1, 1, 5]]))
+    >>> pixels, depth = camera.project(np.array([[0.5, 0.5, 5]]))
+    >>> pixels.round(3).tolist(), bool(depth[0] > 1)
+    ([[320.0, 240.0]], True)
+    """
+    low, high = np.percentile(points, 2, axis=0), np.percentile(points, 98, axis=0)
+    centre, extent = (low + high) / 2, float(max((high - low).max(), 1e-9))
+    pose = np.eye(4)
+    pose[:3, 3] = np.array([0.0, 0.0, 1.8 * extent]) - centre
+    return Camera("front", np.array([[640.0, 0, 320], [0, 640, 240], [0, 0, 1]]), pose, 640, 480)
 
 
 def _held(files: Sequence[Path]) -> int:

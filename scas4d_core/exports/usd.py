@@ -195,7 +195,7 @@ class UsdSequence:
             geometry.Scope.Define(self._stage, "/World/Cameras")
             taken: set[str] = set()
             for number, camera in enumerate(self._rig.cameras):
-                name = names(camera.name)
+                name = names(f"cam_{camera.name}" if camera.name[:1].isdigit() else camera.name)
                 name = f"{name}_{number}" if name in taken else name
                 taken.add(name)
                 prim = geometry.Camera.Define(self._stage, f"/World/Cameras/{name}")

@@ -89,5 +89,6 @@ def package(name: str, export: str) -> Any:
         return importlib.import_module(name)
     except ImportError as error:
         raise InputError(
-            f"format {export!r} needs the package {name}, which is not installed", "pip install 'scas4d[exports]'"
+            f"format {export!r} needs the package {name}, which is not installed",
+            "in the project's folder: pip install -e '.[exports]'",
         ) from error

@@ -162,7 +162,10 @@ def _camera(given: Source, name: str | None, beside: Capture | None) -> Camera:
             other: camera for other, camera in cameras.items() if other not in given.head.rig.names
         }
     if not cameras:
-        raise InputError(f"{given.name} tells no cameras", "write it with its rig: scas4d reconstruct does")
+        raise InputError(
+            f"{given.name} tells no cameras; those of USD and .glb are not read back",
+            "give the folder of scas4d reconstruct, its .s4d file, or --beside a capture",
+        )
     if name is None:
         return next(iter(cameras.values()))
     if name not in cameras:

@@ -117,6 +117,10 @@ def _sequence(source: str, suffix: str, files: dict[int, tuple[str, Bytes]], rat
     frames, named = list(files), list(files.values())
     name, read = named[0]
     remarks = [f"numbered files have no times: {rate:g} frames a second are taken"] if len(frames) > 1 else []
+    if NUMBERED.fullmatch(name) is None:
+        remarks.append(
+            f"{name} tells no frame and is taken for frame 0: call it frame_000013{suffix} if it is frame 13"
+        )
     cloud: Callable[[int], Cloud]
     if suffix == ".ply":
         rows = PlyRows(named)
