@@ -83,7 +83,7 @@ def package(name: str, export: str) -> Any:
 
     >>> package("no_such_package", "usd")
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: format 'usd' needs the package no_such_package, which is not installed; pip ...
+    scas4d_core.errors.InputError: format 'usd' needs the package no_such_package, which is not installed; in ...
     """
     try:
         return importlib.import_module(name)
