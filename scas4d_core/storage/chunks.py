@@ -13,7 +13,7 @@ import re
 import weakref
 from bisect import bisect_right, insort
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -74,14 +74,9 @@ class Chunks:
         self._readers: OrderedDict[Path, tuple[Chunk, CompactReader]] = OrderedDict()
         weakref.finalize(self, _close_all, self._readers)
 
-    def look(self, names: Iterable[str] | None = None) -> None:
-        """Picks up chunks that are new, grew or are gone; others stay unopened.
-
-        Args:
-            names: of the files in the folder, where they are known.
-        """
-        listed = os.listdir(self.directory) if names is None else names
-        firsts = sorted(first for name in listed if (first := chunk_of(name)) is not None)
+    def look(self) -> None:
+        """Picks up chunks that are new, grew or are gone; others stay unopened."""
+        firsts = sorted(first for name in os.listdir(self.directory) if (first := chunk_of(name)) is not None)
         found = {first: chunk for first in firsts if (chunk := self._looked_at(first)) is not None}
         for first in self.known.keys() - found.keys():
             self._close(self.known[first].path)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from scas4d_core.compact import CompactWriter, FileError, Head
 from scas4d_core.storage.chunks import chunk_file, note_of
+from scas4d_core.storage.frame_files import frame_of
 from scas4d_core.storage.history import NEWEST_KEPT, History
 from scas4d_core.storage.npz import sync_folder
 
@@ -100,7 +101,8 @@ class Compaction:
     def _complete(self) -> None:
         """Deletes files of frames that are in a chunk, whole and on disk: a stop left them beside it."""
         first = next(iter(self._history.indices), -1)
-        own = [index for index in self._files.chunks if index != first and self._files.path(index).exists()]
+        names = map(frame_of, os.listdir(self._files.directory))
+        own = [index for index in names if index is not None and index != first and index in self._files.chunks]
         for path in {chunk.path for index in own if (chunk := self._files.chunks.of(index)) is not None}:
             _confirm(path)
         for index in own:

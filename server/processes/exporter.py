@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
-import signal
 from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -19,7 +17,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.storage.history import DamagedFrameError, History, HistoryError
 from server.processes.compact_answers import compact_head
 from server.processes.messages import Damaged, ExportEnded, ExportProgressed, ExportSpec
-from server.processes.placement import end_with_parent, use_one_thread
+from server.processes.placement import begin_aside, end_aside, use_one_thread
 from server.storage.disk import free_bytes, no_room
 
 NICE = 15
@@ -36,9 +34,7 @@ class ShortOfRoomError(RuntimeError):
 
 def main(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
     """Runs one export; the service ends the process when it is not wanted any more."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(NICE)
-    end_with_parent()
+    begin_aside(NICE)
     fault: str | None = None
     try:
         _export(spec, connection)
@@ -46,11 +42,7 @@ def main(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
         known = isinstance(error, InputError | HistoryError | ShortOfRoomError) or no_room(error)
         log.warning("scene %s: an export failed: %s", spec.scene.folder.name, error, exc_info=not known)
         fault = words(error)
-    with contextlib.suppress(EOFError, OSError):  # the service is gone
-        connection.send(ExportEnded(fault))
-        logging.shutdown()
-        connection.recv()  # until it is asked to stop: an end of its own would be taken for a fault
-    os._exit(0)
+    end_aside(connection, ExportEnded(fault))
 
 
 def words(error: Exception) -> str:

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import multiprocessing
 import os
 import queue
+import signal
 import threading
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, NoReturn
 
 from server.processes.messages import Stop
 
@@ -51,6 +53,26 @@ def end_with_parent() -> None:
         os._exit(0)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def begin_aside(nice: int) -> None:
+    """Begins a process that does one thing beside the updates: less eager than they are, and gone with its parent.
+
+    Args:
+        nice: added to its niceness.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the service says when to stop
+    os.nice(nice)
+    end_with_parent()
+
+
+def end_aside(connection: Connection[Any, Any], ended: Any) -> NoReturn:
+    """Ends it: sends its last message, and waits to be asked to stop. An end of its own would be taken for a fault."""
+    with contextlib.suppress(EOFError, OSError):  # the service is gone
+        connection.send(ended)
+        logging.shutdown()
+        connection.recv()
+    os._exit(0)
 
 
 def use_one_thread() -> None:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
-import signal
 from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
@@ -13,7 +10,7 @@ from typing import Any
 from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History
 from server.processes.messages import Damaged, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
-from server.processes.placement import end_with_parent, use_one_thread
+from server.processes.placement import begin_aside, end_aside, use_one_thread
 from server.processes.worker import decode, read
 
 NICE = 15
@@ -26,20 +23,14 @@ log = logging.getLogger("scas4d.replayer")
 
 def main(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
     """Runs one replay; the service ends the process when its answer is not wanted any more."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(NICE)
-    end_with_parent()
+    begin_aside(NICE)
     fault: str | None = None
     try:
         _replay(spec, connection)
     except Exception as error:  # whatever the core raises, the service goes on and says so
         log.exception("scene %s: the replay failed", spec.scene.folder.name)
         fault = f"{type(error).__name__}: {message_of(error)}"
-    with contextlib.suppress(EOFError, OSError):  # the service is gone
-        connection.send(ReplayEnded(fault))
-        logging.shutdown()
-        connection.recv()  # until it is asked to stop: an end of its own would be taken for a fault
-    os._exit(0)
+    end_aside(connection, ReplayEnded(fault))
 
 
 def _replay(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
