@@ -13,7 +13,7 @@ import numpy as np
 
 from client.importers.open_source import open_source
 from scas4d_core import metrics
-from scas4d_core.cameras import WorldFrame
+from scas4d_core.cameras import WorldFrame, rig_inside
 from scas4d_core.captures import Capture
 from scas4d_core.compact import Bounds, CompactReader, CompactWriter, Head
 from scas4d_core.compact.records import Kind, scan
@@ -21,6 +21,7 @@ from scas4d_core.compact.writer import KEY_EVERY
 from scas4d_core.errors import InputError
 from scas4d_core.gaussians import UNBORN, Gaussians, moving_extent
 from scas4d_core.query.committed import CommittedScene
+from scas4d_core.rasterize.limits import DEFAULT, Limits, scene_limits
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 
@@ -186,13 +187,14 @@ def _pictures(
     rig = capture.test_rig
     if rig is None:
         return None, None
+    limits = scene_limits(Settings().scene.near, rig_inside(world, capture.rig.cameras).radius)
     chosen = [history.indices[k] for k in np.linspace(1, len(history.indices) - 1, VIEWS).astype(int)]
     losses = []
     for index in chosen:
         truth = capture.test_frame(index)
         scores = []
         for state in (decoded[index], history.gaussians(index)):
-            scene = _scene(world, {index: state})
+            scene = _scene(world, {index: state}, limits)
             found = [
                 metrics.psnr(scene.render(camera, background=history.background).colour, truth.images[camera.name])
                 for camera in rig.cameras
@@ -214,10 +216,10 @@ def _tracks(world: WorldFrame, history: History, decoded: Mapping[int, Gaussians
     return float(100 * np.nanmedian(np.linalg.norm(tracks[0] - tracks[1], axis=-1)) / extent)
 
 
-def _scene(world: WorldFrame, states: Mapping[int, Gaussians]) -> CommittedScene:
+def _scene(world: WorldFrame, states: Mapping[int, Gaussians], limits: Limits = DEFAULT) -> CommittedScene:
     history = History()
     for index, state in states.items():
         known = history.ids if len(history) else state.ids
         born = np.full(len(state) - len(known), UNBORN, np.int64)  # they get ids of this history
         history.append(index, float(index), state.replace(ids=np.concatenate([known, born])))
-    return CommittedScene(history, world)
+    return CommittedScene(history, world, limits)
