@@ -21,7 +21,7 @@ from scas4d_core.compact.columns import (
     turns_of,
     vectors_of,
 )
-from scas4d_core.compact.frame_code import MARGIN, completed, lost_volume, whole_steps
+from scas4d_core.compact.frame_code import completed, lost_volume
 from scas4d_core.compact.planes import Ints, PlaneError, pack, unpack
 from scas4d_core.compact.sections import (
     read_array,
@@ -33,6 +33,7 @@ from scas4d_core.compact.sections import (
     write_mask,
     write_residuals,
 )
+from scas4d_core.compact.told import MARGIN, whole_steps
 
 Float = NDArray[np.float64]
 

@@ -74,6 +74,10 @@ class Clusters:
         table[STANDS], table[1:] = stands, values
         return table[self.labels]
 
+    def rows(self, rows: NDArray[np.intp]) -> Clusters:
+        """Those of some Gaussians: of all that move at least, so that each cluster is the same."""
+        return Clusters(self.labels[rows])
+
     def joined(self, labels: Ints) -> Clusters:
         """With those of more Gaussians after them."""
         return Clusters(np.concatenate([self.labels, labels]))

@@ -96,6 +96,18 @@ class Columns:
         rows = {name: getattr(self, name)[..., count:] for name in BY_ROW}
         return self.having(**rows, gloss=None, environment=None)
 
+    def rows(self, rows: NDArray[np.intp]) -> Columns:
+        """Some of the Gaussians, dull."""
+        taken = {name: np.take(getattr(self, name), rows, axis=-1) for name in BY_ROW}
+        return self.having(**taken, gloss=None, environment=None)
+
+    def placed(self, rows: NDArray[np.intp], part: Columns) -> Columns:
+        """The same with place and shape of some rows exchanged."""
+        changed = {name: getattr(self, name).copy() for name in SHAPED}
+        for name, array in changed.items():
+            array[..., rows] = getattr(part, name)
+        return self.having(**changed)
+
     @property
     def moving(self) -> NDArray[np.bool_]:
         """[N] bool: the Gaussians that move, by their label; none that is retired."""
@@ -117,6 +129,8 @@ class Columns:
 
 BY_ROW = ("means", "factors", "rotations", "colours", "foreground", "ids", "opacities", "retired")
 """Arrays with a column for each Gaussian."""
+SHAPED = BY_ROW[:3]
+"""Those of them that say where a Gaussian is and of which shape."""
 
 
 def sizes_of(factors: Array) -> Array:

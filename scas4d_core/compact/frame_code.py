@@ -6,40 +6,27 @@ The reference is a decoded state, so errors do not add up: what one frame leaves
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.compact.bounds import Bounds
 from scas4d_core.compact.cluster_motion import ClusterMotion, Clusters
-from scas4d_core.compact.columns import (
-    LABELS,
-    Columns,
-    by_green,
-    label_of,
-    levels_of,
-    mapped,
-    of_green,
-    products,
-    turns_between,
-    turns_of,
-    vectors_of,
-)
+from scas4d_core.compact.columns import Columns, turns_between, vectors_of
 from scas4d_core.compact.planes import Ints, PlaneError, pack, unpack
 from scas4d_core.compact.sections import (
     read_array,
     read_exact,
     read_mask,
-    read_residuals,
+    read_told,
     write_array,
     write_exact,
     write_mask,
     write_residuals,
 )
-from scas4d_core.gaussians import rotation_rows
+from scas4d_core.compact.told import LARGEST, SHAPE, Told, looks, told_shape, whole_steps
 
 Array = NDArray[np.float32]
 Float = NDArray[np.float64]
@@ -47,14 +34,8 @@ Float = NDArray[np.float64]
 FLAT = 0.1
 """A decoded Gaussian whose volume is not between this part of the true one and its inverse is told exactly: thin ones,
 whose error in an axis is as large as the axis, would lose their volume or turn inside out."""
-SCALE_STEP = 0.08
-"""Step of the logarithm of a size; so the size that steps are parts of is within four percent of the true one."""
-MARGIN = 0.95
-"""Of steps that are parts of a size, for that."""
 SLACK = 1 + 1e-4
 """On bounds, for the rounding of float32."""
-LARGEST = 1 << 30
-"""Residuals from here on, in steps, are told exactly, as are numbers that are not finite."""
 SHIFT_STEP = 0.5
 """Step of a cluster's motion in parts of the middle step of a centre."""
 COARSEST = 0.01
@@ -93,29 +74,115 @@ def encode(reference: Columns, state: Columns, clusters: Clusters, bounds: Bound
     >>> bool((again.means == coded.decoded.means).all())
     True
     """
-    motion = ClusterMotion.between(clusters, reference, state)
-    steps = _steps(clusters, reference, bounds)
+    rows, still = _changing(reference, state, clusters, bounds)
+    before, true, own = reference, state, clusters
+    if rows is not None:
+        before, true, own = reference.rows(rows), state.rows(rows), clusters.rows(rows)
+    motion = ClusterMotion.between(own, before, true)
+    steps = _steps(own, before, bounds)
     planes = np.rint(np.concatenate([motion.matrices.reshape(-1, 9) / steps[0], motion.shifts / steps[1]], axis=1).T)
     planes = np.clip(planes, -LARGEST, LARGEST).astype(np.int64)
-    told = _Told.of(bounds, _moved(reference, clusters, planes, steps))
-    exact = np.zeros(len(state), np.bool_)
+    told = Told.of(bounds, _moved(before, own, planes, steps))
+    exact = np.zeros(len(true), np.bool_)
     sections = [_STEPS.pack(*steps), *(pack(plane) for plane in planes)]
-    for name in told.names:
-        residual, beyond = whole_steps(told.residual(name, state))
-        exact[: len(beyond)] |= beyond
+    for name in SHAPE:
+        residual, beyond = whole_steps(told.residual(name, true))
+        exact |= beyond
+        sections.append(write_residuals(residual, rows, len(state)))
+        told = told.having(name, residual)
+    exact |= _beyond(told.state, true, bounds)
+    exactly, values = np.flatnonzero(exact), np.concatenate([true.means[:, exact], true.factors[:, exact]])
+    shaped = completed(told.state, exactly, values)
+    errors = {name: max(float(each.max(initial=0)), still.get(name, 0)) for name, each in _apart(shaped, true).items()}
+    told = replace(told, state=shaped if rows is None else reference.placed(rows, shaped))
+    for name in looks(state):
+        residual, _ = whole_steps(told.residual(name, state))
         sections.append(write_residuals(residual))
         told = told.having(name, residual)
-    exact |= _beyond(told.state, state, bounds)
-    rows = np.flatnonzero(exact)
-    values = np.concatenate([state.means[:, rows], state.factors[:, rows]])
-    sections.append(write_exact(rows, values))
+    sections.append(write_exact(exactly if rows is None else rows[exactly], values))
     retired, environment = state.retired, state.environment
     sections.append(write_mask(None if np.array_equal(reference.retired, retired) else retired))
     if environment is not None and reference.environment is not None:
         environment = None if np.array_equal(environment, reference.environment) else environment
     sections.append(write_array(environment))
-    decoded = completed(told.state, rows, values, retired, environment)
-    return Coded(b"".join(sections), decoded, errors_of(decoded, state))
+    decoded = completed(told.state, retired=retired, environment=environment)
+    return Coded(b"".join(sections), decoded, errors | _unlike(decoded, state))
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """What the body of one state tells.
+
+    Attributes:
+        steps: of A and t. motion: [12, clusters] in these steps.
+        residuals: of each attribute, [R] rows and [P, R] whole steps.
+        rows, values: what is told exactly, [E] and [12, E]. retired, environment: None where they are as before.
+    """
+
+    steps: tuple[float, float]
+    motion: NDArray[np.int64]
+    residuals: Mapping[str, tuple[NDArray[np.intp], Ints]]
+    rows: NDArray[np.intp]
+    values: Array
+    retired: NDArray[np.bool_] | None
+    environment: Array | None
+
+    @classmethod
+    def read(cls, body: bytes, reference: Columns, clusters: Clusters) -> Change:
+        """Reads a body.
+
+        Args:
+            reference, clusters: of the same Gaussians.
+
+        Raises:
+            PlaneError: the bytes are no such state.
+        """
+        if len(body) < _STEPS.size:
+            raise PlaneError(f"{len(body)} bytes are no state")
+        steps = _STEPS.unpack_from(body)
+        if not np.isfinite(steps).all():
+            raise PlaneError(f"steps {steps} cannot be")
+        offset, motion = _STEPS.size, np.zeros((12, clusters.count), np.int64)
+        for plane in motion:
+            plane[:], offset = unpack(body, clusters.count, offset)
+        residuals = {}
+        for name in (*SHAPE, *looks(reference)):
+            rows, planes, offset = read_told(body, offset, *told_shape(reference, name))
+            residuals[name] = rows, planes
+        rows, values, offset = read_exact(body, offset, len(reference), 12)
+        retired, offset = read_mask(body, offset, len(reference))
+        environment, offset = read_array(body, offset)
+        if offset != len(body):
+            raise PlaneError(f"{len(body) - offset} bytes follow the state")
+        return cls(steps, motion, residuals, rows, values, retired, environment)
+
+    def shaped(self, state: Columns, clusters: Clusters, bounds: Bounds, places: NDArray[np.intp] | None) -> Columns:
+        """A state with the changes of centres, axes and rotations; what is glossy turns with its cluster.
+
+        Args:
+            places: column of ``state`` of each row; None: they are the same.
+        """
+        told = Told.of(bounds, _moved(state, clusters, self.motion, self.steps))
+        for name in SHAPE:
+            rows, planes = self.residuals[name]
+            told = told.having(name, _dense(told.state, name, rows if places is None else places[rows], planes))
+        return completed(told.state, self.rows if places is None else places[self.rows], self.values)
+
+    def lit(self, state: Columns, bounds: Bounds) -> Columns:
+        """A state with all other changes."""
+        told = Told(bounds, state, np.zeros(0, np.float32))
+        for name in looks(state):
+            told = told.having(name, _dense(state, name, *self.residuals[name]))
+        return completed(told.state, retired=self.retired, environment=self.environment)
+
+
+def _dense(state: Columns, name: str, rows: NDArray[np.intp], planes: Ints) -> Ints:
+    """[P, N] residuals of all rows."""
+    if len(rows) == told_shape(state, name)[1]:
+        return planes
+    dense = np.zeros(told_shape(state, name), np.int32)
+    dense[:, rows] = planes
+    return dense
 
 
 def decode(reference: Columns, clusters: Clusters, bounds: Bounds, body: bytes) -> Columns:
@@ -127,38 +194,55 @@ def decode(reference: Columns, clusters: Clusters, bounds: Bounds, body: bytes) 
     Raises:
         PlaneError: the bytes are no such state.
     """
-    if len(body) < _STEPS.size:
-        raise PlaneError(f"{len(body)} bytes are no state")
-    steps = _STEPS.unpack_from(body)
-    if not np.isfinite(steps).all():
-        raise PlaneError(f"steps {steps} cannot be")
-    offset, planes = _STEPS.size, np.zeros((12, clusters.count), np.int64)
-    for plane in planes:
-        plane[:], offset = unpack(body, clusters.count, offset)
-    told = _Told.of(bounds, _moved(reference, clusters, planes, steps))
-    for name in told.names:
-        residual, offset = read_residuals(body, offset, *told.shape(name))
-        told = told.having(name, residual)
-    rows, values, offset = read_exact(body, offset, len(reference), 12)
-    retired, offset = read_mask(body, offset, len(reference))
-    environment, offset = read_array(body, offset)
-    if offset != len(body):
-        raise PlaneError(f"{len(body) - offset} bytes follow the state")
-    return completed(told.state, rows, values, retired, environment)
+    return after(reference, clusters, bounds, [Change.read(body, reference, clusters)])
+
+
+def after(reference: Columns, clusters: Clusters, bounds: Bounds, changes: Sequence[Change]) -> Columns:
+    """A state after several changes, one by one, of the same Gaussians; what stands all the while is not touched."""
+    state, places, own = reference, None, clusters
+    if not _whole(reference, clusters):
+        chosen = clusters.labels > 0
+        for change in changes:
+            for told in (change.rows, *(change.residuals[name][0] for name in SHAPE)):
+                chosen[told] = True
+        rows, places = np.flatnonzero(chosen), np.cumsum(chosen) - 1
+        state, own = reference.rows(rows), clusters.rows(rows)
+    if places is None:
+        for change in changes:
+            state = change.lit(change.shaped(state, own, bounds, None), bounds)
+        return state
+    for change in changes:
+        state = change.shaped(state, own, bounds, places)
+    state = reference.placed(rows, state)
+    for change in changes:
+        state = change.lit(state, bounds)
+    return state
 
 
 def errors_of(decoded: Columns, state: Columns) -> dict[str, float]:
     """The largest error of each attribute of a decoded state, in the units of ``Bounds``."""
-    sizes = np.maximum(state.sizes(), 1e-12)
+    apart = {name: float(errors.max(initial=0)) for name, errors in _apart(decoded, state).items()}
+    return apart | _unlike(decoded, state)
 
-    def largest(found: Array, true: Array, unit: Array | float = 1.0) -> float:
-        return float((np.abs(found - true) / unit).max(initial=0))
 
+def _apart(decoded: Columns, state: Columns) -> dict[str, Array]:
+    """[N] the error of each Gaussian in centre, axes and rotation."""
+    sizes = np.maximum(state.sizes(), np.float32(1e-12))
     turns = vectors_of(turns_between(state.rotations, decoded.rotations))
+    return {
+        "position": np.abs(decoded.means - state.means).max(axis=0) / sizes,
+        "axes": np.abs(decoded.factors - state.factors).max(axis=0) / sizes,
+        "rotation": np.sqrt(np.square(turns).sum(axis=0)),
+    }
+
+
+def _unlike(decoded: Columns, state: Columns) -> dict[str, float]:
+    """The largest errors in what a Gaussian looks like."""
+
+    def largest(found: Array, true: Array) -> float:
+        return float(np.abs(found - true).max(initial=0))
+
     found = {
-        "position": largest(decoded.means, state.means, sizes),
-        "axes": largest(decoded.factors, state.factors, sizes),
-        "rotation": float(np.sqrt(np.square(turns).sum(axis=0)).max(initial=0)),
         "colour": largest(decoded.colours, state.colours),
         "opacity": largest(decoded.opacities, state.opacities),
     }
@@ -167,87 +251,26 @@ def errors_of(decoded: Columns, state: Columns) -> dict[str, float]:
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class _Told:
-    """A state as far as it is told: what clusters foretell, and attributes one after the other.
+def _whole(reference: Columns, clusters: Clusters) -> bool:
+    """Whether a state is told row by row: where all move, or have gloss, looking for what stands only takes time."""
+    return reference.gloss is not None or bool(clusters.labels.all())
 
-    What comes first helps the next: axes turn with the rotation, and steps are parts of the told size.
+
+def _changing(
+    reference: Columns, state: Columns, clusters: Clusters, bounds: Bounds
+) -> tuple[NDArray[np.intp] | None, dict[str, float]]:
+    """[E] the Gaussians whose shape or place is told: they move, or are off by more than the bounds; None for all.
+
+    Returns:
+        And the largest errors of the others.
     """
-
-    bounds: Bounds
-    state: Columns
-    sizes: Array
-    """[N] metres, as they are told so far."""
-
-    @classmethod
-    def of(cls, bounds: Bounds, state: Columns) -> _Told:
-        return cls(bounds, state, state.sizes())
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        names = ("sizes", "rotations", "factors", "means", "colours", "foreground")
-        return names if self.state.gloss is None else (*names, "gloss")
-
-    def shape(self, name: str) -> tuple[int, int]:
-        """Components and rows."""
-        if name == "gloss" and self.state.gloss is not None:
-            return 3, self.state.gloss.shape[1]
-        return {"sizes": 1, "factors": 9, "foreground": 1}.get(name, 3), len(self.state)
-
-    def _step(self, name: str) -> Array | np.float32:
-        bounds = self.bounds
-        if name in ("means", "factors"):
-            part = bounds.position if name == "means" else bounds.axes
-            return np.asarray(np.float32(2 * part * MARGIN) * self.sizes, np.float32)
-        if name == "rotations":
-            return np.float32(bounds.rotation_step)
-        return np.float32(2 * (bounds.colour if name == "colours" else bounds.gloss))
-
-    def residual(self, name: str, state: Columns) -> NDArray[Any]:
-        """[P, N] what a state has beside, in whole steps."""
-        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            if name == "sizes":
-                steps = np.rint(np.log(state.sizes() / self.sizes) / SCALE_STEP)
-                return np.asarray(np.nan_to_num(steps, posinf=0, neginf=0))[None]
-            if name == "foreground":
-                return np.asarray(levels_of(state.foreground) - levels_of(self.state.foreground))[None]
-            if name == "rotations":
-                vectors = vectors_of(turns_between(state.rotations, self.state.rotations))
-                return np.asarray(np.rint(vectors / self._step(name)))
-            found = np.rint((getattr(state, name) - getattr(self.state, name)) / self._step(name))
-        return np.asarray(by_green(found) if name == "colours" else found)
-
-    def having(self, name: str, residual: Ints) -> _Told:
-        """The same with another attribute."""
-        if not residual.any():
-            return self
-        if name == "sizes":
-            scales = np.exp(np.float32(SCALE_STEP) * np.clip(residual[0], -500, 500).astype(np.float32))
-            return replace(
-                self, state=self.state.having(factors=self.state.factors * scales), sizes=self.sizes * scales
-            )
-        if name == "foreground":
-            levels = np.clip(levels_of(self.state.foreground) + residual[0], 0, LABELS - 1)
-            return replace(self, state=self.state.having(foreground=label_of(levels)))
-        if name == "rotations":
-            return self._turned(residual.astype(np.float32) * self._step(name))
-        if name == "colours":
-            residual = of_green(residual)
-        changed = getattr(self.state, name) + residual.astype(np.float32) * self._step(name)
-        return replace(self, state=self.state.having(**{name: changed}))
-
-    def _turned(self, vectors: Array) -> _Told:
-        turns = turns_of(vectors)
-        factors = np.stack(mapped(rotation_rows(turns), self.state.factors))
-        rotations = products(turns, self.state.rotations)
-        rotations /= np.sqrt(np.square(rotations).sum(axis=0))
-        return replace(self, state=self.state.having(rotations=rotations, factors=factors))
-
-
-def whole_steps(found: NDArray[Any]) -> tuple[Ints, NDArray[np.bool_]]:
-    """[P, N] as whole numbers, 0 for those that are none or too large, and [N] whether a row has any of these."""
-    outside = ~(np.abs(found) < LARGEST)
-    return np.where(outside, 0, found).astype(np.int32), outside.any(axis=0)
+    if _whole(reference, clusters):
+        return None, {}
+    errors = _apart(reference, state)
+    changing = lost_volume(reference, state) | (clusters.labels > 0)
+    for name, error in errors.items():
+        changing |= ~(error <= getattr(bounds, name))
+    return np.flatnonzero(changing), {name: float(error[~changing].max(initial=0)) for name, error in errors.items()}
 
 
 def _moved(reference: Columns, clusters: Clusters, planes: NDArray[np.int64], steps: tuple[float, float]) -> Columns:
@@ -286,14 +309,18 @@ def lost_volume(found: Columns, true: Columns) -> NDArray[np.bool_]:
 
 
 def completed(
-    state: Columns, rows: NDArray[np.intp], values: Array, retired: NDArray[np.bool_] | None, environment: Array | None
+    state: Columns,
+    rows: NDArray[np.intp] | None = None,
+    values: Array | None = None,
+    retired: NDArray[np.bool_] | None = None,
+    environment: Array | None = None,
 ) -> Columns:
     """A state with what is told exactly: centres and axes [12, E] of some rows, who is retired, what is mirrored.
 
     Args:
-        retired, environment: None where the state's own hold.
+        rows, values: None for no rows. retired, environment: None where the state's own hold.
     """
-    if len(rows):
+    if rows is not None and values is not None and len(rows):
         means, factors = state.means.copy(), state.factors.copy()
         means[:, rows], factors[:, rows] = values[:3], values[3:]
         state = state.having(means=means, factors=factors)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from scas4d_core.compact.birth_code import decode_born
 from scas4d_core.compact.cluster_motion import Clusters
 from scas4d_core.compact.columns import Columns
-from scas4d_core.compact.frame_code import decode
+from scas4d_core.compact.frame_code import Change, after
 from scas4d_core.compact.head import Head
 from scas4d_core.compact.index import read_index
-from scas4d_core.compact.notes import read_note
 from scas4d_core.compact.planes import PlaneError, unpack
 from scas4d_core.compact.records import (
     HEAD_SIZE,
@@ -28,9 +27,11 @@ from scas4d_core.compact.records import (
     Record,
     checksum_bytes,
     read_body,
+    read_note,
     record_bytes,
     scan,
 )
+from scas4d_core.compact.told import LastTold
 from scas4d_core.gaussians import Gaussians
 
 __all__ = ["CompactReader", "DamagedFileError", "FileError"]
@@ -38,24 +39,6 @@ __all__ = ["CompactReader", "DamagedFileError", "FileError"]
 STATES = (Kind.KEY, Kind.DELTA)
 MOST_PER_BYTE = 4
 """Gaussians for each byte that tells of them; a count that lies must not fill the memory."""
-
-
-@dataclass(frozen=True, eq=False)
-class LastTold:
-    """The end of a file that is gone on with.
-
-    Attributes:
-        head: of the file. records: up to the last state. told: the record of that. state: that, as it is read.
-        born, clusters: of all Gaussians so far, as they were told. since_key: states since the last key.
-    """
-
-    head: Head
-    records: tuple[Record, ...]
-    told: Record
-    state: Columns
-    born: Columns
-    clusters: Clusters
-    since_key: int
 
 
 class CompactReader:
@@ -177,10 +160,10 @@ class CompactReader:
                 break
             begin -= 1
         state = self._last[1] if self._last is not None and self._last[0] == begin else None
-        for one in range(begin if state is None else begin + 1, place + 1):
-            state = self._decoded(one, state)
-            self._last = (one, state)
+        for _, places in groupby(range(begin if state is None else begin + 1, place + 1), self._births_by):
+            state = self._decoded(list(places), state)
         assert state is not None
+        self._last = (place, state)
         return state.gaussians()
 
     def copied(self, first: int, last: int, file: BinaryIO) -> list[int]:
@@ -287,15 +270,30 @@ class CompactReader:
         elif record.kind is Kind.NOTE:
             self._notes[record.frame] = record
 
-    def _decoded(self, place: int, before: Columns | None) -> Columns:
-        record = self._states[place]
-        born, clusters = self._born_by(record.frame)
-        if record.kind is Kind.BORN:
+    def _births_by(self, place: int) -> int:
+        """Times that Gaussians were born by a state; −1 for that which they are themselves."""
+        state = self._states[place]
+        return -1 if state.kind is Kind.BORN else sum(birth.frame <= state.frame for birth in self._births)
+
+    def _decoded(self, places: list[int], before: Columns | None) -> Columns:
+        """The last of some states of the same Gaussians, of which only the first may be a key; ``before`` them."""
+        first = self._states[places[0]]
+        born, clusters = self._born_by(first.frame)
+        if first.kind is Kind.BORN:
             return born
-        if record.kind is Kind.KEY or before is None:
+        if first.kind is Kind.KEY or before is None:
             before = born
         elif len(before) < len(born):
             before = before.joined(born.after(len(before)))
+        changes = [self._change(place, before, clusters) for place in places]
+        try:
+            return after(before, clusters, self.head.bounds, changes)
+        except ValueError as error:
+            raise self._damaged(self._states[places[-1]], error) from None
+
+    def _change(self, place: int, reference: Columns, clusters: Clusters) -> Change:
+        """What the record of a state tells."""
+        record = self._states[place]
         body = read_body(self._file, record, self.path.name)
         if record.kind is Kind.DELTA:
             told = checksum_bytes(self._states[place - 1])
@@ -303,7 +301,7 @@ class CompactReader:
                 raise self._damaged(record, PlaneError("the state before it is another one"))
             body = body[len(told) :]
         try:
-            return decode(before, clusters, self.head.bounds, body)
+            return Change.read(body, reference, clusters)
         except (PlaneError, ValueError) as error:
             raise self._damaged(record, error) from None
 

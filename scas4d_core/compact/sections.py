@@ -20,8 +20,11 @@ LARGEST_ARRAY = 1 << 24
 """Bytes; no exact array is larger."""
 
 
-def write_residuals(planes: Ints) -> bytes:
+def write_residuals(planes: Ints, rows: NDArray[np.intp] | None = None, total: int = 0) -> bytes:
     """[P, N] residuals of an attribute: of no row, of all, or of those that a mask names; component by component.
+
+    Args:
+        rows: [N] those of ``total`` that the planes are of; None: they are of all.
 
     >>> planes = np.array([[0, 0, 5, 0], [0, 0, 1, 0]])
     >>> read_residuals(write_residuals(planes), 0, 2, 4)[0]
@@ -29,28 +32,43 @@ def write_residuals(planes: Ints) -> bytes:
            [0, 0, 1, 0]], dtype=int32)
     """
     changed: NDArray[np.bool_] = np.any(planes, axis=0)
-    share = np.count_nonzero(changed) / max(len(changed), 1)
-    if share == 0:
+    if not changed.any():
         return bytes([NONE])
-    if share >= SPARSE:
-        return bytes([ALL]) + b"".join(pack(plane) for plane in planes)
-    return write_mask(changed) + b"".join(pack(plane) for plane in planes[:, changed])
+    every = changed
+    if rows is not None:
+        every = np.zeros(total, np.bool_)
+        every[rows] = changed
+    if np.count_nonzero(every) < SPARSE * len(every):
+        return write_mask(every) + b"".join(pack(plane) for plane in planes[:, changed])
+    if rows is not None:
+        planes, some = np.zeros((len(planes), total), np.int32), planes
+        planes[:, rows] = some
+    return bytes([ALL]) + b"".join(pack(plane) for plane in planes)
 
 
 def read_residuals(body: bytes, offset: int, components: int, rows: int) -> tuple[Ints, int]:
     """[components, rows] residuals of a section, and where it ends; raises PlaneError."""
-    kind, offset = _read_kind(body, offset)
+    chosen, told, offset = read_told(body, offset, components, rows)
+    if len(chosen) == rows:
+        return told, offset
     planes = np.zeros((components, rows), np.int32)
+    planes[:, chosen] = told
+    return planes, offset
+
+
+def read_told(body: bytes, offset: int, components: int, rows: int) -> tuple[NDArray[np.intp], Ints, int]:
+    """[R] the rows that a section has residuals of, [components, R] these, and where it ends; raises PlaneError."""
+    kind, offset = _read_kind(body, offset)
     if kind == NONE:
-        return planes, offset
-    chosen: Any = slice(None)
-    count = rows
+        return np.zeros(0, np.intp), np.zeros((components, 0), np.int32), offset
+    chosen = np.arange(rows)
     if kind == SOME:
         mask, offset = _read_bits(body, offset, rows)
-        chosen, count = np.flatnonzero(mask), int(np.count_nonzero(mask))
+        chosen = np.flatnonzero(mask)
+    planes = np.empty((components, len(chosen)), np.int32)
     for plane in planes:
-        plane[chosen], offset = unpack(body, count, offset)
-    return planes, offset
+        plane[:], offset = unpack(body, len(chosen), offset)
+    return chosen, planes, offset
 
 
 def write_mask(mask: NDArray[np.bool_] | None) -> bytes:

@@ -19,10 +19,9 @@ from scas4d_core.compact.columns import Columns
 from scas4d_core.compact.frame_code import encode, errors_of
 from scas4d_core.compact.head import Head
 from scas4d_core.compact.index import footer, index_body
-from scas4d_core.compact.notes import note_bytes
 from scas4d_core.compact.planes import pack
 from scas4d_core.compact.reader import STATES, CompactReader
-from scas4d_core.compact.records import FileError, Kind, Record, checksum_bytes, parse_head, record_bytes
+from scas4d_core.compact.records import FileError, Kind, Record, checksum_bytes, note_bytes, parse_head, record_bytes
 from scas4d_core.gaussians import Gaussians
 
 ERRORS = "errors"
@@ -193,7 +192,7 @@ class CompactWriter:
             if _glossy(state.gloss) != (0 if born.gloss is None else born.gloss.shape[1]):
                 raise FileError(f"{name}: frame {index} has gloss of {_glossy(state.gloss)} Gaussians, others before")
         for field in ("means", "factors", "rotations", "colours", "own_opacities", "gloss"):
-            if (array := getattr(state, field)) is None:
+            if (array := getattr(state, field)) is None or np.isfinite(array).all():
                 continue
             wrong = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))
             if len(wrong):

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scas4d_core.compact.bounds import Bounds
 from scas4d_core.compact.cluster_motion import PER_CLUSTER, ClusterMotion, Clusters, polar_rotations, quaternions_of
 from scas4d_core.compact.columns import Columns
-from scas4d_core.compact.frame_code import FLAT, Coded, decode, encode, errors_of
+from scas4d_core.compact.frame_code import FLAT, Change, Coded, after, decode, encode, errors_of
 from scas4d_core.compact.planes import PlaneError
 from scas4d_core.gaussians import Gaussians, quaternion_products
 
@@ -168,6 +168,32 @@ def test_errors_do_not_add_up() -> None:
         result = encode(told, Columns.of(true), clusters, BOUNDS)
         told = result.decoded
     assert within(dict(result.errors), BOUNDS)
+
+
+def test_states_are_the_same_told_at_once_or_one_by_one() -> None:
+    """Some of what stands is pushed, turned or lit once: whichever frames are read with it, its bits are the same."""
+    true = cloud()
+    standing = np.flatnonzero(~true.moving)
+    clusters, told = Clusters.of(true), Columns.of(true)
+    first, changes = told, []
+    for frame in range(6):
+        true = carried(true, Rotation.from_rotvec([0.02, 0.05, 0]), (0.01, 0, 0))
+        pushed, jogged = standing[frame::7], jittered(true, 0.3, seed=frame)
+        means, factors, rotations = true.means.copy(), true.factors.copy(), true.rotations.copy()
+        means[pushed], factors[pushed], rotations[pushed] = (
+            array[pushed] for array in (jogged.means, jogged.factors, jogged.rotations)
+        )
+        colours = true.colours.copy()
+        colours[standing[frame::5]] *= np.float32(0.9)
+        true = true.replace(means=means, factors=factors, rotations=rotations, colours=colours)
+        coded_state = encode(told, Columns.of(true), clusters, BOUNDS)
+        assert within(dict(coded_state.errors), BOUNDS)
+        changes.append(Change.read(coded_state.body, told, clusters))
+        told = coded_state.decoded
+    at_once = after(first, clusters, BOUNDS, changes)
+    for name in ("means", "factors", "rotations", "colours", "foreground"):
+        assert np.array_equal(getattr(at_once, name), getattr(told, name)), name
+    assert within(errors_of(at_once, Columns.of(true)), BOUNDS)
 
 
 @pytest.mark.parametrize("cut", [0, 5, 16, 40, 200, -1])

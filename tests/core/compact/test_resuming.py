@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from scas4d_core.compact import CompactReader, CompactWriter, DamagedFileError, FileError
-from scas4d_core.compact.notes import note_bytes, read_note
 from scas4d_core.compact.planes import PlaneError
+from scas4d_core.compact.records import note_bytes, read_note
 from tests.core.compact.test_files import BORN_AT, FRAMES, HEAD, TRUE, near
 
 

@@ -1,0 +1,147 @@
+"""A state as far as it is told: attribute by attribute, in whole steps of what the bounds allow. Numpy only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.compact.bounds import Bounds
+from scas4d_core.compact.cluster_motion import Clusters
+from scas4d_core.compact.columns import (
+    LABELS,
+    Columns,
+    by_green,
+    label_of,
+    levels_of,
+    mapped,
+    of_green,
+    products,
+    turns_between,
+    turns_of,
+    vectors_of,
+)
+from scas4d_core.compact.head import Head
+from scas4d_core.compact.planes import Ints
+from scas4d_core.compact.records import Record
+from scas4d_core.gaussians import rotation_rows
+
+Array = NDArray[np.float32]
+
+SCALE_STEP = 0.08
+"""Step of the logarithm of a size; so the size that steps are parts of is within four percent of the true one."""
+MARGIN = 0.95
+"""Of steps that are parts of a size, for that."""
+LARGEST = 1 << 30
+"""Residuals from here on, in steps, are told exactly, as are numbers that are not finite."""
+
+
+SHAPE = ("sizes", "rotations", "factors", "means")
+"""What is told first, in this order: each helps the next."""
+
+
+def looks(state: Columns) -> tuple[str, ...]:
+    """What is told after the shape, each by itself."""
+    return ("colours", "foreground") if state.gloss is None else ("colours", "foreground", "gloss")
+
+
+def told_shape(state: Columns, name: str) -> tuple[int, int]:
+    """Components and rows of what is told of an attribute."""
+    if name == "gloss" and state.gloss is not None:
+        return 3, state.gloss.shape[1]
+    return {"sizes": 1, "factors": 9, "foreground": 1}.get(name, 3), len(state)
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """A state as far as it is told: what clusters foretell, and attributes one after the other.
+
+    What comes first helps the next: axes turn with the rotation, and steps are parts of the told size.
+    """
+
+    bounds: Bounds
+    state: Columns
+    sizes: Array
+    """[N] metres, as they are told so far."""
+
+    @classmethod
+    def of(cls, bounds: Bounds, state: Columns) -> Told:
+        """A state of which nothing is told but what its clusters foretell."""
+        return cls(bounds, state, state.sizes())
+
+    def _step(self, name: str) -> Array | np.float32:
+        bounds = self.bounds
+        if name in ("means", "factors"):
+            part = bounds.position if name == "means" else bounds.axes
+            return np.asarray(np.float32(2 * part * MARGIN) * self.sizes, np.float32)
+        if name == "rotations":
+            return np.float32(bounds.rotation_step)
+        return np.float32(2 * (bounds.colour if name == "colours" else bounds.gloss))
+
+    def residual(self, name: str, state: Columns) -> NDArray[Any]:
+        """[P, N] what a state has beside, in whole steps."""
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            if name == "sizes":
+                steps = np.rint(np.log(state.sizes() / self.sizes) / SCALE_STEP)
+                return np.asarray(np.nan_to_num(steps, posinf=0, neginf=0))[None]
+            if name == "foreground":
+                return np.asarray(levels_of(state.foreground) - levels_of(self.state.foreground))[None]
+            if name == "rotations":
+                vectors = vectors_of(turns_between(state.rotations, self.state.rotations))
+                return np.asarray(np.rint(vectors / self._step(name)))
+            found = np.rint((getattr(state, name) - getattr(self.state, name)) / self._step(name))
+        return np.asarray(by_green(found) if name == "colours" else found)
+
+    def having(self, name: str, residual: Ints) -> Told:
+        """The same with another attribute."""
+        if not residual.any():
+            return self
+        if name == "sizes":
+            scales = np.exp(np.float32(SCALE_STEP) * np.clip(residual[0], -500, 500).astype(np.float32))
+            return replace(
+                self, state=self.state.having(factors=self.state.factors * scales), sizes=self.sizes * scales
+            )
+        if name == "foreground":
+            levels = np.clip(levels_of(self.state.foreground) + residual[0], 0, LABELS - 1)
+            return replace(self, state=self.state.having(foreground=label_of(levels)))
+        if name == "rotations":
+            return self._turned(residual.astype(np.float32) * self._step(name))
+        if name == "colours":
+            residual = of_green(residual)
+        changed = getattr(self.state, name) + residual.astype(np.float32) * self._step(name)
+        return replace(self, state=self.state.having(**{name: changed}))
+
+    def _turned(self, vectors: Array) -> Told:
+        turns = turns_of(vectors)
+        factors = np.stack(mapped(rotation_rows(turns), self.state.factors))
+        rotations = products(turns, self.state.rotations)
+        rotations /= np.sqrt(np.square(rotations).sum(axis=0))
+        # What does not turn keeps its bits, whichever other rows are told with it.
+        rotations = np.where(vectors.any(axis=0), rotations, self.state.rotations)
+        return replace(self, state=self.state.having(rotations=rotations, factors=factors))
+
+
+def whole_steps(found: NDArray[Any]) -> tuple[Ints, NDArray[np.bool_]]:
+    """[P, N] as whole numbers, 0 for those that are none or too large, and [N] whether a row has any of these."""
+    outside = ~(np.abs(found) < LARGEST)
+    return np.where(outside, 0, found).astype(np.int32), outside.any(axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class LastTold:
+    """The end of a file that is gone on with.
+
+    Attributes:
+        head: of the file. records: up to the last state. told: the record of that. state: that, as it is read.
+        born, clusters: of all Gaussians so far, as they were told. since_key: states since the last key.
+    """
+
+    head: Head
+    records: tuple[Record, ...]
+    told: Record
+    state: Columns
+    born: Columns
+    clusters: Clusters
+    since_key: int
