@@ -69,7 +69,8 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         settings.data.mkdir(parents=True, exist_ok=True)
         app.state.hub = Hub(settings.max_subscribers)
-        where = placement or Placement()
+        app.state.placement = where = placement or Placement()
+        await where.open()
         app.state.readiness = Readiness(settings, where)
         app.state.scenes = Scenes(settings, where, app.state.hub)
         await app.state.scenes.open()
@@ -79,6 +80,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         await app.state.exports.stop()
         await app.state.readiness.stop()
         await app.state.scenes.stop()
+        await where.close()
 
     app = FastAPI(
         title="SCas4D",

@@ -8,6 +8,7 @@ import logging
 import os
 import signal
 import socket
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -63,7 +64,7 @@ def serve(settings: ServerSettings) -> None:
     sockets = listen(settings.host, settings.port)
     keep_freed_memory()
     config = guarded(
-        create_app(_with_files(settings), Placement(prepare)),
+        create_app(_with_files(settings), _placement(settings, prepare)),
         log_config=None,
         access_log=False,
         timeout_graceful_shutdown=max(1, round(STOP_SECONDS)),
@@ -77,6 +78,23 @@ def serve(settings: ServerSettings) -> None:
     )
     Server(config, greeting).run(sockets)
     log.info("ended")
+
+
+def _placement(settings: ServerSettings, prepare: Callable[[], None]) -> Placement:
+    """Where processes of scenes run.
+
+    Raises:
+        RuntimeError: on a Ray cluster, and Ray is not installed.
+    """
+    if settings.placement == "local":
+        return Placement(prepare)
+    try:
+        from server.cluster.ray_placement import RayPlacement
+    except ModuleNotFoundError:
+        raise RuntimeError(
+            "placement is ray, and Ray is not installed; pip install 'scas4d[ray]', or take --placement local"
+        ) from None
+    return RayPlacement(prepare, settings.placement.partition("=")[2] or None, settings)
 
 
 def _with_files(settings: ServerSettings) -> ServerSettings:

@@ -158,6 +158,12 @@ class ServerSettings(BaseSettings):
         default="info", description="info has a line a request."
     )
 
+    placement: str = Field(
+        default="local",
+        pattern=r"^(local|ray(=\S+)?)$",
+        description="Where processes of scenes run: `local`, on this machine; `ray`, on the Ray cluster that runs here "
+        "or that RAY_ADDRESS names; `ray=HOST:6379`, on that one (docs/cluster.md).",
+    )
     max_scenes: int = Field(
         default=8,
         ge=1,

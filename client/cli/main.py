@@ -43,6 +43,9 @@ def serve(
     ] = None,
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="8000 where not set otherwise.")] = None,
     data: Annotated[Path | None, typer.Option(help="Folder of the scenes; ./data where not set otherwise.")] = None,
+    placement: Annotated[
+        str | None, typer.Option(help="`local`, or `ray[=HOST:PORT]`: scenes run on a Ray cluster (docs/cluster.md).")
+    ] = None,
     config: Annotated[
         Path | None, typer.Option(help="TOML file of settings; docs/operations.md lists them. The environment wins.")
     ] = None,
@@ -53,7 +56,7 @@ def serve(
     from server.serve import serve as run
     from server.settings import ServerSettings
 
-    run(ServerSettings.from_environment(host=host, port=port, data=data))
+    run(ServerSettings.from_environment(host=host, port=port, data=data, placement=placement))
 
 
 @app.command()

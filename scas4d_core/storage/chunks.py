@@ -25,6 +25,7 @@ from scas4d_core.compact import CompactReader, FileError
 from scas4d_core.errors import message_of
 from scas4d_core.storage.births import Int
 from scas4d_core.storage.frame_arrays import EVENTS, Arrays, Stamp
+from scas4d_core.storage.npz import written_whole
 
 REPORT = "report"
 """Name of the report in a frame's note."""
@@ -216,9 +217,10 @@ class Chunks:
         else:
             with CompactReader(chunk.path) as reader:
                 end = reader.end_before(index)
-            with chunk.path.open("r+b") as file:
-                file.truncate(end)
-                os.fsync(file.fileno())
+            beside = chunk.path.with_name(f".{chunk.path.name}.part")
+            # A new file in its place: the old one may have other links (server/storage/fencing.py).
+            with chunk.path.open("rb") as old, written_whole(chunk.path, beside) as file:
+                file.write(old.read(end))
         self.look()
 
 

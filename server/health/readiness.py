@@ -18,7 +18,7 @@ from typing import Any
 from scas4d_core.errors import message_of
 from server.problems import Problem
 from server.processes.messages import Stop
-from server.processes.placement import Placement, Process, end_with_parent
+from server.processes.placement import AnyProcess, Placement, end_with_parent
 from server.settings import ServerSettings
 
 log = logging.getLogger("scas4d.server")
@@ -79,7 +79,7 @@ class Readiness:
         self.stopping = False
         self.compiled: Compiled | None = None
         self._said = self._began
-        self._process: Process | None = None
+        self._process: AnyProcess | None = None
         if settings.warm_up:
             log.info("warming up the kernels; the first time they are compiled, which takes half a minute")
             self._process = placement.start(main, None, self._received, self._ended)

@@ -15,7 +15,11 @@ from server.storage.layout import SceneFolder
 
 @dataclass(frozen=True, eq=False)
 class SceneSpec:
-    """The scene as its processes are given it when they start."""
+    """The scene as its processes are given it when they start.
+
+    `takes_over`: of a worker with an epoch of its own (`folder.epoch`), the epoch whose states it goes on from; None:
+    there are none.
+    """
 
     folder: SceneFolder
     rig: Rig
@@ -23,6 +27,7 @@ class SceneSpec:
     minimum_cameras: int = 1
     kept: IngestSettings = field(default_factory=IngestSettings)
     frames_per_second: float | None = None
+    takes_over: int | None = None
 
 
 # To the worker.
@@ -90,6 +95,13 @@ class Ready:
     report: dict[str, Any] = field(default_factory=dict)
     undone: tuple[int, ...] = ()
     faults: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class WaitsForNode:
+    """The worker has not started: no machine has room for it. Sent by the placement."""
+
+    reason: str
 
 
 @dataclass(frozen=True)

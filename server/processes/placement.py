@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Protocol
 
 from server.processes.messages import Stop
 
@@ -36,9 +36,9 @@ class Ended(str):
 
     exit_code: int | None
 
-    def __new__(cls, exit_code: int | None) -> Ended:
-        """Makes the sentence for an exit code."""
-        self = super().__new__(cls, f"its process ended by itself (exit code {exit_code})")
+    def __new__(cls, exit_code: int | None, why: str = "") -> Ended:
+        """Makes the sentence for an exit code, or for another reason."""
+        self = super().__new__(cls, why or f"its process ended by itself (exit code {exit_code})")
         self.exit_code = exit_code
         return self
 
@@ -84,8 +84,22 @@ def use_one_thread() -> None:
     threadpool_limits(1)  # scikit-learn's threads spin while they wait: 16 s for a part query on busy cores
 
 
+class AnyProcess(Protocol):
+    """A running process of a scene, wherever it is."""
+
+    @property
+    def pid(self) -> int | None:
+        """The process id on its machine; None while it is not known."""
+
+    def send(self, message: Any) -> None:
+        """Posts a message and returns at once; messages to a process that has ended are dropped."""
+
+    async def stop(self, seconds: float = STOP_SECONDS) -> None:
+        """Asks the process to end, waits for `seconds`, then kills it."""
+
+
 class Process:
-    """A running process of a scene. Two threads move its messages, so that the event loop never waits on a pipe."""
+    """A running process on this machine. Two threads move its messages, and the event loop never waits on a pipe."""
 
     def __init__(
         self,
@@ -119,11 +133,11 @@ class Process:
         return self._process.pid
 
     def send(self, message: Any) -> None:
-        """Posts a message and returns at once; messages to a process that has ended are dropped."""
+        """See `AnyProcess`."""
         self._outbox.put(message)
 
     async def stop(self, seconds: float = STOP_SECONDS) -> None:
-        """Asks the process to end, waits for `seconds`, then kills it."""
+        """See `AnyProcess`."""
         self._stopping = True
         self.send(Stop())
         await asyncio.to_thread(self._join, seconds)
@@ -177,15 +191,20 @@ class Placement:
     Args:
         prepare: called first in every process, before its entry imports the core; it has to pickle. The service sets up
             its logs with it, and tests put a fake in place of the core.
+
+    Attributes:
+        fenced: workers get epochs (`server.storage.fencing`): one may go on after it was taken for dead.
     """
+
+    fenced = False
 
     def __init__(self, prepare: Callable[[], None] | None = None) -> None:
         self.prepare = prepare
 
     def start(
         self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[Ended], None]
-    ) -> Process:
-        """Spawns a process.
+    ) -> AnyProcess:
+        """Starts a process.
 
         Args:
             entry: the module-level function that runs there.
@@ -194,3 +213,9 @@ class Placement:
             on_end: called on the event loop once, with the reason, when the process ended without being asked to.
         """
         return Process(entry, spec, on_message, on_end, self.prepare)
+
+    async def open(self) -> None:
+        """Makes ready to start processes; called once, before any."""
+
+    async def close(self) -> None:
+        """Gives back what `open` took, when all processes have ended."""

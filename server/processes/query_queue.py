@@ -15,7 +15,7 @@ from functools import partial
 from server.health import metrics
 from server.problems import Problem, counted
 from server.processes.messages import Damaged, SceneSpec
-from server.processes.placement import Entry, Placement, Process
+from server.processes.placement import AnyProcess, Entry, Placement
 from server.processes.queries import Answer, AskedQuery, Query, Refused
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
@@ -72,7 +72,7 @@ class QueryQueue:
         self._damaged = damaged
         self._waiting: deque[_WaitingQuery] = deque()
         self._at_work: _WaitingQuery | None = None
-        self.process: Process | None = None
+        self.process: AnyProcess | None = None
         self._life: object = None
         self._ending: set[asyncio.Task[None]] = set()
         self._failures = 0

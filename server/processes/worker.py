@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import signal
@@ -44,7 +43,7 @@ from server.processes.messages import (
 from server.processes.placement import end_with_parent
 from server.repair import repairs
 from server.repair.repairs import mend_at_start
-from server.storage.disk import FolderLock, no_room
+from server.storage.disk import alone, no_room
 from server.storage.frame_store import FrameDamage, holds, read_pictures
 from server.storage.ledger import frame_identity
 
@@ -64,10 +63,7 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the service says when to stop
     os.nice(NICE)
     end_with_parent()
-    # A service that was killed leaves a worker in the middle of an update: two must not commit to one history.
-    lock = FolderLock(spec.folder.worker_lock, wait=True)
-    with contextlib.suppress(OSError):  # a full disk is no reason not to work
-        lock.write(f"{os.getpid()}\n")
+    lock = alone(spec.folder, spec.takes_over)
     worker = Worker(spec, connection)
     try:
         if worker.open():

@@ -18,7 +18,7 @@ from server.processes.messages import (
     ReplayUpdated,
     SceneSpec,
 )
-from server.processes.placement import Ended, Placement, Process
+from server.processes.placement import AnyProcess, Ended, Placement
 from server.scene.status import effective_budget
 from server.scene.supervision import Background
 from server.storage.ledger import Ledger
@@ -54,7 +54,7 @@ class Replays:
         self._placement = placement
         self._damaged = damaged
         self._background = background
-        self._process: Process | None = None
+        self._process: AnyProcess | None = None
         self._life: object = None
         self.status = ReplayStatus()
         self.points: dict[int, TradeoffPoint] = {}

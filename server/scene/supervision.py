@@ -6,19 +6,24 @@ A death is the worker's own doing or not; that decides when it is started again 
 from __future__ import annotations
 
 import asyncio
+import logging
 import signal
 import time
 from collections import deque
 from collections.abc import Callable, Coroutine
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 from server.processes import worker
 from server.processes.messages import SceneSpec
-from server.processes.placement import Ended, Placement, Process
+from server.processes.placement import AnyProcess, Ended, Placement
 from server.storage.events import FrameSetAside, WorkerDied
+from server.storage.fencing import epochs, found_epoch, publish, sweep
 from server.storage.frame_table import FrameEntry
+
+log = logging.getLogger("scas4d.server")
 
 OWN_SIGNALS = frozenset(
     {signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSYS, signal.SIGTRAP}
@@ -28,6 +33,9 @@ OWN_DEATHS = 2
 OTHER_DEATHS = 6
 """A frame is set aside after so many deaths from outside, too: something is wrong with it all the same."""
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.5, 30.0
+
+SWEEP_AFTER_S = 60.0
+"""The states of a worker that was given up are kept for so long: NFS shows a link as it was for up to a minute."""
 
 UPDATES_KEPT = 8
 """The prediction is the median of so many updates: a changed budget shows after a few frames."""
@@ -122,9 +130,13 @@ class WorkerProcess:
         self._placement = placement
         self._received = received
         self._ended = ended
-        self._process: Process | None = None
+        self._process: AnyProcess | None = None
         self._next: asyncio.TimerHandle | None = None
         self._closed = False
+        self._epoch: int | None = None
+        """Of the newest process; None before the first."""
+        self._taken: int | None = None
+        """That of the states which are read."""
 
     @property
     def starts_again(self) -> bool:
@@ -135,7 +147,32 @@ class WorkerProcess:
         """Starts the process, unless it runs, is about to, or the scene ends."""
         if self._process is None and self._next is None and not self._closed:
             self.deaths.started()
-            self._process = self._placement.start(worker.main, self.spec, self._received, self._gone)
+            self._process = self._placement.start(worker.main, self._fenced(), self._received, self._gone)
+
+    def _fenced(self) -> SceneSpec:
+        """The spec of the next process: with an epoch of its own, where one before may be at work still."""
+        if not self._placement.fenced:
+            return self.spec
+        states = self.spec.folder.states
+        if self._epoch is None:
+            self._taken = found_epoch(states)
+            self._epoch = max(epochs(states), default=-1)
+        self._epoch += 1
+        return replace(self.spec, folder=replace(self.spec.folder, epoch=self._epoch), takes_over=self._taken)
+
+    async def publish(self) -> None:
+        """Has the states that the process took over read from now on; to be called before it gets a frame."""
+        if self._epoch is not None and self._epoch != self._taken:
+            await asyncio.to_thread(publish, self.spec.folder.states, self._epoch)
+            self._taken = self._epoch
+
+    async def sweep(self) -> None:
+        """Removes the states of workers before, once whoever reads through an old link has seen the new one."""
+        if self._taken is None:
+            return
+        await asyncio.sleep(SWEEP_AFTER_S)
+        if names := await asyncio.to_thread(sweep, self.spec.folder.states, self._taken):
+            log.info("scene %s: removed %s, of workers before", self.spec.folder.name, ", ".join(names))
 
     def start_in(self, seconds: float) -> None:
         """Starts the next process after so long."""

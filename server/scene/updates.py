@@ -23,6 +23,7 @@ from server.processes.messages import (
     SceneSpec,
     Stalled,
     StatesRetained,
+    WaitsForNode,
 )
 from server.processes.placement import Ended, Placement
 from server.processes.readers import Readers
@@ -202,6 +203,9 @@ class Updates:
                 self.trouble = f"frame {message.index} waits for room on the disk: {message.reason}"
                 self.clock.stall(message.seconds)
                 self.tell(SceneChanged())
+            case WaitsForNode():
+                self.trouble = message.reason
+                self.tell(SceneChanged())
             case Broken():
                 self._ledger.fatal = f"what is committed cannot be gone on from: {message.reason}"
                 log.error("scene %s: %s", self._ledger.scene, self._ledger.fatal)
@@ -209,6 +213,7 @@ class Updates:
 
     async def _resume(self, ready: Ready) -> None:
         """Brings the ledger in line with the committed states that a new worker has loaded, and goes on."""
+        await self.worker.publish()
         ledger = self._ledger
         newest = ledger.committed[-1] if ledger.committed else -1
         again = self.mending.waiting.keys() | {i for i in ready.damaged if i < max(ready.indices, default=-1)}
@@ -227,6 +232,7 @@ class Updates:
         self.worker.ready = True
         self.mending.taken_up(ready.damaged)
         self.begin()
+        self._background.run(self.worker.sweep(), endless=True)
 
     async def _commit(self, message: FrameCommitted) -> None:
         self.worker.deaths.committed()

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from scas4d_core.storage.npz import sync_folder
 from server.storage.events import ReconstructionBegun
+from server.storage.fencing import epoch_folder
 
 
 @dataclass(frozen=True)
@@ -69,11 +70,13 @@ class SceneFolder:
 
     Attributes:
         reconstruction: its number. cloud: number of the reconstruction whose points it begins from.
+        epoch: of the worker that commits to the states (`server.storage.fencing`); None: of whoever has the scene.
     """
 
     path: Path
     reconstruction: int = 0
     cloud: int = 0
+    epoch: int | None = None
 
     def begun(self, event: ReconstructionBegun | None) -> SceneFolder:
         """The folder with the names of the reconstruction that was begun last; None: the one that came with the scene.
@@ -91,7 +94,8 @@ class SceneFolder:
         made = [replace(self, reconstruction=number) for number in range(event.number)]
         points = [self.points_of(number) for number in range(event.number + 1) if number != event.points]
         paths = [path for folder in made for path in (folder.states, folder.parts)] + points
-        return [path for path in paths if path.exists()]
+        paths += [path for folder in made for path in sorted(self.path.glob(f"{folder.states.name}.*"))]
+        return [path for path in paths if path.exists() or path.is_symlink()]
 
     @property
     def name(self) -> str:
@@ -115,8 +119,9 @@ class SceneFolder:
 
     @property
     def states(self) -> Path:
-        """Committed states (`scas4d_core.storage.history`)."""
-        return self._of("states")
+        """Committed states (`scas4d_core.storage.history`); a folder, or a link to that of an epoch."""
+        states = self._of("states")
+        return states if self.epoch is None else epoch_folder(states, self.epoch)
 
     @property
     def points(self) -> Path:

@@ -1,0 +1,1 @@
+"""Processes of scenes on the nodes of a Ray cluster (docs/cluster.md)."""

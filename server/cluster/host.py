@@ -1,0 +1,83 @@
+"""The actor that has one process of a scene, on whichever node Ray has placed it.
+
+The process is a child of the actor: it runs as it does on one machine (signals, niceness, threads), and how it ended is
+known by its exit code, which Ray does not tell. It ends with the actor. Imports no Ray: an actor is made of the class.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from server.processes.placement import Ended, Entry, Placement, Process
+
+
+@dataclass(frozen=True)
+class Started:
+    """The process runs, or does not: `fault` says why."""
+
+    node: str
+    pid: int | None = None
+    fault: str | None = None
+
+
+@dataclass(frozen=True)
+class Gone:
+    """The process ended without being asked to, with this exit code."""
+
+    exit_code: int | None
+
+
+class Host:
+    """Starts the process, hands its messages on in order, and says how it ended.
+
+    Args:
+        prepare: see `Placement`. data: folder that this node has to see.
+    """
+
+    def __init__(self, prepare: Callable[[], None] | None, data: Path) -> None:
+        self._placement = Placement(prepare)
+        self._data = data
+        self._said: asyncio.Queue[Any] = asyncio.Queue()
+        self._process: Process | None = None
+        self._early: dict[int, Any] = {}
+        self._next = 0
+
+    async def start(self, entry: Entry, spec: Any) -> Started:
+        """Starts the process."""
+        node = socket.gethostname()
+        if not os.access(self._data, os.R_OK | os.W_OK | os.X_OK):
+            return Started(node, fault=f"node {node} cannot write to the data folder {self._data}; mount it there")
+        self._process = Process(entry, spec, self._said.put_nowait, self._ended, self._placement.prepare)
+        return Started(node, self._process.pid)
+
+    async def post(self, number: int, message: Any) -> None:
+        """Posts a message to the process; by their numbers, as Ray may call in another order."""
+        self._early[number] = message
+        while self._next in self._early:
+            message = self._early.pop(self._next)
+            self._next += 1
+            if self._process is not None:
+                self._process.send(message)
+
+    async def take(self) -> list[Any]:
+        """The next messages of the process, one at least; `Gone` is the last."""
+        found = [await self._said.get()]
+        while not self._said.empty():
+            found.append(self._said.get_nowait())
+        return found
+
+    async def stop(self, seconds: float) -> None:
+        """Asks the process to end, waits for so long, then kills it."""
+        if self._process is not None:
+            process, self._process = self._process, None
+            await process.stop(seconds)
+
+    def _ended(self, why: Ended) -> None:
+        self._process = None
+        self._said.put_nowait(Gone(why.exit_code))

@@ -1,0 +1,62 @@
+"""What a process of a scene needs of a node, by the estimate of its scene; Ray's scheduler counts with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from client.wire import RigModel
+from server.health.estimate import estimate
+from server.processes import renderer, worker
+from server.processes.messages import SceneSpec
+from server.processes.placement import Entry
+from server.settings import ServerSettings
+
+READER_CPUS = 0.25
+"""Of a reader: it works while somebody looks, and goes before the updates then."""
+ASIDE_CPUS = 0.1
+"""Of a replay or an export: they take what is left."""
+
+
+@dataclass(frozen=True)
+class Needs:
+    """Of one process.
+
+    Attributes:
+        role: what it does, in a word. scene: whose. cpus, gpus: parts of them. memory: bytes.
+    """
+
+    role: str
+    scene: str
+    cpus: float
+    gpus: float
+    memory: int
+
+    def words(self) -> str:
+        """In words.
+
+        >>> Needs("worker", "a", 1, 0, 700_000_000).words()
+        '1 CPU and 0.7 GB of memory'
+        """
+        gpus = f", {self.gpus:g} GPU" if self.gpus else ""
+        return f"{self.cpus:g} CPU{gpus} and {self.memory / 1e9:.1f} GB of memory"
+
+    def options(self) -> dict[str, Any]:
+        """As options of a Ray actor."""
+        return {"num_cpus": self.cpus, "num_gpus": self.gpus, "memory": self.memory}
+
+
+def needs_of(entry: Entry, spec: Any, server: ServerSettings) -> Needs | None:
+    """Needs of a process; None where it is of no scene, and belongs to the service's own machine."""
+    scene = spec if isinstance(spec, SceneSpec) else getattr(spec, "scene", None)
+    if not isinstance(scene, SceneSpec):
+        return None
+    found = estimate(RigModel.of(scene.rig), scene.settings, server)
+    name = scene.folder.name
+    if entry is worker.main:
+        gpu = 1.0 if scene.settings.device == "cuda" else 0.0
+        return Needs("worker", name, 1.0, gpu, round(1e6 * found.worker_mb))
+    memory = round(1e6 * found.readers_mb / 2)
+    if entry in (renderer.views, renderer.bulk):
+        return Needs(entry.__name__, name, READER_CPUS, 0.0, memory)
+    return Needs(entry.__module__.rpartition(".")[2], name, ASIDE_CPUS, 0.0, memory)

@@ -1,0 +1,198 @@
+"""Runs the processes of scenes as actors on a Ray cluster. Ray chooses the node, and tells when one is lost."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import secrets
+from collections.abc import Callable
+from typing import Any
+
+import ray
+from ray.exceptions import RayActorError, RayError
+
+from server.cluster.folder import check_folder, living_nodes
+from server.cluster.host import Gone, Host, Started
+from server.cluster.needs import Needs, needs_of
+from server.processes import worker
+from server.processes.messages import WaitsForNode
+from server.processes.placement import STOP_SECONDS, AnyProcess, Ended, Entry, Placement
+from server.settings import ServerSettings
+
+NAMESPACE = "scas4d"
+WAIT_S = 3.0
+"""A worker that is not placed after so long says what it waits for."""
+STOPPED_S = 5.0
+"""An actor has so much longer than its process to say that this has ended."""
+
+log = logging.getLogger("scas4d.server")
+
+
+class RayPlacement(Placement):
+    """Starts processes of scenes on a cluster, and those of the service on its own machine.
+
+    Args:
+        prepare: see `Placement`. address: of the cluster's head, or None: that which runs on this machine, or that of
+            RAY_ADDRESS. server: settings of the service; every node has to see its data folder at the same path.
+
+    Attributes:
+        places: processes that were started and have not ended, by name of their actor, with the node once it is known.
+    """
+
+    fenced = True
+
+    def __init__(self, prepare: Callable[[], None] | None, address: str | None, server: ServerSettings) -> None:
+        super().__init__(prepare)
+        self.places: dict[str, tuple[Needs, str | None]] = {}
+        self._address = address
+        self._server = server
+        self._token = secrets.token_hex(3)
+        self._started = 0
+
+    async def open(self) -> None:
+        """Joins the cluster, and checks that all nodes see the data folder.
+
+        Raises:
+            RuntimeError: there is no cluster, or a node does not see the folder.
+        """
+        try:
+            await asyncio.to_thread(
+                ray.init,
+                address=self._address or "auto",
+                namespace=NAMESPACE,
+                log_to_driver=True,
+                configure_logging=False,
+            )
+        except (ConnectionError, ValueError, RayError) as error:
+            where = "on this machine" if self._address is None else f"at {self._address}"
+            raise RuntimeError(
+                f"there is no Ray cluster {where} ({error}); start one with `ray start --head`, or name its address: "
+                "--placement ray=HOST:6379"
+            ) from None
+        await asyncio.to_thread(check_folder, self._server.data.resolve())
+        log.info("scenes run on a Ray cluster of %d nodes", len(living_nodes()))
+
+    async def close(self) -> None:
+        """Leaves the cluster; actors that are left end."""
+        await asyncio.to_thread(ray.shutdown)
+
+    def start(
+        self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[Ended], None]
+    ) -> AnyProcess:
+        """Starts a process on the node that has room; see `Placement`."""
+        needs = needs_of(entry, spec, self._server)
+        if needs is None:
+            return super().start(entry, spec, on_message, on_end)
+        self._started += 1
+        epoch = spec.folder.epoch if entry is worker.main else self._started
+        name = f"{needs.scene}.{needs.role}.{epoch}.{self._token}"
+        self.places[name] = needs, None
+        return RayProcess(self, name, needs, (entry, spec), on_message, on_end)
+
+    def host(self, name: str, needs: Needs) -> Any:
+        """An actor for a process."""
+        made: Any = ray.remote(Host)
+        return made.options(name=name, **needs.options()).remote(self.prepare, self._server.data.resolve())
+
+
+class RayProcess:
+    """A process of a scene on some node; its messages go by its actor. On the event loop."""
+
+    def __init__(
+        self,
+        placement: RayPlacement,
+        name: str,
+        needs: Needs,
+        runs: tuple[Entry, Any],
+        on_message: Callable[[Any], None],
+        on_end: Callable[[Ended], None],
+    ) -> None:
+        self._placement = placement
+        self._name = name
+        self._needs = needs
+        self._on_message = on_message
+        self._on_end = on_end
+        self._pid: int | None = None
+        self._sent = 0
+        self._over = False
+        self._actor = placement.host(name, needs)
+        self._posts: set[asyncio.Task[None]] = set()
+        self._task = asyncio.get_running_loop().create_task(self._run(*runs))
+
+    @property
+    def pid(self) -> int | None:
+        """See `AnyProcess`."""
+        return self._pid
+
+    def send(self, message: Any) -> None:
+        """See `AnyProcess`."""
+        if self._over:
+            return
+        post = asyncio.get_running_loop().create_task(self._post(self._actor.post.remote(self._sent, message)))
+        self._sent += 1
+        self._posts.add(post)
+        post.add_done_callback(self._posts.discard)
+
+    async def stop(self, seconds: float = STOP_SECONDS) -> None:
+        """See `AnyProcess`."""
+        started, over, self._over = self._pid is not None, self._over, True
+        self._task.cancel()
+        if started and not over:
+            with contextlib.suppress(RayError, TimeoutError):
+                await asyncio.wait_for(self._actor.stop.remote(seconds), seconds + STOPPED_S)
+        self._leave()
+
+    async def _run(self, entry: Entry, spec: Any) -> None:
+        try:
+            await self._begin(entry, spec)
+            while True:
+                for message in await self._actor.take.remote():
+                    if isinstance(message, Gone):
+                        self._end(Ended(message.exit_code))
+                        return
+                    if self._over:
+                        return
+                    self._on_message(message)
+        except RayActorError as error:
+            log.warning("actor %s is lost: %s", self._name, error)
+            self._end(Ended(None, f"the node or the actor of its {self._needs.role} is lost"))
+        except (RayError, _NotStarted) as error:
+            log.warning("actor %s did not start: %s", self._name, error)
+            self._end(Ended(None, f"its {self._needs.role} could not be started: {error}"))
+
+    async def _begin(self, entry: Entry, spec: Any) -> None:
+        """Starts the process, and says what it waits for as long as no node has room."""
+        starting = asyncio.ensure_future(self._actor.start.remote(entry, spec))
+        said = False
+        while not (await asyncio.wait([starting], timeout=WAIT_S))[0]:
+            if self._needs.role == "worker" and not said:
+                said = True
+                self._on_message(WaitsForNode(f"no node has room for its worker, which needs {self._needs.words()}"))
+        started: Started = starting.result()
+        if started.fault is not None:
+            raise _NotStarted(started.fault)
+        self._pid = started.pid
+        self._placement.places[self._name] = self._needs, started.node
+
+    async def _post(self, sending: Any) -> None:
+        try:
+            await sending
+        except RayError as error:  # it did not get the message, so it must not go on
+            self._end(Ended(None, f"a message did not reach its {self._needs.role}: {error}"))
+
+    def _end(self, why: Ended) -> None:
+        if not self._over:
+            self._over = True
+            self._task.cancel()
+            self._leave()
+            self._on_end(why)
+
+    def _leave(self) -> None:
+        self._placement.places.pop(self._name, None)
+        with contextlib.suppress(RayError, ValueError):
+            ray.kill(self._actor)
+
+
+class _NotStarted(RuntimeError):
+    """The node could not start the process."""
