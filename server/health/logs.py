@@ -35,7 +35,7 @@ class JsonFormatter(logging.Formatter):
             "message": record.getMessage(),
             "process": record.process,
         }
-        entry |= {name: value for name, value in record.__dict__.items() if name not in _PLAIN}
+        entry |= {name: value for name, value in record.__dict__.items() if name not in _PLAIN and name[0] != "_"}
         if record.exc_info:
             entry["exception"] = self.formatException(record.exc_info)
         return hidden(json.dumps(entry, default=str))

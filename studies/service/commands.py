@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -30,8 +31,12 @@ def faults(
     ] = 3,
     part: Annotated[
         list[str] | None,
-        typer.Option(help="Only this: kills, beginnings, log, disk, bits or strangers. May be repeated."),
+        typer.Option(
+            help="Only this: kills, beginnings, log, disk, bits or strangers; on a cluster nodes, stopped, kills, "
+            "beginnings, log or bits. May be repeated."
+        ),
     ] = None,
+    placement: Annotated[str, typer.Option(help="`ray`: on a Ray cluster of three nodes, on this machine.")] = "local",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random moments and places.")] = 0,
     work: Annotated[Path, typer.Option(help="Folder for data folders and logs; what is there goes.")] = Path(
         "out/faults"
@@ -48,13 +53,17 @@ def faults(
     from client.cli.changes import parse_changes
     from client.cli.extras import need_server
     from client.importers.open_source import open_source
+    from studies.cluster import faults as of_nodes
     from studies.service import faults as of_faults
-    from studies.service.outcome import table
+    from studies.service.outcome import ScenarioResult, table
     from studies.service.study import Study, encoded_frames
 
     need_server()
-    if unknown := set(part or []) - set(of_faults.PARTS):
-        raise typer.BadParameter(f"there is no part {sorted(unknown)[0]!r}; the parts are {', '.join(of_faults.PARTS)}")
+    if placement not in ("local", "ray"):
+        raise typer.BadParameter(f"there is no placement {placement!r}; give local or ray", param_hint="--placement")
+    known = of_faults.PARTS if placement == "local" else (*of_nodes.ON_NODES, *of_nodes.AS_LOCALLY)
+    if unknown := set(part or []) - set(known):
+        raise typer.BadParameter(f"there is no part {sorted(unknown)[0]!r}; the parts are {', '.join(known)}")
     opened = open_source(capture)
     study = Study(
         work.resolve(),
@@ -63,10 +72,24 @@ def faults(
         parse_changes(changes),
         {},
     )
-    parts = part or of_faults.PARTS
-    outcomes = of_faults.run(
-        study, moments=kills, cuts=cuts, flips=flips, bits=bits, seed=seed, turns=turns, parts=parts, echo=typer.echo
-    )
+
+    def run(study: Study, parts: Sequence[str]) -> list[ScenarioResult]:
+        return of_faults.run(
+            study,
+            moments=kills,
+            cuts=cuts,
+            flips=flips,
+            bits=bits,
+            seed=seed,
+            turns=turns,
+            parts=parts,
+            echo=typer.echo,
+        )
+
+    if placement == "local":
+        outcomes = run(study, part or known)
+    else:
+        outcomes = of_nodes.run(study, count=kills, seed=seed, parts=part or known, local=run, echo=typer.echo)
     text = table(outcomes)
     typer.echo(text)
     write_page(out, text)

@@ -1,0 +1,161 @@
+"""Nodes of a cluster killed, stopped and continued late: nothing acknowledged is lost, no bit of the states differs."""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+from server.storage.fencing import epoch_folder, epochs, found_epoch
+from server.storage.layout import DataFolder
+from studies.cluster.nodes import Nodes
+from studies.options import Echo
+from studies.service.outcome import ScenarioResult
+from studies.service.process import PATIENCE_S, Service, StudyError
+from studies.service.study import AGAIN_S, FrameSender, Study, compare, digests, undisturbed
+
+Run = Callable[[Study, Sequence[str]], list[ScenarioResult]]
+
+GOES_ON_S = 30.0
+"""A scene works again so soon after its node is gone."""
+SWEPT_S = 90.0
+"""Folders of workers before are gone after so long."""
+
+
+def killed_nodes(
+    study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, count: int, seed: int, echo: Echo
+) -> ScenarioResult:
+    """`kill -9` of the node on which the scene's worker runs, `count` times, at random moments; a new one joins."""
+    random_ = random.Random(seed)
+    moments = [random_.randrange(1, len(study.frames)) for _ in range(count)]
+    service = study.service("nodes")
+    service.start()
+    scene = study.create(service)
+    sender = FrameSender(study, service, scene)
+    pauses = []
+    try:
+        for index in range(len(study.frames)):
+            thread = threading.Thread(target=sender.send, args=(index,))
+            thread.start()
+            for _ in range(moments.count(index)):
+                time.sleep(random_.uniform(0, 1.5 * update_s))
+                nodes.kill(_node_of(service, nodes, scene))
+                began = time.monotonic()
+                nodes.add()
+                _until(lambda: _works(service, scene), "the scene did not go on")
+                pauses.append(time.monotonic() - began)
+                echo(f"killed the node at frame {index}: {len(pauses)} of {count}, on after {pauses[-1]:.1f} s")
+            thread.join()
+        service.finish(scene, len(study.frames))
+        faults = sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
+        faults += [f"the scene went on after {pause:.0f} s" for pause in pauses if pause > GOES_ON_S]
+        lost = len(study.frames) - len(sender.receipts)
+        longest = max(pauses, default=0.0)
+        found = f"{lost} acknowledged frames lost, {len(expected)} states compared, on after at most {longest:.1f} s"
+        target = f"0 acknowledged frames lost, final state bit-identical, on within {GOES_ON_S:g} s"
+        return ScenarioResult(f"a node killed at {count} random moments", target, found, faults)
+    finally:
+        service.stop()
+
+
+def stopped_node(
+    study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo
+) -> ScenarioResult:
+    """SIGSTOP of a node during an update; it is continued when its scene has gone on elsewhere."""
+    service = study.service("stopped")
+    service.start()
+    scene = study.create(service)
+    sender = FrameSender(study, service, scene)
+    states = DataFolder(service.data).scene(scene).states
+    half = len(study.frames) // 2
+    try:
+        for index in range(half):
+            sender.send(index)
+        service.finish(scene, half)
+        for index in range(half, len(study.frames)):
+            sender.send(index)
+        time.sleep(0.5 * update_s)
+        node = _node_of(service, nodes, scene)
+        stale = found_epoch(states)
+        assert stale is not None
+        nodes.stop(node)
+        began, committed = time.monotonic(), service.status(scene).committed
+        _until(lambda: service.status(scene).committed > committed, "the scene did not go on")
+        pause = time.monotonic() - began
+        echo(f"on after {pause:.1f} s; the node is continued")
+        folder = epoch_folder(states, stale)
+        before = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+        nodes.resume(node)
+        written: set[str] = set()
+        until = time.monotonic() + 5 * update_s + 5
+        while time.monotonic() < until:
+            if folder.is_dir():
+                now = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+                written |= {name for name, changed in now.items() if before.get(name) != changed}
+            time.sleep(AGAIN_S / 5)
+        service.finish(scene, len(study.frames))
+        faults = sender.check() + compare(digests(states), expected)
+        until = time.monotonic() + SWEPT_S
+        while len(epochs(states)) > 1 and time.monotonic() < until:
+            time.sleep(AGAIN_S)
+        if left := sorted(epochs(states))[:-1]:
+            faults.append(f"the folders of epochs {left} are still there")
+        found = f"on after {pause:.1f} s; then the old worker wrote {len(written)} files, which nothing read; removed"
+        target = "nothing it wrote is read; found and removed; final state bit-identical"
+        return ScenarioResult("a node stopped, and continued after its scene has moved", target, found, faults)
+    finally:
+        service.stop()
+
+
+def _node_of(service: Service, nodes: Nodes, scene: str) -> int:
+    """The node of the scene's worker, as soon as there is one."""
+    until = time.monotonic() + PATIENCE_S
+    while time.monotonic() < until:
+        pid = service.worker_pid(scene)
+        if pid is not None and (node := nodes.of(pid)) is not None:
+            return node
+        time.sleep(AGAIN_S)
+    raise StudyError("the scene's worker is on no node")
+
+
+def _works(service: Service, scene: str) -> bool:
+    """Whether the worker has a frame again, or has nothing left to do."""
+    status = service.status(scene)
+    return status.state == "updating" or status.queued == 0
+
+
+def _until(done: Callable[[], bool], fault: str) -> None:
+    until = time.monotonic() + PATIENCE_S
+    while not done():
+        if time.monotonic() > until:
+            raise StudyError(fault)
+        time.sleep(AGAIN_S)
+
+
+ON_NODES = ("nodes", "stopped")
+"""Scenarios of nodes by name."""
+AS_LOCALLY = ("kills", "beginnings", "log", "bits")
+"""Scenarios that run as on one machine; a full disk and strangers are the service's own, wherever workers run."""
+
+
+def run(study: Study, *, count: int, seed: int, parts: Sequence[str], local: Run, echo: Echo) -> list[ScenarioResult]:
+    """The scenarios of nodes on three of them, and those of `local`; states are compared with a run on one machine.
+
+    Args:
+        count: of kills. local: runs scenarios by name, over a study whose service is on the cluster.
+    """
+    outcomes = []
+    with Nodes() as nodes:
+        there = replace(study, environment={**study.environment, "SCAS4D_PLACEMENT": f"ray={nodes.address}"})
+        if set(parts) & set(ON_NODES):
+            expected, update_s = undisturbed(study)
+            echo(f"undisturbed, on one machine: {len(expected)} states, {update_s:.2f} s an update")
+            if "nodes" in parts:
+                outcomes.append(killed_nodes(there, nodes, expected, update_s, count, seed, echo))
+            if "stopped" in parts:
+                outcomes.append(stopped_node(there, nodes, expected, update_s, echo))
+        if others := [part for part in parts if part in AS_LOCALLY]:
+            outcomes += local(there, others)
+    return outcomes

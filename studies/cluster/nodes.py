@@ -1,0 +1,111 @@
+"""A Ray cluster of several nodes on one machine, whose nodes can be killed, stopped and continued."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+HEALTH = {"period_ms": 1000, "timeout_ms": 2000, "failure_threshold": 3, "initial_delay_ms": 1000}
+"""Ray's checks of its nodes: one that does not answer is lost after 3 to 9 s (defaults: about a minute)."""
+STORE_BYTES = 80 * 2**20
+"""Of a node's object store, which scenes do not use."""
+
+
+class Nodes:
+    """A head without room for scenes, and some nodes beside.
+
+    Args:
+        count: of nodes beside the head. cpus: of each.
+
+    Attributes:
+        address: of the head, for `--placement ray=ADDRESS`.
+    """
+
+    def __init__(self, count: int = 3, cpus: float = 2) -> None:
+        from ray.cluster_utils import Cluster
+
+        os.environ.update({f"RAY_health_check_{name}": str(value) for name, value in HEALTH.items()})
+        self._cpus = cpus
+        self._cluster: Any = Cluster(
+            initialize_head=True,
+            head_node_args={"num_cpus": 0, "object_store_memory": STORE_BYTES, "include_dashboard": False},
+        )
+        self._nodes: dict[int, Any] = {}
+        self.address = str(self._cluster.address)
+        for _ in range(count):
+            self.add()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for pid in tuple(self._nodes):
+            self.resume(pid)
+        self._cluster.shutdown()
+
+    def add(self) -> int:
+        """Adds a node; returns the process id of its raylet."""
+        node = self._cluster.add_node(num_cpus=self._cpus, object_store_memory=STORE_BYTES)
+        pid = int(node.all_processes["raylet"][0].process.pid)
+        self._nodes[pid] = node
+        return pid
+
+    def of(self, pid: int) -> int | None:
+        """The node, by its raylet, on which a process runs; None where it runs elsewhere, or not any more."""
+        while pid > 1:
+            if pid in self._nodes:
+                return pid
+            pid = _parent(pid)
+        return None
+
+    def kill(self, node: int) -> None:
+        """`kill -9` of everything on a node; it does not come back."""
+        tree = [node, *_below(node)]
+        for pid in tree:
+            _signal(pid, signal.SIGKILL)
+        with contextlib.suppress(Exception):  # it is gone as far as Ray is concerned
+            self._cluster.remove_node(self._nodes[node], allow_graceful=False)
+        del self._nodes[node]
+
+    def stop(self, node: int) -> None:
+        """SIGSTOP of everything on a node, the raylet first."""
+        for pid in (node, *_below(node)):
+            _signal(pid, signal.SIGSTOP)
+
+    def resume(self, node: int) -> None:
+        """SIGCONT, its processes first: they have a moment before their raylet learns that it was given up."""
+        for pid in (*reversed(_below(node)), node):
+            _signal(pid, signal.SIGCONT)
+
+
+def _signal(pid: int, number: signal.Signals) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, number)
+
+
+def _parent(pid: int) -> int:
+    """0 for a process that is gone."""
+    try:
+        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+    except (OSError, IndexError, ValueError):
+        return 0
+
+
+def _below(pid: int) -> list[int]:
+    """Processes below one, parents first."""
+    parents = {each: _parent(each) for each in _pids()}
+    found, level = [], [pid]
+    while level := [each for each, parent in parents.items() if parent in level]:
+        found += level
+    return found
+
+
+def _pids() -> Iterator[int]:
+    return (int(path.name) for path in Path("/proc").iterdir() if path.name.isdecimal())
