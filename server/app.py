@@ -27,6 +27,7 @@ from server.processes.placement import Placement
 from server.routes import (
     access,
     budget,
+    cluster,
     estimate,
     exports,
     frames,
@@ -128,7 +129,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
             tradeoff,
             exports,
         ),
-        *(estimate, tickets, shares, health, metrics, viewer, reference),
+        *(estimate, cluster, tickets, shares, health, metrics, viewer, reference),
     )
     for resource in resources:
         app.include_router(

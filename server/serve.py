@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import errno
 import logging
@@ -61,10 +62,12 @@ def serve(settings: ServerSettings) -> None:
         lock_data(settings.data).release()  # said here in a sentence; taken for good when the application starts
     except OSError as error:
         raise RuntimeError(f"data folder {settings.data}: {error.strerror}; name another with --data") from None
+    placement = _placement(settings, prepare)
     sockets = listen(settings.host, settings.port)
+    asyncio.run(placement.open())  # said here in a sentence, too
     keep_freed_memory()
     config = guarded(
-        create_app(_with_files(settings), _placement(settings, prepare)),
+        create_app(_with_files(settings), placement),
         log_config=None,
         access_log=False,
         timeout_graceful_shutdown=max(1, round(STOP_SECONDS)),

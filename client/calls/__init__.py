@@ -25,7 +25,7 @@ from client.calls.scenes import (
     scene,
     scenes,
 )
-from client.calls.service import ingest_ready, live, metrics, ready, share, ticket
+from client.calls.service import cluster, ingest_ready, live, metrics, ready, share, ticket
 from client.calls.tracks import tracks, tracks_arrays
 from client.calls.views import render, render_arrays, render_file
 
@@ -35,6 +35,7 @@ __all__ = [
     "begin_export",
     "budget",
     "close_frame",
+    "cluster",
     "create_scene",
     "declare_missing",
     "delete_export",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from client.calls.call import Call, body, reads
-from client.wire import Health, Share, ShareRequest, Ticket
+from client.wire import Cluster, Health, Share, ShareRequest, Ticket
 
 
 def live() -> Call[Health]:
@@ -31,6 +31,15 @@ def ingest_ready() -> Call[Health]:
     True
     """
     return Call("GET", "/health/ingest", reads(Health))
+
+
+def cluster() -> Call[Cluster]:
+    """Reads on which machines scenes run, and what waits for room.
+
+    >>> [node.alive for node in client.cluster().nodes]
+    [True]
+    """
+    return Call("GET", "/v1/cluster", reads(Cluster))
 
 
 def metrics() -> Call[str]:

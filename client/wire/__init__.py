@@ -48,7 +48,7 @@ from client.wire.scenes import (
     SceneStatus,
     StateBounds,
 )
-from client.wire.service import Health, ProblemDetails, Share, ShareRequest, Ticket
+from client.wire.service import Cluster, Health, Node, ProblemDetails, Share, ShareRequest, Ticket, Waiting
 from client.wire.tracks import GaussianModel, GaussiansModel, TracksModel, TracksRequest, tracks_model
 from client.wire.tradeoff import (
     CurveMean,
@@ -74,6 +74,7 @@ __all__ = [
     "CameraModel",
     "CameraName",
     "CameraResidualModel",
+    "Cluster",
     "CurveMean",
     "CurvePointModel",
     "EffectModel",
@@ -99,6 +100,7 @@ __all__ = [
     "IngestSettings",
     "MissingRequest",
     "Model",
+    "Node",
     "PartReceipt",
     "PartsModel",
     "Pixel",
@@ -135,6 +137,7 @@ __all__ = [
     "TradeoffModel",
     "TradeoffPoint",
     "Unit",
+    "Waiting",
     "frame_chunks",
     "head_length",
     "parse_frame",

@@ -59,3 +59,33 @@ class Share(Model):
     scene: str | None
     ends: str = Field(description="UTC, ISO 8601.")
     address: str = Field(description="Behind the address of the service. What follows # is sent to no server.")
+
+
+class Node(Model):
+    """A machine on which processes of scenes run."""
+
+    id: str
+    host: str
+    alive: bool
+    cpus: float
+    cpus_taken: float = Field(description="By processes of this service's scenes, as they were estimated.")
+    gpus: float
+    memory_mb: float
+    memory_taken_mb: float
+    scenes: list[str] = Field(description="Those whose worker is here.")
+
+
+class Waiting(Model):
+    """A process that no node has room for."""
+
+    scene: str
+    role: str
+    needs: str
+
+
+class Cluster(Model):
+    """Machines of the service, and what waits for room on them."""
+
+    placement: Literal["local", "ray"]
+    nodes: list[Node]
+    waiting: list[Waiting]

@@ -14,15 +14,12 @@ import ray
 from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from server.cluster.nodes import living_nodes
+
 PROBE = ".probe"
 PATIENCE_S = 30.0
 """A node has so long to answer; NFS shows a new file to other machines after a few seconds."""
 SEEN_S = 10.0
-
-
-def living_nodes() -> list[dict[str, Any]]:
-    """Nodes that Ray says are alive, as it describes them."""
-    return [node for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
 
 
 def check_folder(data: Path) -> None:

@@ -1,7 +1,7 @@
 """The actor that has one process of a scene, on whichever node Ray has placed it.
 
 The process is a child of the actor: it runs as it does on one machine (signals, niceness, threads), and how it ended is
-known by its exit code, which Ray does not tell. It ends with the actor. Imports no Ray: an actor is made of the class.
+known by its exit code, which Ray does not tell. It ends with the actor.
 """
 
 from __future__ import annotations
@@ -33,6 +33,13 @@ class Gone:
     exit_code: int | None
 
 
+def _node_id() -> str:
+    """Of the node that this actor is on."""
+    import ray
+
+    return str(ray.get_runtime_context().get_node_id())
+
+
 class Host:
     """Starts the process, hands its messages on in order, and says how it ended.
 
@@ -50,9 +57,10 @@ class Host:
 
     async def start(self, entry: Entry, spec: Any) -> Started:
         """Starts the process."""
-        node = socket.gethostname()
+        node = _node_id()
         if not os.access(self._data, os.R_OK | os.W_OK | os.X_OK):
-            return Started(node, fault=f"node {node} cannot write to the data folder {self._data}; mount it there")
+            host = socket.gethostname()
+            return Started(node, fault=f"node {host} cannot write to the data folder {self._data}; mount it there")
         self._process = Process(entry, spec, self._said.put_nowait, self._ended, self._placement.prepare)
         return Started(node, self._process.pid)
 

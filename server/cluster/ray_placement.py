@@ -6,15 +6,18 @@ import asyncio
 import contextlib
 import logging
 import secrets
+import socket
 from collections.abc import Callable
 from typing import Any
 
 import ray
 from ray.exceptions import RayActorError, RayError
 
-from server.cluster.folder import check_folder, living_nodes
+from client.wire import Cluster
+from server.cluster.folder import check_folder
 from server.cluster.host import Gone, Host, Started
 from server.cluster.needs import Needs, needs_of
+from server.cluster.nodes import all_nodes, cluster_of, living_nodes
 from server.processes import worker
 from server.processes.messages import WaitsForNode
 from server.processes.placement import STOP_SECONDS, AnyProcess, Ended, Entry, Placement
@@ -23,6 +26,8 @@ from server.settings import ServerSettings
 NAMESPACE = "scas4d"
 WAIT_S = 3.0
 """A worker that is not placed after so long says what it waits for."""
+REACH_S = 5.0
+"""The head of the cluster answers within so long."""
 STOPPED_S = 5.0
 """An actor has so much longer than its process to say that this has ended."""
 
@@ -37,7 +42,8 @@ class RayPlacement(Placement):
             RAY_ADDRESS. server: settings of the service; every node has to see its data folder at the same path.
 
     Attributes:
-        places: processes that were started and have not ended, by name of their actor, with the node once it is known.
+        places: processes that were started and have not ended, by name of their actor, with the id of the node once it
+            is known.
     """
 
     fenced = True
@@ -56,7 +62,11 @@ class RayPlacement(Placement):
         Raises:
             RuntimeError: there is no cluster, or a node does not see the folder.
         """
+        if ray.is_initialized():
+            return
         try:
+            if self._address is not None:
+                _reach(self._address)  # Ray would end this process where nobody listens
             await asyncio.to_thread(
                 ray.init,
                 address=self._address or "auto",
@@ -64,7 +74,7 @@ class RayPlacement(Placement):
                 log_to_driver=True,
                 configure_logging=False,
             )
-        except (ConnectionError, ValueError, RayError) as error:
+        except (OSError, ValueError, RayError) as error:
             where = "on this machine" if self._address is None else f"at {self._address}"
             raise RuntimeError(
                 f"there is no Ray cluster {where} ({error}); start one with `ray start --head`, or name its address: "
@@ -72,6 +82,10 @@ class RayPlacement(Placement):
             ) from None
         await asyncio.to_thread(check_folder, self._server.data.resolve())
         log.info("scenes run on a Ray cluster of %d nodes", len(living_nodes()))
+
+    async def cluster(self) -> Cluster:
+        """See `Placement`."""
+        return cluster_of(await asyncio.to_thread(all_nodes), self.places)
 
     async def close(self) -> None:
         """Leaves the cluster; actors that are left end."""
@@ -94,6 +108,13 @@ class RayPlacement(Placement):
         """An actor for a process."""
         made: Any = ray.remote(Host)
         return made.options(name=name, **needs.options()).remote(self.prepare, self._server.data.resolve())
+
+
+def _reach(address: str) -> None:
+    """Connects to the cluster's head and goes; an OSError where nobody answers."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    with socket.create_connection((host, int(port)), timeout=REACH_S):
+        pass
 
 
 class RayProcess:
@@ -156,7 +177,7 @@ class RayProcess:
                     self._on_message(message)
         except RayActorError as error:
             log.warning("actor %s is lost: %s", self._name, error)
-            self._end(Ended(None, f"the node or the actor of its {self._needs.role} is lost"))
+            self._end(Ended(None, f"the node of its {self._needs.role} is lost", lost=True))
         except (RayError, _NotStarted) as error:
             log.warning("actor %s did not start: %s", self._name, error)
             self._end(Ended(None, f"its {self._needs.role} could not be started: {error}"))

@@ -18,6 +18,7 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any, NoReturn, Protocol
 
+from client.wire import Cluster
 from server.processes.messages import Stop
 
 Entry = Callable[..., None]
@@ -32,14 +33,20 @@ _context = multiprocessing.get_context("spawn")
 
 
 class Ended(str):
-    """The sentence that says why a process is gone; `exit_code` as in multiprocessing: −N for signal N, or None."""
+    """The sentence that says why a process is gone.
+
+    Attributes:
+        exit_code: as in multiprocessing: −N for signal N; None where it is not known.
+        lost: its machine is gone, or cannot be reached.
+    """
 
     exit_code: int | None
+    lost: bool
 
-    def __new__(cls, exit_code: int | None, why: str = "") -> Ended:
-        """Makes the sentence for an exit code, or for another reason."""
+    def __new__(cls, exit_code: int | None, why: str = "", *, lost: bool = False) -> Ended:
+        """Makes the sentence for an exit code, or takes another."""
         self = super().__new__(cls, why or f"its process ended by itself (exit code {exit_code})")
-        self.exit_code = exit_code
+        self.exit_code, self.lost = exit_code, lost
         return self
 
 
@@ -213,6 +220,10 @@ class Placement:
             on_end: called on the event loop once, with the reason, when the process ended without being asked to.
         """
         return Process(entry, spec, on_message, on_end, self.prepare)
+
+    async def cluster(self) -> Cluster | None:
+        """The machines on which processes run; None: this one alone."""
+        return None
 
     async def open(self) -> None:
         """Makes ready to start processes; called once, before any."""

@@ -77,8 +77,8 @@ class WorkerDeaths:
         """Notes that the worker works: it has committed a frame."""
         self._in_a_row = 0
 
-    def died(self, exit_code: int | None) -> tuple[bool, float]:
-        """Notes that the worker is gone.
+    def died(self, exit_code: int | None, *, lost: bool = False) -> tuple[bool, float]:
+        """Notes that the worker is gone; `lost`: with its machine, and another one is waited for no longer than once.
 
         Returns:
             True where it died by its own doing (it exited, or by a signal that only a fault of its own sends, or it was
@@ -86,8 +86,10 @@ class WorkerDeaths:
         """
         own = exit_code is not None and (exit_code > 0 or -exit_code in OWN_SIGNALS)
         own = own or oom_kills() > self._oom_kills
-        delay = min(LONGEST_DELAY_S, FIRST_DELAY_S * 2**self._in_a_row)
         self.count += 1
+        if lost:
+            return False, FIRST_DELAY_S
+        delay = min(LONGEST_DELAY_S, FIRST_DELAY_S * 2**self._in_a_row)
         self._in_a_row += 1
         return own, delay
 

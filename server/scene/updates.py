@@ -329,7 +329,7 @@ class Updates:
         if self._ledger.fatal is not None:
             return
         metrics.RESTARTS.labels("worker").inc()
-        own, delay = self.worker.deaths.died(reason.exit_code)
+        own, delay = self.worker.deaths.died(reason.exit_code, lost=reason.lost)
         self.trouble = f"the worker is gone: {reason}; it is started again in {delay:g} s"
         log.error("scene %s: %s", self._ledger.scene, self.trouble)
         self._background.run(self._after_death(str(reason), own, delay))

@@ -78,6 +78,7 @@ def take_over(states: Path, epoch: int, before: int | None) -> Path:
         if before is None or _linked(epoch_folder(states, before), beside):
             break
     else:
+        shutil.rmtree(beside, ignore_errors=True)
         raise FencingError(f"files of {states.name}.{before} kept vanishing while it was taken over")
     sync_folder(beside)
     beside.rename(folder)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ from server.storage.fencing import epoch_folder, epochs, found_epoch
 from server.storage.layout import DataFolder
 from studies.cluster.nodes import Nodes
 from studies.options import Echo
+from studies.service.faults import KILLS_OF_A_WORKER_AT_A_FRAME
 from studies.service.outcome import ScenarioResult
 from studies.service.process import PATIENCE_S, Service, StudyError
 from studies.service.study import AGAIN_S, FrameSender, Study, compare, digests, undisturbed
@@ -34,14 +36,15 @@ def killed_nodes(
     service.start()
     scene = study.create(service)
     sender = FrameSender(study, service, scene)
-    pauses = []
+    pauses: list[float] = []
+    killed: Counter[int] = Counter()
     try:
         for index in range(len(study.frames)):
             thread = threading.Thread(target=sender.send, args=(index,))
             thread.start()
             for _ in range(moments.count(index)):
                 time.sleep(random_.uniform(0, 1.5 * update_s))
-                nodes.kill(_node_of(service, nodes, scene))
+                nodes.kill(_node_of(service, nodes, scene, killed))
                 began = time.monotonic()
                 nodes.add()
                 _until(lambda: _works(service, scene), "the scene did not go on")
@@ -109,12 +112,20 @@ def stopped_node(
         service.stop()
 
 
-def _node_of(service: Service, nodes: Nodes, scene: str) -> int:
-    """The node of the scene's worker, as soon as there is one."""
+def _node_of(service: Service, nodes: Nodes, scene: str, killed: Counter[int] | None = None) -> int:
+    """The node of the scene's worker, as soon as there is one.
+
+    Args:
+        killed: nodes by the frame at work; one that has had its share of kills is let through.
+    """
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
-        pid = service.worker_pid(scene)
-        if pid is not None and (node := nodes.of(pid)) is not None:
+        pid, status = service.worker_pid(scene), service.status(scene)
+        at_work = status.next_frame - status.queued
+        open_ = killed is None or killed[at_work] < KILLS_OF_A_WORKER_AT_A_FRAME
+        if pid is not None and open_ and (node := nodes.of(pid)) is not None:
+            if killed is not None:
+                killed[at_work] += 1
             return node
         time.sleep(AGAIN_S)
     raise StudyError("the scene's worker is on no node")

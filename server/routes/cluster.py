@@ -1,0 +1,38 @@
+"""Route of the cluster: machines, their scenes, and what waits for room."""
+
+from __future__ import annotations
+
+import os
+import socket
+
+from fastapi import APIRouter, Request
+
+from client.wire import Cluster, Node, RigModel
+from server.health.estimate import estimate, machine_mb
+from server.processes.placement import Placement
+from server.routes.access import AllScenes, TheSettings
+
+router = APIRouter(prefix="/v1/cluster", tags=["service"])
+
+
+@router.get("")
+async def get(request: Request, scenes: AllScenes, server: TheSettings) -> Cluster:
+    """Returns the machines on which scenes run. What they take is by the estimates of the scenes, not measured."""
+    placement: Placement = request.app.state.placement
+    if (found := await placement.cluster()) is not None:
+        return found
+    awake = sorted(id for id, scene in scenes.by_id.items() if scene.has_place)
+    made = [scenes[id].spec for id in awake]
+    taken = sum(estimate(RigModel.of(spec.rig), spec.settings, server).memory_mb for spec in made)
+    here = Node(
+        id="local",
+        host=socket.gethostname(),
+        alive=True,
+        cpus=os.cpu_count() or 1,
+        cpus_taken=len(awake),
+        gpus=0,
+        memory_mb=round(machine_mb(), 1),
+        memory_taken_mb=round(taken, 1),
+        scenes=awake,
+    )
+    return Cluster(placement="local", nodes=[here], waiting=[])

@@ -1,0 +1,204 @@
+"""Scenes on a Ray cluster of two nodes: placed, watched, fenced, and found again; the core is a fake."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import fakes
+import pytest
+from running import pictures
+from sending import create, put_framed
+
+from client.wire import Cluster
+from server.storage.fencing import epochs, found_epoch
+from server.storage.layout import DataFolder
+from studies.cluster.nodes import Nodes
+from studies.service.process import Service
+
+pytest.importorskip("ray", reason="Ray is not installed: pip install 'scas4d[ray]'")
+pytestmark = pytest.mark.filterwarnings("default")
+PATIENCE_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def nodes() -> Iterator[Nodes]:
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in fakes.environment().items():
+            patch.setenv(name, value)
+        with Nodes(count=2, cpus=2) as nodes:
+            yield nodes
+
+
+@pytest.fixture(scope="module")
+def service(nodes: Nodes, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    data = tmp_path_factory.mktemp("cluster") / "data"
+    environment = fakes.environment(SCAS4D_PLACEMENT=f"ray={nodes.address}", SCAS4D_LOG_LEVEL="info")
+    service = Service(data, environment)
+    service.start()
+    yield service
+    service.stop()
+
+
+@pytest.fixture
+def scene(service: Service) -> Iterator[str]:
+    id = create(service.http, queue_frames=50)
+    yield id
+    service.http.delete(f"/v1/scenes/{id}")
+
+
+def until(done: Callable[[], object]) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def sent(service: Service, scene: str, frames: range) -> None:
+    for index in frames:
+        assert put_framed(service.http, scene, index, pictures(index)).status_code == 202
+
+
+def committed(service: Service, scene: str) -> int:
+    return service.status(scene).committed
+
+
+def states(service: Service, scene: str) -> Path:
+    return DataFolder(service.data).scene(scene).states
+
+
+def cluster(service: Service) -> Cluster:
+    return Cluster.model_validate_json(service.http.get("/v1/cluster").content)
+
+
+def node_of(service: Service, nodes: Nodes, scene: str) -> int:
+    found: list[int] = []
+
+    def there() -> bool:
+        pid = service.worker_pid(scene)
+        node = None if pid is None else nodes.of(pid)
+        found.extend([] if node is None else [node])
+        return bool(found)
+
+    until(there)
+    return found[0]
+
+
+def test_frames_are_committed_on_a_node_and_views_are_answered(service: Service, nodes: Nodes, scene: str) -> None:
+    sent(service, scene, range(3))
+    until(lambda: committed(service, scene) == 3)
+    assert node_of(service, nodes, scene)
+    assert found_epoch(states(service, scene)) == 0
+    view = service.http.post(f"/v1/scenes/{scene}/render", json={"camera": "c0", "frame": 1})
+    assert (view.status_code, view.headers["content-type"]) == (200, "image/png"), view.text
+    found = cluster(service)
+    assert found.placement == "ray"
+    assert len([node for node in found.nodes if node.alive]) == 3  # with the head, which has no room
+    (here,) = [node for node in found.nodes if scene in node.scenes]
+    assert here.cpus == 2
+    assert 1 <= here.cpus_taken <= 1.5
+    assert here.memory_taken_mb > 100
+
+
+def test_a_worker_that_dies_is_followed_by_one_of_the_next_epoch(service: Service, scene: str) -> None:
+    sent(service, scene, range(2))
+    until(lambda: committed(service, scene) == 2)
+    pid = service.worker_pid(scene)
+    assert pid is not None
+    os.kill(pid, signal.SIGKILL)
+    sent(service, scene, range(2, 4))
+    until(lambda: committed(service, scene) == 4)
+    assert found_epoch(states(service, scene)) == 1
+    assert service.status(scene).worker_deaths == 1
+
+
+def test_a_scene_goes_on_when_its_node_is_lost(service: Service, nodes: Nodes, scene: str) -> None:
+    sent(service, scene, range(2))
+    until(lambda: committed(service, scene) == 2)
+    lost = node_of(service, nodes, scene)
+    nodes.kill(lost)
+    sent(service, scene, range(2, 5))
+    until(lambda: committed(service, scene) == 5)
+    assert node_of(service, nodes, scene) != lost
+    assert [service.frame(scene, index).state for index in range(5)] == ["committed"] * 5
+    nodes.add()
+
+
+def test_what_a_stopped_node_writes_later_is_not_read(service: Service, nodes: Nodes, scene: str) -> None:
+    """Its worker is at a frame that takes two seconds; it goes on once another worker has committed that."""
+    sent(service, scene, range(2))
+    until(lambda: committed(service, scene) == 2)
+    node = node_of(service, nodes, scene)
+    assert put_framed(service.http, scene, 2, pictures(fakes.SLOW)).status_code == 202
+    until(lambda: service.status(scene).state == "updating")
+    nodes.stop(node)
+    sent(service, scene, range(3, 5))
+    until(lambda: committed(service, scene) == 5)
+    stale = min(epochs(states(service, scene)).values(), key=lambda path: int(path.suffix[1:]))
+    mine = {path.name: path.read_bytes() for path in states(service, scene).glob("frame_*.npz")}
+    nodes.resume(node)
+    time.sleep(fakes.SLOW_S + 1)
+    assert stale != states(service, scene).resolve()
+    assert {path.name: path.read_bytes() for path in states(service, scene).glob("frame_*.npz")} == mine
+    assert committed(service, scene) == 5
+    nodes.kill(node)
+    nodes.add()
+
+
+def test_a_scene_without_room_waits_and_says_why(service: Service, nodes: Nodes) -> None:
+    """Each node has two processors, and a worker takes one."""
+    ids = [create(service.http) for _ in range(5)]
+    try:
+
+        def waiting() -> list[str]:
+            return [one.scene for one in cluster(service).waiting if one.role == "worker"]
+
+        until(waiting)
+        time.sleep(1)
+        (late, *_) = waiting()
+        until(lambda: service.status(late).error)
+        said = service.status(late)
+        assert said.degraded
+        assert "no node has room for its worker, which needs 1 CPU and" in str(said.error)
+        sent(service, late, range(1))
+        for id in ids:
+            if id not in waiting():
+                service.http.delete(f"/v1/scenes/{id}")
+        until(lambda: committed(service, late) == 1)
+    finally:
+        for id in ids:
+            service.http.delete(f"/v1/scenes/{id}")
+
+
+def test_scenes_are_found_again_after_the_service_was_killed(service: Service, scene: str) -> None:
+    sent(service, scene, range(3))
+    until(lambda: committed(service, scene) == 3)
+    service.kill()
+    service.start()
+    until(lambda: service.http.get(f"/v1/scenes/{scene}").status_code == 200)
+    sent(service, scene, range(3, 4))
+    until(lambda: committed(service, scene) == 4)
+    assert found_epoch(states(service, scene)) == 1
+
+
+@pytest.mark.parametrize(
+    ("placement", "words"),
+    [("ray=127.0.0.1:1", "there is no Ray cluster at 127.0.0.1:1"), ("kubernetes", "SCAS4D_PLACEMENT")],
+)
+def test_what_is_no_cluster_is_one_line(placement: str, words: str, tmp_path: Path) -> None:
+    environment = fakes.environment(SCAS4D_WARM_UP="false")
+    done = subprocess.run(
+        [sys.executable, "-m", "client.cli.main", "serve", "--port", "0", "--data", str(tmp_path)],
+        env={**environment, "SCAS4D_PLACEMENT": placement},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert words in done.stderr.splitlines()[-1]
