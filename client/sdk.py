@@ -64,11 +64,8 @@ class _ClientBase:
     def __init__(self, url: str, token: str | None, patience: float, outage: float, on_retry: OnRetry | None) -> None:
         if not url.startswith(("http://", "https://")):
             raise ValueError(f"url {url!r} is no address of a service; write http://{url.partition('://')[2] or url}")
-        self.url = url.rstrip("/")
-        self.token = token
-        self.patience = patience
-        self.outage = outage
-        self.on_retry = on_retry
+        self.url, self.token = url.rstrip("/"), token
+        self.patience, self.outage, self.on_retry = patience, outage, on_retry
 
     def _http_arguments(self) -> dict[str, Any]:
         headers = {} if self.token is None else {"Authorization": f"Bearer {self.token}"}

@@ -84,7 +84,7 @@ def serve(settings: ServerSettings) -> None:
 
 
 def _placement(settings: ServerSettings, prepare: Callable[[], None]) -> Placement:
-    """Where processes of scenes run.
+    """Makes the placement of scenes' processes.
 
     Raises:
         RuntimeError: on a Ray cluster, and Ray is not installed.

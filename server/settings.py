@@ -160,7 +160,6 @@ class ServerSettings(BaseSettings):
 
     placement: str = Field(
         default="local",
-        pattern=r"^(local|ray(=\S+)?)$",
         description="Where processes of scenes run: `local`, on this machine; `ray`, on the Ray cluster that runs here "
         "or that RAY_ADDRESS names; `ray=HOST:6379`, on that one (docs/cluster.md).",
     )
@@ -249,6 +248,8 @@ class ServerSettings(BaseSettings):
 
     @model_validator(mode="after")
     def _guarded(self) -> ServerSettings:
+        if not re.fullmatch(r"local|ray(=\S+:\d+)?", self.placement):
+            raise ValueError(f"placement is {self.placement!r}; give local, ray, or ray=HOST:PORT")
         if self.token is not None and self.token_file is not None:
             raise ValueError("token and token_file are two tokens; give one of them")
         if self.token_file is not None and not self.token_file.is_file():

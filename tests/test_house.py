@@ -20,9 +20,9 @@ MOST_HEADLESS = 20
 HEADLESS = {"What", "Who", "Whoever", "Where", "Which", "How", "Whether", "That"}
 """First words of docstrings without a subject."""
 
-MOST_SETTINGS = 87
+MOST_SETTINGS = 88
 """Each is one that a user would set; a new one takes the place of another, or says here why not: 86 and 87 are how many
-states of a scene stay exact, and the bounds of the others."""
+states of a scene stay exact, and the bounds of the others; 88 is where scenes run (placement)."""
 
 
 def all_imports() -> dict[str, set[str]]:

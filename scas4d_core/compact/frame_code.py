@@ -111,7 +111,7 @@ def encode(reference: Columns, state: Columns, clusters: Clusters, bounds: Bound
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """What the body of one state tells.
+    """Changes that the body of one state tells.
 
     Attributes:
         steps: of A and t. motion: [12, clusters] in these steps.
@@ -252,7 +252,7 @@ def _unlike(decoded: Columns, state: Columns) -> dict[str, float]:
 
 
 def _whole(reference: Columns, clusters: Clusters) -> bool:
-    """Whether a state is told row by row: where all move, or have gloss, looking for what stands only takes time."""
+    """True where all rows are told: if all move, or have gloss, a search for those that stand only takes time."""
     return reference.gloss is not None or bool(clusters.labels.all())
 
 

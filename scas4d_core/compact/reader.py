@@ -292,7 +292,7 @@ class CompactReader:
             raise self._damaged(self._states[places[-1]], error) from None
 
     def _change(self, place: int, reference: Columns, clusters: Clusters) -> Change:
-        """What the record of a state tells."""
+        """Changes that the record of a state tells."""
         record = self._states[place]
         body = read_body(self._file, record, self.path.name)
         if record.kind is Kind.DELTA:

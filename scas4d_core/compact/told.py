@@ -43,7 +43,7 @@ SHAPE = ("sizes", "rotations", "factors", "means")
 
 
 def looks(state: Columns) -> tuple[str, ...]:
-    """What is told after the shape, each by itself."""
+    """Attributes that are told after the shape, each by itself."""
     return ("colours", "foreground") if state.gloss is None else ("colours", "foreground", "gloss")
 
 

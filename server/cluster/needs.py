@@ -1,4 +1,4 @@
-"""What a process of a scene needs of a node, by the estimate of its scene; Ray's scheduler counts with it."""
+"""Needs of a scene's process, for a node that has room: by the estimate of its scene; Ray's scheduler counts with it."""
 
 from __future__ import annotations
 

@@ -116,6 +116,7 @@ class WorkerProcess:
 
     Attributes:
         ready: the process has said that it has taken the scene up; to be set by who receives that message.
+        life: of the process, another each time; None without one.
         deaths: how often a process died, and whether by its own doing.
     """
 
@@ -128,6 +129,7 @@ class WorkerProcess:
     ) -> None:
         self.spec = spec
         self.ready = False
+        self.life: object | None = None
         self.deaths = WorkerDeaths()
         self._placement = placement
         self._received = received
@@ -149,6 +151,7 @@ class WorkerProcess:
         """Starts the process, unless it runs, is about to, or the scene ends."""
         if self._process is None and self._next is None and not self._closed:
             self.deaths.started()
+            self.life = object()
             self._process = self._placement.start(worker.main, self._fenced(), self._received, self._gone)
 
     def _fenced(self) -> SceneSpec:
@@ -164,9 +167,9 @@ class WorkerProcess:
 
     async def publish(self) -> None:
         """Has the states that the process took over read from now on; to be called before it gets a frame."""
-        if self._epoch is not None and self._epoch != self._taken:
-            await asyncio.to_thread(publish, self.spec.folder.states, self._epoch)
-            self._taken = self._epoch
+        if (epoch := self._epoch) is not None and epoch != self._taken:
+            await asyncio.to_thread(publish, self.spec.folder.states, epoch)
+            self._taken = epoch
 
     async def sweep(self) -> None:
         """Removes the states of workers before, once whoever reads through an old link has seen the new one."""
@@ -205,7 +208,7 @@ class WorkerProcess:
         self.start()
 
     def _gone(self, reason: Ended) -> None:
-        self.ready, self._process = False, None
+        self.ready, self.life, self._process = False, None, None
         if not self._closed:
             self._ended(reason)
 

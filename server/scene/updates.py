@@ -173,16 +173,10 @@ class Updates:
     def _from_worker(self, message: Any) -> None:
         match message:
             case Ready():
-                self._background.run(self._resume(message))
+                self._background.run(self._resume(message, self.worker.life))
             case Progressed():
                 over = message.stage == STAGE and message.done == message.total  # an update tells no other stage
-                self.progress = (
-                    None
-                    if over
-                    else ProgressModel(
-                        stage=message.stage, done=message.done, total=message.total, detail=message.detail
-                    )
-                )
+                self.progress = None if over else ProgressModel(**vars(message))
                 self.clock.progress(message.stage, message.done, message.total, message.detail.get("seconds_left"))
                 self.tell(SceneChanged())
             case FrameCommitted():
@@ -211,7 +205,7 @@ class Updates:
                 log.error("scene %s: %s", self._ledger.scene, self._ledger.fatal)
                 self.tell(SceneChanged())
 
-    async def _resume(self, ready: Ready) -> None:
+    async def _resume(self, ready: Ready, life: object) -> None:
         """Brings the ledger in line with the committed states that a new worker has loaded, and goes on."""
         await self.worker.publish()
         ledger = self._ledger
@@ -228,6 +222,8 @@ class Updates:
             self._readers.refresh()
             if ready.indices[-1] > newest:  # committed by a worker that died before it could say so
                 self.tell(FrameFinished(ledger.frames[ready.indices[-1]].report))
+        if life is None or life is not self.worker.life:  # it died meanwhile
+            return
         self.trouble = last_trouble(self._ledger)
         self.worker.ready = True
         self.mending.taken_up(ready.damaged)

@@ -154,7 +154,7 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _closed(chunk: Path) -> bool:
-    """Whether a compact file has its index: nothing is written to it any more."""
+    """True for a compact file that has its index: nothing is written to it any more."""
     with chunk.open("rb") as file:
         file.seek(max(0, file.seek(0, os.SEEK_END) - len(FOOTER_MAGIC)))
         return file.read() == FOOTER_MAGIC

@@ -132,7 +132,7 @@ def _node_of(service: Service, nodes: Nodes, scene: str, killed: Counter[int] | 
 
 
 def _works(service: Service, scene: str) -> bool:
-    """Whether the worker has a frame again, or has nothing left to do."""
+    """True where the worker has a frame again, or nothing left to do."""
     status = service.status(scene)
     return status.state == "updating" or status.queued == 0
 

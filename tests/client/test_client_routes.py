@@ -54,6 +54,7 @@ CALLS = [
     calls.parts("s"),
     calls.gaussians("s", [0]),
     calls.budget("s"),
+    calls.cluster(),
     calls.set_budget("s", iterations=50),
     calls.tradeoff("s"),
     calls.replay("s"),

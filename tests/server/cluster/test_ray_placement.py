@@ -188,7 +188,10 @@ def test_scenes_are_found_again_after_the_service_was_killed(service: Service, s
 
 @pytest.mark.parametrize(
     ("placement", "words"),
-    [("ray=127.0.0.1:1", "there is no Ray cluster at 127.0.0.1:1"), ("kubernetes", "SCAS4D_PLACEMENT")],
+    [
+        ("ray=127.0.0.1:1", "there is no Ray cluster at 127.0.0.1:1"),
+        ("kubernetes", "give local, ray, or ray=HOST:PORT"),
+    ],
 )
 def test_what_is_no_cluster_is_one_line(placement: str, words: str, tmp_path: Path) -> None:
     environment = fakes.environment(SCAS4D_WARM_UP="false")
