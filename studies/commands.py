@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import typer
 
+from studies.cluster.commands import cluster
 from studies.compact.commands import compact, opening
 from studies.effort.commands import effort
 from studies.exports.commands import exports
@@ -21,6 +22,7 @@ from studies.quality.commands import (
     targets,
 )
 from studies.rigs.commands import calibration, drift, rigs
+from studies.scale.commands import scale
 from studies.service.commands import crossing, faults, ingest, memory, sleeping, views
 from studies.variants.commands import variants
 
@@ -29,9 +31,9 @@ STUDIES = {
     "Rigs": (rigs, calibration, drift),
     "What comes out": (compact, opening, exports),
     "Accuracy against time": (frontier, effort, paper, variants),
-    "Speed of the code": (kernels, device, moving, startup),
+    "Speed of the code": (kernels, device, moving, scale, startup),
     "Hard cases": (stability, timing),
-    "The running service": (faults, ingest, views, memory, sleeping, crossing),
+    "The running service": (faults, ingest, views, memory, sleeping, crossing, cluster),
 }
 """The commands by the heading under which `scripts/bench --help` lists them."""
 

@@ -6,6 +6,9 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+PRESETS = "scas4d, adaptive, fast, paper, dynamic3dgs, rigid, articulated, cloth, people or lights."
+"""Names of the presets, for the help of commands, which do not load them."""
+
 
 def parse_changes(changes: Sequence[str] | None) -> dict[str, Any]:
     """Reads each value as JSON, else as text; None gives no changes.

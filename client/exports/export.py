@@ -42,6 +42,11 @@ def export(
         raise InputError(f"id is given for format {format!r}", "leave --id out; it chooses the Gaussians of tracks")
     if out is not None and not wanted.numbered:
         check_suffix(out, wanted)
+    elif out is not None and out.suffix.lower() in wanted.suffixes:
+        raise InputError(
+            f"out {str(out)!r} is the name of one file, and {format} has one for each frame",
+            f"give a folder, or {out.stem}.zip",
+        )
     with_parts = wanted.needs_parts or format in WITH_PARTS
     with opened(source, low, high, with_parts, url, token, rate) as found, Bars() as bars:
         given = found.of

@@ -1,4 +1,4 @@
-"""Needs of a scene's process, for a node that has room: by the estimate of its scene; Ray's scheduler counts with it."""
+"""Needs of a scene's process, for a node that has room: by its scene's estimate; Ray's scheduler counts with it."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -121,3 +122,10 @@ def test_a_folder_that_cannot_be_written_is_one_line(capture_folder, tmp_path):
     (tmp_path / "file").touch()
     said = refused("demo", "--capture", capture_folder, "--out", tmp_path / "file" / "out")
     assert str(tmp_path / "file" / "out") in said
+
+
+def test_the_help_names_every_preset():
+    from client.cli.changes import PRESETS as named
+    from scas4d_core.presets import PRESETS
+
+    assert set(re.split(r", | or ", named.rstrip("."))) == set(PRESETS)

@@ -1,0 +1,44 @@
+"""`scripts/bench cluster`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from studies.options import Changes, Page, write_page
+from studies.service.commands import Repeated
+
+
+def cluster(
+    capture: Repeated,
+    frames: Annotated[int, typer.Option(min=3, help="Frames of each scene.")] = 12,
+    scenes: Annotated[int, typer.Option(min=1, help="Scenes at a time, on three nodes.")] = 6,
+    turns: Annotated[int, typer.Option(min=1, help="Turns of each placement.")] = 3,
+    views: Annotated[int, typer.Option(min=1, help="Views a turn, of a scene at rest.")] = 60,
+    work: Annotated[Path, typer.Option(help="Folder for the services' data; what is there goes.")] = Path(
+        "out/cluster"
+    ),
+    out: Page = None,
+    changes: Changes = None,
+) -> None:
+    """Measures what a Ray cluster of three nodes, on this machine, adds to updates and views, against local processes.
+
+    Example: scripts/bench cluster samples/robot --set static.iterations=300 --set update.iterations=20
+    """
+    from client.cli.changes import parse_changes
+    from client.cli.extras import need_server
+    from client.importers.open_source import open_source
+    from studies.cluster.cost import measure, told
+    from studies.cluster.nodes import Nodes
+    from studies.service.study import Study, encoded_frames
+
+    need_server()
+    opened = open_source(capture)
+    study = Study(work.resolve(), opened, encoded_frames(opened, frames), parse_changes(changes), {})
+    with Nodes(count=3, cpus=3) as nodes:
+        found = measure(study, nodes.address, scenes=scenes, turns=turns, views=views, echo=typer.echo)
+    text = told(found, scenes)
+    typer.echo(text)
+    write_page(out, text)

@@ -1,0 +1,152 @@
+"""``scripts/bench cluster``: what Ray adds to an update and to a view, and scenes on three nodes against local ones.
+
+Both services run on this machine, in turns: what differs is how processes are started and how messages go.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from statistics import median
+
+from client.wire import FrameState
+from studies.options import Echo
+from studies.service.process import Service, StudyError
+from studies.service.study import FrameSender, Study
+
+PLACEMENTS = ("local", "ray")
+
+
+@dataclass
+class CostFigures:
+    """Of one placement.
+
+    Attributes:
+        updates: seconds from one commit to the next, of frames that wait. views: seconds of a view.
+        throughput: committed frames a second of all scenes together, one a turn.
+    """
+
+    updates: list[float] = field(default_factory=list)
+    views: list[float] = field(default_factory=list)
+    throughput: list[float] = field(default_factory=list)
+
+
+def measure(
+    study: Study, address: str, *, scenes: int, turns: int, views: int, echo: Echo = print
+) -> dict[str, CostFigures]:
+    """Runs both placements in turns.
+
+    Args:
+        study: its frames are sent to each scene. address: of the cluster.
+    """
+    found = {name: CostFigures() for name in PLACEMENTS}
+    services = {
+        "local": study.service("local", {"SCAS4D_MAX_SCENES": str(scenes + 1)}),
+        "ray": study.service("ray", {"SCAS4D_MAX_SCENES": str(scenes + 1), "SCAS4D_PLACEMENT": f"ray={address}"}),
+    }
+    try:
+        for service in services.values():
+            service.start()
+        lone = {name: _begun(study, service) for name, service in services.items()}
+        for turn in range(turns):
+            for name in (PLACEMENTS, PLACEMENTS[::-1])[turn % 2]:
+                scene = _begun(study, services[name])
+                found[name].updates += _updates(study, services[name], scene)
+                found[name].views += _views(services[name], lone[name], study.capture.full_rig.names[0], views)
+                services[name].http.delete(f"/v1/scenes/{scene}")
+            echo(f"turn {turn + 1} of {turns}: one scene")
+        for name, scene in lone.items():
+            services[name].http.delete(f"/v1/scenes/{scene}")
+        for turn in range(turns):
+            for name in (PLACEMENTS, PLACEMENTS[::-1])[turn % 2]:
+                found[name].throughput.append(_together(study, services[name], scenes))
+            echo(f"turn {turn + 1} of {turns}: {scenes} scenes")
+    finally:
+        for service in services.values():
+            service.stop()
+    return found
+
+
+def told(found: dict[str, CostFigures], scenes: int) -> str:
+    """The figures as Markdown."""
+    local, ray = found["local"], found["ray"]
+    rows = [
+        ("an update, median, s", median(local.updates), median(ray.updates), 3),
+        ("a view, median, ms", 1e3 * median(local.views), 1e3 * median(ray.views), 1),
+        (f"{scenes} scenes, frames a second, median", median(local.throughput), median(ray.throughput), 2),
+    ]
+    table = ["| | local | Ray | ratio | difference |", "|---|---|---|---|---|"]
+    for name, here, there, digits in rows:
+        table.append(
+            f"| {name} | {here:.{digits}f} | {there:.{digits}f} | {there / here:.3f} | {there - here:+.{digits}f} |"
+        )
+    return "\n".join(table)
+
+
+def _begun(study: Study, service: Service) -> str:
+    """A scene with its first frame."""
+    scene = study.create(service)
+    FrameSender(study, service, scene).send(0)
+    service.finish(scene, 1)
+    return scene
+
+
+def _updates(study: Study, service: Service, scene: str) -> list[float]:
+    """Seconds of each update, of frames that are all there before the first begins."""
+    service.http.post(f"/v1/scenes/{scene}/pause")
+    sender = FrameSender(study, service, scene)
+    for index in range(1, len(study.frames)):
+        sender.send(index)
+    began = time.monotonic()
+    service.http.post(f"/v1/scenes/{scene}/resume")
+    service.finish(scene, len(study.frames))
+    return [(time.monotonic() - began) / (len(study.frames) - 1)]
+
+
+def _views(service: Service, scene: str, camera: str, count: int) -> list[float]:
+    """Seconds of each view of a scene at rest; the first is not counted."""
+    seconds = []
+    for _ in range(count + 1):
+        began = time.monotonic()
+        answer = service.http.post(f"/v1/scenes/{scene}/render", json={"camera": camera, "format": "jpeg"})
+        seconds.append(time.monotonic() - began)
+        if answer.status_code != 200:
+            raise StudyError(answer.text)
+    return seconds[1:]
+
+
+def _together(study: Study, service: Service, scenes: int) -> float:
+    """Frames a second that so many scenes commit together, after their first frames."""
+    ids = [_begun(study, service) for _ in range(scenes)]
+    threads = [threading.Thread(target=_send_all, args=(study, service, id)) for id in ids]
+    for id in ids:
+        service.http.post(f"/v1/scenes/{id}/pause")
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    began = time.monotonic()
+    for id in ids:
+        service.http.post(f"/v1/scenes/{id}/resume")
+    for id in ids:
+        service.finish(id, len(study.frames))
+    seconds = time.monotonic() - began
+    _check(service, ids, len(study.frames))
+    for id in ids:
+        service.http.delete(f"/v1/scenes/{id}")
+    return scenes * (len(study.frames) - 1) / seconds
+
+
+def _send_all(study: Study, service: Service, scene: str) -> None:
+    sender = FrameSender(study, service, scene)
+    for index in range(1, len(study.frames)):
+        sender.send(index)
+
+
+def _check(service: Service, scenes: Sequence[str], frames: int) -> None:
+    for scene in scenes:
+        report = service.frame(scene, frames - 1)
+        if report.state != FrameState.COMMITTED:
+            raise StudyError(f"scene {scene}: frame {frames - 1} is {report.state}: {report.error}")

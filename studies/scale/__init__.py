@@ -1,0 +1,1 @@
+"""Cost against size: pixels, Gaussians, cameras, the share that moves, frames."""

@@ -1,0 +1,41 @@
+"""`scripts/bench scale`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from studies.options import Page, write_page
+
+
+def scale(
+    sweep: Annotated[
+        list[str] | None,
+        typer.Option(help="Only this: Gaussians, pixels, cameras, share that moves. May be repeated."),
+    ] = None,
+    frames: Annotated[
+        list[int] | None, typer.Option(min=0, help="Frames after which memory is looked at; 0: not at all.")
+    ] = None,
+    work: Annotated[Path, typer.Option(help="Folder of figures; what it has is not measured again.")] = Path(
+        "out/scale"
+    ),
+    picture: Annotated[Path | None, typer.Option(help="File of the plot, as scale.png.")] = None,
+    out: Page = None,
+) -> None:
+    """Measures seconds and memory against pixels, Gaussians, cameras, the share that moves and frames: exponents.
+
+    Example: NUMBA_NUM_THREADS=1 scripts/bench scale --sweep cameras
+    """
+    from studies.scale.scale import FRAMES, SWEEPS, plot, run, told
+
+    if unknown := set(sweep or []) - set(SWEEPS):
+        raise typer.BadParameter(f"there is no sweep {sorted(unknown)[0]!r}; they are {', '.join(SWEEPS)}")
+    counts = [count for count in frames or FRAMES if count]
+    found = run(work.resolve(), sweep or list(SWEEPS), counts, typer.echo)
+    text = told(found)
+    typer.echo(text)
+    write_page(out, text)
+    if picture is not None:
+        plot(found, picture)

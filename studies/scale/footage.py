@@ -1,0 +1,75 @@
+"""A textured wall of any number of Gaussians before any number of cameras; its middle slides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scas4d_core.cameras import Camera, Rig
+from scas4d_core.captures.frame import Frame
+from scas4d_core.first_frame.static_result import StaticResult
+from scas4d_core.gaussians import Gaussians
+from studies.kernels.synthetic import photograph
+
+WIDTH_M, AWAY_M, BASELINE_M = 2.0, 3.0, 1.0
+"""Of the wall; the cameras before it; from the first camera to the last."""
+SLIDE_M = 0.008
+RATE = 30.0
+
+
+@dataclass(frozen=True)
+class Size:
+    """A scene to be measured.
+
+    Attributes:
+        gaussians: about so many: the wall is as many by as many. width, height: pixels of each camera.
+        moving: share of the wall that moves.
+    """
+
+    gaussians: int = 20_000
+    width: int = 256
+    height: int = 256
+    cameras: int = 12
+    moving: float = 0.25
+
+
+def wall(size: Size) -> Gaussians:
+    """[N] Gaussians of the wall, its middle labelled as moving; metres, the wall's middle at the origin."""
+    side = round(size.gaussians**0.5)
+    lines = np.linspace(-WIDTH_M / 2, WIDTH_M / 2, side)
+    x, y = (axis.ravel() for axis in np.meshgrid(lines, lines))
+    rng = np.random.default_rng(5)
+    patches = rng.uniform(0.1, 0.9, (50, 50, 3))  # the same picture whatever it is made of
+    row, column = (np.minimum(((axis / WIDTH_M + 0.5) * 50).astype(int), 49) for axis in (y, x))
+    points = np.stack([x, y, 0.01 * rng.standard_normal(len(x))], axis=1)
+    found = Gaussians.of_points(points, radius=0.6 * WIDTH_M / side, colours=patches[row, column])
+    moves = np.maximum(np.abs(x), np.abs(y)) <= np.sqrt(size.moving) * WIDTH_M / 2 + 1e-9
+    return found.replace(foreground=moves.astype(np.float32))
+
+
+def rig(size: Size) -> Rig:
+    """A row of cameras before the wall, which fills their pictures in height."""
+    focal = size.height * AWAY_M / WIDTH_M
+    lens = np.array([[focal, 0, size.width / 2], [0, focal, size.height / 2], [0, 0, 1]])
+    cameras = []
+    for number, offset in enumerate(np.linspace(-BASELINE_M / 2, BASELINE_M / 2, size.cameras)):
+        pose, angle = np.eye(4), np.arctan2(offset, AWAY_M)
+        cos, sin = np.cos(angle), np.sin(angle)
+        pose[:3, :3] = [[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]]
+        pose[:3, 3] = pose[:3, :3] @ np.array([-offset, 0, AWAY_M])
+        cameras.append(Camera(f"c{number}", lens, pose, size.width, size.height))
+    return Rig(tuple(cameras))
+
+
+def shown(state: Gaussians, index: int, cameras: Rig) -> Frame:
+    """The frame after so many slides."""
+    way = np.array([SLIDE_M * index, 0.5 * SLIDE_M * index, 0], np.float32)
+    means = state.means + np.where(state.moving[:, None], way, np.float32(0))
+    return replace(photograph(state.replace(means=means.astype(np.float32)), cameras), index=index, time=index / RATE)
+
+
+def known(state: Gaussians, cameras: Rig) -> StaticResult:
+    """Frame 0 as it is, in the world of the cameras."""
+    world = cameras.world_frame(1.0)
+    return StaticResult(state.replace(means=world.to_inside(state.means).astype(np.float32)), {}, [])

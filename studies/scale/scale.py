@@ -1,0 +1,177 @@
+"""``scripts/bench scale``: seconds and memory against one size at a time; each size in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import resource
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.settings import Settings
+from studies.options import Echo
+from studies.scale.footage import Size, known, rig, shown, wall
+
+ITERATIONS = 30
+"""Of an update, at every size."""
+UPDATES = 4
+"""The first, which looks for the motion, does not count."""
+SWEEPS: Mapping[str, Sequence[Size]] = {
+    "Gaussians": [Size(gaussians=count) for count in (5_000, 10_000, 20_000, 50_000, 100_000, 200_000)],
+    "pixels": [Size(width=side, height=side) for side in (128, 256, 512, 1024)],
+    "pixels, all of which move": [Size(width=side, height=side, moving=1.0) for side in (128, 256, 512)],
+    "cameras": [Size(cameras=count) for count in (4, 8, 16, 32, 64)],
+    "share that moves": [Size(moving=share) for share in (0.05, 0.1, 0.2, 0.4, 0.8)],
+}
+"""Sizes by what rises in them; all else is that of ``Size()``."""
+FRAMES = (100, 400, 1600)
+"""Frames of one process; its memory is looked at after each of these numbers."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Of one size.
+
+    Attributes:
+        update: seconds of an update, median. view: seconds of a view. first: seconds of a start from the known state:
+            clusters, neighbours, first rendering. memory: MB, the most that the process had.
+    """
+
+    update: float
+    view: float
+    first: float
+    memory: float
+
+
+def amount(name: str, size: Size) -> float:
+    """The number that rises in a sweep."""
+    if name.startswith("pixels"):
+        return float(size.width * size.height)
+    return float({"Gaussians": size.gaussians, "cameras": size.cameras, "share that moves": size.moving}[name])
+
+
+def slope(amounts: Sequence[float], costs: Sequence[float]) -> float:
+    """Exponent of the cost: the slope of its logarithm by least squares.
+
+    >>> round(slope([1, 10, 100], [2, 20, 200]), 6)
+    1.0
+    """
+    return float(np.polyfit(np.log(amounts), np.log(costs), 1)[0])
+
+
+def cost(size: Size) -> Cost:
+    """Measures a size in this process."""
+    settings = Settings.model_validate(
+        {"scene": {"metres_per_unit": 1.0}, "update": {"iterations": ITERATIONS}, "effects": {"camera_gain": "off"}}
+    )
+    state, cameras = wall(size), rig(size)
+    frames = [shown(state, index, cameras) for index in range(UPDATES + 1)]
+    began = perf_counter()
+    scene = Reconstruction.start(cameras, frames[0], settings, static=known(state, cameras))
+    first = perf_counter() - began
+    seconds, views = [], []
+    for frame in frames[1:]:
+        began = perf_counter()
+        scene.step(frame)
+        seconds.append(perf_counter() - began)
+        began = perf_counter()
+        scene.render(cameras.cameras[0])
+        views.append(perf_counter() - began)
+    return Cost(median(seconds[1:]), median(views[1:]), first, _peak_mb())
+
+
+def growth(frames: Sequence[int]) -> dict[int, float]:
+    """Peak memory, MB, of a process after so many frames of a small scene, its states beside it in a folder."""
+    from tempfile import TemporaryDirectory
+
+    size = Size(gaussians=2_000, width=64, height=64, cameras=4)
+    settings = Settings.model_validate({"scene": {"metres_per_unit": 1.0}, "update": {"iterations": 2}})
+    state, cameras = wall(size), rig(size)
+    found: dict[int, float] = {}
+    with TemporaryDirectory() as folder:
+        scene = Reconstruction.start(cameras, shown(state, 0, cameras), settings, static=known(state, cameras))
+        scene.history.put_aside(Path(folder))
+        for index in range(1, max(frames) + 1):
+            way = index % 16 if index % 32 < 16 else 16 - index % 16  # to and fro
+            scene.step(replace(shown(state, way, cameras), index=index, time=index / 30))
+            if index in frames:
+                found[index] = _peak_mb()
+    return found
+
+
+def run(work: Path, sweeps: Sequence[str], frames: Sequence[int], echo: Echo) -> dict[str, Any]:
+    """Measures what ``work`` does not hold yet; a run that was stopped goes on."""
+    work.mkdir(parents=True, exist_ok=True)
+    for name in sweeps:
+        for size in SWEEPS[name]:
+            echo(f"{name} {amount(name, size):g}: {_kept(work, asdict(size))}")
+    grown = _kept(work, {"frames": list(frames)}) if frames else {}
+    return {"sweeps": {name: [_kept(work, asdict(size)) for size in SWEEPS[name]] for name in sweeps}, "frames": grown}
+
+
+def told(found: Mapping[str, Any]) -> str:
+    """Tables of costs and slopes, as Markdown."""
+    lines = []
+    for name, costs in found["sweeps"].items():
+        amounts = [amount(name, size) for size in SWEEPS[name]]
+        lines += ["", f"| {name} | update, s | view, ms | start, s | memory, MB |", "|---|---|---|---|---|"]
+        lines += [
+            f"| {size:g} | {one['update']:.2f} | {1e3 * one['view']:.0f} | {one['first']:.2f} | {one['memory']:.0f} |"
+            for size, one in zip(amounts, costs, strict=True)
+        ]
+        slopes = [slope(amounts, [one[field.name] for one in costs]) for field in fields(Cost)]
+        lines.append("| **exponent** | " + " | ".join(f"**{each:.2f}**" for each in slopes) + " |")
+    if found["frames"]:
+        lines += ["", "| frames of one process | memory, MB |", "|---|---|"]
+        lines += [f"| {int(count):,} | {mb:.0f} |" for count, mb in found["frames"].items()]
+    return "\n".join(lines).strip()
+
+
+def plot(found: Mapping[str, Any], path: Path) -> None:
+    """Seconds of an update against each size, relative to the smallest, on logarithmic axes."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(7, 5))
+    for name, costs in found["sweeps"].items():
+        amounts = [amount(name, size) for size in SWEEPS[name]]
+        seconds = [one["update"] for one in costs]
+        axes.loglog([each / amounts[0] for each in amounts], [each / seconds[0] for each in seconds], "o-", label=name)
+    ends = axes.get_xlim()
+    axes.loglog([1, ends[1]], [1, ends[1]], "k:", linewidth=1, label="as its size")
+    axes.set(xlabel="size, of the smallest", ylabel="seconds of an update, of those at the smallest")
+    axes.legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    pyplot.close(figure)
+
+
+def _kept(work: Path, asked: Mapping[str, Any]) -> Any:
+    """The figures of a size, or of frames, from the folder; measured in a new process where it has none."""
+    name = "-".join(f"{key}_{value}" for key, value in asked.items()).replace(" ", "").replace("[", "").replace("]", "")
+    file = work / f"{name}.json"
+    if not file.exists():
+        done = subprocess.run(
+            [sys.executable, "-m", "studies.scale.scale", json.dumps(asked)], capture_output=True, text=True, check=True
+        )
+        file.write_text(done.stdout.splitlines()[-1])
+    return json.loads(file.read_text())
+
+
+def _peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+
+
+if __name__ == "__main__":
+    given = json.loads(sys.argv[1])
+    print(json.dumps(growth(given["frames"]) if "frames" in given else asdict(cost(Size(**given)))))

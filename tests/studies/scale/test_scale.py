@@ -1,0 +1,51 @@
+"""The study of cost against size: exponents, its processes, and that it goes on after a stop."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from studies.scale import scale
+from studies.scale.footage import Size, rig, shown, wall
+
+TINY = Size(gaussians=400, width=32, height=24, cameras=3)
+
+
+def test_exponents_are_those_of_powers() -> None:
+    assert scale.slope([2, 4, 8], [5, 20, 80]) == pytest.approx(2)
+    assert scale.slope([2, 4, 8], [3, 3, 3]) == pytest.approx(0)
+
+
+def test_the_wall_is_the_same_picture_whatever_it_is_made_of() -> None:
+    pictures = [
+        next(iter(shown(wall(Size(gaussians=count)), 0, rig(Size(cameras=1))).images.values()))
+        for count in (10_000, 40_000)
+    ]
+    assert np.abs(pictures[0].astype(int) - pictures[1]).mean() < 20
+
+
+def test_the_middle_moves_as_far_as_is_asked() -> None:
+    for share in (0.1, 0.5, 1.0):
+        assert wall(Size(moving=share)).moving.mean() == pytest.approx(share, abs=0.02)
+
+
+def test_sizes_are_measured_once_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scale, "SWEEPS", {"cameras": [TINY]})
+    said: list[str] = []
+    found = scale.run(tmp_path, ["cameras"], [2, 4], said.append)
+    (one,) = found["sweeps"]["cameras"]
+    assert min(one.values()) > 0
+    assert set(found["frames"]) == {"2", "4"}
+    (tmp_path / "frames_2,4.json").write_text('{"2": 100, "4": 101}')
+    again = scale.run(tmp_path, ["cameras"], [2, 4], said.append)
+    assert again["sweeps"] == found["sweeps"]
+    assert again["frames"] == {"2": 100, "4": 101}
+    monkeypatch.setattr(scale, "SWEEPS", {"cameras": [TINY, Size(cameras=6)]})
+    costs = [{"update": 1.0, "view": 0.01, "first": 2.0, "memory": 100.0}] * 2
+    text = scale.told({"sweeps": {"cameras": costs}, "frames": {"2": 100}})
+    assert "| 3 | 1.00 | 10 | 2.00 | 100 |" in text
+    assert "| **exponent** | **0.00** |" in text
+    scale.plot({"sweeps": {"cameras": costs}, "frames": {}}, tmp_path / "a.png")
+    assert (tmp_path / "a.png").stat().st_size > 1000
