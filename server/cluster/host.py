@@ -44,10 +44,13 @@ class Host:
     """Starts the process, hands its messages on in order, and says how it ended.
 
     Args:
-        prepare: see `Placement`. data: folder that this node has to see.
+        prepare: see `Placement`. data: folder that this node has to see. threads: OMP_NUM_THREADS of the service.
     """
 
-    def __init__(self, prepare: Callable[[], None] | None, data: Path) -> None:
+    def __init__(self, prepare: Callable[[], None] | None, data: Path, threads: str | None = None) -> None:
+        os.environ.pop("OMP_NUM_THREADS", None)  # Ray sets it to the actor's CPUs
+        if threads is not None:
+            os.environ["OMP_NUM_THREADS"] = threads
         self._placement = Placement(prepare)
         self._data = data
         self._said: asyncio.Queue[Any] = asyncio.Queue()

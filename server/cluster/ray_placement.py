@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import os
 import secrets
 import socket
 from collections.abc import Callable
@@ -107,7 +108,9 @@ class RayPlacement(Placement):
     def host(self, name: str, needs: Needs) -> Any:
         """An actor for a process."""
         made: Any = ray.remote(Host)
-        return made.options(name=name, **needs.options()).remote(self.prepare, self._server.data.resolve())
+        return made.options(name=name, **needs.options()).remote(
+            self.prepare, self._server.data.resolve(), os.environ.get("OMP_NUM_THREADS")
+        )
 
 
 def _reach(address: str) -> None:
