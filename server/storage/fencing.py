@@ -21,7 +21,7 @@ from scas4d_core.storage.npz import sync_folder
 PART = ".part"
 """Ends the name of a folder that is not whole."""
 PASSES = 20
-"""Times that a folder is listed whose files vanish meanwhile: whoever deletes them is at work still."""
+"""Times that a folder is linked which changes meanwhile: whoever writes to it is at work still."""
 
 
 class FencingError(RuntimeError):
@@ -68,7 +68,7 @@ def take_over(states: Path, epoch: int, before: int | None) -> Path:
     Whoever writes to the latter does so for nothing from now on.
 
     Raises:
-        FencingError: files of the epoch before kept vanishing.
+        FencingError: that folder kept changing.
     """
     folder = epoch_folder(states, epoch)
     beside = folder.with_name(f"{folder.name}.{secrets.token_hex(4)}{PART}")
@@ -79,7 +79,7 @@ def take_over(states: Path, epoch: int, before: int | None) -> Path:
             break
     else:
         shutil.rmtree(beside, ignore_errors=True)
-        raise FencingError(f"files of {states.name}.{before} kept vanishing while it was taken over")
+        raise FencingError(f"{states.name}.{before} kept changing while it was taken over")
     sync_folder(beside)
     beside.rename(folder)
     sync_folder(folder.parent)
@@ -113,28 +113,26 @@ def _epoch_of(path: Path) -> int:
 
 
 def _linked(source: Path, target: Path) -> bool:
-    """Links all files of a folder into another; False where one vanished meanwhile, as another may have come then."""
-    chunks = []
-    with os.scandir(source) as entries:
-        for entry in entries:
-            if entry.name.startswith(".") or not entry.is_file(follow_symlinks=False):
-                continue
-            if entry.name.endswith(".s4d"):
-                chunks.append(entry)  # last: a frame is in one before its own file goes
-                continue
-            try:
-                _link(Path(entry), target / entry.name)
-            except FileNotFoundError:
-                return False
-    for chunk in chunks:
+    """Links all files of a folder into another; False where the folder has changed meanwhile.
+
+    Its worker may be at work: a frame that it moves to a compact file, or commits, must be seen whole.
+    """
+    names = _names(source)
+    for name in names:
         try:
-            if _closed(Path(chunk)):
-                _link(Path(chunk), target / chunk.name)
+            if name.endswith(".s4d") and not _closed(source / name):
+                _copy(source / name, target / name)
             else:
-                _copy(Path(chunk), target / chunk.name)
+                _link(source / name, target / name)
         except FileNotFoundError:
             return False
-    return True
+    return names == _names(source)
+
+
+def _names(folder: Path) -> list[str]:
+    """Files but those that are being written; compact files last: a frame is in one before its own file goes."""
+    names = [name for name in os.listdir(folder) if not name.startswith(".")]
+    return sorted(names, key=lambda name: (name.endswith(".s4d"), name))
 
 
 def _link(source: Path, target: Path) -> None:

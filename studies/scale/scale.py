@@ -142,7 +142,7 @@ def plot(found: Mapping[str, Any], path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(figsize=(7, 5))
+    figure, axes = pyplot.subplots(figsize=(7, 5), layout="tight")
     for name, costs in found["sweeps"].items():
         amounts = [amount(name, size) for size in SWEEPS[name]]
         seconds = [one["update"] for one in costs]
@@ -151,7 +151,6 @@ def plot(found: Mapping[str, Any], path: Path) -> None:
     axes.loglog([1, ends[1]], [1, ends[1]], "k:", linewidth=1, label="as its size")
     axes.set(xlabel="size, of the smallest", ylabel="seconds of an update, of those at the smallest")
     axes.legend()
-    figure.tight_layout()
     figure.savefig(path, dpi=120)
     pyplot.close(figure)
 

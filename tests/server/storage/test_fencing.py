@@ -110,12 +110,33 @@ def test_a_frame_that_moves_meanwhile_is_not_lost(states: Path, monkeypatch: pyt
     assert not list(states.parent.glob("*.part"))
 
 
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_commit_meanwhile_is_taken_over_whole(states: Path, monkeypatch: pytest.MonkeyPatch, place: int) -> None:
+    """The old worker commits a frame, and compacts one that is linked already, or is not yet."""
+    old, link = epoch_folder(states, 3), os.link
+    (old / "checkpoint_000001.npz").touch()
+    calls = []
+
+    def working(source: Path, target: Path) -> None:
+        calls.append(source)
+        if len(calls) == 1 + place:
+            for name in ("checkpoint_000002.npz", "frame_000002.npz", "states_000000.s4d"):
+                (old / name).write_bytes(b"new")
+            (old / "frame_000000.npz").unlink()
+        link(source, target)
+
+    monkeypatch.setattr(fencing.os, "link", working)
+    folder = take_over(states, 4, 3)
+    assert sorted(os.listdir(folder)) == sorted(os.listdir(old))
+    assert not (folder / "frame_000000.npz").exists()
+
+
 def test_files_that_keep_vanishing_are_a_fault(states: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def gone(source: Path, target: Path) -> None:
         raise FileNotFoundError(source)
 
     monkeypatch.setattr(fencing.os, "link", gone)
-    with pytest.raises(FencingError, match=r"files of states\.3 kept vanishing"):
+    with pytest.raises(FencingError, match=r"states\.3 kept changing"):
         take_over(states, 4, 3)
     assert sorted(epochs(states)) == [3]
 
