@@ -110,6 +110,7 @@ def decode_born(body: bytes, count: int, bounds: Bounds) -> tuple[Columns, Clust
     environment, offset = read_array(body, offset)
     if offset != len(body):
         raise PlaneError(f"{len(body) - offset} bytes follow the Gaussians")
+    values += np.float32(0)  # as in `Columns.placed`
     return completed(state, rows, values, retired, environment), Clusters(labels.astype(np.int64))
 
 

@@ -105,7 +105,7 @@ class Columns:
         """The same with place and shape of some rows exchanged."""
         changed = {name: getattr(self, name).copy() for name in SHAPED}
         for name, array in changed.items():
-            array[..., rows] = getattr(part, name)
+            array[..., rows] = getattr(part, name) + np.float32(0)  # −0 to 0: whichever rows go through arithmetic
         return self.having(**changed)
 
     @property

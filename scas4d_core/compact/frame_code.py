@@ -38,6 +38,8 @@ SLACK = 1 + 1e-4
 """On bounds, for the rounding of float32."""
 SHIFT_STEP = 0.5
 """Step of a cluster's motion in parts of the middle step of a centre."""
+LARGEST_STEP = 1e90
+"""Larger ones are none of a state; what is made of them would not be finite."""
 COARSEST = 0.01
 """Step of A at most."""
 _STEPS = struct.Struct("<dd")
@@ -140,7 +142,7 @@ class Change:
         if len(body) < _STEPS.size:
             raise PlaneError(f"{len(body)} bytes are no state")
         steps = _STEPS.unpack_from(body)
-        if not np.isfinite(steps).all():
+        if not (np.abs(steps) < LARGEST_STEP).all():
             raise PlaneError(f"steps {steps} cannot be")
         offset, motion = _STEPS.size, np.zeros((12, clusters.count), np.int64)
         for plane in motion:

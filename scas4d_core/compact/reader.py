@@ -37,6 +37,8 @@ from scas4d_core.gaussians import Gaussians
 __all__ = ["CompactReader", "DamagedFileError", "FileError"]
 
 STATES = (Kind.KEY, Kind.DELTA)
+AT_ONCE = 8
+"""States whose changes are held at a time."""
 MOST_PER_BYTE = 4
 """Gaussians for each byte that tells of them; a count that lies must not fill the memory."""
 
@@ -155,12 +157,11 @@ class CompactReader:
             held = f"{self._frames[0]} to {self._frames[-1]}" if self._frames else "none"
             raise FileError(f"{self.path.name}: frame {index} is not in the file{self._why()}; it has frames: {held}")
         begin = place
-        while self._states[begin].kind is Kind.DELTA and begin > 0:
-            if self._last is not None and self._last[0] == begin:
-                break
+        while self._states[begin].kind is Kind.DELTA and begin > 0 and not (self._last and self._last[0] == begin):
             begin -= 1
         state = self._last[1] if self._last is not None and self._last[0] == begin else None
-        for _, places in groupby(range(begin if state is None else begin + 1, place + 1), self._births_by):
+        wanted = range(begin if state is None else begin + 1, place + 1)
+        for _, places in groupby(wanted, lambda one: (self._births_by(one), one // AT_ONCE)):
             state = self._decoded(list(places), state)
         assert state is not None
         self._last = (place, state)
@@ -302,7 +303,7 @@ class CompactReader:
             body = body[len(told) :]
         try:
             return Change.read(body, reference, clusters)
-        except (PlaneError, ValueError) as error:
+        except ValueError as error:
             raise self._damaged(record, error) from None
 
     def _born_by(self, index: int) -> tuple[Columns, Clusters]:

@@ -195,11 +195,10 @@ class CompactWriter:
             if (array := getattr(state, field)) is None or np.isfinite(array).all():
                 continue
             wrong = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))
-            if len(wrong):
-                raise FileError(
-                    f"{name}: frame {index}: {len(wrong)} Gaussians have {field} that are not finite, rows "
-                    f"{wrong[:5].tolist()}; leave the frame out, or mend them"
-                )
+            raise FileError(
+                f"{name}: frame {index}: {len(wrong)} Gaussians have {field} that are not finite, rows "
+                f"{wrong[:5].tolist()}; leave the frame out, or mend them"
+            )
 
     def close(self) -> None:
         """Writes the index. A file without it is read all the same, after a look at each record."""

@@ -192,7 +192,7 @@ def test_states_are_the_same_told_at_once_or_one_by_one() -> None:
         told = coded_state.decoded
     at_once = after(first, clusters, BOUNDS, changes)
     for name in ("means", "factors", "rotations", "colours", "foreground"):
-        assert np.array_equal(getattr(at_once, name), getattr(told, name)), name
+        assert getattr(at_once, name).tobytes() == getattr(told, name).tobytes(), name
     assert within(errors_of(at_once, Columns.of(true)), BOUNDS)
 
 
@@ -204,6 +204,14 @@ def test_a_body_that_is_cut_is_refused(cut: int) -> None:
         decode(Columns.of(before), Clusters.of(before), BOUNDS, body[:cut])
     with pytest.raises(PlaneError, match="follow the state"):
         decode(Columns.of(before), Clusters.of(before), BOUNDS, body + b"more")
+
+
+@pytest.mark.parametrize("step", [1e308, float("inf"), float("nan")])
+def test_steps_that_cannot_be_are_refused_where_they_are(step: float) -> None:
+    before = cloud()
+    body = coded(before, jittered(before, 0.1)).body
+    with pytest.raises(PlaneError, match="cannot be"):
+        Change.read(np.float64(step).tobytes() + body[8:], Columns.of(before), Clusters.of(before))
 
 
 def test_maps_of_clusters_are_those_that_were_made() -> None:
