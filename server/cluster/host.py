@@ -65,16 +65,18 @@ class Host:
             host = socket.gethostname()
             return Started(node, fault=f"node {host} cannot write to the data folder {self._data}; mount it there")
         self._process = Process(entry, spec, self._said.put_nowait, self._ended, self._placement.prepare)
+        self._hand_on()  # what was posted before
         return Started(node, self._process.pid)
 
     async def post(self, number: int, message: Any) -> None:
         """Posts a message to the process; by their numbers, as Ray may call in another order."""
         self._early[number] = message
-        while self._next in self._early:
-            message = self._early.pop(self._next)
+        self._hand_on()
+
+    def _hand_on(self) -> None:
+        while self._process is not None and self._next in self._early:
+            self._process.send(self._early.pop(self._next))
             self._next += 1
-            if self._process is not None:
-                self._process.send(message)
 
     async def take(self) -> list[Any]:
         """The next messages of the process, one at least; `Gone` is the last."""

@@ -169,7 +169,7 @@ class WorkerProcess:
         """Has the states that the process took over read from now on; to be called before it gets a frame."""
         if (epoch := self._epoch) is not None and epoch != self._taken:
             await asyncio.to_thread(publish, self.spec.folder.states, epoch)
-            self._taken = epoch
+            self._taken = epoch if self._taken is None else max(epoch, self._taken)
 
     async def sweep(self) -> None:
         """Removes the states of workers before, once whoever reads through an old link has seen the new one."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
+import threading
 from pathlib import Path
 
 from scas4d_core.compact.index import FOOTER_MAGIC
@@ -20,6 +21,8 @@ from scas4d_core.storage.npz import sync_folder
 
 PART = ".part"
 """Ends the name of a folder that is not whole."""
+_PUBLISHING = threading.Lock()
+"""One service at most has a data folder; its threads may come late."""
 PASSES = 20
 """Times that a folder is linked which changes meanwhile: whoever writes to it is at work still."""
 
@@ -87,7 +90,13 @@ def take_over(states: Path, epoch: int, before: int | None) -> Path:
 
 
 def publish(states: Path, epoch: int) -> None:
-    """Has the states of an epoch read from now on, in one step."""
+    """Has the states of an epoch read from now on, in one step; never those of an earlier one again."""
+    with _PUBLISHING:
+        if not (states.is_symlink() and states.is_dir() and _epoch_of(states.readlink()) > epoch):
+            _point(states, epoch)
+
+
+def _point(states: Path, epoch: int) -> None:
     beside = states.with_name(f".{states.name}.link")
     beside.unlink(missing_ok=True)
     beside.symlink_to(epoch_folder(states, epoch).name)

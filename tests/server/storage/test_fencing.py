@@ -181,6 +181,14 @@ def test_two_workers_of_one_epoch_cannot_both_have_it(states: Path) -> None:
         take_over(states, 4, 3)
 
 
+def test_a_link_that_comes_late_does_not_go_back(states: Path) -> None:
+    take_over(states, 4, 3)
+    take_over(states, 5, 3)
+    publish(states, 5)
+    publish(states, 4)
+    assert found_epoch(states) == 5
+
+
 def test_sweeping_leaves_later_epochs_and_other_reconstructions(states: Path) -> None:
     take_over(states, 4, 3)
     other = states.with_name("states_2.1")
