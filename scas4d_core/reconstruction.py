@@ -28,7 +28,7 @@ from scas4d_core.frame_report import FrameReport, Progress, report_of_first, rep
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import Preparation, room_for_births
 from scas4d_core.query.committed import CommittedScene
-from scas4d_core.rasterize.limits import scene_limits
+from scas4d_core.rasterize.limits import rig_limits
 from scas4d_core.rig_checks import check_rig
 from scas4d_core.robust.alarms import first_watched, sharpness
 from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness, fingerprints, goes_on, lit, noted
@@ -74,7 +74,7 @@ class Reconstruction(CommittedScene):
         """Without a frame yet; ``rig`` as given, of the frames' pictures. ``found``: None: as the history began."""
         require_device(settings.device)
         world, scale = rig.world_frame(settings.scene.metres_per_unit), settings.scene.image_scale
-        limits = scene_limits(settings.scene.near, rig_inside(world, rig.cameras).radius)
+        limits = rig_limits(settings.scene.near, world, rig.cameras)
         super().__init__(history, world, limits)
         self.calibrated = rig = in_use(rig, history.first_report if found is None else {"calibration": asdict(found)})
         self.rig = rig_inside(world, rig.scaled(scale).cameras)

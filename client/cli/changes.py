@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 PRESETS = "scas4d, adaptive, fast, paper, dynamic3dgs, rigid, articulated, cloth, people or lights."
 """Names of the presets, for the help of commands, which do not load them."""
+Preset = Annotated[str, typer.Option(help=PRESETS)]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NAME=VALUE", help="Change a setting, as update.iterations=200. May be repeated."),
+]
 
 
 def parse_changes(changes: Sequence[str] | None) -> dict[str, Any]:

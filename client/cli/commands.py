@@ -13,7 +13,7 @@ import typer
 from client import rig
 from client.cli import scenes
 from client.cli.capture_options import opened, takes_capture
-from client.cli.changes import PRESETS, parse_changes
+from client.cli.changes import Changes, Preset, parse_changes
 from client.cli.progress import Bars, console
 from client.importers.open_source import CaptureOptions
 from client.sdk import DEFAULT_URL, Client
@@ -81,16 +81,8 @@ def push(
     ] = WhenFull.REFUSE,
     outage: Annotated[float, typer.Option(min=0, help="Seconds to wait for a service that is away.")] = PUSH_OUTAGE_S,
     encoding: Encode = Encoding.JPEG,
-    preset: Annotated[
-        str,
-        typer.Option(help=PRESETS),
-    ] = "scas4d",
-    changes: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="NAME=VALUE", help="Change a setting, as update.iterations=200. May be repeated."
-        ),
-    ] = None,
+    preset: Preset = "scas4d",
+    changes: Changes = None,
 ) -> None:
     """Sends a capture to a running service as its rig would, and waits for the last frame."""
     settings = parse_changes(changes)

@@ -14,7 +14,7 @@ import typer
 from client import __version__
 from client.cli import commands, extras
 from client.cli.capture_options import opened, takes_capture
-from client.cli.changes import PRESETS, parse_changes
+from client.cli.changes import Changes, Preset, parse_changes
 from client.cli.progress import console
 from client.errors import ServiceError, ServiceUnreachable
 from client.exports import commands as looks
@@ -27,11 +27,6 @@ commands.register(app)
 looks.register(app)
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture.")]
-Preset = Annotated[str, typer.Option(help=PRESETS)]
-Changes = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="NAME=VALUE", help="Change a setting, as update.iterations=200. May be repeated."),
-]
 Frames = Annotated[int | None, typer.Option(min=1, help="Take only so many frames.")]
 Out = Annotated[Path, typer.Option(help="Folder for the results.")]
 

@@ -72,10 +72,9 @@ def evaluate_states(
 
 def _measure(found: Source, truth: Capture, store: Store, frames: int | None, report: Report) -> Row:
     # These bring the kernels; the command does not.
-    from scas4d_core.cameras import rig_inside
     from scas4d_core.metrics.evaluation import measure_flicker, measure_parts, measure_pictures, measure_tracks
     from scas4d_core.query.committed import CommittedScene
-    from scas4d_core.rasterize.limits import scene_limits
+    from scas4d_core.rasterize.limits import rig_limits
     from scas4d_core.storage.history import History
 
     given, last = found.of, truth.frame_count - 1
@@ -88,7 +87,7 @@ def _measure(found: Source, truth: Capture, store: Store, frames: int | None, re
             "give states of this capture",
         )
     world, history = given.head.world, History()
-    limits = scene_limits(Settings().scene.near, rig_inside(world, truth.rig.cameras).radius)
+    limits = rig_limits(Settings().scene.near, world, truth.rig.cameras)
     scene = CommittedScene(history, world, limits)
     key = f"{truth.name}-{found.name}"
     store.start_frames(key)

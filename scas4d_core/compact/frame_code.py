@@ -21,6 +21,7 @@ from scas4d_core.compact.sections import (
     read_exact,
     read_mask,
     read_told,
+    scattered,
     write_array,
     write_exact,
     write_mask,
@@ -167,24 +168,16 @@ class Change:
         told = Told.of(bounds, _moved(state, clusters, self.motion, self.steps))
         for name in SHAPE:
             rows, planes = self.residuals[name]
-            told = told.having(name, _dense(told.state, name, rows if places is None else places[rows], planes))
+            own = rows if places is None else places[rows]
+            told = told.having(name, scattered(own, planes, told_shape(state, name)[1]))
         return completed(told.state, self.rows if places is None else places[self.rows], self.values)
 
     def lit(self, state: Columns, bounds: Bounds) -> Columns:
         """A state with all other changes."""
         told = Told(bounds, state, np.zeros(0, np.float32))
         for name in looks(state):
-            told = told.having(name, _dense(state, name, *self.residuals[name]))
+            told = told.having(name, scattered(*self.residuals[name], told_shape(state, name)[1]))
         return completed(told.state, retired=self.retired, environment=self.environment)
-
-
-def _dense(state: Columns, name: str, rows: NDArray[np.intp], planes: Ints) -> Ints:
-    """[P, N] residuals of all rows."""
-    if len(rows) == told_shape(state, name)[1]:
-        return planes
-    dense = np.zeros(told_shape(state, name), np.int32)
-    dense[:, rows] = planes
-    return dense
 
 
 def decode(reference: Columns, clusters: Clusters, bounds: Bounds, body: bytes) -> Columns:
@@ -201,18 +194,16 @@ def decode(reference: Columns, clusters: Clusters, bounds: Bounds, body: bytes) 
 
 def after(reference: Columns, clusters: Clusters, bounds: Bounds, changes: Sequence[Change]) -> Columns:
     """A state after several changes, one by one, of the same Gaussians; what stands all the while is not touched."""
-    state, places, own = reference, None, clusters
-    if not _whole(reference, clusters):
-        chosen = clusters.labels > 0
+    if _whole(reference, clusters):
         for change in changes:
-            for told in (change.rows, *(change.residuals[name][0] for name in SHAPE)):
-                chosen[told] = True
-        rows, places = np.flatnonzero(chosen), np.cumsum(chosen) - 1
-        state, own = reference.rows(rows), clusters.rows(rows)
-    if places is None:
-        for change in changes:
-            state = change.lit(change.shaped(state, own, bounds, None), bounds)
-        return state
+            reference = change.lit(change.shaped(reference, clusters, bounds, None), bounds)
+        return reference
+    chosen = clusters.labels > 0
+    for change in changes:
+        for told in (change.rows, *(change.residuals[name][0] for name in SHAPE)):
+            chosen[told] = True
+    rows, places = np.flatnonzero(chosen), np.cumsum(chosen) - 1
+    state, own = reference.rows(rows), clusters.rows(rows)
     for change in changes:
         state = change.shaped(state, own, bounds, places)
     state = reference.placed(rows, state)

@@ -17,6 +17,7 @@ from scas4d_core.compact.columns import Columns
 from scas4d_core.compact.frame_code import Change, after
 from scas4d_core.compact.head import Head
 from scas4d_core.compact.index import read_index
+from scas4d_core.compact.last_told import LastTold
 from scas4d_core.compact.planes import PlaneError, unpack
 from scas4d_core.compact.records import (
     HEAD_SIZE,
@@ -31,7 +32,6 @@ from scas4d_core.compact.records import (
     record_bytes,
     scan,
 )
-from scas4d_core.compact.told import LastTold
 from scas4d_core.gaussians import Gaussians
 
 __all__ = ["CompactReader", "DamagedFileError", "FileError"]

@@ -41,19 +41,27 @@ def write_residuals(planes: Ints, rows: NDArray[np.intp] | None = None, total: i
     if np.count_nonzero(every) < SPARSE * len(every):
         return write_mask(every) + b"".join(pack(plane) for plane in planes[:, changed])
     if rows is not None:
-        planes, some = np.zeros((len(planes), total), np.int32), planes
-        planes[:, rows] = some
+        planes = scattered(rows, planes, total)
     return bytes([ALL]) + b"".join(pack(plane) for plane in planes)
 
 
 def read_residuals(body: bytes, offset: int, components: int, rows: int) -> tuple[Ints, int]:
     """[components, rows] residuals of a section, and where it ends; raises PlaneError."""
     chosen, told, offset = read_told(body, offset, components, rows)
-    if len(chosen) == rows:
-        return told, offset
-    planes = np.zeros((components, rows), np.int32)
-    planes[:, chosen] = told
-    return planes, offset
+    return scattered(chosen, told, rows), offset
+
+
+def scattered(rows: NDArray[np.intp], planes: Ints, total: int) -> Ints:
+    """[P, total] residuals of all rows, of [P, R] those of some in rising order; 0 for the others.
+
+    >>> scattered(np.array([1, 3]), np.array([[7, 9]]), 4)
+    array([[0, 7, 0, 9]], dtype=int32)
+    """
+    if len(rows) == total:
+        return planes
+    dense = np.zeros((len(planes), total), np.int32)
+    dense[:, rows] = planes
+    return dense
 
 
 def read_told(body: bytes, offset: int, components: int, rows: int) -> tuple[NDArray[np.intp], Ints, int]:

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.compact.bounds import Bounds
-from scas4d_core.compact.cluster_motion import Clusters
 from scas4d_core.compact.columns import (
     LABELS,
     Columns,
@@ -23,9 +22,7 @@ from scas4d_core.compact.columns import (
     turns_of,
     vectors_of,
 )
-from scas4d_core.compact.head import Head
 from scas4d_core.compact.planes import Ints
-from scas4d_core.compact.records import Record
 from scas4d_core.gaussians import rotation_rows
 
 Array = NDArray[np.float32]
@@ -36,8 +33,6 @@ MARGIN = 0.95
 """Of steps that are parts of a size, for that."""
 LARGEST = 1 << 30
 """Residuals from here on, in steps, are told exactly, as are numbers that are not finite."""
-
-
 SHAPE = ("sizes", "rotations", "factors", "means")
 """What is told first, in this order: each helps the next."""
 
@@ -127,21 +122,3 @@ def whole_steps(found: NDArray[Any]) -> tuple[Ints, NDArray[np.bool_]]:
     """[P, N] as whole numbers, 0 for those that are none or too large, and [N] whether a row has any of these."""
     outside = ~(np.abs(found) < LARGEST)
     return np.where(outside, 0, found).astype(np.int32), outside.any(axis=0)
-
-
-@dataclass(frozen=True, eq=False)
-class LastTold:
-    """The end of a file that is gone on with.
-
-    Attributes:
-        head: of the file. records: up to the last state. told: the record of that. state: that, as it is read.
-        born, clusters: of all Gaussians so far, as they were told. since_key: states since the last key.
-    """
-
-    head: Head
-    records: tuple[Record, ...]
-    told: Record
-    state: Columns
-    born: Columns
-    clusters: Clusters
-    since_key: int

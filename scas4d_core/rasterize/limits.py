@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from scas4d_core import guards
+from scas4d_core.cameras import Camera, WorldFrame, rig_inside
 
 
 class Limits(NamedTuple):
@@ -49,6 +51,17 @@ def scene_limits(near: float | str, rig_radius: float) -> Limits:
         # A single camera has no radius.
         near = NEAR_SHARE * rig_radius if rig_radius > 0 else Limits().near
     return Limits(near=near)
+
+
+def rig_limits(near: float | str, world: WorldFrame, cameras: Sequence[Camera]) -> Limits:
+    """The rasterizer's constants for a scene, by its cameras in the user's world; see ``scene_limits``.
+
+    >>> import numpy as np
+    >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
+    >>> rig_limits(0.05, WorldFrame(np.zeros(3)), [camera]).near
+    0.05
+    """
+    return scene_limits(near, rig_inside(world, cameras).radius)
 
 
 DEFAULT = Limits()

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from server.processes.placement import Ended, Entry, Placement, Process
+from server.processes.placement import AnyProcess, Ended, Entry, Placement
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Host:
         self._placement = Placement(prepare)
         self._data = data
         self._said: asyncio.Queue[Any] = asyncio.Queue()
-        self._process: Process | None = None
+        self._process: AnyProcess | None = None
         self._early: dict[int, Any] = {}
         self._next = 0
 
@@ -64,7 +64,7 @@ class Host:
         if not os.access(self._data, os.R_OK | os.W_OK | os.X_OK):
             host = socket.gethostname()
             return Started(node, fault=f"node {host} cannot write to the data folder {self._data}; mount it there")
-        self._process = Process(entry, spec, self._said.put_nowait, self._ended, self._placement.prepare)
+        self._process = self._placement.start(entry, spec, self._said.put_nowait, self._ended)
         self._hand_on()  # what was posted before
         return Started(node, self._process.pid)
 

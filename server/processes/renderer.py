@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from client.wire import GaussianModel, GaussiansModel, part_colour, parts_model
-from scas4d_core.cameras import rig_inside
 from scas4d_core.errors import InputError, message_of, without_paths
-from scas4d_core.rasterize.limits import scene_limits
+from scas4d_core.rasterize.limits import rig_limits
 from scas4d_core.storage.frame_files import frame_file
 from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFrameError
 from server.processes import track_answers
@@ -123,7 +122,7 @@ class Renderer:
             use_one_thread()
             settings, rig = self.spec.settings.scene, self.spec.rig
             world = rig.world_frame(settings.metres_per_unit)
-            limits = scene_limits(settings.near, rig_inside(world, rig.cameras).radius)
+            limits = rig_limits(settings.near, world, rig.cameras)
             self._reader = CommittedScene(history, world, limits)
         return self._reader
 

@@ -24,7 +24,7 @@ class CostFigures:
     """Of one placement.
 
     Attributes:
-        updates: seconds from one commit to the next, of frames that wait. views: seconds of a view.
+        updates: seconds of an update, mean of a turn, of frames that wait. views: seconds of a view.
         throughput: committed frames a second of all scenes together, one a turn.
     """
 
@@ -52,10 +52,8 @@ def measure(
         lone = {name: _begun(study, service) for name, service in services.items()}
         for turn in range(turns):
             for name in (PLACEMENTS, PLACEMENTS[::-1])[turn % 2]:
-                scene = _begun(study, services[name])
-                found[name].updates += _updates(study, services[name], scene)
+                found[name].updates.append(1 / _together(study, services[name], 1))
                 found[name].views += _views(services[name], lone[name], study.capture.full_rig.names[0], views)
-                services[name].http.delete(f"/v1/scenes/{scene}")
             echo(f"turn {turn + 1} of {turns}: one scene")
         for name, scene in lone.items():
             services[name].http.delete(f"/v1/scenes/{scene}")
@@ -91,18 +89,6 @@ def _begun(study: Study, service: Service) -> str:
     FrameSender(study, service, scene).send(0)
     service.finish(scene, 1)
     return scene
-
-
-def _updates(study: Study, service: Service, scene: str) -> list[float]:
-    """Seconds of each update, of frames that are all there before the first begins."""
-    service.http.post(f"/v1/scenes/{scene}/pause")
-    sender = FrameSender(study, service, scene)
-    for index in range(1, len(study.frames)):
-        sender.send(index)
-    began = time.monotonic()
-    service.http.post(f"/v1/scenes/{scene}/resume")
-    service.finish(scene, len(study.frames))
-    return [(time.monotonic() - began) / (len(study.frames) - 1)]
 
 
 def _views(service: Service, scene: str, camera: str, count: int) -> list[float]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from client.importers.open_source import open_source
 from scas4d_core import metrics
-from scas4d_core.cameras import WorldFrame, rig_inside
+from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures import Capture
 from scas4d_core.compact import Bounds, CompactReader, CompactWriter, Head
 from scas4d_core.compact.records import Kind, scan
@@ -21,7 +21,7 @@ from scas4d_core.compact.writer import KEY_EVERY
 from scas4d_core.errors import InputError
 from scas4d_core.gaussians import UNBORN, Gaussians, moving_extent
 from scas4d_core.query.committed import CommittedScene
-from scas4d_core.rasterize.limits import DEFAULT, Limits, scene_limits
+from scas4d_core.rasterize.limits import DEFAULT, Limits, rig_limits
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 
@@ -187,7 +187,7 @@ def _pictures(
     rig = capture.test_rig
     if rig is None:
         return None, None
-    limits = scene_limits(Settings().scene.near, rig_inside(world, capture.rig.cameras).radius)
+    limits = rig_limits(Settings().scene.near, world, capture.rig.cameras)
     chosen = [history.indices[k] for k in np.linspace(1, len(history.indices) - 1, VIEWS).astype(int)]
     losses = []
     for index in chosen:

@@ -16,14 +16,14 @@ from scipy.spatial.transform import Rotation
 from client.cli import pictures
 from client.importers.open_source import open_source
 from scas4d_core import metrics
-from scas4d_core.cameras import WorldFrame, rig_inside
+from scas4d_core.cameras import WorldFrame
 from scas4d_core.exports.formats import FORMATS
 from scas4d_core.exports.sequence import export_sequence
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.committed import CommittedScene
 from scas4d_core.query.parts import parts
 from scas4d_core.query.ply import SH_DEGREE_0
-from scas4d_core.rasterize.limits import scene_limits
+from scas4d_core.rasterize.limits import rig_limits
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 
@@ -129,7 +129,7 @@ def _rendered(state: Gaussians, world: WorldFrame, of: History, cameras: Any) ->
     history = History()
     ids = np.arange(len(state), dtype=np.int64)
     history.append(0, 0.0, state.replace(ids=ids))
-    limits = scene_limits(Settings().scene.near, rig_inside(world, cameras).radius)
+    limits = rig_limits(Settings().scene.near, world, cameras)
     scene = CommittedScene(history, world, limits)
     return [scene.render(camera, background=of.background).colour for camera in cameras]
 

@@ -1,9 +1,9 @@
 """Files of the three packages that one frame crosses between PUT and commit, and one render between request and answer.
 
 Both bound how much a reader has to open to follow a frame. A file counts when a function of it runs, in whatever
-process. Left aside are `__init__` files, the kernels, the groups of effects (those that a scene has: a few of many) and
-`server/repair` (which looks at the disk every few seconds, whatever comes). The service runs as usual, with a profiler
-in each process.
+process, for each of two frames, or of two renders: what a process happens to do meanwhile is left aside. So are
+`__init__` files, the kernels, the groups of effects (those that a scene has: a few of many) and `server/repair` (which
+looks at the disk every few seconds, whatever comes). The service runs as usual, with a profiler in each process.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from studies.service.process import Service
 PACKAGES = ("scas4d_core", "server", "client")
 MOST_OF_A_FRAME, MOST_OF_A_RENDER = 61, 26
 """They are 61 and 26. The tail of what came before a frame would cross files of its own."""
-LATER = 3
-"""The frame that is followed: frame 0 and the first updates have work of their own."""
+LATER = (3, 4)
+"""The frames that are followed: frame 0 and the first updates have work of their own."""
 SETTINGS = {
     "scene": {"image_scale": 0.25},
     "static": {"iterations": 300, "max_gaussians": 2500},
@@ -69,7 +69,7 @@ def crossed(folder: Path, capture: Capture) -> dict[str, list[str]]:
 
     Args:
         folder: for the service's data; made when missing.
-        capture: has at least four frames and a test camera.
+        capture: has at least five frames and a test camera.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "sitecustomize.py").write_text(PROFILER)
@@ -97,20 +97,24 @@ def crossed(folder: Path, capture: Capture) -> dict[str, list[str]]:
                 masks = {name: capture.encoded_mask(index, name) for name in capture.rig.names}
                 client.put_frame(scene, index, images, {name: mask for name, mask in masks.items() if mask})
 
-            for index in range(LATER):
+            for index in range(LATER[0]):
                 put(index)
-            client.wait(scene, LATER - 1)
-            client.render(scene, camera, LATER - 1)
-            state = folder / "data" / "scenes" / scene / "states" / f"frame_{LATER:06d}.npz"
-            with _phase(folder, "frame"):
-                put(LATER)
-                _until(state.exists)  # asking the service would cross other files
-            assert client.frame(scene, LATER).state is FrameState.COMMITTED
-            with _phase(folder, "render"):
-                client.render(scene, camera, LATER)
+            client.wait(scene, LATER[0] - 1)
+            client.render(scene, camera, LATER[0] - 1)
+            for index in LATER:
+                state = folder / "data" / "scenes" / scene / "states" / f"frame_{index:06d}.npz"
+                with _phase(folder, f"frame {index}"):
+                    put(index)
+                    _until(state.exists)  # asking the service would cross other files
+                assert client.frame(scene, index).state is FrameState.COMMITTED
+                with _phase(folder, f"render {index}"):
+                    client.render(scene, camera, index)
     finally:
         service.stop()
-    return {phase: sorted(set(_files(folder, phase, root))) for phase in ("frame", "render")}
+    return {
+        phase: sorted(set.intersection(*(set(_files(folder, f"{phase} {index}", root)) for index in LATER)))
+        for phase in ("frame", "render")
+    }
 
 
 @contextmanager

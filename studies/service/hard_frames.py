@@ -20,14 +20,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from client.wire import FRAME_MEDIA_TYPE, FrameState, frame_chunks
-from scas4d_core.cameras import rig_inside
 from scas4d_core.captures.frame import Frame
 from scas4d_core.frame_outcome import Alarm, AlarmKind, FrameOutcome
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import psnr
 from scas4d_core.query.committed import CommittedScene
-from scas4d_core.rasterize.limits import scene_limits
+from scas4d_core.rasterize.limits import rig_limits
 from scas4d_core.storage.history import History
 from server.storage.layout import DataFolder
 from studies.hard_frames.footage import AnyFootage
@@ -205,7 +204,7 @@ def _push(service: Service, footage: AnyFootage, sent: Sequence[Sent], echo: Ech
     echo(f"scene {scene}: {status.next_frame} frames, {len(faults)} faults")
     history = History.load(DataFolder(service.data).scene(scene).states)
     world = footage.rig.world_frame(footage.settings.scene.metres_per_unit)
-    limits = scene_limits(footage.settings.scene.near, rig_inside(world, footage.rig.cameras).radius)
+    limits = rig_limits(footage.settings.scene.near, world, footage.rig.cameras)
     return Pushed(CommittedScene(history, world, limits), len(sent)), faults
 
 

@@ -121,7 +121,8 @@ class FakeReconstruction:
         for done in range(3):
             progress(Progress("fitting", done + 1, 3, {"psnr": 30.0}))
         given = points.positions if points is not None else np.array([[0.0, 0, 0], [0.5, 0, 0]])
-        scene = cls(rig.world_frame().to_inside(given), history)
+        # As states keep them: one that is resumed before the first update goes on with the same bits.
+        scene = cls(rig.world_frame().to_inside(given).astype(np.float32), history)
         if int(next(iter(frame.images.values()))[0, 0, 0]) == REFINES:
             notes = {**(notes or {}), "calibration": refined(rig.cameras[1])}
         scene.commit(frame, dropped, notes)

@@ -14,7 +14,7 @@ from client.exports.video.camera_path import CameraPath, by_keys, orbit, still
 from client.exports.video.moments import moments
 from client.exports.video.overlay import Trails, rows_that_move
 from client.exports.video.part_paint import painted
-from scas4d_core.cameras import Camera, Rig, rig_inside
+from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import Capture
 from scas4d_core.captures.images import resize_area
 from scas4d_core.errors import InputError
@@ -80,10 +80,10 @@ class Shot:
     def pictures(self) -> Iterator[Picture]:
         """The pictures, [H, W, 3], one after the other; two states are in memory at once."""
         from scas4d_core.query.view import ViewRenderer
-        from scas4d_core.rasterize.limits import DEFAULT, scene_limits
+        from scas4d_core.rasterize.limits import DEFAULT, rig_limits
 
         head, options = self.given.head, self.options
-        limits = DEFAULT if head.rig is None else scene_limits("auto", rig_inside(head.world, head.rig.cameras).radius)
+        limits = DEFAULT if head.rig is None else rig_limits("auto", head.world, head.rig.cameras)
         renderer = ViewRenderer(head.world, limits)
         background = head.background if options.background is None else options.background
         labels = self._labels() if options.parts else None

@@ -1,0 +1,28 @@
+"""The end of a compact file, for a writer that goes on with it after a stop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from scas4d_core.compact.cluster_motion import Clusters
+from scas4d_core.compact.columns import Columns
+from scas4d_core.compact.head import Head
+from scas4d_core.compact.records import Record
+
+
+@dataclass(frozen=True, eq=False)
+class LastTold:
+    """The end of a file that is gone on with.
+
+    Attributes:
+        head: of the file. records: up to the last state. told: the record of that. state: that, as it is read.
+        born, clusters: of all Gaussians so far, as they were told. since_key: states since the last key.
+    """
+
+    head: Head
+    records: tuple[Record, ...]
+    told: Record
+    state: Columns
+    born: Columns
+    clusters: Clusters
+    since_key: int
