@@ -6,7 +6,6 @@ import contextlib
 import os
 import secrets
 import socket
-import time
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +13,17 @@ import ray
 from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from server.cluster.marks import appears
 from server.cluster.nodes import living_nodes
+from server.storage.fencing import PART
 
 PROBE = ".probe"
 PATIENCE_S = 30.0
-"""A node has so long to answer; NFS shows a new file to other machines after a few seconds."""
-SEEN_S = 10.0
+"""A node has so long to answer."""
 
 
 def check_folder(data: Path) -> None:
-    """Has every node read what this process wrote, write a file, sync it, rename it, and lock one; reads it back.
+    """Has every node read what this process wrote, write a file, sync it, rename and link it; reads it back.
 
     Raises:
         RuntimeError: a node does not see the folder, or its file system does not do.
@@ -33,7 +33,6 @@ def check_folder(data: Path) -> None:
     probe = data / f"{PROBE}-{word}"
     probe.write_text(word)
     nodes = {node["NodeID"]: node for node in living_nodes()}
-    made: list[Path] = []
     try:
         asked = {
             id: _look.options(scheduling_strategy=NodeAffinitySchedulingStrategy(id, soft=False)).remote(
@@ -49,20 +48,19 @@ def check_folder(data: Path) -> None:
                 raise RuntimeError(f"{name} does not answer: {error}") from None
             if fault is not None:
                 raise RuntimeError(f"{name} {fault}; mount the data folder {data} there, at the same path")
-            made.append(data / f"{PROBE}-{word}-{id[:8]}")
-            if not _appears(made[-1], word):
+            if not appears(data / f"{PROBE}-{word}-{id[:8]}", word):
                 raise RuntimeError(f"what {name} writes to {data} does not appear here; is it the same folder?")
     finally:
-        for path in (probe, *made):
+        for path in data.glob(f"{PROBE}-{word}*"):  # what a node left that did not get to its end, too
             path.unlink(missing_ok=True)
 
 
 def probe_here(data: Path, word: str, id: str) -> str | None:
     """Tries the folder on this node; returns what is wrong, after the node's name. Blocking."""
     try:
-        if not _appears(data / f"{PROBE}-{word}", word):
+        if not appears(data / f"{PROBE}-{word}", word):
             return f"does not see what the service writes to {data}"
-        beside, path = (data / f"{PROBE}-{word}-{id[:8]}{end}" for end in (".part", ""))
+        beside, path = (data / f"{PROBE}-{word}-{id[:8]}{end}" for end in (PART, ""))
         with beside.open("w") as file:
             file.write(word)
             file.flush()
@@ -77,19 +75,6 @@ def probe_here(data: Path, word: str, id: str) -> str | None:
     except OSError as error:
         return f"({socket.gethostname()}) cannot write to {data}: {error.strerror}"
     return None
-
-
-def _appears(path: Path, word: str) -> bool:
-    until = time.monotonic() + SEEN_S
-    while True:
-        try:
-            if path.read_text() == word:
-                return True
-        except OSError:
-            pass
-        if time.monotonic() > until:
-            return False
-        time.sleep(0.05)
 
 
 @ray.remote(num_cpus=0)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from server.cluster.marks import is_marked
 from server.processes.placement import AnyProcess, Ended, Entry, Placement
 
 
@@ -44,15 +45,16 @@ class Host:
     """Starts the process, hands its messages on in order, and says how it ended.
 
     Args:
-        prepare: see `Placement`. data: folder that this node has to see. threads: OMP_NUM_THREADS of the service.
+        prepare: see `Placement`. data: folder of the service, which this node has to see. word: of the service's mark
+            in it. threads: OMP_NUM_THREADS of the service.
     """
 
-    def __init__(self, prepare: Callable[[], None] | None, data: Path, threads: str | None = None) -> None:
+    def __init__(self, prepare: Callable[[], None] | None, data: Path, word: str, threads: str | None = None) -> None:
         os.environ.pop("OMP_NUM_THREADS", None)  # Ray sets it to the actor's CPUs
         if threads is not None:
             os.environ["OMP_NUM_THREADS"] = threads
         self._placement = Placement(prepare)
-        self._data = data
+        self._data, self._word = data, word
         self._said: asyncio.Queue[Any] = asyncio.Queue()
         self._process: AnyProcess | None = None
         self._early: dict[int, Any] = {}
@@ -61,9 +63,11 @@ class Host:
     async def start(self, entry: Entry, spec: Any) -> Started:
         """Starts the process."""
         node = _node_id()
+        if not await asyncio.to_thread(is_marked, self._data, self._word):
+            fault = f"node {socket.gethostname()} does not see the data folder {self._data}; mount it there"
+            return Started(node, fault=fault)
         if not os.access(self._data, os.R_OK | os.W_OK | os.X_OK):
-            host = socket.gethostname()
-            return Started(node, fault=f"node {host} cannot write to the data folder {self._data}; mount it there")
+            return Started(node, fault=f"node {socket.gethostname()} cannot write to the data folder {self._data}")
         self._process = self._placement.start(entry, spec, self._said.put_nowait, self._ended)
         self._hand_on()  # what was posted before
         return Started(node, self._process.pid)

@@ -22,6 +22,14 @@ def living_nodes() -> list[dict[str, Any]]:
     return [node for node in all_nodes() if node["Alive"]]
 
 
+def is_lost(id: str) -> bool:
+    """True where a node is dead, or the head of the cluster does not say. Blocking."""
+    try:
+        return id not in {node["NodeID"] for node in living_nodes()}
+    except Exception:  # whatever Ray raises without its head
+        return True
+
+
 def cluster_of(nodes: Sequence[Mapping[str, Any]], places: Mapping[str, tuple[Needs, str | None]]) -> Cluster:
     """Nodes that are alive, and lost ones that had a process, with what they have.
 

@@ -8,7 +8,7 @@ import logging
 import os
 import secrets
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 import ray
@@ -17,8 +17,9 @@ from ray.exceptions import RayActorError, RayError
 from client.wire import Cluster
 from server.cluster.folder import check_folder
 from server.cluster.host import Gone, Host, Started
+from server.cluster.marks import mark
 from server.cluster.needs import Needs, needs_of
-from server.cluster.nodes import all_nodes, cluster_of, living_nodes
+from server.cluster.nodes import all_nodes, cluster_of, is_lost, living_nodes
 from server.processes import worker
 from server.processes.messages import WaitsForNode
 from server.processes.placement import STOP_SECONDS, AnyProcess, Ended, Entry, Placement
@@ -67,7 +68,7 @@ class RayPlacement(Placement):
             return
         try:
             if self._address is not None:
-                _reach(self._address)  # Ray would end this process where nobody listens
+                await asyncio.to_thread(_reach, self._address)  # Ray would end this process where nobody listens
             await asyncio.to_thread(
                 ray.init,
                 address=self._address or "auto",
@@ -81,7 +82,9 @@ class RayPlacement(Placement):
                 f"there is no Ray cluster {where} ({error}); start one with `ray start --head`, or name its address: "
                 "--placement ray=HOST:6379"
             ) from None
-        await asyncio.to_thread(check_folder, self._server.data.resolve())
+        data = self._server.data.resolve()
+        await asyncio.to_thread(check_folder, data)
+        await asyncio.to_thread(mark, data, self._token)
         log.info("scenes run on a Ray cluster of %d nodes", len(living_nodes()))
 
     async def cluster(self) -> Cluster:
@@ -106,10 +109,10 @@ class RayPlacement(Placement):
         return RayProcess(self, name, needs, (entry, spec), on_message, on_end)
 
     def host(self, name: str, needs: Needs) -> Any:
-        """An actor for a process."""
+        """An actor for a process. Blocking: the head registers its name."""
         made: Any = ray.remote(Host)
         return made.options(name=name, **needs.options()).remote(
-            self.prepare, self._server.data.resolve(), os.environ.get("OMP_NUM_THREADS")
+            self.prepare, self._server.data.resolve(), self._token, os.environ.get("OMP_NUM_THREADS")
         )
 
 
@@ -121,7 +124,7 @@ def _reach(address: str) -> None:
 
 
 class RayProcess:
-    """A process of a scene on some node; its messages go by its actor. On the event loop."""
+    """A process of a scene on some node; its messages go by its actor. On the event loop, which never waits for Ray."""
 
     def __init__(
         self,
@@ -137,12 +140,17 @@ class RayProcess:
         self._needs = needs
         self._on_message = on_message
         self._on_end = on_end
+        self._node: str | None = None
         self._pid: int | None = None
+        self._early: list[Any] | None = []
+        """Messages before there is an actor."""
         self._sent = 0
         self._over = False
-        self._actor = placement.host(name, needs)
-        self._posts: set[asyncio.Task[None]] = set()
-        self._task = asyncio.get_running_loop().create_task(self._run(*runs))
+        self._actor: Any = None
+        loop = asyncio.get_running_loop()
+        self._making = loop.run_in_executor(None, placement.host, name, needs)
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._task = loop.create_task(self._run(*runs))
 
     @property
     def pid(self) -> int | None:
@@ -153,69 +161,99 @@ class RayProcess:
         """See `AnyProcess`."""
         if self._over:
             return
-        post = asyncio.get_running_loop().create_task(self._post(self._actor.post.remote(self._sent, message)))
+        if self._early is not None:
+            self._early.append(message)
+            return
+        self._beside(self._post(self._actor.post.remote(self._sent, message)))
         self._sent += 1
-        self._posts.add(post)
-        post.add_done_callback(self._posts.discard)
 
     async def stop(self, seconds: float = STOP_SECONDS) -> None:
         """See `AnyProcess`."""
         started, over, self._over = self._pid is not None, self._over, True
         self._task.cancel()
+        self._placement.places.pop(self._name, None)
         if started and not over:
             with contextlib.suppress(RayError, TimeoutError):
                 await asyncio.wait_for(self._actor.stop.remote(seconds), seconds + STOPPED_S)
-        self._leave()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._kill(), STOPPED_S)
 
     async def _run(self, entry: Entry, spec: Any) -> None:
+        role = self._needs.role
         try:
             await self._begin(entry, spec)
-            while True:
+            while not self._over:
                 for message in await self._actor.take.remote():
                     if isinstance(message, Gone):
                         self._end(Ended(message.exit_code))
-                        return
-                    if self._over:
-                        return
-                    self._on_message(message)
+                    elif not self._over:
+                        self._tell(message)
         except RayActorError as error:
             log.warning("actor %s is lost: %s", self._name, error)
-            self._end(Ended(None, f"the node of its {self._needs.role} is lost", lost=True))
+            if self._node is not None and await asyncio.to_thread(is_lost, self._node):
+                self._end(Ended(None, f"the node of its {role} is lost", lost=True))
+            else:
+                self._end(Ended(None, f"the actor of its {role} ended: {_first_line(error)}"))
         except (RayError, _NotStarted) as error:
             log.warning("actor %s did not start: %s", self._name, error)
-            self._end(Ended(None, f"its {self._needs.role} could not be started: {error}"))
+            self._end(Ended(None, f"its {role} could not be started: {_first_line(error)}"))
+        except Exception as error:  # whatever it is, the scene must not stand still
+            log.exception("actor %s", self._name)
+            self._end(Ended(None, f"its {role} was given up: {type(error).__name__}: {error}"))
 
     async def _begin(self, entry: Entry, spec: Any) -> None:
         """Starts the process, and says what it waits for as long as no node has room."""
+        self._actor = await asyncio.shield(self._making)
         starting = asyncio.ensure_future(self._actor.start.remote(entry, spec))
+        starting.add_done_callback(lambda done: done.cancelled() or done.exception())  # who stops it does not ask
+        early, self._early = self._early or [], None
+        for message in early:
+            self.send(message)
         said = False
         while not (await asyncio.wait([starting], timeout=WAIT_S))[0]:
             if self._needs.role == "worker" and not said:
                 said = True
-                self._on_message(WaitsForNode(f"no node has room for its worker, which needs {self._needs.words()}"))
+                self._tell(WaitsForNode(f"no node has room for its worker, which needs {self._needs.words()}"))
         started: Started = starting.result()
         if started.fault is not None:
             raise _NotStarted(started.fault)
-        self._pid = started.pid
+        self._pid, self._node = started.pid, started.node
         self._placement.places[self._name] = self._needs, started.node
+
+    def _tell(self, message: Any) -> None:
+        try:
+            self._on_message(message)
+        except Exception:  # a fault of the service's own: the next message is none of it
+            log.exception("a message of actor %s", self._name)
 
     async def _post(self, sending: Any) -> None:
         try:
             await sending
+        except RayActorError:
+            pass  # `_run` learns of it, too, and says what became of it
         except RayError as error:  # it did not get the message, so it must not go on
-            self._end(Ended(None, f"a message did not reach its {self._needs.role}: {error}"))
+            self._end(Ended(None, f"a message did not reach its {self._needs.role}: {_first_line(error)}"))
 
     def _end(self, why: Ended) -> None:
         if not self._over:
             self._over = True
-            self._task.cancel()
-            self._leave()
+            self._placement.places.pop(self._name, None)
+            self._beside(self._kill())
             self._on_end(why)
 
-    def _leave(self) -> None:
-        self._placement.places.pop(self._name, None)
-        with contextlib.suppress(RayError, ValueError):
-            ray.kill(self._actor)
+    async def _kill(self) -> None:
+        with contextlib.suppress(RayError, ValueError, OSError):
+            await asyncio.to_thread(ray.kill, await asyncio.shield(self._making))
+
+    def _beside(self, coroutine: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(coroutine)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+
+def _first_line(error: BaseException) -> str:
+    """Ray's messages go on with what people need who look after the cluster; the log has all of it."""
+    return str(error).strip().partition("\n")[0]
 
 
 class _NotStarted(RuntimeError):

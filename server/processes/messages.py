@@ -15,11 +15,7 @@ from server.storage.layout import SceneFolder
 
 @dataclass(frozen=True, eq=False)
 class SceneSpec:
-    """The scene as its processes are given it when they start.
-
-    `takes_over`: of a worker with an epoch of its own (`folder.epoch`), the epoch whose states it goes on from; None:
-    there are none.
-    """
+    """The scene as its processes are given it when they start; a worker's `folder` has its epoch, if it has one."""
 
     folder: SceneFolder
     rig: Rig
@@ -27,7 +23,6 @@ class SceneSpec:
     minimum_cameras: int = 1
     kept: IngestSettings = field(default_factory=IngestSettings)
     frames_per_second: float | None = None
-    takes_over: int | None = None
 
 
 # To the worker.

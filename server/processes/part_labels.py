@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
+import secrets
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,7 +82,7 @@ class PartLabels:
     def _write(self, count: int | None, known: Known) -> None:
         arrays: dict[str, Any] = {"labels": known.labels.astype(np.int16), "frame": np.int64(known.frame)}
         file = self._file(count)
-        beside = file.with_name(f".{file.name}.{os.getpid()}.part")
+        beside = file.with_name(f".{file.name}.{secrets.token_hex(4)}.part")
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             with beside.open("wb") as opened:

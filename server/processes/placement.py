@@ -52,7 +52,8 @@ class Ended(str):
 
 def end_with_parent() -> None:
     """Ends this process soon after the one that started it: for processes that may be busy for long."""
-    parent = os.getppid()
+    starter = multiprocessing.parent_process()
+    parent = os.getppid() if starter is None else starter.pid  # it may have ended by now
 
     def watch() -> None:
         while os.getppid() == parent:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import logging
 import os
+import secrets
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
@@ -43,6 +44,7 @@ from server.processes.queries import (
     RenderQuery,
     TracksQuery,
 )
+from server.storage.layout import EXPORT
 
 if TYPE_CHECKING:
     from scas4d_core.query.committed import CommittedScene
@@ -70,6 +72,8 @@ def views(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
 def bulk(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     """Runs the process for queries that may take long."""
     os.nice(BULK_NICE)
+    for left in spec.folder.path.glob(f"{EXPORT}.*"):  # of one that was killed while it answered
+        left.unlink(missing_ok=True)
     _serve(spec, connection)
 
 
@@ -209,7 +213,7 @@ class Renderer:
 
     def _file(self, number: int, write: Callable[[Path], dict[str, str] | None]) -> Answer:
         """Answers with the file that is written to a path, and the headers that this returns; removes it."""
-        file = self.spec.folder.export
+        file = self.spec.folder.export(secrets.token_hex(4))
         try:
             headers = write(file) or {}
             return Answer(number, file.read_bytes(), BYTES, headers)

@@ -63,7 +63,7 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the service says when to stop
     os.nice(NICE)
     end_with_parent()
-    lock = alone(spec.folder, spec.takes_over)
+    lock = alone(spec.folder)
     worker = Worker(spec, connection)
     try:
         if worker.open():

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from client import __version__
 from client.wire import SceneStatus
-from server.storage.layout import SceneFolder
+from server.storage.layout import EXPORT, SceneFolder
 
 
 def write_card(folder: SceneFolder, status: SceneStatus) -> None:
@@ -54,7 +54,8 @@ def read_card(folder: SceneFolder) -> SceneStatus | None:
 
 def _fingerprint(folder: SceneFolder) -> list[Any]:
     """Names, sizes and times of change of what lies in the folder; those of a folder in it change with its names."""
-    own = {folder.card.name, folder.card.with_suffix(".part").name, folder.worker_lock.name, folder.export.name}
+    own = {folder.card.name, folder.card.with_suffix(".part").name, folder.worker_lock.name}
     with os.scandir(folder.path) as entries:
-        found = [(entry.name, entry.stat()) for entry in entries if entry.name not in own]
+        others = [entry for entry in entries if entry.name not in own and not entry.name.startswith(f"{EXPORT}.")]
+        found = [(entry.name, entry.stat()) for entry in others]
     return [[name, seen.st_size, seen.st_mtime_ns] for name, seen in sorted(found)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -108,7 +109,8 @@ def find(folder: SceneFolder, bury: Callable[[Path, str], object], said: Sequenc
             if not no_room(error):
                 raise
     for path in folder.leftovers(begun):
-        bury(path, f"{folder.name}-{path.name}")
+        with contextlib.suppress(FileNotFoundError):  # states of a worker before: they are swept a minute after it
+            bury(path, f"{folder.name}-{path.name}")
     rig, settings, positions = now.request.rig.rig(), now.settings, points_positions(folder.points)
     return FoundScene(
         now,

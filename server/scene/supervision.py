@@ -16,11 +16,12 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from scas4d_core.errors import message_of
 from server.processes import worker
 from server.processes.messages import SceneSpec
 from server.processes.placement import AnyProcess, Ended, Placement
 from server.storage.events import FrameSetAside, WorkerDied
-from server.storage.fencing import epochs, found_epoch, publish, sweep
+from server.storage.fencing import FencingError, begin_epoch, sweep
 from server.storage.frame_table import FrameEntry
 
 log = logging.getLogger("scas4d.server")
@@ -138,9 +139,8 @@ class WorkerProcess:
         self._next: asyncio.TimerHandle | None = None
         self._closed = False
         self._epoch: int | None = None
-        """Of the newest process; None before the first."""
-        self._taken: int | None = None
-        """That of the states which are read."""
+        self._fencing: asyncio.Task[None] | None = None
+        """Begins an epoch for the next process."""
 
     @property
     def starts_again(self) -> bool:
@@ -149,34 +149,38 @@ class WorkerProcess:
 
     def start(self) -> None:
         """Starts the process, unless it runs, is about to, or the scene ends."""
-        if self._process is None and self._next is None and not self._closed:
-            self.deaths.started()
-            self.life = object()
-            self._process = self._placement.start(worker.main, self._fenced(), self._received, self._gone)
+        if self._process is None and self._fencing is None and self._next is None and not self._closed:
+            # Once a folder has epochs, a worker on another machine may go on that was taken for dead.
+            if self._placement.fenced or self.spec.folder.states.is_symlink():
+                self._fencing = asyncio.get_running_loop().create_task(self._start_fenced())
+            else:
+                self._start(self.spec)
 
-    def _fenced(self) -> SceneSpec:
-        """The spec of the next process: with an epoch of its own, where one before may be at work still."""
-        if not self._placement.fenced:
-            return self.spec
-        states = self.spec.folder.states
-        if self._epoch is None:
-            self._taken = found_epoch(states)
-            self._epoch = max(epochs(states), default=-1)
-        self._epoch += 1
-        return replace(self.spec, folder=replace(self.spec.folder, epoch=self._epoch), takes_over=self._taken)
+    async def _start_fenced(self) -> None:
+        """Starts the process with an epoch of its own; that it cannot begin is as if the process had ended."""
+        folder = self.spec.folder
+        try:
+            epoch = await asyncio.to_thread(begin_epoch, folder.states, folder.worker_lock)
+        except (OSError, FencingError) as error:
+            self._fencing = None
+            self._gone(Ended(None, f"the committed states cannot be taken over: {message_of(error)}"))
+            return
+        self._fencing = None
+        if not self._closed:
+            self._start(replace(self.spec, folder=replace(folder, epoch=epoch)))
 
-    async def publish(self) -> None:
-        """Has the states that the process took over read from now on; to be called before it gets a frame."""
-        if (epoch := self._epoch) is not None and epoch != self._taken:
-            await asyncio.to_thread(publish, self.spec.folder.states, epoch)
-            self._taken = epoch if self._taken is None else max(epoch, self._taken)
+    def _start(self, spec: SceneSpec) -> None:
+        self.deaths.started()
+        self.life = object()
+        self._epoch = spec.folder.epoch
+        self._process = self._placement.start(worker.main, spec, self._received, self._gone)
 
     async def sweep(self) -> None:
         """Removes the states of workers before, once whoever reads through an old link has seen the new one."""
-        if self._taken is None:
+        if (epoch := self._epoch) is None:
             return
         await asyncio.sleep(SWEEP_AFTER_S)
-        if names := await asyncio.to_thread(sweep, self.spec.folder.states, self._taken):
+        if names := await asyncio.to_thread(sweep, self.spec.folder.states, epoch):
             log.info("scene %s: removed %s, of workers before", self.spec.folder.name, ", ".join(names))
 
     def start_in(self, seconds: float) -> None:
@@ -200,6 +204,8 @@ class WorkerProcess:
 
     async def stop(self, seconds: float) -> None:
         """Ends the process, which has `seconds` to do so itself; an unfinished frame is updated again by the next."""
+        if self._fencing is not None:
+            await asyncio.wait({self._fencing})  # a thread changes the folder, which may be deleted next
         if self._process is not None:
             await self._process.stop(seconds)
 

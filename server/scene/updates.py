@@ -207,7 +207,6 @@ class Updates:
 
     async def _resume(self, ready: Ready, life: object) -> None:
         """Brings the ledger in line with the committed states that a new worker has loaded, and goes on."""
-        await self.worker.publish()
         ledger = self._ledger
         newest = ledger.committed[-1] if ledger.committed else -1
         again = self.mending.waiting.keys() | {i for i in ready.damaged if i < max(ready.indices, default=-1)}
@@ -328,19 +327,20 @@ class Updates:
         own, delay = self.worker.deaths.died(reason.exit_code, lost=reason.lost)
         self.trouble = f"the worker is gone: {reason}; it is started again in {delay:g} s"
         log.error("scene %s: %s", self._ledger.scene, self.trouble)
-        self._background.run(self._after_death(str(reason), own, delay))
+        self._background.run(self._after_death(reason, own, delay))
 
-    async def _after_death(self, reason: str, own: bool, delay: float) -> None:
+    async def _after_death(self, reason: Ended, own: bool, delay: float) -> None:
         index, self._index = self._index, None
         if index is not None and self._ledger.frames[index].state == FrameState.UPDATING:
             self._ledger.move(index, FrameState.QUEUED)
-            death = WorkerDied(index=index, reason=reason, own=own)
-            await self._log.write(death)
-            self._ledger.apply(death)
-            # The worker may have died after its commit and before its message: then the next worker tells of it.
-            event = given_up(self._ledger.frames[index], death)
-            if event is not None and not await self._reports.is_committed(index):
-                await self._set_aside(event)
+            if not reason.lost:  # a machine that is lost is no fault of the frame
+                death = WorkerDied(index=index, reason=str(reason), own=own)
+                await self._log.write(death)
+                self._ledger.apply(death)
+                # The worker may have died after its commit and before its message: then the next worker tells of it.
+                event = given_up(self._ledger.frames[index], death)
+                if event is not None and not await self._reports.is_committed(index):
+                    await self._set_aside(event)
         self.tell(SceneChanged())
         self.worker.start_in(delay)
 

@@ -7,12 +7,10 @@ import errno
 import fcntl
 import os
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 from scas4d_core.errors import message_of
 from server.problems import Problem
-from server.storage.fencing import take_over
 from server.storage.layout import DataFolder, SceneFolder
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
@@ -84,19 +82,15 @@ def lock_data(data: Path) -> FolderLock:
         ) from None
 
 
-def alone(folder: SceneFolder, takes_over: int | None) -> FolderLock:
-    """Sees to it that no other worker commits to a scene: waits for its end; with an epoch, leaves it its folder.
+def alone(folder: SceneFolder) -> FolderLock:
+    """Sees to it that no other worker commits to a scene: waits for its end.
 
-    Args:
-        takes_over: the epoch whose states this worker goes on from.
-
-    Raises:
-        FencingError: they cannot be taken over.
+    With an epoch there is nothing to wait for: one on another machine may stop while it holds the lock, and commits to
+    a folder of its own (`server.storage.fencing`).
     """
     path = folder.worker_lock
     if folder.epoch is not None:
-        take_over(replace(folder, epoch=None).states, folder.epoch, takes_over)
-        path.unlink(missing_ok=True)  # one on another machine may stop while it holds the lock; this is another file
+        path.unlink(missing_ok=True)  # this is another file
     # A service that was killed leaves a worker in the middle of an update: two must not commit to one history.
     lock = FolderLock(path, wait=True)
     with contextlib.suppress(OSError):  # a full disk is no reason not to work

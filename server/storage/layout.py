@@ -13,7 +13,6 @@ from pathlib import Path
 
 from scas4d_core.storage.npz import sync_folder
 from server.storage.events import ReconstructionBegun
-from server.storage.fencing import epoch_folder
 
 
 @dataclass(frozen=True)
@@ -62,6 +61,10 @@ class DataFolder:
             else:
                 with contextlib.suppress(OSError):
                     path.unlink()
+
+
+EXPORT = "export"
+"""Begins the names of exports while they are being answered."""
 
 
 @dataclass(frozen=True)
@@ -150,11 +153,19 @@ class SceneFolder:
         """Locked by the worker process that may commit to the states."""
         return self.path / "worker.lock"
 
-    @property
-    def export(self) -> Path:
-        """An export while it is being answered."""
-        return self.path / "export.part"
+    def export(self, word: str) -> Path:
+        """An export while it is being answered; `word`: of the reader, as one that was given up may go on."""
+        return self.path / f"{EXPORT}.{word}.part"
 
 
 def _suffix(reconstruction: int) -> str:
     return f"_{reconstruction}" if reconstruction else ""
+
+
+def epoch_folder(states: Path, epoch: int) -> Path:
+    """Folder of the states of an epoch.
+
+    >>> epoch_folder(Path("a/states"), 3).name
+    'states.3'
+    """
+    return states.with_name(f"{states.name}.{epoch}")

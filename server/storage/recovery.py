@@ -25,6 +25,7 @@ from server.storage.events import (
     StatesDeleted,
     WorkerDied,
 )
+from server.storage.fencing import heal
 from server.storage.frame_store import FrameDamage, StoredPictures, frame_of, read_pictures, remove, stored
 from server.storage.journal import replay, write_journal
 from server.storage.layout import SceneFolder
@@ -103,6 +104,7 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
     folder = folder.begun(ledger.begun)
     sizes = stored(frames)
     in_states: list[str] = []
+    heal(folder.states)
     states = _states(folder.states, in_states)
     events: list[JournalEvent] = []
     if broken:

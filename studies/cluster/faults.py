@@ -9,8 +9,8 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from server.storage.fencing import epoch_folder, epochs, found_epoch
-from server.storage.layout import DataFolder
+from server.storage.fencing import epoch_read, epochs
+from server.storage.layout import DataFolder, epoch_folder
 from studies.cluster.nodes import Nodes
 from studies.options import Echo
 from studies.service.faults import KILLS_OF_A_WORKER_AT_A_FRAME
@@ -81,7 +81,7 @@ def stopped_node(
             sender.send(index)
         time.sleep(0.5 * update_s)
         node = _node_of(service, nodes, scene)
-        stale = found_epoch(states)
+        stale = epoch_read(states)
         assert stale is not None
         nodes.stop(node)
         began, committed = time.monotonic(), service.status(scene).committed

@@ -23,13 +23,16 @@ WIDTH, HEIGHT = 24, 16
 
 
 class Running:
-    """A uvicorn server in a thread; `core` is called first in each of its processes, None: the core itself."""
+    """A uvicorn server in a thread.
 
-    def __init__(self, settings, port=None, ready=True, core=fakes.install):
+    `core` is called first in each of its processes, None: the core itself; `placement` starts them.
+    """
+
+    def __init__(self, settings, port=None, ready=True, core=fakes.install, placement=Placement):
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = port or free.getsockname()[1]
-        self.app = create_app(settings, Placement(core))
+        self.app = create_app(settings, placement(core))
         config = guarded(self.app, port=self.port, log_level="error")
         self.server = uvicorn.Server(config)
         self.thread = threading.Thread(target=self.server.run)

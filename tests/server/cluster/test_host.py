@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from server.cluster import host
+from server.cluster import host, marks
 from server.cluster.host import Host
 from server.processes.messages import Stop
 
@@ -22,8 +22,10 @@ def echo(spec: Any, connection: Connection[Any, Any]) -> None:
 def test_messages_reach_the_process_in_order_from_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(host, "_node_id", lambda: "here")
 
+    marks.mark(tmp_path, "mine")
+
     async def run() -> list[Any]:
-        actor, found = Host(None, tmp_path), list[Any]()
+        actor, found = Host(None, tmp_path, "mine"), list[Any]()
         await actor.post(1, "b")
         await actor.post(0, "a")
         await actor.start(echo, "scene")
@@ -34,3 +36,14 @@ def test_messages_reach_the_process_in_order_from_the_first(tmp_path: Path, monk
         return found
 
     assert asyncio.run(run()) == [("scene", "a"), ("scene", "b"), ("scene", "c")]
+
+
+def test_a_node_with_a_folder_of_its_own_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It joined later, and its folder at that path can be written to: what is committed there would be lost."""
+    monkeypatch.setattr(host, "_node_id", lambda: "here")
+    monkeypatch.setattr(marks, "SEEN_S", 0.1)
+    marks.mark(tmp_path, "another service")
+    started = asyncio.run(Host(None, tmp_path, "mine").start(echo, "scene"))
+    assert started.pid is None
+    assert started.fault is not None
+    assert started.fault.endswith(f"does not see the data folder {tmp_path}; mount it there")

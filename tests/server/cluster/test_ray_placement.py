@@ -16,7 +16,7 @@ from running import pictures
 from sending import create, put_framed
 
 from client.wire import Cluster
-from server.storage.fencing import epochs, found_epoch
+from server.storage.fencing import epoch_read, epochs
 from server.storage.layout import DataFolder
 from studies.cluster.nodes import Nodes
 from studies.service.process import Service
@@ -93,7 +93,7 @@ def test_frames_are_committed_on_a_node_and_views_are_answered(service: Service,
     sent(service, scene, range(3))
     until(lambda: committed(service, scene) == 3)
     assert node_of(service, nodes, scene)
-    assert found_epoch(states(service, scene)) == 0
+    assert epoch_read(states(service, scene)) == 0
     view = service.http.post(f"/v1/scenes/{scene}/render", json={"camera": "c0", "frame": 1})
     assert (view.status_code, view.headers["content-type"]) == (200, "image/png"), view.text
     found = cluster(service)
@@ -113,7 +113,7 @@ def test_a_worker_that_dies_is_followed_by_one_of_the_next_epoch(service: Servic
     os.kill(pid, signal.SIGKILL)
     sent(service, scene, range(2, 4))
     until(lambda: committed(service, scene) == 4)
-    assert found_epoch(states(service, scene)) == 1
+    assert epoch_read(states(service, scene)) == 1
     assert service.status(scene).worker_deaths == 1
 
 
@@ -183,7 +183,7 @@ def test_scenes_are_found_again_after_the_service_was_killed(service: Service, s
     until(lambda: service.http.get(f"/v1/scenes/{scene}").status_code == 200)
     sent(service, scene, range(3, 4))
     until(lambda: committed(service, scene) == 4)
-    assert found_epoch(states(service, scene)) == 1
+    assert epoch_read(states(service, scene)) == 1
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -14,21 +16,26 @@ from scas4d_core.compact import CompactWriter, Head
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.storage.history import History
 from server.storage import fencing
-from server.storage.disk import alone
-from server.storage.fencing import FencingError, epoch_folder, epochs, found_epoch, publish, sweep, take_over
-from server.storage.layout import SceneFolder
+from server.storage.disk import FolderLock, alone
+from server.storage.fencing import FencingError, begin_epoch, epoch_read, epochs, heal, sweep
+from server.storage.layout import SceneFolder, epoch_folder
 
 STATE = Gaussians.of_points(np.random.default_rng(0).normal(size=(20, 3)), radius=0.1)
 
 
 @pytest.fixture
-def states(tmp_path: Path) -> Path:
-    """States of a scene: epoch 3 has frames 0 and 1, and is read."""
+def lock(tmp_path: Path) -> Path:
+    return SceneFolder(tmp_path).worker_lock
+
+
+@pytest.fixture
+def states(tmp_path: Path, lock: Path) -> Path:
+    """States of a scene: epoch 0 has frames 0 and 1, and is read."""
     states = tmp_path / "states"
-    history = History.open(take_over(states, 3, None))
+    assert begin_epoch(states, lock) == 0
+    history = History.open(epoch_folder(states, 0))
     for index in (0, 1):
         history.append(index, float(index), moved(index))
-    publish(states, 3)
     return states
 
 
@@ -40,50 +47,47 @@ def frames(states: Path) -> list[int]:
     return list(History.load(states).indices)
 
 
-def test_the_next_epoch_has_what_was_committed(states: Path) -> None:
-    folder = take_over(states, 4, 3)
-    assert folder == epoch_folder(states, 4)
-    assert frames(folder) == frames(states) == [0, 1]
-    assert found_epoch(states) == 3
-    publish(states, 4)
-    assert found_epoch(states) == 4
+def test_the_next_epoch_has_what_was_committed_and_is_read(states: Path, lock: Path) -> None:
+    assert epoch_read(states) == 0
+    assert begin_epoch(states, lock) == 1
+    assert epoch_read(states) == 1
     assert states.is_symlink()
+    assert states.resolve() == epoch_folder(states, 1)
+    assert frames(states) == frames(epoch_folder(states, 0)) == [0, 1]
 
 
-def test_what_the_old_worker_writes_is_not_read(states: Path) -> None:
-    """It commits a frame, and one again with other bits: neither shows, before the link is changed or after."""
-    old = History.open(epoch_folder(states, 3))
-    take_over(states, 4, 3)
-    new = History.open(epoch_folder(states, 4))
-    publish(states, 4)
+def test_what_the_old_worker_writes_is_not_read(states: Path, lock: Path) -> None:
+    """It commits a frame, and one again with other bits, before the new worker has committed anything and after."""
+    old = History.open(epoch_folder(states, 0))
+    begin_epoch(states, lock)
     old.append(2, 2.0, moved(2, by=9.0))
-    new.append(2, 2.0, moved(2))
+    assert frames(states) == [0, 1]
+    History.open(epoch_folder(states, 1)).append(2, 2.0, moved(2))
     old.append(3, 3.0, moved(3, by=9.0))
     read = History.load(states)
     assert read.indices == [0, 1, 2]
     assert np.array_equal(read.gaussians(2).means, moved(2).means)
 
 
-def test_a_reader_goes_on_over_the_change(states: Path) -> None:
+def test_a_reader_goes_on_over_the_change(states: Path, lock: Path) -> None:
     reader = History.load(states)
-    take_over(states, 4, 3)
-    History.open(epoch_folder(states, 4)).append(2, 2.0, moved(2))
-    publish(states, 4)
-    assert sweep(states, 4) == ["states.3"]
+    begin_epoch(states, lock)
+    History.open(epoch_folder(states, 1)).append(2, 2.0, moved(2))
+    assert sweep(states, 1) == ["states.0"]
     reader.refresh()
     assert reader.indices == [0, 1, 2]
     assert np.array_equal(reader.gaussians(0).means, moved(0).means)
 
 
-def test_a_compact_file_that_is_written_is_copied_and_a_whole_one_linked(states: Path) -> None:
-    old = epoch_folder(states, 3)
+def test_a_compact_file_that_is_written_is_copied_and_a_whole_one_linked(states: Path, lock: Path) -> None:
+    old = epoch_folder(states, 0)
     head = Head(WorldFrame(np.zeros(3)))
     with CompactWriter(old / "states_000000.s4d", head) as writer:
         writer.add(0, 0.0, STATE)
     growing = CompactWriter(old / "states_000120.s4d", head)
     growing.add(120, 4.0, STATE)
     size = growing.path.stat().st_size
-    new = take_over(states, 4, 3)
+    new = epoch_folder(states, begin_epoch(states, lock))
     growing.add(121, 4.1, moved(1))
     growing.close()
     assert (new / "states_000120.s4d").stat().st_size == size
@@ -91,9 +95,9 @@ def test_a_compact_file_that_is_written_is_copied_and_a_whole_one_linked(states:
     assert not (new / "states_000120.s4d").samefile(old / "states_000120.s4d")
 
 
-def test_a_frame_that_moves_meanwhile_is_not_lost(states: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_that_moves_meanwhile_is_not_lost(states: Path, lock: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The old worker compacts while its folder is linked: frames are in a compact file before their own files go."""
-    old, link = epoch_folder(states, 3), os.link
+    old, link = epoch_folder(states, 0), os.link
     calls = []
 
     def moving(source: Path, target: Path) -> None:
@@ -105,15 +109,17 @@ def test_a_frame_that_moves_meanwhile_is_not_lost(states: Path, monkeypatch: pyt
         link(source, target)
 
     monkeypatch.setattr(fencing.os, "link", moving)
-    folder = take_over(states, 4, 3)
+    folder = epoch_folder(states, begin_epoch(states, lock))
     assert (folder / "states_000000.s4d").read_bytes() == b"has both"
     assert not list(states.parent.glob("*.part"))
 
 
 @pytest.mark.parametrize("place", [0, 1, 2])
-def test_a_commit_meanwhile_is_taken_over_whole(states: Path, monkeypatch: pytest.MonkeyPatch, place: int) -> None:
+def test_a_commit_meanwhile_is_taken_over_whole(
+    states: Path, lock: Path, monkeypatch: pytest.MonkeyPatch, place: int
+) -> None:
     """The old worker commits a frame, and compacts one that is linked already, or is not yet."""
-    old, link = epoch_folder(states, 3), os.link
+    old, link = epoch_folder(states, 0), os.link
     (old / "checkpoint_000001.npz").touch()
     calls = []
 
@@ -126,87 +132,154 @@ def test_a_commit_meanwhile_is_taken_over_whole(states: Path, monkeypatch: pytes
         link(source, target)
 
     monkeypatch.setattr(fencing.os, "link", working)
-    folder = take_over(states, 4, 3)
+    folder = epoch_folder(states, begin_epoch(states, lock))
     assert sorted(os.listdir(folder)) == sorted(os.listdir(old))
     assert not (folder / "frame_000000.npz").exists()
 
 
-def test_files_that_keep_vanishing_are_a_fault(states: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_that_keep_vanishing_are_a_fault(states: Path, lock: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def gone(source: Path, target: Path) -> None:
         raise FileNotFoundError(source)
 
     monkeypatch.setattr(fencing.os, "link", gone)
-    with pytest.raises(FencingError, match=r"states\.3 kept changing"):
-        take_over(states, 4, 3)
-    assert sorted(epochs(states)) == [3]
+    with pytest.raises(FencingError, match=r"states\.0 kept changing"):
+        begin_epoch(states, lock)
+    assert epoch_read(states) == 0
+    assert sorted(path.name for path in states.parent.glob("states*")) == ["states", "states.0"]
 
 
-def test_without_links_files_are_copied(states: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_leaves_nothing_behind(states: Path, lock: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(source: Path, target: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(fencing.os, "link", full)
+    monkeypatch.setattr(fencing, "_copy", full)
+    with pytest.raises(OSError, match="No space left"):
+        begin_epoch(states, lock)
+    assert epoch_read(states) == 0
+    assert sorted(path.name for path in states.parent.iterdir()) == ["states", "states.0"]
+
+
+def test_a_link_that_cannot_be_moved_leaves_the_states_as_they_were(
+    states: Path, lock: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(path: Path, target: Path) -> Path:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(Path, "replace", refused)
+    with pytest.raises(OSError, match="Input/output"):
+        begin_epoch(states, lock)
+    monkeypatch.undo()
+    assert epoch_read(states) == 0
+    assert begin_epoch(states, lock) == 2
+    assert frames(states) == [0, 1]
+
+
+def test_without_links_files_are_copied(states: Path, lock: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(source: Path, target: Path) -> None:
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(fencing.os, "link", refused)
-    folder = take_over(states, 4, 3)
+    folder = epoch_folder(states, begin_epoch(states, lock))
     assert frames(folder) == [0, 1]
-    assert not (folder / "frame_000000.npz").samefile(states / "frame_000000.npz")
+    assert not (folder / "frame_000000.npz").samefile(epoch_folder(states, 0) / "frame_000000.npz")
 
 
-def test_a_folder_of_one_machine_becomes_that_of_epoch_0(tmp_path: Path) -> None:
+def test_a_folder_of_one_machine_becomes_that_of_epoch_0(tmp_path: Path, lock: Path) -> None:
     states = tmp_path / "states"
     History.open(states).append(0, 0.0, STATE)
-    assert found_epoch(states) == 0
-    assert states.is_symlink()
+    assert epoch_read(states) is None
+    assert begin_epoch(states, lock) == 1
+    assert frames(states) == frames(epoch_folder(states, 0)) == [0]
+
+
+def test_a_local_worker_that_is_at_work_still_is_waited_for(
+    tmp_path: Path, lock: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It writes by the path `states`: as a link, that would be the folder of the next worker."""
+    states = tmp_path / "states"
+    History.open(states).append(0, 0.0, STATE)
+    held = FolderLock(lock, wait=False)
+    held.write("4711\n")
+    monkeypatch.setattr(fencing, "LOCAL_S", 0.1)
+    with pytest.raises(FencingError, match=r"process 4711\) does not end"):
+        begin_epoch(states, lock)
+    assert not states.is_symlink()
+    monkeypatch.setattr(fencing, "LOCAL_S", 60)
+    threading.Timer(0.2, held.release).start()
+    assert begin_epoch(states, lock) == 1
     assert frames(states) == [0]
-    assert found_epoch(tmp_path / "states_2") is None
 
 
-def test_a_stop_between_renaming_and_linking_loses_nothing(tmp_path: Path) -> None:
+def test_a_stop_between_renaming_and_linking_loses_nothing(tmp_path: Path, lock: Path) -> None:
     states = tmp_path / "states"
     History.open(states).append(0, 0.0, STATE)
     states.rename(epoch_folder(states, 0))
-    assert found_epoch(states) == 0
+    heal(states)
+    assert epoch_read(states) == 0
     assert frames(states) == [0]
+    heal(tmp_path / "states_2")
+    assert not (tmp_path / "states_2").exists()
 
 
-def test_the_link_decides_not_the_highest_number(states: Path) -> None:
-    """A worker that took over and was given up before it could say so has committed nothing."""
-    take_over(states, 7, 3)
-    assert found_epoch(states) == 3
-    assert sorted(epochs(states)) == [3, 7]
+def test_the_link_decides_not_the_highest_number(states: Path, lock: Path) -> None:
+    """A stop came before the link was moved: that epoch has committed nothing."""
+    epoch_folder(states, 7).mkdir()
+    assert begin_epoch(states, lock) == 8
+    assert frames(states) == [0, 1]
 
 
-def test_two_workers_of_one_epoch_cannot_both_have_it(states: Path) -> None:
-    take_over(states, 4, 3)
-    with pytest.raises(OSError, match="not empty"):
-        take_over(states, 4, 3)
+def test_states_that_are_gone_are_not_begun_anew(states: Path, lock: Path) -> None:
+    shutil.rmtree(epoch_folder(states, 0))
+    (states.parent / "states.3").mkdir()
+    os.remove(states)
+    states.symlink_to("states.3")
+    os.rmdir(states.parent / "states.3")
+    with pytest.raises(FencingError, match=r"states\.3 is gone, which is read; put it back"):
+        begin_epoch(states, lock)
 
 
-def test_a_link_that_comes_late_does_not_go_back(states: Path) -> None:
-    take_over(states, 4, 3)
-    take_over(states, 5, 3)
-    publish(states, 5)
-    publish(states, 4)
-    assert found_epoch(states) == 5
+def test_a_deleted_scene_does_not_come_back(states: Path, lock: Path) -> None:
+    shutil.rmtree(states.parent)
+    with pytest.raises(FileNotFoundError):
+        begin_epoch(states, lock)
+    assert not states.parent.exists()
 
 
-def test_sweeping_leaves_later_epochs_and_other_reconstructions(states: Path) -> None:
-    take_over(states, 4, 3)
-    other = states.with_name("states_2.1")
-    shutil.copytree(epoch_folder(states, 3), other)
-    (states.parent / "states.2.abcd.part").mkdir()
-    publish(states, 4)
-    assert sweep(states, 4) == ["states.2.abcd.part", "states.3"]
+def test_two_services_cannot_both_have_an_epoch(states: Path, lock: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both choose the same number; the second finds a folder, and an empty one it must not replace."""
+    folders = fencing._folders
+    monkeypatch.setattr(fencing, "_folders", lambda states: [one for one in folders(states) if one[1] < 1])
+    assert begin_epoch(states, lock) == 1
+    for name in os.listdir(epoch_folder(states, 1)):
+        if not name.startswith("."):
+            os.remove(epoch_folder(states, 1) / name)
+    with pytest.raises(FencingError, match=r"another service began states\.1"):
+        begin_epoch(states, lock)
+
+
+def test_sweeping_leaves_later_epochs_and_other_reconstructions(states: Path, lock: Path) -> None:
+    begin_epoch(states, lock)
+    other = states.with_name("states_2.0")
+    shutil.copytree(epoch_folder(states, 0), other)
+    for name in ("states.0.abcd.part", "states.2.abcd.part"):
+        (states.parent / name).mkdir()
+    assert sweep(states, 1) == ["states.0", "states.0.abcd.part"]
     assert other.is_dir()
+    assert frames(states) == [0, 1]
 
 
-def test_a_worker_with_an_epoch_does_not_wait_for_one_that_stopped(tmp_path: Path) -> None:
-    folder = SceneFolder(tmp_path)
-    held = alone(SceneFolder(tmp_path, epoch=0), None)
-    lock = alone(SceneFolder(tmp_path, epoch=1), 0)  # with the lock of the other it would wait for ever
-    assert int(folder.worker_lock.read_text()) == os.getpid()
-    assert sorted(epochs(folder.states)) == [0, 1]
+def test_parts_of_an_epoch_are_none_of_its_folders(states: Path) -> None:
+    (states.parent / "states.4.abcd.part").mkdir()
+    assert sorted(epochs(states)) == [0]
+
+
+def test_a_worker_with_an_epoch_does_not_wait_for_one_that_stopped(tmp_path: Path, lock: Path) -> None:
+    held = alone(SceneFolder(tmp_path, epoch=0))
+    mine = alone(SceneFolder(tmp_path, epoch=1))  # with the lock of the other it would wait for ever
+    assert int(lock.read_text()) == os.getpid()
     held.release()
-    lock.release()
+    mine.release()
 
 
 def test_what_reconstructions_before_left_is_found_with_its_epochs(states: Path) -> None:
@@ -214,4 +287,4 @@ def test_what_reconstructions_before_left_is_found_with_its_epochs(states: Path)
 
     event = ReconstructionBegun.model_construct(number=1, points=None)
     names = [path.name for path in SceneFolder(states.parent).leftovers(event)]
-    assert names == ["states", "states.3"]
+    assert names == ["states", "states.0"]

@@ -1,0 +1,208 @@
+"""A process on a cluster whose actor fails in every way: the scene always learns of it, and never stands still."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import pytest
+
+ray_placement = pytest.importorskip(
+    "server.cluster.ray_placement", reason="Ray is not installed: pip install 'scas4d[ray]'"
+)
+
+from ray.exceptions import RayActorError, RayError  # noqa: E402
+
+from server.cluster.host import Gone, Started  # noqa: E402
+from server.cluster.needs import Needs  # noqa: E402
+from server.processes.placement import Ended  # noqa: E402
+
+pytestmark = pytest.mark.filterwarnings("default")
+NEEDS = Needs("worker", "scene", 1, 0, 1)
+
+
+class Remote:
+    """A method of an actor."""
+
+    def __init__(self, call: Callable[..., Awaitable[Any]]) -> None:
+        self.remote = call
+
+
+class FakeActor:
+    def __init__(self) -> None:
+        self.said: asyncio.Queue[Any] = asyncio.Queue()
+        self.posted: list[tuple[int, Any]] = []
+        self.begins = asyncio.Event()
+        self.begins.set()
+        self.refuses: BaseException | None = None
+        self.start, self.post = Remote(self._start), Remote(self._post)
+        self.take, self.stop = Remote(self._take), Remote(self._stop)
+
+    async def _start(self, entry: Any, spec: Any) -> Started:
+        await self.begins.wait()
+        if self.refuses is not None:
+            raise self.refuses
+        return Started("node-1", 4711)
+
+    async def _post(self, number: int, message: Any) -> None:
+        self.posted.append((number, message))
+
+    async def _take(self) -> list[Any]:
+        found = await self.said.get()
+        if isinstance(found, BaseException):
+            raise found
+        return [found]
+
+    async def _stop(self, seconds: float) -> None:
+        pass
+
+
+class FakePlacement:
+    def __init__(self) -> None:
+        self.places: dict[str, Any] = {}
+        self.actor = FakeActor()
+        self.may_make = threading.Event()
+        self.may_make.set()
+
+    def host(self, name: str, needs: Needs) -> FakeActor:
+        self.may_make.wait(10)
+        return self.actor
+
+
+class Running:
+    """A process, and what the service was told of it."""
+
+    def __init__(self, placement: FakePlacement) -> None:
+        self.placement, self.actor = placement, placement.actor
+        self.messages: list[Any] = []
+        self.ends: list[Ended] = []
+        self.raises: Exception | None = None
+        runs = (lambda: None, None)
+        made = ray_placement.RayProcess
+        self.process = made(placement, "scene.worker.0", NEEDS, runs, self._received, self.ends.append)
+
+    def _received(self, message: Any) -> None:
+        self.messages.append(message)
+        if self.raises is not None:
+            raise self.raises
+
+
+@pytest.fixture
+def killed(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    found: list[Any] = []
+    monkeypatch.setattr(ray_placement.ray, "kill", found.append)
+    return found
+
+
+async def until(done: Callable[[], object]) -> None:
+    for _ in range(500):
+        if done():
+            return
+        await asyncio.sleep(0.01)
+    raise AssertionError("it did not come")
+
+
+def run(test: Callable[[FakePlacement], Awaitable[None]]) -> None:
+    async def all_of() -> None:
+        await test(FakePlacement())
+
+    asyncio.run(all_of())
+
+
+def dies(words: str = "The actor died.\nmore") -> RayActorError:
+    return RayActorError(error_msg=words)
+
+
+@pytest.mark.parametrize(("alive", "lost"), [(False, True), (True, False)])
+def test_a_node_is_lost_only_if_ray_says_so(
+    killed: list[Any], monkeypatch: pytest.MonkeyPatch, *, alive: bool, lost: bool
+) -> None:
+    """An actor that was killed for want of memory is no lost node: its frame may be to blame."""
+    monkeypatch.setattr(ray_placement, "is_lost", lambda id: not alive)
+
+    async def test(placement: FakePlacement) -> None:
+        running = Running(placement)
+        await until(lambda: running.process.pid)
+        placement.actor.said.put_nowait(dies())
+        await until(lambda: running.ends)
+        (end,) = running.ends
+        assert end.lost is lost
+        assert "\n" not in end
+        await until(lambda: killed == [placement.actor])
+
+    run(test)
+
+
+def test_an_actor_that_cannot_be_made_is_no_lost_node(killed: list[Any]) -> None:
+    async def test(placement: FakePlacement) -> None:
+        placement.actor.refuses = dies("no such environment")
+        running = Running(placement)
+        await until(lambda: running.ends)
+        (end,) = running.ends
+        assert not end.lost
+        assert placement.places == {}
+
+    run(test)
+
+
+@pytest.mark.parametrize("fault", [RayError("the head does not answer"), KeyError("a fault of the service's own")])
+def test_whatever_ends_the_messages_is_told(killed: list[Any], fault: Exception) -> None:
+    async def test(placement: FakePlacement) -> None:
+        running = Running(placement)
+        placement.actor.said.put_nowait(fault)
+        await until(lambda: running.ends)
+        assert not running.ends[0].lost
+
+    run(test)
+
+
+def test_a_message_that_cannot_be_taken_in_does_not_end_the_others(killed: list[Any]) -> None:
+    async def test(placement: FakePlacement) -> None:
+        running = Running(placement)
+        running.raises = KeyError("x")
+        for message in ("a", "b", Gone(3)):
+            placement.actor.said.put_nowait(message)
+        await until(lambda: running.ends)
+        assert running.messages == ["a", "b"]
+        assert running.ends[0].exit_code == 3
+
+    run(test)
+
+
+def test_messages_before_the_actor_is_made_are_posted_in_order_and_nothing_waits(killed: list[Any]) -> None:
+    """Making a named actor takes as long as the head of the cluster takes to answer."""
+
+    async def test(placement: FakePlacement) -> None:
+        placement.may_make.clear()
+        running = Running(placement)
+        for message in ("a", "b"):
+            running.process.send(message)
+        await asyncio.sleep(0.05)
+        assert placement.actor.posted == []
+        placement.may_make.set()
+        await until(lambda: running.process.pid)
+        running.process.send("c")
+        await until(lambda: len(placement.actor.posted) == 3)
+        assert placement.actor.posted == [(0, "a"), (1, "b"), (2, "c")]
+
+    run(test)
+
+
+def test_one_that_is_stopped_before_it_is_made_is_killed_once_it_is(
+    killed: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def test(placement: FakePlacement) -> None:
+        placement.may_make.clear()
+        running = Running(placement)
+        stopping = asyncio.ensure_future(running.process.stop(1))
+        await asyncio.sleep(0.05)
+        assert killed == []
+        placement.may_make.set()
+        await stopping
+        assert killed == [placement.actor]
+        assert running.ends == []
+        assert placement.actor.posted == []
+
+    run(test)
