@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, MutableMapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryFile
 from threading import Lock
@@ -12,15 +12,19 @@ from weakref import finalize
 import numpy as np
 from numpy.typing import NDArray
 
+IN_MEMORY = 16
+"""Newest states of a history without a directory that stay in memory; older ones go to a scratch file."""
+
 
 class ScratchFile:
     """A file without a name: nothing of it is left however the process ends. It is neither synced nor checked.
 
     Args:
-        within: a folder on the disk that it takes room of; the file is made once it is needed.
+        within: a folder on the disk that it takes room of; the file is made once it is needed. None: that of the system
+            for temporary files.
     """
 
-    def __init__(self, within: Path) -> None:
+    def __init__(self, within: Path | None) -> None:
         self._within = within
         self._file: IO[bytes] | None = None
         self._end = 0
@@ -36,6 +40,24 @@ class ScratchFile:
         except OSError:
             self._full = True
             return frame
+
+    def take(
+        self,
+        indices: Sequence[int],
+        frames: MutableMapping[int, Mapping[str, NDArray[Any]]],
+        texts: MutableMapping[int, bytes],
+        told: MutableMapping[int, Mapping[str, NDArray[np.uint8]]],
+    ) -> None:
+        """Moves frames and their reports, from ``texts`` to ``told``; those before one that is here already are, too.
+
+        Args:
+            indices: of the frames, rising.
+        """
+        for index in reversed(indices):
+            if (moved := self.moved(frames[index])) is frames[index]:
+                break
+            frames[index] = moved
+            told[index] = self.moved({"report": np.frombuffer(texts.pop(index), np.uint8)})
 
     def put(self, array: NDArray[Any]) -> int:
         """Adds an array, and says where it begins.

@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 from scas4d_core.gaussians import FIXED
 from scas4d_core.storage.births import NO_EVENTS, Int
 from scas4d_core.storage.frame_arrays import EFFECTS, EVENTS, Arrays, Stamp, unpacked
-from scas4d_core.storage.frame_files import DamagedFrameError, FrameFiles, HistoryError, UnreadableFrameError
+from scas4d_core.storage.frame_files import (
+    DamagedFrameError,
+    FrameFiles,
+    HistoryError,
+    UnreadableFrameError,
+    frame_file,
+)
 
 FRAMES_KEPT = 4
 """Frames of a history on disk that stay in memory: the newest, and the last ones read."""
@@ -35,10 +41,11 @@ class FramesReader:
         self._fixed: Arrays = {}
         self._background: tuple[float, float, float] | None = None
         self._times: dict[int, float] = {}
-        self._reports: dict[int, dict[str, Any]] = {}
         self._stamps: dict[int, Stamp] = {}
         self._texts: dict[int, bytes] = {}
-        """Reports on disk of the frames that are in memory."""
+        """Reports of the frames that are in memory."""
+        self._told: dict[int, Mapping[str, NDArray[np.uint8]]] = {}
+        """Those of frames without a file that are not (``History.put_aside``)."""
         self._packed: dict[int, NDArray[np.uint8]] = {}
         """What effects left of the frames that were written here and are in memory, packed."""
         self._frames: OrderedDict[int, Mapping[str, NDArray[Any]]] = OrderedDict()
@@ -158,6 +165,11 @@ class FramesReader:
         """[T] float64 seconds, in the order of ``indices``."""
         return np.array(list(self._times.values()), dtype=np.float64)
 
+    @property
+    def files(self) -> FrameFiles | None:
+        """The files on disk, to mend them (``scas4d_core.remake``); None in memory."""
+        return self._files
+
     def time(self, index: int) -> float:
         """Seconds of one committed frame."""
         self._require(index)
@@ -170,16 +182,15 @@ class FramesReader:
             HistoryError: the frame was not committed, or its file is damaged.
         """
         self._require(index)
-        if self._files is None:
-            return dict(self._reports[index])
         text = self._texts.get(index)
         if text is None:
-            text = self._from_file(index, ("report",))["report"].tobytes()
+            kept = self._told.get(index)
+            text = (self._from_file(index, ("report",)) if kept is None else kept)["report"].tobytes()
         try:
             report: dict[str, Any] = json.loads(text)
         except ValueError as error:
-            raise HistoryError(f"{self._files.path(index).name}: its report is no JSON ({error})") from error
-        if index in self._frames:
+            raise HistoryError(f"{frame_file(index)}: its report is no JSON ({error})") from error
+        if index in self._frames and index not in self._told:
             self._texts[index] = text
         return report
 
@@ -294,7 +305,7 @@ class FramesReader:
 
     def _forget(self, index: int) -> None:
         self._times.pop(index, None)
-        self._reports.pop(index, None)
+        self._told.pop(index, None)
         self._stamps.pop(index, None)
         self._texts.pop(index, None)
         self._packed.pop(index, None)

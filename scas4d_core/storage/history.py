@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scas4d_core.gaussians import FIXED, PER_FRAME, UNBORN, WHOLES, Gaussians
 from scas4d_core.storage.births import FOUNDERLESS, Event, Int, births_in, events_of, retired_after
 from scas4d_core.storage.frame_arrays import Arrays, EffectArrays, as_written, packed
-from scas4d_core.storage.frame_aside import ScratchFile
+from scas4d_core.storage.frame_aside import IN_MEMORY, ScratchFile
 from scas4d_core.storage.frame_files import DamagedFrameError, FrameFiles, HistoryError, UnreadableFrameError
 from scas4d_core.storage.frames_reader import FRAMES_KEPT
 from scas4d_core.storage.history_reader import ROOT, ROOTS, HistoryReader
@@ -42,8 +42,8 @@ class History(HistoryReader):
     """The committed states of one scene, in the order of their indices; for the process that appends.
 
     Args:
-        directory: made when missing; without it the states stay in memory. A directory that already holds states is
-            opened with ``History.load`` or ``History.open``.
+        directory: made when missing; without it states are in memory, and older ones in a scratch file
+            (``put_aside``). One that holds states is opened with ``History.load`` or ``History.open``.
 
     Attributes:
         record_seconds: seconds that the last ``append`` spent on the report: encoding it, and its share of writing, by
@@ -221,7 +221,7 @@ class History(HistoryReader):
             self._texts[index] = encoded
         else:
             self._stamps[index] = (sum(array.nbytes for array in frame.values()), 0)
-            self._reports[index] = json.loads(text)
+            self._texts[index] = text.encode()
         self._births.update(births)
         if left is not None:
             self._packed[index] = left
@@ -230,6 +230,8 @@ class History(HistoryReader):
         self._log = (index, log)
         self.damaged.pop(index, None)
         self._keep(index, frame)
+        if self._files is None and len(self._times) > IN_MEMORY:
+            self.put_aside(None, IN_MEMORY)
 
     def retain(self, *, last: int | None = None, size_bytes: int | None = None) -> list[int]:
         """Deletes the oldest states until the rules hold. Without a rule all stay.
@@ -260,15 +262,17 @@ class History(HistoryReader):
             self._files.remove_oldest(deleted, self._times)
         return deleted
 
-    def put_aside(self, folder: Path) -> None:
+    def put_aside(self, folder: Path | None, but: int = 1) -> None:
         """Moves states from memory to a scratch file, but for the first and the newest; their bits stay the same.
 
         Args:
-            folder: on the disk of the file, which goes with this history; without room states stay in memory.
+            folder: on the disk of the file, which goes with this history; None: the system's for temporary files.
+                Without room states stay in memory.
+            but: so many of the newest.
         """
         self._scratch = self._scratch or ScratchFile(folder)
-        for index in self.indices[1:-1] if self._files is None else ():
-            self._frames[index] = self._scratch.moved(self._frames[index])
+        if self._files is None:
+            self._scratch.take(self.indices[1:-but], self._frames, self._texts, self._told)
 
     def cut(self, after: int) -> list[int]:
         """Takes back every commit after frame ``after``.
@@ -285,11 +289,6 @@ class History(HistoryReader):
         if known and self._files is not None:
             self._files.sync()
         return known
-
-    @property
-    def files(self) -> FrameFiles | None:
-        """The files on disk, to mend them (``scas4d_core.remake``); None in memory."""
-        return self._files
 
     def mend_fixed(self) -> dict[str, str]:
         """Writes the files that every frame needs, and their copies, anew where they are damaged.

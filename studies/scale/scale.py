@@ -15,25 +15,34 @@ from typing import Any
 
 import numpy as np
 
+from scas4d_core.captures import InitialPoints
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
+from scas4d_core.storage.history import History
 from studies.options import Echo
 from studies.scale.footage import Size, known, rig, shown, wall
 
-ITERATIONS = 30
-"""Of an update, at every size."""
+ITERATIONS = 100
+"""Of an update, at every size: those of the paper."""
+FIRST_ITERATIONS = 100
+"""Of frame 0."""
 UPDATES = 4
 """The first, which looks for the motion, does not count."""
+PIXELS = ((256, 256), (512, 512), (1280, 720), (1920, 1080))
 SWEEPS: Mapping[str, Sequence[Size]] = {
-    "Gaussians": [Size(gaussians=count) for count in (5_000, 10_000, 20_000, 50_000, 100_000, 200_000)],
-    "pixels": [Size(width=side, height=side) for side in (128, 256, 512, 1024)],
-    "pixels, all of which move": [Size(width=side, height=side, moving=1.0) for side in (128, 256, 512)],
-    "cameras": [Size(cameras=count) for count in (4, 8, 16, 32, 64)],
+    "Gaussians": [Size(gaussians=count) for count in (5_000, 20_000, 50_000, 100_000, 200_000, 500_000)],
+    "pixels": [Size(width=wide, height=high, cameras=6) for wide, high in PIXELS],
+    "pixels, all of which move": [Size(width=wide, height=high, cameras=6, moving=1.0) for wide, high in PIXELS],
+    "cameras": [Size(cameras=count) for count in (4, 8, 16, 32, 64, 100)],
     "share that moves": [Size(moving=share) for share in (0.05, 0.1, 0.2, 0.4, 0.8)],
 }
 """Sizes by what rises in them; all else is that of ``Size()``."""
-FRAMES = (100, 400, 1600)
+FRAMES = (100, 1_000, 10_000)
 """Frames of one process; its memory is looked at after each of these numbers."""
+TURN = 16
+"""Frames after which the footage of these goes back."""
+KEPT = {"a folder": True, "the process": False}
+"""Where states of these are kept."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +50,14 @@ class Cost:
     """Of one size.
 
     Attributes:
-        update: seconds of an update, median. view: seconds of a view. first: seconds of a start from the known state:
-            clusters, neighbours, first rendering. memory: MB, the most that the process had.
+        update: seconds of an update, median. view: seconds of a view. frame_0: seconds of frame 0 from its pictures and
+            a point a Gaussian, with few iterations. memory: MB, the most that the process had with updates and views,
+            frame 0 not among them.
     """
 
     update: float
     view: float
-    first: float
+    frame_0: float
     memory: float
 
 
@@ -70,13 +80,15 @@ def slope(amounts: Sequence[float], costs: Sequence[float]) -> float:
 def cost(size: Size) -> Cost:
     """Measures a size in this process."""
     settings = Settings.model_validate(
-        {"scene": {"metres_per_unit": 1.0}, "update": {"iterations": ITERATIONS}, "effects": {"camera_gain": "off"}}
+        {
+            "scene": {"metres_per_unit": 1.0},
+            "static": {"iterations": FIRST_ITERATIONS, "max_gaussians": size.gaussians},
+            "update": {"iterations": ITERATIONS},
+        }
     )
     state, cameras = wall(size), rig(size)
     frames = [shown(state, index, cameras) for index in range(UPDATES + 1)]
-    began = perf_counter()
     scene = Reconstruction.start(cameras, frames[0], settings, static=known(state, cameras))
-    first = perf_counter() - began
     seconds, views = [], []
     for frame in frames[1:]:
         began = perf_counter()
@@ -85,23 +97,33 @@ def cost(size: Size) -> Cost:
         began = perf_counter()
         scene.render(cameras.cameras[0])
         views.append(perf_counter() - began)
-    return Cost(median(seconds[1:]), median(views[1:]), first, _peak_mb())
+    memory = _peak_mb()
+    points = InitialPoints(state.means.astype(np.float64), state.colours, state.foreground)
+    began = perf_counter()
+    Reconstruction.start(cameras, frames[0], settings, points=points)
+    return Cost(median(seconds[1:]), median(views[1:]), perf_counter() - began, memory)
 
 
-def growth(frames: Sequence[int]) -> dict[int, float]:
-    """Peak memory, MB, of a process after so many frames of a small scene, its states beside it in a folder."""
+def growth(frames: Sequence[int], *, folder: bool) -> dict[int, float]:
+    """Peak memory, MB, of a process after so many frames of a small scene.
+
+    Args:
+        frames: numbers of frames after which it is looked at. folder: states are kept in one, as by the service; else
+            by the process alone.
+    """
     from tempfile import TemporaryDirectory
 
     size = Size(gaussians=2_000, width=64, height=64, cameras=4)
     settings = Settings.model_validate({"scene": {"metres_per_unit": 1.0}, "update": {"iterations": 2}})
     state, cameras = wall(size), rig(size)
+    there = [shown(state, way, cameras) for way in range(TURN + 1)]
     found: dict[int, float] = {}
-    with TemporaryDirectory() as folder:
-        scene = Reconstruction.start(cameras, shown(state, 0, cameras), settings, static=known(state, cameras))
-        scene.history.put_aside(Path(folder))
+    with TemporaryDirectory() as work:
+        history = History(Path(work) / "states") if folder else History()
+        scene = Reconstruction.start(cameras, there[0], settings, static=known(state, cameras), history=history)
         for index in range(1, max(frames) + 1):
-            way = index % 16 if index % 32 < 16 else 16 - index % 16  # to and fro
-            scene.step(replace(shown(state, way, cameras), index=index, time=index / 30))
+            way = index % TURN if index % (2 * TURN) < TURN else TURN - index % TURN  # to and fro
+            scene.step(replace(there[way], index=index, time=index / 30))
             if index in frames:
                 found[index] = _peak_mb()
     return found
@@ -113,7 +135,10 @@ def run(work: Path, sweeps: Sequence[str], frames: Sequence[int], echo: Echo) ->
     for name in sweeps:
         for size in SWEEPS[name]:
             echo(f"{name} {amount(name, size):g}: {_kept(work, asdict(size))}")
-    grown = _kept(work, {"frames": list(frames)}) if frames else {}
+    grown = {}
+    for name, folder in KEPT.items() if frames else ():
+        grown[name] = _kept(work, {"frames": list(frames), "folder": folder})
+        echo(f"states in {name}: {grown[name]}")
     return {"sweeps": {name: [_kept(work, asdict(size)) for size in SWEEPS[name]] for name in sweeps}, "frames": grown}
 
 
@@ -122,16 +147,21 @@ def told(found: Mapping[str, Any]) -> str:
     lines = []
     for name, costs in found["sweeps"].items():
         amounts = [amount(name, size) for size in SWEEPS[name]]
-        lines += ["", f"| {name} | update, s | view, ms | start, s | memory, MB |", "|---|---|---|---|---|"]
+        lines += ["", f"| {name} | update, s | view, ms | frame 0, s | memory, MB |", "|---|---|---|---|---|"]
         lines += [
-            f"| {size:g} | {one['update']:.2f} | {1e3 * one['view']:.0f} | {one['first']:.2f} | {one['memory']:.0f} |"
+            f"| {size:g} | {one['update']:.2f} | {1e3 * one['view']:.0f} | {one['frame_0']:.2f} | {one['memory']:.0f} |"
             for size, one in zip(amounts, costs, strict=True)
         ]
         slopes = [slope(amounts, [one[field.name] for one in costs]) for field in fields(Cost)]
         lines.append("| **exponent** | " + " | ".join(f"**{each:.2f}**" for each in slopes) + " |")
     if found["frames"]:
-        lines += ["", "| frames of one process | memory, MB |", "|---|---|"]
-        lines += [f"| {int(count):,} | {mb:.0f} |" for count, mb in found["frames"].items()]
+        kept = list(found["frames"])
+        titles = [f"memory with states in {name}, MB" for name in kept]
+        lines += ["", f"| frames of one process | {' | '.join(titles)} |", "|---" * (1 + len(kept)) + "|"]
+        for count in found["frames"][kept[0]]:
+            lines.append(
+                f"| {int(count):,} | " + " | ".join(f"{found['frames'][name][count]:.0f}" for name in kept) + " |"
+            )
     return "\n".join(lines).strip()
 
 
@@ -173,4 +203,4 @@ def _peak_mb() -> float:
 
 if __name__ == "__main__":
     given = json.loads(sys.argv[1])
-    print(json.dumps(growth(given["frames"]) if "frames" in given else asdict(cost(Size(**given)))))
+    print(json.dumps(growth(**given) if "frames" in given else asdict(cost(Size(**given)))))

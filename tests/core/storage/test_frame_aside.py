@@ -95,3 +95,24 @@ def test_a_history_on_disk_has_no_use_for_it(tmp_path: Path) -> None:
     history.put_aside(tmp_path)
     assert same(history.gaussians(6), state(3))
     assert [path.name for path in tmp_path.iterdir()] == ["states"]
+
+
+def test_the_older_states_of_a_long_history_are_aside_by_themselves() -> None:
+    """A run of any length in one process takes no more memory than a short one."""
+    count, frames = 5_000, 4 * frame_aside.IN_MEMORY
+    one, report = state(0, count), {"loss": [0.5] * 200}
+    history = History()
+    tracemalloc.start()
+    try:
+        sizes = {}
+        for index in range(frames):
+            history.append(index, index / 30, one, report | {"index": index})
+            sizes[index] = tracemalloc.get_traced_memory()[0] / (count * FRAME_BYTES)
+    finally:
+        tracemalloc.stop()
+    assert sizes[frames - 1] - sizes[frame_aside.IN_MEMORY] < 2
+    assert [history.report(index)["index"] for index in (0, 1, 20, frames - 1)] == [0, 1, 20, frames - 1]
+    assert same(history.gaussians(5), one)
+    assert history.cut(5) == list(range(6, frames))
+    history.append(6, 6.0, one, {"index": 7})
+    assert history.report(6)["index"] == 7

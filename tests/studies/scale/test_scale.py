@@ -37,15 +37,17 @@ def test_sizes_are_measured_once_and_told(tmp_path: Path, monkeypatch: pytest.Mo
     found = scale.run(tmp_path, ["cameras"], [2, 4], said.append)
     (one,) = found["sweeps"]["cameras"]
     assert min(one.values()) > 0
-    assert set(found["frames"]) == {"2", "4"}
-    (tmp_path / "frames_2,4.json").write_text('{"2": 100, "4": 101}')
+    assert {name: set(sizes) for name, sizes in found["frames"].items()} == {name: {"2", "4"} for name in scale.KEPT}
+    for file in tmp_path.glob("frames_2,4*.json"):
+        file.write_text('{"2": 100, "4": 101}')
     again = scale.run(tmp_path, ["cameras"], [2, 4], said.append)
     assert again["sweeps"] == found["sweeps"]
-    assert again["frames"] == {"2": 100, "4": 101}
+    assert again["frames"] == {name: {"2": 100, "4": 101} for name in scale.KEPT}
     monkeypatch.setattr(scale, "SWEEPS", {"cameras": [TINY, Size(cameras=6)]})
-    costs = [{"update": 1.0, "view": 0.01, "first": 2.0, "memory": 100.0}] * 2
-    text = scale.told({"sweeps": {"cameras": costs}, "frames": {"2": 100}})
+    costs = [{"update": 1.0, "view": 0.01, "frame_0": 2.0, "memory": 100.0}] * 2
+    text = scale.told({"sweeps": {"cameras": costs}, "frames": {"a folder": {"2": 100}, "the process": {"2": 99}}})
     assert "| 3 | 1.00 | 10 | 2.00 | 100 |" in text
     assert "| **exponent** | **0.00** |" in text
+    assert "| 2 | 100 | 99 |" in text
     scale.plot({"sweeps": {"cameras": costs}, "frames": {}}, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 1000
