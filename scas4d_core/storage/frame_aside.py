@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, MutableMapping, Sequence
+import os
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryFile
 from threading import Lock
@@ -12,6 +13,7 @@ from weakref import finalize
 import numpy as np
 from numpy.typing import NDArray
 
+ROUNDED = 512
 IN_MEMORY = 16
 """Newest states of a history without a directory that stay in memory; older ones go to a scratch file."""
 
@@ -28,6 +30,8 @@ class ScratchFile:
         self._within = within
         self._file: IO[bytes] | None = None
         self._end = 0
+        self._free: dict[int, list[int]] = {}
+        """Places that are free again, by their size."""
         self._full = False
         self._one_at_a_time = Lock()
 
@@ -41,24 +45,6 @@ class ScratchFile:
             self._full = True
             return frame
 
-    def take(
-        self,
-        indices: Sequence[int],
-        frames: MutableMapping[int, Mapping[str, NDArray[Any]]],
-        texts: MutableMapping[int, bytes],
-        told: MutableMapping[int, Mapping[str, NDArray[np.uint8]]],
-    ) -> None:
-        """Moves frames and their reports, from ``texts`` to ``told``; those before one that is here already are, too.
-
-        Args:
-            indices: of the frames, rising.
-        """
-        for index in reversed(indices):
-            if (moved := self.moved(frames[index])) is frames[index]:
-                break
-            frames[index] = moved
-            told[index] = self.moved({"report": np.frombuffer(texts.pop(index), np.uint8)})
-
     def put(self, array: NDArray[Any]) -> int:
         """Adds an array, and says where it begins.
 
@@ -69,19 +55,41 @@ class ScratchFile:
             if self._file is None:
                 self._file = TemporaryFile(dir=self._within, buffering=0)  # noqa: SIM115
                 finalize(self, self._file.close)
-            begins = self._end
-            self._file.seek(begins)
-            array.tofile(self._file)
-            self._end = begins + array.nbytes
+            size = _room(array.nbytes)
+            free = self._free.get(size)
+            begins = free.pop() if free else self._end
+            self._write(array.tobytes(), begins)
+            self._end = max(self._end, begins + size)
             return begins
+
+    def _write(self, data: bytes, begins: int) -> None:
+        assert self._file is not None
+        left = memoryview(data)
+        while left:  # a disk that fills up takes a part, and refuses the next
+            count = os.pwrite(self._file.fileno(), left, begins)
+            left, begins = left[count:], begins + count
 
     def get(self, begins: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
         """The array that begins there."""
-        with self._one_at_a_time:
-            assert self._file is not None
-            self._file.seek(begins)
-            found = np.fromfile(self._file, dtype, int(np.prod(shape)))
-        return found.reshape(shape)
+        assert self._file is not None
+        found = np.empty(shape, dtype)
+        left, at = found.reshape(-1).view(np.uint8).data, begins
+        while left:
+            count = os.preadv(self._file.fileno(), [left], at)
+            if count == 0:
+                raise OSError(f"the scratch file ends at byte {at}")
+            left, at = left[count:], at + count
+        return found
+
+    def free(self, places: Mapping[str, tuple[int, int]]) -> None:
+        """Has places, each where it begins and its bytes, used again. Without the lock: a collection may call this."""
+        for begins, size in places.values():
+            self._free.setdefault(_room(size), []).append(begins)
+
+
+def _room(size: int) -> int:
+    """Bytes that are taken for an array: places of about one size take the place of one another."""
+    return -(-size // ROUNDED) * ROUNDED
 
 
 class FrameAside(Mapping[str, NDArray[Any]]):
@@ -100,6 +108,7 @@ class FrameAside(Mapping[str, NDArray[Any]]):
 
     def __init__(self, file: ScratchFile, begins: Mapping[str, int], frame: Mapping[str, NDArray[Any]]) -> None:
         self._file = file
+        finalize(self, file.free, {name: (begins[name], array.nbytes) for name, array in frame.items()})
         self._places = {name: (begins[name], array.dtype, array.shape) for name, array in frame.items()}
 
     def __getitem__(self, name: str) -> NDArray[Any]:

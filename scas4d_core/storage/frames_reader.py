@@ -44,7 +44,7 @@ class FramesReader:
         self._stamps: dict[int, Stamp] = {}
         self._texts: dict[int, bytes] = {}
         """Reports of the frames that are in memory."""
-        self._told: dict[int, Mapping[str, NDArray[np.uint8]]] = {}
+        self._reports_aside: dict[int, Mapping[str, NDArray[np.uint8]]] = {}
         """Those of frames without a file that are not (``History.put_aside``)."""
         self._packed: dict[int, NDArray[np.uint8]] = {}
         """What effects left of the frames that were written here and are in memory, packed."""
@@ -184,13 +184,13 @@ class FramesReader:
         self._require(index)
         text = self._texts.get(index)
         if text is None:
-            kept = self._told.get(index)
+            kept = self._reports_aside.get(index)
             text = (self._from_file(index, ("report",)) if kept is None else kept)["report"].tobytes()
         try:
             report: dict[str, Any] = json.loads(text)
         except ValueError as error:
             raise HistoryError(f"{frame_file(index)}: its report is no JSON ({error})") from error
-        if index in self._frames and index not in self._told:
+        if index in self._frames and index not in self._reports_aside:
             self._texts[index] = text
         return report
 
@@ -305,7 +305,7 @@ class FramesReader:
 
     def _forget(self, index: int) -> None:
         self._times.pop(index, None)
-        self._told.pop(index, None)
+        self._reports_aside.pop(index, None)
         self._stamps.pop(index, None)
         self._texts.pop(index, None)
         self._packed.pop(index, None)

@@ -73,9 +73,7 @@ class History(HistoryReader):
         if self._files is not None:
             self._files.directory.mkdir(parents=True, exist_ok=True)
             if self._files.listed():
-                raise HistoryError(
-                    f"{self._files.directory.name} already holds a history; open it with History.load or empty it"
-                )
+                raise HistoryError(f"{self._files.directory.name} already holds a history; History.load opens it")
 
     @classmethod
     def open(cls, directory: Path | str) -> History:
@@ -262,17 +260,22 @@ class History(HistoryReader):
             self._files.remove_oldest(deleted, self._times)
         return deleted
 
-    def put_aside(self, folder: Path | None, but: int = 1) -> None:
+    def put_aside(self, folder: Path | None, keep_newest: int = 1) -> None:
         """Moves states from memory to a scratch file, but for the first and the newest; their bits stay the same.
 
         Args:
             folder: on the disk of the file, which goes with this history; None: the system's for temporary files.
                 Without room states stay in memory.
-            but: so many of the newest.
+            keep_newest: so many stay.
         """
         self._scratch = self._scratch or ScratchFile(folder)
-        if self._files is None:
-            self._scratch.take(self.indices[1:-but], self._frames, self._texts, self._told)
+        for index in reversed(self.indices[1:-keep_newest] if self._files is None else ()):
+            if (moved := self._scratch.moved(self._frames[index])) is self._frames[index]:
+                break  # it is there already, and so are all before it; or there is no room
+            self._frames[index] = moved
+            self._reports_aside[index] = self._scratch.moved(
+                {"report": np.frombuffer(self._texts.pop(index), np.uint8)}
+            )
 
     def cut(self, after: int) -> list[int]:
         """Takes back every commit after frame ``after``.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import gc
+import os
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -116,3 +118,43 @@ def test_the_older_states_of_a_long_history_are_aside_by_themselves() -> None:
     assert history.cut(5) == list(range(6, frames))
     history.append(6, 6.0, one, {"index": 7})
     assert history.report(6)["index"] == 7
+
+
+def test_a_disk_that_fills_up_loses_no_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The system takes a part of what it is given, and refuses the next."""
+    room, write = [3 * 4096 + 100], os.pwrite
+
+    def little(file: int, data: bytes, at: int) -> int:
+        if room[0] <= 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        count = write(file, data[: min(len(data), room[0], 1000)], at)
+        room[0] -= count
+        return count
+
+    monkeypatch.setattr(frame_aside.os, "pwrite", little)
+    history = History()
+    for index in range(3 * frame_aside.IN_MEMORY):
+        history.append(index, index / 30, state(index), {"index": index})
+    assert room[0] <= 0
+    for index in range(3 * frame_aside.IN_MEMORY):
+        assert same(history.gaussians(index), state(index))
+        assert history.report(index) == {"index": index}
+
+
+def test_places_of_states_that_are_deleted_are_used_again(tmp_path: Path) -> None:
+    history, sizes = History(), []
+    for index in range(200):
+        history.append(index, index / 30, state(0), {"index": index})
+        history.retain(last=20)
+        sizes.append(0 if history._scratch is None else history._scratch._end)
+    assert sizes[-1] == sizes[60] > 0
+    assert [history.report(index)["index"] for index in history.indices] == [0, *range(180, 200)]
+    assert same(history.gaussians(185), state(0))
+
+
+def test_a_file_that_was_cut_is_an_error() -> None:
+    scratch = frame_aside.ScratchFile(None)
+    aside = scratch.moved({"a": np.arange(4000.0)})
+    os.ftruncate(scratch._file.fileno(), 8000)
+    with pytest.raises(OSError, match="ends at byte 8000"):
+        aside["a"]
